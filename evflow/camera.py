@@ -1,0 +1,242 @@
+"""The camera: per-pixel contrast thresholds and noise rates, and the sensor they sit in.
+
+`Camera` is a pytree of four float32 maps (..., H, W); it passes through jit, vmap and grad.
+`SensorModel` is what is *not* per pixel: a frozen, hashable description of the pixel circuit.
+`CameraPrior` is the distribution that cameras are drawn from (paper, Section IV-E, Eq. 12).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+
+Array = jax.Array
+
+THETA_MIN = 0.01  # v2e clamps thresholds here; a pixel at the clamp is a hot pixel
+PARAMETERS = ("theta_on", "theta_off", "eta_on", "eta_off")
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Per-pixel parameters, each float32 (..., H, W).
+
+    theta_on, theta_off: contrast thresholds in natural-log units, > 0.
+    eta_on, eta_off: noise events per second (Hz) and pixel, >= 0, at the recording's mean
+    intensity (`SensorModel(eta_intensity=True)` lets the rate follow Eq. 12 with intensity).
+    """
+
+    theta_on: Array
+    theta_off: Array
+    eta_on: Array
+    eta_off: Array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(np.shape(self.theta_on))
+
+    @staticmethod
+    def constant(
+        shape: tuple[int, ...],
+        theta_on: float = 0.2,
+        theta_off: float = 0.2,
+        eta_on: float = 0.0,
+        eta_off: float = 0.0,
+    ) -> Camera:
+        """The same parameters at every pixel of `shape` = (..., H, W)."""
+        values = (theta_on, theta_off, eta_on, eta_off)
+        return Camera(*(jnp.full(shape, v, jnp.float32) for v in values)).validate()
+
+    @staticmethod
+    def sample(key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None) -> Camera:
+        """One camera with pixels (..., H, W); leading axes are independent cameras."""
+        prior = prior or CameraPrior()
+        k_nominal, k_pixels = jax.random.split(key)
+        return sample_pixels(k_pixels, sample_nominal(k_nominal, shape[:-2], prior), shape[-2:])
+
+    def validate(self) -> Camera:
+        """Return self, or raise EV014 / EV015 (host side; skipped on traced arrays)."""
+        leaves = {name: getattr(self, name) for name in PARAMETERS}
+        if any(isinstance(v, jax.core.Tracer) for v in leaves.values()):
+            return self
+        shapes = {name: np.shape(v) for name, v in leaves.items()}
+        if len(set(shapes.values())) > 1:
+            raise EvflowDataError(
+                "EV015", f"the camera's maps have different shapes: {shapes}.",
+                "All four maps must be (..., H, W) of one sensor.",
+            )
+        for name, value in leaves.items():
+            array = np.asarray(value)
+            bad = ~np.isfinite(array) | (array <= 0 if name.startswith("theta") else array < 0)
+            if bad.any():
+                where = tuple(int(i) for i in np.argwhere(bad)[0])
+                rule = "> 0" if name.startswith("theta") else ">= 0"
+                raise EvflowDataError(
+                    "EV014",
+                    f"{name} is {array[where]} at index {where} ({bad.sum()} such values).",
+                    f"It must be finite and {rule}"
+                    + (f"; clamp thresholds at {THETA_MIN}." if rule == "> 0" else "."),
+                )
+        return self
+
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: Any) -> Path:
+        """Write an .npz with the four maps, `extra` arrays beside them, and the units."""
+        self.validate()
+        units = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
+        arrays = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
+        arrays |= {k: np.asarray(v) for k, v in extra.items()}
+        with atomic_write(path, overwrite=overwrite) as temporary, open(temporary, "wb") as f:
+            np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
+        return Path(path)
+
+    @staticmethod
+    def load(path: str | os.PathLike) -> Camera:
+        """Read the maps written by `save` (pickled arrays are refused)."""
+        path = Path(path)
+        if not path.is_file():
+            raise EvflowDataError("EV016", f"no camera file at {path}.", "Make one: evflow estimate.")
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                missing = [n for n in PARAMETERS if n not in data]
+                if missing:
+                    raise EvflowDataError(
+                        "EV008", f"{path} holds {sorted(data)} but not {missing}.",
+                        "Expected a camera.npz written by evflow estimate or Camera.save.",
+                    )
+                maps = [jnp.asarray(data[n], jnp.float32) for n in PARAMETERS]
+        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as e:
+            raise EvflowDataError("EV009", f"{path} is not a readable .npz ({e}).") from e
+        return Camera(*maps).validate()
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorModel:
+    """What is not per pixel. The default is v2e's noise-free pixel with true crossing times.
+
+    kind: the pixel circuit; "v2e".
+    timestamps: "crossing" = the instant at which the (linearly interpolated) log intensity
+        crosses the threshold; "v2e" = v2e's slots, shared by the k-th event of every pixel.
+    log_map: "linlog" (v2e: linear below 20 DN) or "log_eps" (ESIM: log(I/255 + 1e-3)).
+    cutoff_hz: corner of the intensity-dependent first-order low-pass at 255 DN; 0 = off.
+    refractory_s: dead time after an event; the contrast is kept and fires later (v2e).
+    leak_hz, leak_jitter, leak_fpn_decades: ON leak events per second, the relative jitter of
+        each step, and the spread of the fixed pattern in decades.
+    shot_hz: v2e's shot-noise rate R, both polarities together, on top of the camera's eta.
+    eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
+        of the first frame.
+    noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
+        False adds it to the stream (the paper).
+    """
+
+    kind: Literal["v2e"] = "v2e"
+    timestamps: Literal["crossing", "v2e"] = "crossing"
+    log_map: Literal["linlog", "log_eps"] = "linlog"
+    cutoff_hz: float = 0.0
+    refractory_s: float = 0.0
+    leak_hz: float = 0.0
+    leak_jitter: float = 0.0
+    leak_fpn_decades: float = 0.0
+    shot_hz: float = 0.0
+    eta_intensity: bool = False
+    noise_resets_memory: bool = False
+
+    def __post_init__(self) -> None:
+        allowed = {"kind": ("v2e",), "timestamps": ("crossing", "v2e"),
+                   "log_map": ("linlog", "log_eps")}
+        for name, values in allowed.items():
+            if getattr(self, name) not in values:
+                raise EvflowDataError(
+                    "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
+        for name in ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades",
+                     "shot_hz"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise EvflowDataError(
+                    "EV020", f"SensorModel({name}={getattr(self, name)}).", "It must be >= 0.")
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraPrior:
+    """The distribution of cameras.
+
+    theta: range of the nominal threshold, uniform, drawn apart for ON and OFF (paper: .1-.5).
+    mismatch: range of the per-pixel standard deviation (v2e's default .03; the paper .15).
+    noise: "eq12" ties the rate to the threshold, eta = g R(theta) with g uniform in
+        [F, 1] (the intensity factor of Eq. 12); "independent" draws it log-uniform in
+        `eta`; "mixed" takes either with equal chance; "none" is silent.
+    eta_spread: standard deviation of log eta from pixel to pixel.
+    """
+
+    theta: tuple[float, float] = (0.1, 0.5)
+    mismatch: tuple[float, float] = (0.03, 0.03)
+    noise: Literal["eq12", "independent", "mixed", "none"] = "eq12"
+    eta: tuple[float, float] = (0.02, 1.0)
+    eta_spread: float = 0.0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """What a whole camera shares, each float32 (...,): the medians of the four maps and the
+    threshold mismatch (standard deviation over pixels, before the clamp) per polarity."""
+
+    theta_on: Array
+    theta_off: Array
+    eta_on: Array
+    eta_off: Array
+    sigma_on: Array
+    sigma_off: Array
+
+
+def noise_of_threshold(theta: Array) -> Array:
+    """R(theta) = 4 / (90 theta - 5) of Eq. 12, clipped to the paper's range [.1, 1] Hz.
+
+    The pole at theta = .0556 lies inside the clip: smaller thresholds get 1 Hz.
+    """
+    return jnp.where(theta <= 0.1, 1.0, jnp.clip(4.0 / (90.0 * jnp.maximum(theta, 0.1) - 5.0), 0.1, 1.0))
+
+
+def sample_nominal(key: Array, batch: tuple[int, ...], prior: CameraPrior) -> Summary:
+    """Draw the camera-wide values, each of shape `batch`."""
+    k_theta, k_sigma, k_gain, k_free, k_link = jax.random.split(key, 5)
+    theta = jax.random.uniform(k_theta, (2, *batch), minval=prior.theta[0], maxval=prior.theta[1])
+    sigma = jax.random.uniform(
+        k_sigma, (2, *batch), minval=prior.mismatch[0], maxval=prior.mismatch[1])
+    tied = noise_of_threshold(theta) * jax.random.uniform(k_gain, (2, *batch), minval=0.25)
+    lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])
+    free = jnp.exp(jax.random.uniform(k_free, (2, *batch), minval=lo, maxval=hi))
+    either = jnp.where(jax.random.bernoulli(k_link, 0.5, batch), tied, free)
+    eta = {"eq12": tied, "independent": free, "mixed": either,
+           "none": jnp.zeros_like(tied)}[prior.noise]
+    return Summary(*theta, *eta, *sigma)
+
+
+def sample_pixels(
+    key: Array, nominal: Summary, shape: tuple[int, int], eta_spread: float = 0.0
+) -> Camera:
+    """Spread the camera-wide values over pixels: theta ~ N(median, sigma) clamped at .01 (v2e),
+    eta log-normal around its median. Returns maps (*batch, H, W)."""
+    k_on, k_off, k_eta = jax.random.split(key, 3)
+    size = (*jnp.shape(nominal.theta_on), *shape)
+
+    def theta(k: Array, median: Array, sigma: Array) -> Array:
+        draw = median[..., None, None] + sigma[..., None, None] * jax.random.normal(k, size)
+        return jnp.maximum(draw, THETA_MIN)
+
+    spread = jnp.exp(eta_spread * jax.random.normal(k_eta, (2, *size)))
+    return Camera(
+        theta(k_on, nominal.theta_on, nominal.sigma_on),
+        theta(k_off, nominal.theta_off, nominal.sigma_off),
+        nominal.eta_on[..., None, None] * spread[0],
+        nominal.eta_off[..., None, None] * spread[1],
+    )

@@ -1,0 +1,43 @@
+"""One exception for bad data, with a stable code.
+
+Every message says what was seen, where, what it probably means and what to do about it.
+Nothing else in evflow raises for data: a `ValueError` or `TypeError` from the library is a
+programming error, an `EvflowDataError` is something about the user's file or arrays.
+"""
+
+from __future__ import annotations
+
+CODES: dict[str, str] = {
+    "EV001": "empty input",
+    "EV002": "wrong shape",
+    "EV003": "wrong dtype or values that do not fit it",
+    "EV004": "timestamps not sorted",
+    "EV005": "coordinates outside the sensor",
+    "EV006": "unknown polarity convention",
+    "EV007": "NaN or infinite values",
+    "EV008": "unknown or unreadable file format",
+    "EV009": "damaged or truncated file",
+    "EV010": "an optional package is missing",
+    "EV011": "no intensity frames",
+    "EV012": "frames and events do not overlap in time",
+    "EV013": "refusing to overwrite",
+    "EV014": "camera parameters out of range",
+    "EV015": "sizes of camera, frames and events disagree",
+    "EV016": "file or folder not found",
+    "EV017": "too little information to estimate a camera",
+    "EV018": "weights do not fit this version of the network",
+    "EV019": "the disk is full or the output cannot be written",
+    "EV020": "option out of range",
+}
+
+
+class EvflowDataError(Exception):
+    """Bad input data.
+
+    `code` is one of `CODES`; `seen` says what was found and where; `fix` says what to do.
+    `str(error)` is "EV004 timestamps not sorted: <seen> <fix>" on one line.
+    """
+
+    def __init__(self, code: str, seen: str, fix: str = "") -> None:
+        self.code, self.seen, self.fix = code, seen, fix
+        super().__init__(f"{code} {CODES[code]}: {seen}{' ' + fix if fix else ''}")

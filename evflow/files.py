@@ -1,0 +1,38 @@
+"""Writing files so that nothing is ever half-written or overwritten unasked."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from evflow.errors import EvflowDataError
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; rename it into place only if the block succeeds.
+
+    Raises EV013 where `path` exists and `overwrite` is false, EV019 where the disk is full or
+    the folder cannot be written. The temporary file is removed on any failure, Ctrl-C included.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as e:
+        reasons = {errno.ENOSPC: "no space left", errno.EACCES: "permission denied",
+                   errno.EROFS: "read-only file system", errno.ENOTDIR: "not a folder"}
+        if e.errno in reasons:
+            raise EvflowDataError(
+                "EV019", f"{path} was not written ({reasons[e.errno]}).",
+                "Nothing is left behind; free space or choose another output.") from e
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
