@@ -63,7 +63,8 @@ class Camera:
         """One camera with pixels (..., H, W); leading axes are independent cameras."""
         prior = prior or CameraPrior()
         k_nominal, k_pixels = jax.random.split(key)
-        return sample_pixels(k_pixels, sample_nominal(k_nominal, shape[:-2], prior), shape[-2:])
+        nominal = sample_nominal(k_nominal, shape[:-2], prior)
+        return sample_pixels(k_pixels, nominal, shape[-2:], prior.eta_spread)
 
     def validate(self) -> Camera:
         """Return self, or raise EV014 / EV015 (host side; skipped on traced arrays)."""

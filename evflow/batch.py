@@ -1,0 +1,123 @@
+"""Training data, made where it is used: scenes -> cameras -> voxels, one jitted program.
+
+`sample_batch(key, bank, config)` is a pure function: step i of a run draws its batch from
+fold_in(key, i), on any number of devices, and nothing touches the disk.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Camera, SensorModel, Summary, sample_nominal, sample_pixels
+from evflow.config import TrainConfig
+from evflow.intensity import lin_log, noise_factor, normalised_intensity
+from evflow.scenes import TextureBank, render, sample_scene
+from evflow.simulator import scan
+from evflow.simulator.voxels import simulate_window
+
+Array = jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """B sequences of W windows of H x W' pixels.
+
+    voxels (B, W, H, W', 32); dlogI (B, W, H, W') from the noisy 8-bit frames at the window's
+    edges; changes (B, W, H, W', m) true signed log-intensity changes; intensity (B, W, H, W')
+    mean log intensity of the two frames; window_s (B,); camera maps (B, H, W'); nominal: the
+    sequence's true Summary (B,).
+    """
+
+    voxels: Array
+    dlogI: Array
+    changes: Array
+    intensity: Array
+    window_s: Array
+    camera: Camera
+    nominal: Summary
+
+
+def sample_batch(key: Array, bank: TextureBank, config: TrainConfig) -> Batch:
+    """Render `scenes` scenes, see each with `cameras` cameras; B = scenes x cameras."""
+    k_scene, k_window, k_camera = jax.random.split(key, 3)
+    shape = (config.crop, config.crop)
+    steps = config.windows * config.steps_per_window
+    low, high = np.log(config.window_s[0]), np.log(config.window_s[1])
+    window_s = jnp.exp(jax.random.uniform(k_window, (config.scenes,), minval=low, maxval=high))
+
+    def scene_frames(key: Array, window_s: Array) -> Array:
+        scene = sample_scene(key, bank, config.scene, shape)
+        times = (jnp.arange(steps + 1) - 0.5 * steps) * (window_s / config.steps_per_window)
+        return render(scene, times, shape)
+
+    frames = jax.vmap(scene_frames)(jax.random.split(k_scene, config.scenes), window_s)
+    parts = []
+    for index, model in enumerate(config.sensors):
+        keys = jax.random.split(jax.random.fold_in(k_camera, index),
+                                (config.cameras // len(config.sensors), config.scenes))
+        see = partial(_sequence, model=model, config=config)
+        parts.append(jax.vmap(jax.vmap(see), in_axes=(0, None, None))(keys, frames, window_s))
+    batch = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), batch)
+
+
+def _sequence(
+    key: Array, frames: Array, window_s: Array, *, model: SensorModel, config: TrainConfig
+) -> Batch:
+    """One camera on one scene: frames (W*steps + 1, H, W') DN."""
+    k_nominal, k_pixels, k_phase, k_sim, k_frame = jax.random.split(key, 5)
+    shape = frames.shape[1:]
+    nominal = sample_nominal(k_nominal, (), config.prior)
+    camera = sample_pixels(k_pixels, nominal, shape, config.prior.eta_spread)
+    log_frames = lin_log(frames)
+    # A window is cut from a running camera: each pixel is somewhere between its thresholds.
+    phase = jax.random.uniform(k_phase, shape)
+    phase = phase * (camera.theta_on + camera.theta_off) - camera.theta_off
+    state = scan.start(k_sim, log_frames[0], model, phase)
+    windows = log_frames[1:].reshape(config.windows, config.steps_per_window, *shape)
+    dt = window_s / config.steps_per_window
+
+    def window(state: scan.SimState, log_frames: Array) -> tuple[scan.SimState, Array]:
+        return simulate_window(model, True, camera, state, log_frames, dt, config.model.bins)
+
+    _, voxels = jax.lax.scan(window, state, windows)
+    seen = frames[:: config.steps_per_window]
+    seen = seen + config.frame_noise_dn * jax.random.normal(k_frame, seen.shape)
+    seen = lin_log(jnp.clip(jnp.round(seen), 0.0, 255.0))
+    gain = _noise_gain(frames, model)  # targets are rates at the sequence's mean intensity
+    return Batch(
+        voxels=voxels,
+        dlogI=seen[1:] - seen[:-1],
+        changes=_changes(log_frames, config),
+        intensity=0.5 * (seen[1:] + seen[:-1]),
+        window_s=window_s,
+        camera=_scale_noise(camera, gain),
+        nominal=_scale_noise(nominal, gain),
+    )
+
+
+def _changes(log_frames: Array, config: TrainConfig) -> Array:
+    """True changes over the m equal parts of each window, (W, H, W', m)."""
+    knots = log_frames[:: config.steps_per_window // config.model.changes]
+    parts = jnp.diff(knots, axis=0).reshape(config.windows, config.model.changes,
+                                            *log_frames.shape[1:])
+    return jnp.moveaxis(parts, 1, -1)
+
+
+def _noise_gain(frames: Array, model: SensorModel) -> Array:
+    """Mean noise rate over the sequence relative to the simulator's reference, its first frame."""
+    if not model.eta_intensity:
+        return jnp.ones(())
+    i01 = normalised_intensity(frames)
+    return jnp.mean(noise_factor(i01)) / noise_factor(jnp.mean(i01[0]))
+
+
+def _scale_noise(parameters: Camera | Summary, gain: Array) -> Camera | Summary:
+    return dataclasses.replace(parameters, eta_on=parameters.eta_on * gain,
+                               eta_off=parameters.eta_off * gain)

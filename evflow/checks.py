@@ -1,0 +1,160 @@
+"""The border: what arrays must be to become `Events` or a `Recording`. NumPy only.
+
+Every check returns its argument in the canonical dtype (without a copy where it fits) or raises
+an `EvflowDataError` that says what was seen, where, and what to do. Nothing is repaired.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+
+Size = tuple[int, int]
+
+COLUMNS = ("x", "y", "t", "p")
+RESET_US = 1_000_000  # a step back by more than this is another clock, not a late packet
+
+
+def check_size(size: Any) -> Size:
+    """(width, height) as ints, 1..65536, or EV020."""
+    try:
+        width, height = (operator.index(v) for v in size)
+    except (TypeError, ValueError):
+        width = height = 0
+    if not (0 < width <= 65536 and 0 < height <= 65536):
+        raise EvflowDataError(
+            "EV020", f"size is {size!r}.", "Give (width, height) in pixels, e.g. (346, 260).")
+    return width, height
+
+
+def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
+    """Times (N,) as int64 in order (strict: no two equal); EV003, EV004."""
+    if t.size == 0:
+        return np.zeros(0, np.int64)
+    if t.dtype.kind not in "iu":
+        raise EvflowDataError(
+            "EV003", f"{name} has dtype {t.dtype} (first value {t[0]}); times are integer us.",
+            "Multiply seconds by 1e6 and round: np.rint(t * 1e6).astype(np.int64).")
+    if t.dtype == np.uint64 and t.max() > np.iinfo(np.int64).max:
+        raise EvflowDataError(
+            "EV003", f"{name} reaches {t.max()}, more than int64 holds.",
+            "Times are microseconds; was a negative time stored as unsigned?")
+    t = t.astype(np.int64, copy=False)
+    back = t[1:] <= t[:-1] if strict else t[1:] < t[:-1]
+    if back.any():
+        raise _unsorted(t, np.flatnonzero(back), name)
+    return t
+
+
+def _unsorted(t: np.ndarray, steps: np.ndarray, name: str) -> EvflowDataError:
+    first, most = int(steps[0]), max(int(t[i]) - int(t[i + 1]) for i in steps[:100_000])
+    times = "time" if len(steps) == 1 else "times"
+    verb = "do not advance" if most == 0 else "go back"
+    seen = (f"{name}: timestamps {verb} {len(steps):,} {times}, first at index {first + 1:,}: "
+            f"{t[first]:,} -> {t[first + 1]:,} us (at most {most:,} us back).")
+    fix = ("Two of them share an instant: wrong time unit, or repeated?" if most == 0 else
+           "A camera reset, or two recordings joined? Split them there." if most > RESET_US else
+           "Nothing is sorted silently: if the order does not matter, sort all columns by "
+           "np.argsort(t, kind='stable').")
+    return EvflowDataError("EV004", seen, fix)
+
+
+def check_polarity(p: np.ndarray) -> np.ndarray:
+    """Polarity (N,) as bool, True = ON, from bool or integers in {0, 1} or {-1, 1}; EV006."""
+    if p.size == 0 or p.dtype == bool:
+        return p.astype(bool, copy=False)
+    if p.dtype.kind in "iu":
+        low, high = int(p.min()), int(p.max())
+        if low >= 0 and high <= 1:
+            return p.astype(bool)
+        if low == -1 and high <= 1 and p.all():
+            return p > 0
+    some = np.unique(p[:1_000_000]) if p.dtype.kind in "iuf" else p
+    values = ", ".join(str(v) for v in some[:5])
+    raise EvflowDataError(
+        "EV006", f"p has dtype {p.dtype} and holds {values}.",
+        "Expected bool, {0, 1} or {-1, 1}; a -1 stored as unsigned reads 255: use int8.")
+
+
+def check_columns(*given: Any) -> dict[str, np.ndarray]:
+    """x, y, t, p as 1-D arrays of one length without NaN; EV002, EV007."""
+    columns = {name: np.asarray(v) for name, v in zip(COLUMNS, given, strict=True)}
+    for name, a in columns.items():
+        if a.ndim != 1:
+            fix = "Columns are 1-D arrays of one length."
+            if a.ndim == 2 and 4 in a.shape:
+                rows = "events.T" if a.shape[1] == 4 else "events"
+                fix = f"That looks like all columns in one array: unpack it, x, y, t, p = {rows}."
+            raise EvflowDataError("EV002", f"{name} has shape {a.shape}.", fix)
+    lengths = {name: len(a) for name, a in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise EvflowDataError("EV002", f"columns differ in length: {lengths}.")
+    for name, a in columns.items():
+        if a.dtype.kind == "f" and not (finite := np.isfinite(a)).all():
+            where = int(np.argmin(finite))
+            raise EvflowDataError(
+                "EV007", f"{name} is {a[where]} at event {where:,} ({(~finite).sum():,} such).")
+    return columns
+
+
+def check_coordinates(x: np.ndarray, y: np.ndarray, size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """x, y as uint16 inside `size`; EV003, EV005."""
+    if x.size == 0:
+        return np.zeros(0, np.uint16), np.zeros(0, np.uint16)
+    for name, a in (("x", x), ("y", y)):
+        if a.dtype.kind not in "iu":
+            raise EvflowDataError(
+                "EV003", f"{name} has dtype {a.dtype} (first value {a[0]}).",
+                "Coordinates are raw integer pixels: were they undistorted? Use the raw ones.")
+    width, height = size
+    if min(x.min(), y.min()) < 0 or x.max() >= width or y.max() >= height:
+        outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
+        swapped = min(x.min(), y.min()) >= 0 and x.max() < height and y.max() < width
+        first = int(np.argmax(outside))
+        raise EvflowDataError(
+            "EV005",
+            f"{outside.sum():,} of {x.size:,} events ({100 * outside.mean():.1f} %) lie outside "
+            f"{width}x{height}: x {x.min()}..{x.max()}, y {y.min()}..{y.max()}, first at event "
+            f"{first:,} (x={x[first]}, y={y[first]}).",
+            f"size is (width, height): did you mean ({height}, {width})?" if swapped else
+            "Wrong sensor size or bit mask? Pass the size of this sensor.")
+    return x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False)
+
+
+def check_frames(frames: np.ndarray, size: Size) -> None:
+    """(T, H, W) of a known dtype, of the events' size, finite; EV002, EV003, EV007, EV015."""
+    width, height = size
+    if frames.ndim == 4 and frames.shape[-1] in (3, 4):
+        raise EvflowDataError(
+            "EV002", f"frames are colour, {frames.shape}.",
+            "Convert them: frames = evflow.types.luma(frames[..., :3]) (RGB, Rec. 709).")
+    if frames.ndim != 3:
+        raise EvflowDataError("EV002", f"frames have shape {frames.shape}.", "Expected (T, H, W).")
+    if frames.dtype not in (np.uint8, np.uint16, np.float32):
+        raise EvflowDataError(
+            "EV003", f"frames have dtype {frames.dtype}.", "Expected uint8, uint16 or float32 DN.")
+    if frames.shape[1:] != (height, width):
+        swapped = " Swap width and height of size." if frames.shape[1:] == (width, height) else ""
+        raise EvflowDataError(
+            "EV015", f"frames are {frames.shape[2]}x{frames.shape[1]} (width x height) but events "
+            f"are {width}x{height}.", f"Both must come from one sensor, uncropped.{swapped}")
+    if frames.dtype == np.float32 and len(frames):
+        _float_frames(frames)
+
+
+def _float_frames(frames: np.ndarray) -> None:
+    for index, frame in enumerate(frames):  # one by one: no (T, H, W) temporary
+        finite = np.isfinite(frame)
+        if not finite.all():
+            raise EvflowDataError(
+                "EV007", f"frame {index} has {(~finite).sum():,} NaN or infinite values.",
+                "The log of negative or missing pixels? Frames are linear DN.")
+    low, high = float(frames.min()), float(frames.max())
+    if low < 0 or high > 255 or 0 < high <= 1:
+        fix = "Multiply by 255." if low >= 0 and high <= 1 else "Rescale, or pass uint16."
+        raise EvflowDataError(
+            "EV003", f"float frames span {low:g}..{high:g}; expected DN 0..255.", fix)

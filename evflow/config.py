@@ -1,0 +1,144 @@
+"""Frozen configurations and their presets: `paper` (as printed), `default` (ours), `debug`.
+
+A configuration is hashable (a static argument of jit), overridden with dataclasses.replace or
+from the command line, and saved as JSON with every result.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+from evflow.camera import CameraPrior, SensorModel
+from evflow.errors import EvflowDataError
+from evflow.flow.config import FlowConfig
+from evflow.scenes.config import SceneConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """Static structure of the network.
+
+    pool: estimate a camera summary from all pixels and condition on it (one pixel alone
+        cannot tell its threshold: Bayes error .105 against .003 pooled).
+    code: "changes" builds the condition from the m signed intensity changes alone, so that a
+        video is enough to generate; "feature" passes the encoder's hidden feature, which
+        contains the events themselves (paper).
+    output: "log" or "tanh" coordinates of the parameters (see squash.py).
+    changes: m, intensity changes per window. piece: encoder features per change.
+    """
+
+    flow: FlowConfig = FlowConfig(condition=41)
+    bins: int = 16
+    changes: int = 16
+    piece: int = 24
+    encoder_hidden: int = 96
+    summary_hidden: int = 96
+    summary_features: int = 64
+    rate_features: int = 16
+    gates: int = 4
+    pool: bool = True
+    code: Literal["changes", "feature"] = "changes"
+    output: Literal["log", "tanh"] = "log"
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Weights of the losses (Eq. 11), and how they are evaluated.
+
+    adaptive: scale each loss by a power of ten into 0..10 (Section IV-D3).
+    change_l1: Charbonnier on the intensity changes beside Eq. 6 (its gradient vanishes
+        quadratically near the target, and most targets are ~.01).
+    confidence: weight L_P by the sample's share of the batch's events (lambda of Eq. 7).
+    inverse_flow: weight of L_F' (Eq. 10). It is minus the log-det part of L_F, so it cancels
+        or runs away unless small: 0 by default.
+    patches: side lengths of the local patches of Eq. 9; edge: the log-intensity gradient per
+        pixel at which a patch counts as an edge.
+    """
+
+    condition: float = 1.0
+    change_l1: float = 1.0
+    parameter: float = 1.0
+    flow: float = 0.02
+    event: float = 1.0
+    inverse_flow: float = 0.0
+    summary: float = 2.0
+    spread: float = 0.2
+    adaptive: bool = True
+    confidence: bool = False
+    dequantise: float = 0.02
+    patches: tuple[int, ...] = (4, 8, 16)
+    edge: float = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """One training run. Content of step i depends on (config, seed, i) alone.
+
+    scenes x cameras: sequences per step; cameras share a scene (rendering is the dearer part).
+    windows: windows per sequence; window_s: range of their length (log-uniform).
+    steps_per_window: rendered frames per window; motion stays near 1 px per frame.
+    block: pixels (h, w) of each crop that the flow sees; the summary sees the whole crop.
+    sensors: pixel models; the cameras of a step are split evenly among them.
+    """
+
+    model: ModelConfig = ModelConfig()
+    loss: LossConfig = LossConfig()
+    prior: CameraPrior = CameraPrior(
+        theta=(0.05, 0.6), mismatch=(0.0, 0.15), noise="mixed", eta=(0.02, 2.0), eta_spread=0.1)
+    scene: SceneConfig = SceneConfig()
+    sensors: tuple[SensorModel, ...] = (
+        SensorModel(eta_intensity=True), SensorModel(noise_resets_memory=True))
+    crop: int = 64
+    block: tuple[int, int] = (16, 16)
+    scenes: int = 8
+    cameras: int = 2
+    windows: int = 3
+    window_s: tuple[float, float] = (0.03, 0.1)
+    steps_per_window: int = 16
+    frame_noise_dn: float = 0.5
+    textures: int = 192
+    steps: int = 3000
+    warmup: int = 100
+    learning_rate: float = 1e-3
+    clip: float = 1.0
+    ema: float = 0.998
+    seed: int = 0
+
+
+def _small_flow(config: FlowConfig) -> FlowConfig:
+    return dataclasses.replace(config, steps=2, hidden=16)
+
+
+PAPER_MODEL = ModelConfig(
+    flow=FlowConfig(condition=96, injector=False, asinh=False), piece=6, pool=False,
+    code="feature", output="tanh")
+
+MODELS = {"default": ModelConfig(), "paper": PAPER_MODEL}
+
+PRESETS: dict[str, TrainConfig] = {
+    "default": TrainConfig(),
+    "paper": TrainConfig(
+        model=PAPER_MODEL,
+        loss=LossConfig(change_l1=0.0, inverse_flow=0.5, flow=1.0, summary=0.0, spread=0.0,
+                        confidence=True),
+        prior=CameraPrior(theta=(0.1, 0.5), mismatch=(0.15, 0.15), noise="eq12"),
+        scene=SceneConfig.preset("paper"), sensors=(SensorModel(eta_intensity=True),),
+        window_s=(0.032, 0.032), steps_per_window=32, windows=1, learning_rate=1e-4),
+    "debug": TrainConfig(
+        model=ModelConfig(flow=_small_flow(FlowConfig(condition=41)), summary_hidden=32,
+                          encoder_hidden=32),
+        crop=32, scenes=2, cameras=2, windows=2, textures=16, steps=20, warmup=5),
+}
+
+
+def preset(name: str) -> TrainConfig:
+    """A named configuration; unknown names raise EV020 with the known ones."""
+    if name not in PRESETS:
+        raise EvflowDataError("EV020", f"no preset {name!r}.", f"Choose one of {sorted(PRESETS)}.")
+    return PRESETS[name]
+
+
+def as_dict(config: Any) -> dict[str, Any]:
+    """A configuration as JSON-ready nested dicts."""
+    return dataclasses.asdict(config)

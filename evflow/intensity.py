@@ -1,0 +1,100 @@
+"""From pixel values (DN, 0..255) to log intensity, and back.
+
+Every log here is natural. `lin_log` is v2e's map: linear below 20 DN, logarithmic above, so
+that dark pixels do not turn quantisation steps into contrast. `log_eps` is ESIM's.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.errors import EvflowDataError
+
+Array = jax.Array
+
+LINLOG_KNEE = 20.0  # DN; v2e's threshold between the linear and the logarithmic part
+LINLOG_SLOPE = float(np.log(LINLOG_KNEE) / LINLOG_KNEE)
+LOG_EPS = 1e-3
+
+
+def lin_log(dn: Array) -> Array:
+    """v2e's lin-log map of DN in 0..255: I ln(20)/20 up to 20 DN, ln I above. Range 0..5.54."""
+    dn = jnp.asarray(dn)
+    dn = dn if jnp.issubdtype(dn.dtype, jnp.floating) else dn.astype(jnp.float32)
+    above = jnp.log(jnp.maximum(dn, LINLOG_KNEE))
+    return jnp.where(dn <= LINLOG_KNEE, dn * LINLOG_SLOPE, above)
+
+
+def lin_log_inverse(log_i: Array) -> Array:
+    """DN of a lin-log value."""
+    above = jnp.exp(jnp.maximum(log_i, LINLOG_KNEE * LINLOG_SLOPE))
+    return jnp.where(log_i <= LINLOG_KNEE * LINLOG_SLOPE, log_i / LINLOG_SLOPE, above)
+
+
+def log_eps(dn: Array) -> Array:
+    """ESIM's map ln(I/255 + 1e-3) of DN in 0..255."""
+    dn = jnp.asarray(dn)
+    dn = dn if jnp.issubdtype(dn.dtype, jnp.floating) else dn.astype(jnp.float32)
+    return jnp.log(dn / 255.0 + LOG_EPS)
+
+
+def log_eps_inverse(log_i: Array) -> Array:
+    """DN of a `log_eps` value."""
+    return 255.0 * (jnp.exp(log_i) - LOG_EPS)
+
+
+LOG_MAPS = {"linlog": (lin_log, lin_log_inverse), "log_eps": (log_eps, log_eps_inverse)}
+
+
+@lru_cache
+def uint8_table(log_map: str) -> np.ndarray:
+    """The log map of the 256 byte values, computed in float64 and rounded to 1e-8 as in v2e,
+    then float32: exact threshold ties of 8-bit video fall as they do there."""
+    dn = np.arange(256, dtype=np.float64)
+    if log_map == "linlog":
+        value = np.where(dn <= LINLOG_KNEE, dn * LINLOG_SLOPE, np.log(np.maximum(dn, 1.0)))
+        return np.round(value, 8).astype(np.float32)
+    return np.log(dn / 255.0 + LOG_EPS).astype(np.float32)
+
+
+def to_log(frames: Array | np.ndarray, log_map: str = "linlog") -> Array:
+    """Log intensity (float32) of uint8 or float DN frames 0..255, or uint16 on 0..65535."""
+    frames = jnp.asarray(frames)
+    if frames.dtype == jnp.uint8:
+        return jnp.take(jnp.asarray(uint8_table(log_map)), frames, axis=0)
+    if frames.dtype == jnp.uint16:
+        frames = frames.astype(jnp.float32) * (255.0 / 65535.0)
+    return LOG_MAPS[log_map][0](frames.astype(jnp.float32))
+
+
+def to_dn(frames: np.ndarray, full_scale: float) -> np.ndarray:
+    """Frames on 0..full_scale (255, 1023, 4095, 65535...) as float32 DN on 0..255 (host)."""
+    if not full_scale > 0:
+        raise EvflowDataError("EV020", f"full_scale={full_scale}.", "It must be > 0.")
+    return np.asarray(frames, np.float32) * np.float32(255.0 / full_scale)
+
+
+def normalised_intensity(dn: Array) -> Array:
+    """I01 = (I + 20) / 275 in (.07, 1]: v2e's rescaling, the N_01 of Eq. 12."""
+    return (dn + 20.0) / 275.0
+
+
+def noise_factor(i01: Array) -> Array:
+    """((F - 1) I01 + 1) of Eq. 12 with F = 0.25: noise falls linearly with intensity."""
+    return 1.0 - 0.75 * i01
+
+
+def delta_log_intensity(frame0: Array, frame1: Array) -> Array:
+    """Change of lin-log intensity between two frames (..., H, W) of DN 0..255 -> float32."""
+    for name, frame in (("frame0", frame0), ("frame1", frame1)):
+        if np.ndim(frame) < 2:
+            raise EvflowDataError("EV002", f"{name} has shape {np.shape(frame)}.",
+                                  "Expected (..., H, W).")
+    if np.shape(frame0) != np.shape(frame1):
+        raise EvflowDataError(
+            "EV002", f"the frames differ in shape: {np.shape(frame0)} and {np.shape(frame1)}.")
+    return to_log(frame1) - to_log(frame0)

@@ -1,0 +1,127 @@
+"""The paper's objectives, one function per equation.
+
+A loss returns per-element values; the caller reduces and weights them (Eq. 11).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from evflow.camera import Camera
+
+Array = jax.Array
+
+EPSILON = 1e-3  # of the Charbonnier losses (Eq. 7)
+COUNT_LIMIT = 6.0  # asinh(200): events per bin above it are no camera's, only an untrained flow's
+
+
+def condition_loss(logits: Array, target: Array, beta: float = 2.0) -> Array:
+    """Quality focal loss L_I (Eq. 6) of logits against targets in 0..1, element-wise."""
+    p = jax.nn.sigmoid(logits)
+    entropy = -(target * jax.nn.log_sigmoid(logits) + (1 - target) * jax.nn.log_sigmoid(-logits))
+    return jnp.abs(p - target) ** beta * entropy
+
+
+def charbonnier(error: Array) -> Array:
+    """sqrt(error^2 + 1e-6): an absolute value with a smooth foot, element-wise."""
+    return jnp.sqrt(error * error + EPSILON**2)
+
+
+def parameter_loss(predicted: Array, target: Array, confidence: Array | float = 1.0) -> Array:
+    """L_P (Eq. 7): Charbonnier over the four parameters, (..., 4) -> (...).
+
+    confidence: lambda, the sample's share of the batch's events times the batch size.
+    """
+    squared = jnp.sum((predicted - target) ** 2, -1)
+    return jnp.sqrt(confidence**2 * squared + EPSILON**2)
+
+
+def confidence_weight(voxels: Array) -> Array:
+    """lambda of Eq. 7 times the batch size (mean 1): voxels (B, ...) -> (B,)."""
+    events = voxels.reshape(voxels.shape[0], -1).sum(-1)
+    return events * voxels.shape[0] / jnp.maximum(events.sum(), 1.0)
+
+
+def flow_loss(log_prior: Array, log_latent: Array, log_det: Array) -> Array:
+    """L_F (Eq. 8): minus the log-likelihood, from log p(y), log p(z) and the log-det (...).
+
+    log p(y) is absent in the paper's preset (0), where L_P plays its part.
+    """
+    return -(log_prior + log_latent + log_det)
+
+
+def inverse_flow_loss(log_det: Array) -> Array:
+    """L_F' (Eq. 10): minus the log-det of the inverse map, (...)."""
+    return -log_det
+
+
+def edge_weight(dL: Array, size: int, edge: float) -> Array:
+    """1 - gamma of Eq. 9 for patches of side `size`: how much a patch is moving edge, in 0..1.
+
+    dL: total log-intensity change (..., h, w). A patch counts fully where the root mean square
+    change reaches `edge` log units; where nothing changes, its events are noise.
+    """
+    strength = jnp.sqrt(_patches(dL[..., None] ** 2, size).mean((-3, -2, -1)) + 1e-12)
+    return jnp.clip(strength / edge, 0.0, 1.0)
+
+
+def event_loss(generated: Array, voxels: Array, dL: Array, sizes: tuple[int, ...],
+               edge: float) -> Array:
+    """L_E (Eq. 9), (..., h, w, 2B) -> (...), averaged over patches and summed over scales.
+
+    generated: asinh of the generated voxels, voxels: true ones. Where edges move, the voxels themselves are compared (Charbonnier on asinh: a pixel's
+    count spans three decades); elsewhere only the events per patch and polarity, as a
+    Gaussian likelihood of variance count + 1.
+    """
+    error = charbonnier(generated - jnp.arcsinh(voxels))
+    events = jnp.sinh(jnp.clip(generated, -COUNT_LIMIT, COUNT_LIMIT))
+    total = jnp.zeros(voxels.shape[:-3])
+    for size in sizes:
+        moving = edge_weight(dL, size, edge)
+        values = _patches(error, size).mean((-3, -2, -1))
+        counts, true = _counts(jax.nn.elu(events), size), _counts(voxels, size)
+        noise = (0.5 * (counts - true) ** 2 / (true + 1.0)).mean(-1) / size**2
+        total += (moving * values + (1.0 - moving) * noise).mean(-1)
+    return total
+
+
+def _patches(x: Array, size: int) -> Array:
+    """(..., h, w, C) -> (..., patches, size, size, C); ragged edges are left out."""
+    *lead, h, w, channels = x.shape
+    rows, columns = h // size, w // size
+    x = x[..., : rows * size, : columns * size, :]
+    x = x.reshape(*lead, rows, size, columns, size, channels)
+    return jnp.moveaxis(x, -3, -4).reshape(*lead, rows * columns, size, size, channels)
+
+
+def _counts(voxels: Array, size: int) -> Array:
+    """Events per patch and polarity, (..., patches, 2)."""
+    patches = _patches(voxels, size)
+    on, off = jnp.split(patches, 2, -1)
+    return jnp.stack([on.sum((-3, -2, -1)), off.sum((-3, -2, -1))], -1)
+
+
+def summary_loss(y: Array, y_std: Array, target: Array) -> Array:
+    """Charbonnier of the summary, and the Gaussian likelihood of its std (which does not pull
+    on the mean), per component: (..., 6) each -> (..., 6)."""
+    error = y - target
+    return charbonnier(error) + 0.2 * gaussian_nll(jax.lax.stop_gradient(error), y_std)
+
+
+def gaussian_nll(error: Array, std: Array) -> Array:
+    """-log N(error; 0, std^2) up to a constant, element-wise."""
+    return 0.5 * (error / std) ** 2 + jnp.log(std)
+
+
+def adaptive_weight(loss: Array) -> Array:
+    """Section IV-D3: the power of ten that brings a loss into 0..10 (2.3e3 -> 2.3), without
+    gradient. Losses below 10 keep their weight."""
+    size = jnp.maximum(jnp.abs(jax.lax.stop_gradient(loss)), 1e-30)
+    return jnp.where(size >= 10.0, 10.0 ** -jnp.floor(jnp.log10(size)), 1.0)
+
+
+def camera_errors(estimate: Camera, truth: Camera) -> dict[str, Array]:
+    """Mean absolute error of each map, over everything."""
+    names = ("theta_on", "theta_off", "eta_on", "eta_off")
+    return {n: jnp.mean(jnp.abs(getattr(estimate, n) - getattr(truth, n))) for n in names}

@@ -1,0 +1,75 @@
+"""Camera parameters <-> the unbounded coordinates y in which the networks work.
+
+y = (log parameter - centre) / scale for (theta_on, theta_off, eta_on, eta_off), so thresholds
+stay positive and noise rates unbounded above (a tanh would allow negative thresholds, cap
+rates at 1 Hz and lose the bijection at its edges; it remains as the paper's option).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Camera, Summary
+
+Array = jax.Array
+Output = Literal["log", "tanh"]
+
+ETA_FLOOR = 1e-3  # Hz: one event per pixel in 17 minutes; a silent pixel is mapped here
+SIGMA_OFFSET = 0.01  # lets the mismatch be 0
+CENTRE = np.log(np.array([0.22, 0.22, 0.12, 0.12], np.float32))
+SCALE = np.array([0.6, 0.6, 1.0, 1.0], np.float32)
+SIGMA_CENTRE, SIGMA_SCALE = np.float32(np.log(0.06)), np.float32(0.8)
+TANH_EDGE = 0.999
+
+
+def squash(y: Array, output: Output = "log") -> Camera:
+    """y (..., 4) -> Camera of maps (...)."""
+    values = jnp.tanh(y) if output == "tanh" else jnp.exp(jnp.asarray(y) * SCALE + CENTRE)
+    return Camera(*jnp.moveaxis(values, -1, 0))
+
+
+def unsquash(camera: Camera, output: Output = "log") -> Array:
+    """Camera of maps (...) -> y (..., 4); eta below 1e-3 Hz is taken as 1e-3 Hz."""
+    if output == "tanh":
+        values = jnp.stack([camera.theta_on, camera.theta_off, camera.eta_on, camera.eta_off], -1)
+        return jnp.arctanh(jnp.clip(values, -TANH_EDGE, TANH_EDGE))
+    eta = [jnp.maximum(e, ETA_FLOOR) for e in (camera.eta_on, camera.eta_off)]
+    values = jnp.stack([camera.theta_on, camera.theta_off, *eta], -1)
+    return (jnp.log(values) - CENTRE) / SCALE
+
+
+def unsquash_summary(summary: Summary) -> Array:
+    """Summary of (...,) -> (..., 6): y of the medians, then the two mismatches."""
+    medians = Camera(summary.theta_on, summary.theta_off, summary.eta_on, summary.eta_off)
+    sigma = jnp.stack([summary.sigma_on, summary.sigma_off], -1)
+    sigma_y = (jnp.log(sigma + SIGMA_OFFSET) - SIGMA_CENTRE) / SIGMA_SCALE
+    return jnp.concatenate([unsquash(medians), sigma_y], -1)
+
+
+def squash_summary(y: Array) -> Summary:
+    """(..., 6) -> Summary of (...,)."""
+    medians = squash(y[..., :4])
+    sigma = jnp.exp(y[..., 4:] * SIGMA_SCALE + SIGMA_CENTRE) - SIGMA_OFFSET
+    sigma = jnp.maximum(sigma, 0.0)
+    return Summary(medians.theta_on, medians.theta_off, medians.eta_on, medians.eta_off,
+                   sigma[..., 0], sigma[..., 1])
+
+
+def summary_std(summary: Summary, y_std: Array) -> Summary:
+    """Standard deviation in natural units from that of y (..., 6), to first order."""
+    s = y_std * jnp.asarray([*SCALE, SIGMA_SCALE, SIGMA_SCALE])
+    return Summary(
+        summary.theta_on * s[..., 0], summary.theta_off * s[..., 1], summary.eta_on * s[..., 2],
+        summary.eta_off * s[..., 3], (summary.sigma_on + SIGMA_OFFSET) * s[..., 4],
+        (summary.sigma_off + SIGMA_OFFSET) * s[..., 5])
+
+
+def camera_std(camera: Camera, y_std: Array) -> Camera:
+    """Standard deviation maps in natural units from that of y (..., 4), to first order."""
+    s = jnp.moveaxis(y_std * SCALE, -1, 0)
+    return Camera(camera.theta_on * s[0], camera.theta_off * s[1], camera.eta_on * s[2],
+                  camera.eta_off * s[3])

@@ -1,0 +1,215 @@
+"""The words all rooms speak: `Events`, `Recording`, `Window`. Host side, NumPy only.
+
+An object that exists is valid: construction checks shape, dtype, NaN, order, coordinates and
+polarity once, and raises an `EvflowDataError` that says what was seen, where, and what to do.
+Nothing is sorted, clipped or dropped. Arrays are kept read-only, and without a copy where their
+dtype already fits. Units: times are int64 microseconds on the recording's own clock, a size is
+(width, height), an image is (height, width), brightness is in DN (digital numbers).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Sequence
+
+import numpy as np
+
+from evflow.checks import (
+    COLUMNS,
+    Size,
+    check_columns,
+    check_coordinates,
+    check_frames,
+    check_polarity,
+    check_size,
+    check_times,
+)
+from evflow.errors import EvflowDataError
+
+BIT_DEPTHS = (8, 10, 12, 14, 16)  # of the converters in image sensors; 16-bit files hold any
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709 weights of R, G, B
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Events:
+    """Events of one camera in time order; N may be 0 (a silent camera).
+
+    x, y: (N,) any integer dtype, inside `size`; kept as uint16.
+    t: (N,) any integer dtype, microseconds, non-decreasing; kept as int64.
+    p: (N,) bool, or integers in {0, 1} or {-1, 1}; kept as bool, True = ON (brighter).
+    size: (width, height) of the sensor in pixels.
+
+    Raises EV002 (shape), EV003 (dtype), EV004 (order), EV005 (coordinates), EV006 (polarity),
+    EV007 (NaN), EV020 (size).
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    t: np.ndarray
+    p: np.ndarray
+    size: Size
+
+    def __post_init__(self) -> None:
+        columns = check_columns(self.x, self.y, self.t, self.p)
+        size = check_size(self.size)
+        x, y = check_coordinates(columns["x"], columns["y"], size)
+        t = check_times(columns["t"], "t", strict=False)
+        self._set(x, y, t, check_polarity(columns["p"]), size)
+
+    def _set(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, size: Size) -> None:
+        for name, value in zip(COLUMNS, (x, y, t, p), strict=True):
+            object.__setattr__(self, name, read_only(value))
+        object.__setattr__(self, "size", size)
+
+    @classmethod
+    def unchecked(
+        cls, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, size: Size
+    ) -> Events:
+        """Wrap columns that are canonical and valid by construction; O(1), nothing is checked."""
+        events = object.__new__(cls)
+        events._set(x, y, t, p, size)
+        return events
+
+    @staticmethod
+    def concatenate(parts: Sequence[Events]) -> Events:
+        """Join consecutive parts of one camera.
+
+        Raises EV001 (no part), EV015 (different sizes), EV004 (a part begins before the end of
+        the one before it).
+        """
+        if not parts:
+            raise EvflowDataError("EV001", "there are no events to concatenate.")
+        sizes = sorted({part.size for part in parts})
+        if len(sizes) > 1:
+            raise EvflowDataError(
+                "EV015", f"cannot join events of sizes {sizes}.", "Join parts of one camera only.")
+        x, y, t, p = (np.concatenate([getattr(part, n) for part in parts]) for n in COLUMNS)
+        return Events.unchecked(x, y, check_times(t, "t", strict=False), p, sizes[0])
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        width, height = self.size
+        text = f"{len(self):,} events, {width}x{height}, {self.duration_us / 1e6:.3f} s"
+        return text + (f", {100 * self.p.mean():.0f} % ON" if len(self) else "")
+
+    @property
+    def duration_us(self) -> int:
+        """Time from the first to the last event in microseconds; 0 without events."""
+        return int(self.t[-1] - self.t[0]) if len(self) else 0
+
+    def slice(self, t0_us: int, t1_us: int) -> Events:
+        """The events with t0_us <= t < t1_us, as views (no copy, nothing is checked again)."""
+        bounds = np.array([operator.index(t0_us), operator.index(t1_us)], np.int64)
+        first, last = np.searchsorted(self.t, bounds)
+        x, y, t, p = (getattr(self, name)[first:last] for name in COLUMNS)
+        return Events.unchecked(x, y, t, p, self.size)
+
+    def count_map(self) -> np.ndarray:
+        """Events per pixel, uint32 (2, H, W) = [ON, OFF]."""
+        width, height = self.size
+        counts = np.zeros(2 * height * width, np.uint32)
+        for first in range(0, len(self), 1 << 22):  # bounds the int64 indices to 32 MiB
+            part = slice(first, first + (1 << 22))
+            plane = np.where(self.p[part], 0, height)
+            index = (plane + self.y[part]) * width + self.x[part]
+            counts += np.bincount(index, minlength=counts.size).astype(np.uint32)
+        return counts.reshape(2, height, width)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Recording:
+    """Events and intensity frames of one camera on one clock.
+
+    frames: (T, H, W) uint8, uint16 or float32 in DN; T may be 0. Float frames are 0..255.
+    frame_times: (T,) any integer dtype, microseconds, mid-exposure, strictly increasing;
+        kept as int64.
+    notes: what a reader assumed or converted, a sentence each.
+
+    Raises EV002 (shape, colour), EV003 (dtype, range of float frames), EV004 (order),
+    EV007 (NaN), EV015 (frames and events of different size).
+    """
+
+    events: Events
+    frames: np.ndarray
+    frame_times: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        frames, times = np.asarray(self.frames), np.asarray(self.frame_times)
+        check_frames(frames, self.events.size)
+        if times.shape != frames.shape[:1]:
+            raise EvflowDataError(
+                "EV002", f"frame_times has shape {times.shape} for {len(frames)} frames.",
+                "Give one mid-exposure time in microseconds per frame.")
+        times = check_times(times, "frame_times", strict=True)
+        object.__setattr__(self, "frames", read_only(frames))
+        object.__setattr__(self, "frame_times", read_only(times))
+
+    @staticmethod
+    def of_events(events: Events, notes: tuple[str, ...] = ()) -> Recording:
+        """A recording without frames."""
+        width, height = events.size
+        return Recording(
+            events, np.zeros((0, height, width), np.uint8), np.zeros(0, np.int64), notes)
+
+    def __repr__(self) -> str:
+        return f"{self.events!r}, {len(self.frames)} frames ({self.frames.dtype})"
+
+    @property
+    def has_frames(self) -> bool:
+        return len(self.frames) > 0
+
+    @functools.cached_property
+    def full_scale(self) -> int:
+        """The DN of a saturated pixel: 255 for uint8 and, by convention, for float32; for uint16
+        that of the smallest converter (8, 10, 12, 14, 16 bits: 255, 1023, 4095, 16383, 65535)
+        that holds the maximum of all frames."""
+        if self.frames.dtype != np.uint16 or not self.has_frames:
+            return 255
+        peak = int(self.frames.max())
+        return next(2**bits - 1 for bits in BIT_DEPTHS if peak < 2**bits)
+
+    def frame_dn(self, index: int) -> np.ndarray:
+        """Frame `index` as float32 (H, W), scaled so that `full_scale` is 255 DN."""
+        return self.frames[index].astype(np.float32) * np.float32(255 / self.full_scale)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Window:
+    """What a camera saw between two of its frames.
+
+    events: those with t0_us <= t < t1_us. frame0, frame1: float32 (H, W) in DN 0..255, taken at
+    t0_us and t1_us (microseconds, mid-exposure). index: its place among the windows, from 0.
+    """
+
+    events: Events
+    frame0: np.ndarray
+    frame1: np.ndarray
+    t0_us: int
+    t1_us: int
+    index: int
+
+    @property
+    def window_s(self) -> float:
+        return (self.t1_us - self.t0_us) / 1e6
+
+
+def luma(frames: np.ndarray) -> np.ndarray:
+    """Grey frames of colour ones, (..., 3) RGB -> (...), by the Rec. 709 weights.
+
+    uint16 stays uint16 (rounded) and so keeps its full scale; uint8 and float32 become float32
+    in 0..255, unrounded, so that no contrast step is added.
+    """
+    grey = frames.astype(np.float32) @ LUMA
+    return np.rint(grey).astype(np.uint16) if frames.dtype == np.uint16 else grey
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    """A view that cannot be written; the caller's own array keeps its flags."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
