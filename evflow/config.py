@@ -67,7 +67,7 @@ class LossConfig:
     adaptive: bool = True
     confidence: bool = False
     dequantise: float = 0.02
-    patches: tuple[int, ...] = (4, 8, 16)
+    patches: tuple[int, ...] = (4, 8)
     edge: float = 0.1
 
 
@@ -86,11 +86,11 @@ class TrainConfig:
     loss: LossConfig = LossConfig()
     prior: CameraPrior = CameraPrior(
         theta=(0.05, 0.6), mismatch=(0.0, 0.15), noise="mixed", eta=(0.02, 2.0), eta_spread=0.1)
-    scene: SceneConfig = SceneConfig()
+    scene: SceneConfig = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
     sensors: tuple[SensorModel, ...] = (
         SensorModel(eta_intensity=True), SensorModel(noise_resets_memory=True))
     crop: int = 64
-    block: tuple[int, int] = (16, 16)
+    block: tuple[int, int] = (8, 16)
     scenes: int = 8
     cameras: int = 2
     windows: int = 3
@@ -101,6 +101,8 @@ class TrainConfig:
     steps: int = 3000
     warmup: int = 100
     learning_rate: float = 1e-3
+    summary_rate: float = 2e-3
+    flow_rate: float = 5e-4
     clip: float = 1.0
     ema: float = 0.998
     seed: int = 0
@@ -124,7 +126,7 @@ PRESETS: dict[str, TrainConfig] = {
                         confidence=True),
         prior=CameraPrior(theta=(0.1, 0.5), mismatch=(0.15, 0.15), noise="eq12"),
         scene=SceneConfig.preset("paper"), sensors=(SensorModel(eta_intensity=True),),
-        window_s=(0.032, 0.032), steps_per_window=32, windows=1, learning_rate=1e-4),
+        window_s=(0.032, 0.032), steps_per_window=32, windows=1, learning_rate=1e-4, flow_rate=1e-4),
     "debug": TrainConfig(
         model=ModelConfig(flow=_small_flow(FlowConfig(condition=41)), summary_hidden=32,
                           encoder_hidden=32),

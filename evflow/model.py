@@ -35,6 +35,7 @@ from evflow.errors import EvflowDataError
 from evflow.squash import (
     SCALE,
     camera_std,
+    per_channel,
     squash,
     squash_summary,
     summary_std,
@@ -351,7 +352,8 @@ def base_std(summary_y: Array) -> Array:
     known = squash_summary(summary_y)
     theta = jnp.stack([known.sigma_on / known.theta_on, known.sigma_off / known.theta_off], -1)
     theta = jnp.sqrt(theta**2 + 0.05**2)
-    return jnp.concatenate([theta, jnp.full_like(theta, 0.3)], -1) / SCALE
+    spread = jnp.concatenate([theta, jnp.full_like(theta, 0.3)], -1)
+    return spread / per_channel(SCALE, spread)
 
 
 def log_normal(x: Array, mean: Array | float, std: Array | float) -> Array:

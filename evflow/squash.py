@@ -26,9 +26,15 @@ SIGMA_CENTRE, SIGMA_SCALE = np.float32(np.log(0.06)), np.float32(0.8)
 TANH_EDGE = 0.999
 
 
+def per_channel(values: np.ndarray, like: Array) -> Array:
+    """Constants (C,) shaped to meet like (..., C): rank promotion stays explicit."""
+    return jnp.asarray(values, like.dtype).reshape((1,) * (like.ndim - 1) + (-1,))
+
+
 def squash(y: Array, output: Output = "log") -> Camera:
     """y (..., 4) -> Camera of maps (...)."""
-    values = jnp.tanh(y) if output == "tanh" else jnp.exp(jnp.asarray(y) * SCALE + CENTRE)
+    y = jnp.asarray(y)
+    values = jnp.tanh(y) if output == "tanh" else jnp.exp(y * per_channel(SCALE, y) + per_channel(CENTRE, y))
     return Camera(*jnp.moveaxis(values, -1, 0))
 
 
@@ -39,7 +45,7 @@ def unsquash(camera: Camera, output: Output = "log") -> Array:
         return jnp.arctanh(jnp.clip(values, -TANH_EDGE, TANH_EDGE))
     eta = [jnp.maximum(e, ETA_FLOOR) for e in (camera.eta_on, camera.eta_off)]
     values = jnp.stack([camera.theta_on, camera.theta_off, *eta], -1)
-    return (jnp.log(values) - CENTRE) / SCALE
+    return (jnp.log(values) - per_channel(CENTRE, values)) / per_channel(SCALE, values)
 
 
 def unsquash_summary(summary: Summary) -> Array:
@@ -61,7 +67,7 @@ def squash_summary(y: Array) -> Summary:
 
 def summary_std(summary: Summary, y_std: Array) -> Summary:
     """Standard deviation in natural units from that of y (..., 6), to first order."""
-    s = y_std * jnp.asarray([*SCALE, SIGMA_SCALE, SIGMA_SCALE])
+    s = y_std * per_channel(np.array([*SCALE, SIGMA_SCALE, SIGMA_SCALE]), y_std)
     return Summary(
         summary.theta_on * s[..., 0], summary.theta_off * s[..., 1], summary.eta_on * s[..., 2],
         summary.eta_off * s[..., 3], (summary.sigma_on + SIGMA_OFFSET) * s[..., 4],
@@ -70,6 +76,6 @@ def summary_std(summary: Summary, y_std: Array) -> Summary:
 
 def camera_std(camera: Camera, y_std: Array) -> Camera:
     """Standard deviation maps in natural units from that of y (..., 4), to first order."""
-    s = jnp.moveaxis(y_std * SCALE, -1, 0)
+    s = jnp.moveaxis(y_std * per_channel(SCALE, y_std), -1, 0)
     return Camera(camera.theta_on * s[0], camera.theta_off * s[1], camera.eta_on * s[2],
                   camera.eta_off * s[3])

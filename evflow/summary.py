@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.config import ModelConfig
-from evflow.squash import CENTRE, SCALE
+from evflow.squash import CENTRE, SCALE, per_channel
 
 Array = jax.Array
 
@@ -143,7 +143,7 @@ def pooled_features(stats: Stats) -> Array:
     mean_active = stats.active / (stats.pixels_active + 1.0)[..., None]
     log_rates = jnp.log((stats.rates + 1e-3) / stats.exposure[..., None])
     theta = jnp.clip(least_squares(stats.normal), 0.01, 2.0)
-    theta_y = (jnp.log(theta) - CENTRE[:2]) / SCALE[:2]
+    theta_y = (jnp.log(theta) - per_channel(CENTRE[:2], theta)) / per_channel(SCALE[:2], theta)
     scalars = jnp.stack(
         [jnp.log((stats.pixels_active + 0.5) / stats.pixels), log_rate(stats.events_on),
          log_rate(stats.events_off), jnp.log(stats.exposure / stats.pixels)], -1)

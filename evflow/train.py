@@ -52,10 +52,22 @@ class Block:
 
 
 def optimiser(config: TrainConfig) -> optax.GradientTransformation:
-    """Adam with warm-up, cosine decay and clipped gradients."""
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, config.warmup, max(config.steps, config.warmup + 1))
-    return optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(schedule))
+    """Adam with warm-up and cosine decay, gradients clipped part by part: the flow's likelihood
+    has gradients 50 times those of the summary, which a common clip would silence."""
+
+    def part(rate: float) -> optax.GradientTransformation:
+        schedule = optax.warmup_cosine_decay_schedule(
+            0.0, rate, config.warmup, max(config.steps, config.warmup + 1))
+        return optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(schedule))
+
+    rates = {"summary": config.summary_rate, "encoder": config.learning_rate,
+             "spread": config.learning_rate, "flow": config.flow_rate}
+
+    def labels(params: dict[str, Any]) -> dict[str, Any]:
+        return {name: {k: jax.tree.map(lambda _, k=k: k, v) for k, v in net.items()}
+                for name, net in params.items()}
+
+    return optax.partition({k: part(rate) for k, rate in rates.items()}, labels)
 
 
 def init_state(
@@ -118,8 +130,7 @@ def summary_losses(
     k_windows, k_intensity = jax.random.split(key)
     known = jax.random.bernoulli(k_intensity, 0.5, (count, 1, 1, 1))
     intensity = jnp.where(known, batch.intensity, jnp.nan)  # half the users have none to give
-    stats = summary.pool(config.model, net["summary"], batch.voxels, batch.dlogI,
-                         jnp.broadcast_to(batch.window_s[:, None], (count, windows)), intensity)
+    stats = _pool_windows(net["summary"], batch, intensity, config)
     used = jax.random.randint(k_windows, (count, 1), 1, windows + 1)
     keep = (jnp.arange(windows)[None] < used).astype(jnp.float32)
 
@@ -135,6 +146,20 @@ def summary_losses(
     metrics = {f"summary/{n}": jnp.abs(getattr(seen, n) - getattr(batch.nominal, n)).mean()
                for n in names}
     return loss, y, metrics
+
+
+def _pool_windows(
+    net: dict[str, Any], batch: Batch, intensity: Array, config: TrainConfig
+) -> Stats:
+    """Stats (B, W), window by window and recomputed in the backward pass: activations of one
+    window stay in cache (gradient of 48 windows of 64x64: .23 s against .82 s at once)."""
+    lead = batch.dlogI.shape[:2]
+    window_s = jnp.broadcast_to(batch.window_s[:, None], lead)
+    arrays = (batch.voxels, batch.dlogI, window_s, intensity)
+    flat = tuple(a.reshape(-1, *a.shape[2:]) for a in arrays)
+    pool = jax.checkpoint(lambda window: summary.pool(config.model, net, *window))
+    stats = jax.lax.map(pool, flat)
+    return jax.tree.map(lambda a: a.reshape(*lead, *a.shape[1:]), stats)
 
 
 def pixel_losses(

@@ -1,0 +1,15 @@
+"""Recordings from and to files. NumPy only: reading never imports JAX."""
+
+from evflow.io.base import read_events, read_recording, write_events
+from evflow.io.dsec import DsecWriter
+from evflow.io.windows import WindowPlan, iter_windows, plan_windows
+
+__all__ = [
+    "DsecWriter",
+    "WindowPlan",
+    "iter_windows",
+    "plan_windows",
+    "read_events",
+    "read_recording",
+    "write_events",
+]

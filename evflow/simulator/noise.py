@@ -71,11 +71,11 @@ def noise_rates(
     """
     eta = jnp.stack([camera.eta_on, camera.eta_off])
     if model.eta_intensity:
-        eta = eta * (noise_factor(i01) / noise_factor(reference))
+        eta = eta * (noise_factor(i01) / noise_factor(reference))[None]
     if model.shot_hz > 0:
         theta = jnp.stack([camera.theta_on, camera.theta_off])
         median = jnp.median(theta.reshape(2, -1), axis=1).reshape(2, *[1] * (theta.ndim - 1))
-        eta = eta + 0.5 * model.shot_hz * noise_factor(i01) * (median / theta)
+        eta = eta + 0.5 * model.shot_hz * noise_factor(i01)[None] * (median / theta)
     return eta[0], eta[1]
 
 

@@ -1,15 +1,15 @@
 """Log frames -> voxel grid without ever making an event; jit, vmap and scan it.
 
 Within an interval a pixel's events sit on an arithmetic progression, so the sum of their
-triangular weights (Eq. 2) has a closed form: the hat is a second difference of ramps,
-hat(s - j) = r(j+1-s) - 2 r(j-s) + r(j-1-s), and a sum of ramps over a progression needs only
-the number of terms below each knot. An interval touches few bins; only those are computed.
+triangular weights (Eq. 2) has a closed form (`hat_sums`). An interval touches few bins; only
+those are computed.
 """
 
 from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,64 +24,70 @@ from evflow.voxel import BINS
 Array = jax.Array
 
 
-def ramp_sum(knot: Array, first: Array, spacing: Array, count: Array) -> Array:
-    """Sum over k < count of max(0, knot - (first + k spacing)), element-wise."""
-    room = knot - first
-    below = jnp.floor(room / jnp.maximum(spacing, 1e-12)) + 1.0
-    below = jnp.clip(jnp.where(room > 0, below, 0.0), 0.0, count)
-    return below * room - spacing * (0.5 * below * (below - 1.0))
+def hat_sums(low: Array, width: int, first: Array, spacing: Array, count: Array) -> list[Array]:
+    """Weights on bins low, low+1, ... (`width` of them) of a progression of events.
 
-
-def hat_sums(low: Array, width: int, first: Array, spacing: Array, count: Array) -> Array:
-    """Weights (width, ...) that a progression of events puts on bins low, low+1, ...
-
-    first, spacing are in bins; every event must lie in [low, low + width - 1].
+    first, spacing are in bins; every event must lie in [low, low + width - 1]. Within a gap
+    between two bins the weights are linear, so the number of events in it and the sum of their
+    positions suffice: one division, whatever the count.
     """
-    knots = [low + (j - 1.0) for j in range(width + 2)]
-    ramps = [ramp_sum(knot, first, spacing, count) for knot in knots]
-    return jnp.stack([ramps[j] - 2.0 * ramps[j + 1] + ramps[j + 2] for j in range(width)])
+    start = first - low
+    inverse = 1.0 / jnp.maximum(spacing, 1e-12)
+    weights = [jnp.zeros_like(count) for _ in range(width)]
+    done, total = jnp.zeros_like(count), jnp.zeros_like(count)
+    for gap in range(width - 1):
+        if gap == width - 2:
+            upto = count
+        else:
+            upto = jnp.clip(jnp.floor((gap + 1.0 - start) * inverse) + 1.0, 0.0, count)
+        position = upto * (start + spacing * (0.5 * (upto - 1.0)))  # sum of the first `upto`
+        number, moment = upto - done, position - total
+        weights[gap] += (gap + 1.0) * number - moment
+        weights[gap + 1] += moment - gap * number
+        done, total = upto, position
+    return weights
 
 
-def _interval_bins(
+def _signal_bins(
     interval: Interval, low: Array, begin: Array, length: Array, width: int, dead: Array | None
-) -> Array:
-    """Weights (width, 2, H, W) of one interval that spans [begin, begin + length] bins.
+) -> list[Array]:
+    """Weights (H, W) per touched bin of one interval's signal events, both polarities together.
 
-    dead: the refractory period in interval lengths, None where pixels never wait."""
+    The interval spans [begin, begin + length] bins. dead: the refractory period in interval
+    lengths, None where pixels never wait.
+    """
     spikes = interval.spikes
     count = jnp.abs(spikes.count).astype(jnp.float32)
-    if dead is not None:  # refractory: the waiting events come first, dead apart, then the crossings
-        gain = jnp.maximum(spikes.spacing - dead, 1e-9)
-        waiting = jnp.ceil(jnp.maximum(spikes.earliest - spikes.first, 0.0) / gain)
-        waiting = jnp.clip(waiting, 0.0, count)
-        signal = hat_sums(low, width, begin + spikes.earliest * length,
-                          jnp.zeros_like(count) + dead * length, waiting)
-        at = spikes.first + waiting * spikes.spacing
-        signal += hat_sums(low, width, begin + at * length, spikes.spacing * length,
-                           count - waiting)
-    else:
-        signal = hat_sums(low, width, begin + spikes.first * length, spikes.spacing * length,
-                          count)
-    rising = spikes.count > 0
-    pair = jnp.stack([jnp.where(rising, signal, 0.0), jnp.where(rising, 0.0, signal)], 1)
-    return pair + _noise_bins(interval, low, begin, length, width)
+    spacing = spikes.spacing * length
+    if dead is None:
+        return hat_sums(low, width, begin + spikes.first * length, spacing, count)
+    # The waiting events come first, `dead` apart, then those that cross in their own time.
+    gain = jnp.maximum(spikes.spacing - dead, 1e-9)
+    waiting = jnp.ceil(jnp.maximum(spikes.earliest - spikes.first, 0.0) / gain)
+    waiting = jnp.clip(waiting, 0.0, count)
+    at = spikes.first + waiting * spikes.spacing
+    late = hat_sums(low, width, begin + spikes.earliest * length,
+                    jnp.zeros_like(count) + dead * length, waiting)
+    timely = hat_sums(low, width, begin + at * length, spacing, count - waiting)
+    return [a + b for a, b in zip(late, timely, strict=True)]
 
 
 def _noise_bins(
     interval: Interval, low: Array, begin: Array, length: Array, width: int
-) -> Array:
-    """Weights (width, 2, H, W) of the noise events."""
+) -> list[Array]:
+    """Weights (2, H, W) per touched bin of one interval's noise events (ON, OFF). The loop runs
+    only where some pixel sends two or more in one interval."""
     counts = jnp.stack([interval.noise_on, interval.noise_off])
-    bins = low + jnp.arange(width, dtype=jnp.float32).reshape(width, 1, 1, 1)
 
-    def place(k: int, total: Array) -> Array:
-        s = begin + noise.placed(interval.noise_at, k) * length
-        hat = jnp.maximum(0.0, 1.0 - jnp.abs(bins - s[None]))
-        return total + hat * (counts > k)[None]
+    def place(k: Array | int) -> list[Array]:
+        s = begin + noise.placed(interval.noise_at, k) * length - low
+        struck = jnp.where(counts > k, 1.0, 0.0)
+        return [struck * jnp.maximum(0.0, 1.0 - jnp.abs(s - j)) for j in range(width)]
 
-    most = jnp.max(counts).astype(jnp.int32)
-    zero = jnp.zeros((width, *counts.shape), jnp.float32)
-    return jax.lax.fori_loop(0, most, place, zero)
+    def more(k: Array, weights: list[Array]) -> list[Array]:
+        return [a + b for a, b in zip(weights, place(k), strict=True)]
+
+    return jax.lax.fori_loop(1, jnp.max(counts).astype(jnp.int32), more, place(0))
 
 
 def simulate_window(
@@ -102,19 +108,34 @@ def simulate_window(
     waits = model.refractory_s > 0 and model.timestamps == "crossing"
     dead = model.refractory_s / dt if waits else None
 
-    def body(state: SimState, inputs: tuple[Array, Array, Array]) -> tuple[SimState, Array]:
+    def body(state: SimState, inputs: tuple[Array, Array, Array]) -> tuple[SimState, Any]:
         log_i, at, begin = inputs
         end_s = jnp.stack([state.frame.astype(jnp.float32) * dt, jnp.zeros(())])
         state, interval = scan.advance(model, noisy, camera, state, log_i, dt, end_s)
-        return state, _interval_bins(interval, at, begin, jnp.float32(length), width, dead)
+        weights = _signal_bins(interval, at, begin, jnp.float32(length), width, dead)
+        # An interval has one polarity per pixel: its sign marks it, and halves the traffic.
+        sign = jnp.sign(interval.spikes.count).astype(jnp.float32)
+        struck = _noise_bins(interval, at, begin, jnp.float32(length), width) if noisy else []
+        return state, ([w * sign for w in weights], struck)
 
     inputs = (log_frames, jnp.asarray(low, jnp.float32), jnp.asarray(edges, jnp.float32))
-    state, parts = jax.lax.scan(body, state, inputs)
-    chosen = np.zeros((bins, steps, width), np.float32)
-    for j in range(width):
-        chosen[low + j, np.arange(steps), j] = 1.0
-    grid = jnp.einsum("btj,tjphw->hwpb", chosen, parts, precision="highest")
-    return state, grid.reshape(*grid.shape[:2], 2 * bins)
+    state, (signed, struck) = jax.lax.scan(body, state, inputs)
+    grid = [_collect(signed, struck, low, j, polarity) for polarity in (0, 1) for j in range(bins)]
+    return state, jnp.stack(grid, -1)
+
+
+def _collect(
+    signed: list[Array], struck: list[Array], low: np.ndarray, j: int, polarity: int
+) -> Array:
+    """Bin j of one polarity (0 ON, 1 OFF): the few (interval, touched bin) pairs that fall on
+    it, added. signed: per touched bin (T, H, W); struck: (T, 2, H, W), empty without noise."""
+    total = jnp.zeros(signed[0].shape[1:], jnp.float32)
+    for t in np.flatnonzero((low <= j) & (j < low + len(signed))):
+        weight = signed[j - low[t]][t]
+        total += jax.nn.relu(weight if polarity == 0 else -weight)
+        if struck:
+            total += struck[j - low[t]][t, polarity]
+    return total
 
 
 def simulate_voxels(

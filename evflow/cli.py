@@ -1,0 +1,236 @@
+"""The command line: parse, call, print. Results go to stdout, progress and errors to stderr.
+
+Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Union
+
+import tyro
+
+from evflow.errors import EvflowDataError
+
+RESOURCES = ("EV019",)
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """What is in a recording.
+
+    Example: evflow info flight.aedat4
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder (AEDAT4, IJRR text folder or zip, HDF5 in the DSEC layout, npz)."""
+    json: bool = False
+    """Print JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """Measure a camera: per-pixel thresholds and noise rates, from events and frames.
+
+    Example: evflow estimate flight.aedat4 -o cam/
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """A recording with frames."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for camera.npz, camera.json and the pictures."""
+    weights: str = "default"
+    """Name of released weights, or a .safetensors path."""
+    window_ms: float = 40.0
+    """Shortest window; windows run from frame to frame."""
+    start: float | None = None
+    """Use the recording from here (seconds from its first event)."""
+    stop: float | None = None
+    """... to here."""
+    plots: bool = True
+    """Write maps and histograms as PNG (needs matplotlib)."""
+    overwrite: bool = False
+    json: bool = False
+    """Print the summary as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate:
+    """Simulate a video, or a recording's frames, as a camera would have seen it.
+
+    Example: evflow simulate ride.mp4 --camera cam/camera.npz -o synth.h5
+    """
+
+    video: tyro.conf.Positional[Path]
+    """A video file, or a recording whose frames are used."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Output, HDF5 in the DSEC layout (.h5)."""
+    camera: Path | None = None
+    """camera.npz from evflow estimate; without it the same thresholds everywhere."""
+    theta_on: float = 0.2
+    theta_off: float = 0.2
+    eta_on: float = 0.0
+    eta_off: float = 0.0
+    fps: float | None = None
+    """Frame rate of the video, if its own is wrong."""
+    max_motion_px: float = 1.0
+    """Interpolate frames until motion per step is below this; 0 = use the frames as they are."""
+    noise_resets_memory: bool = True
+    """A noise event stores the present intensity, as in real pixels."""
+    seed: int = 0
+    overwrite: bool = False
+    json: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Version:
+    """Print the versions of evflow and of what it runs on.
+
+    Example: evflow version
+    """
+
+
+Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these annotations
+    Annotated[Info, tyro.conf.subcommand("info")],
+    Annotated[Estimate, tyro.conf.subcommand("estimate")],
+    Annotated[Simulate, tyro.conf.subcommand("simulate")],
+    Annotated[Version, tyro.conf.subcommand("version")],
+]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the `evflow` command."""
+    command = tyro.cli(
+        Command, args=argv, prog="evflow",
+        description="Measure an event camera from its recording; simulate any video as it "
+        "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
+    run = {Info: _info, Estimate: _estimate, Simulate: _simulate, Version: _version}
+    try:
+        run[type(command)](command)  # type: ignore[operator]
+    except EvflowDataError as e:
+        print(e, file=sys.stderr)
+        return 3 if e.code in RESOURCES else 1
+    except MemoryError as e:
+        print(f"out of memory: {e}", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        print("interrupted; no half-written file is left.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _info(command: Info) -> None:
+    from evflow import io
+
+    recording = io.read_recording(command.recording)
+    events, times = recording.events, recording.frame_times
+    facts = {
+        "events": len(events), "size": list(events.size), "duration_s": events.duration_us / 1e6,
+        "first_us": int(events.t[0]) if len(events) else None,
+        "last_us": int(events.t[-1]) if len(events) else None,
+        "on_fraction": float(events.p.mean()) if len(events) else None,
+        "frames": len(times),
+        "first_frame_us": int(times[0]) if len(times) else None,
+        "last_frame_us": int(times[-1]) if len(times) else None,
+        "frame_dtype": str(recording.frames.dtype), "notes": list(recording.notes),
+    }
+    if len(times) > 1 and len(events):
+        plan = io.plan_windows(recording)
+        facts["windows"], facts["skipped"] = len(plan.pairs), list(plan.skipped)
+    if command.json:
+        print(json.dumps(facts, indent=2))
+        return
+    print(recording)
+    for name, value in facts.items():
+        print(f"  {name:16} {value}")
+
+
+def _estimate(command: Estimate) -> None:
+    from evflow import io
+    from evflow.progress import bar
+    from evflow.recording import estimate_camera
+    from evflow.report import plots
+    from evflow.report.text import describe
+    from evflow.weights import load_weights, model_card
+
+    out = command.out
+    if (out / "camera.npz").exists() and not command.overwrite:
+        raise EvflowDataError("EV013", f"{out / 'camera.npz'} exists.", "Pass --overwrite.")
+    if command.plots:
+        plots.require()
+    recording = io.read_recording(command.recording, start_s=command.start, stop_s=command.stop)
+    params = load_weights(command.weights)
+    with bar("estimating") as progress:
+        found = estimate_camera(recording, params, min_window_us=round(command.window_ms * 1000),
+                                progress=progress)
+    found.save(out / "camera.npz", overwrite=command.overwrite)
+    facts = {**found.as_dict(), "recording": str(command.recording), "weights": command.weights,
+             "weights_steps": model_card(command.weights).get("steps")}
+    _write_json(out / "camera.json", facts)
+    if command.plots:
+        plots.camera_maps(found, out / "maps.png")
+        plots.camera_histograms(found, out / "histograms.png")
+    print(json.dumps(facts, indent=2) if command.json else describe(found))
+    print(f"written to {out}/", file=sys.stderr)
+
+
+def _write_json(path: Path, facts: dict) -> None:
+    from evflow.files import atomic_write
+
+    with atomic_write(path, overwrite=True) as temporary:
+        temporary.write_text(json.dumps(facts, indent=2) + "\n")
+
+
+def _simulate(command: Simulate) -> None:
+    import jax
+
+    from evflow import io
+    from evflow.camera import Camera, SensorModel
+    from evflow.progress import bar
+    from evflow.io.source import open_frames
+    from evflow.simulator import simulate_stream
+    from evflow.simulator.interpolate import unzip, upsample
+
+    source = open_frames(command.video, fps=command.fps)
+    width, height = source.size
+    if command.camera:
+        camera = Camera.load(command.camera)
+    else:
+        camera = Camera.constant((height, width), command.theta_on, command.theta_off,
+                                 command.eta_on, command.eta_off)
+    if camera.shape != (height, width):
+        raise EvflowDataError(
+            "EV015", f"the video is {width}x{height}, the camera "
+            f"{camera.shape[1]}x{camera.shape[0]}.", "Resize the video to the camera's size.")
+    notes: list[str] = []
+    with bar("simulating") as progress, io.DsecWriter(
+            command.out, source.size, overwrite=command.overwrite) as writer:
+        pairs = source.watched(progress)
+        if command.max_motion_px > 0:
+            pairs = upsample(pairs, max_motion_px=command.max_motion_px, warn=notes.append)
+        sensor = SensorModel(noise_resets_memory=command.noise_resets_memory)
+        for events in simulate_stream(jax.random.key(command.seed), *unzip(pairs), camera,
+                                      model=sensor):
+            writer.append(events)
+        count = writer.n_events
+    for note in notes:
+        print(note, file=sys.stderr)
+    facts = {"out": str(command.out), "events": count, "frames": source.count}
+    print(json.dumps(facts) if command.json else f"{count:,} events -> {command.out}")
+
+
+def _version(_: Version) -> None:
+    import importlib.metadata
+
+    import evflow
+
+    print(f"evflow {evflow.__version__}")
+    for name in ("jax", "jaxlib", "numpy"):
+        print(f"{name} {importlib.metadata.version(name)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,9 @@
+"""The conditional normalizing flow (paper, Section IV-B and IV-C): pure functions on params."""
+
+from __future__ import annotations
+
+from evflow.flow.config import FlowConfig
+from evflow.flow.fold import fold, forward_folded
+from evflow.flow.stack import data_init, forward, init, inverse
+
+__all__ = ["FlowConfig", "data_init", "fold", "forward", "forward_folded", "init", "inverse"]

@@ -1,0 +1,157 @@
+"""What a user may tell a reader, and how every reader obeys it.
+
+A reader parses its file, passes raw columns through `microseconds`, `on` and `sensor`, and its
+result through `crop`; so units, polarity, size and time range mean the same for every format.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size, check_polarity, check_size
+from evflow.errors import EvflowDataError
+from evflow.types import Recording
+
+UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+POLARITIES = ("auto", "01", "pm1", "invert")
+
+
+@dataclasses.dataclass(frozen=True)
+class Hints:
+    """What the user knows about a file.
+
+    start_s, stop_s: keep events and frames with start <= time < stop, in seconds from the
+        file's first event; None = all.
+    time_unit: "auto" = what the format says; "s", "ms", "us" or "ns" overrides it.
+    polarity: "auto" = {0, 1} or {-1, 1}, whichever it is; "01" and "pm1" insist; "invert"
+        swaps ON and OFF.
+    size: (width, height), overrides what the file says.
+    """
+
+    start_s: float | None = None
+    stop_s: float | None = None
+    time_unit: str = "auto"
+    polarity: str = "auto"
+    size: Size | None = None
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("time_unit", ("auto", *UNITS_US)), ("polarity", POLARITIES)):
+            if getattr(self, name) not in allowed:
+                raise EvflowDataError(
+                    "EV020", f"{name}={getattr(self, name)!r}.", f"Choose from {allowed}.")
+        for name in ("start_s", "stop_s"):
+            value = getattr(self, name)
+            number = isinstance(value, int | float | np.number)
+            if value is not None and not (number and 0 <= value < np.inf):
+                raise EvflowDataError(
+                    "EV020", f"{name}={value!r}.", "Give seconds from the first event, >= 0.")
+        if self.stop_s is not None and self.stop_s <= (self.start_s or 0.0):
+            raise EvflowDataError(
+                "EV020", f"stop_s={self.stop_s} is not after start_s={self.start_s or 0.0}.")
+        if self.size is not None:
+            object.__setattr__(self, "size", check_size(self.size))
+
+    @staticmethod
+    def parse(given: dict[str, Any]) -> Hints:
+        """Hints of keyword arguments; an unknown one raises EV020."""
+        names = [field.name for field in dataclasses.fields(Hints)]
+        unknown = sorted(set(given) - set(names))
+        if unknown:
+            raise EvflowDataError(
+                "EV020", f"unknown option {', '.join(unknown)}.", f"Readers know {names}.")
+        return Hints(**given)
+
+    def sensor(self, *known: Size | None, reach: tuple[int, int] | None = None) -> Size:
+        """The first of `self.size` and `known` that is not None, or EV015.
+
+        reach: the largest x and y seen, for the message.
+        """
+        for size in (self.size, *known):
+            if size is not None:
+                return check_size(size)
+        raise EvflowDataError(
+            "EV015", "the file does not tell the size of its sensor"
+            + (f" (events reach x={reach[0]}, y={reach[1]})." if reach else "."),
+            "Pass size=(width, height), --size WxH.")
+
+    def microseconds(self, t: np.ndarray, native: str) -> np.ndarray:
+        """Times of any dtype in `time_unit` (auto: `native`) as int64 us; EV003, EV007.
+
+        Integers stay exact; floats and ns are rounded to the nearest microsecond.
+        """
+        if t.size == 0:
+            return np.zeros(0, np.int64)
+        unit = native if self.time_unit == "auto" else self.time_unit
+        if t.dtype.kind == "f":
+            if self.time_unit == "auto" and native != "s":
+                raise EvflowDataError(
+                    "EV003", f"times have dtype {t.dtype} (first {t[0]}) where {native} are whole.",
+                    "Are they seconds? Pass time_unit='s' (--time-unit s).")
+            if not np.isfinite(t).all():
+                raise EvflowDataError("EV007", f"{(~np.isfinite(t)).sum():,} times are not finite.")
+            us = np.rint(t.astype(np.float64) * UNITS_US[unit])
+            if np.abs(us).max() >= 2.0**63:
+                raise _too_late(t, unit)
+            return us.astype(np.int64)
+        if t.dtype.kind not in "iu":
+            raise EvflowDataError("EV003", f"times have dtype {t.dtype}.", "Expected numbers.")
+        if max(abs(int(t.min())), abs(int(t.max()))) * max(UNITS_US[unit], 1) >= 2**63:
+            raise _too_late(t, unit)
+        whole = t.astype(np.int64, copy=False)
+        return (whole + 500) // 1000 if unit == "ns" else whole * np.int64(UNITS_US[unit])
+
+    def instant(self, t: Any, native: str) -> int:
+        """One time as `microseconds` has it."""
+        return int(self.microseconds(np.asarray(t).reshape(1), native)[0])
+
+    def on(self, p: np.ndarray) -> np.ndarray:
+        """Polarity as bool, True = ON, after the convention asked for; EV006."""
+        expected = {"01": (0, 1), "pm1": (-1, 1)}.get(self.polarity)
+        if expected and p.size and p.dtype != bool:
+            values = np.unique(p)
+            if not np.isin(values, expected).all():
+                raise EvflowDataError(
+                    "EV006", f"p holds {values[:5]} but polarity={self.polarity!r} was asked for.",
+                    f"Expected {expected} only; polarity='auto' detects the convention.")
+        on = check_polarity(p)
+        return ~on if self.polarity == "invert" else on
+
+    def span_us(self, first_us: int) -> tuple[int, int]:
+        """The absolute half-open range [start, stop) in us for a file that begins at first_us."""
+        limits = np.iinfo(np.int64)
+        start = limits.min if self.start_s is None else first_us + round(self.start_s * 1e6)
+        stop = limits.max if self.stop_s is None else first_us + round(self.stop_s * 1e6)
+        return min(start, limits.max), min(stop, limits.max)
+
+    @property
+    def whole(self) -> bool:
+        return self.start_s is None and self.stop_s is None
+
+    def crop(self, recording: Recording) -> Recording:
+        """The part between start_s and stop_s; EV001 where it holds no event."""
+        events = recording.events
+        if self.whole or len(events) == 0:
+            return recording
+        start, stop = self.span_us(int(events.t[0]))
+        part = events.slice(start, stop)
+        if len(part) == 0:
+            raise self.empty(events.duration_us)
+        keep = slice(*np.searchsorted(recording.frame_times, np.array([start, stop])))
+        return Recording(
+            part, recording.frames[keep], recording.frame_times[keep], recording.notes)
+
+    def empty(self, duration_us: int) -> EvflowDataError:
+        """EV001 for a time range without events in a recording of that duration."""
+        stop = "the end" if self.stop_s is None else f"{self.stop_s:g} s"
+        return EvflowDataError(
+            "EV001", f"no events between {self.start_s or 0:g} s and {stop}.",
+            f"The recording covers 0.000 to {duration_us / 1e6:.3f} s.")
+
+
+def _too_late(t: np.ndarray, unit: str) -> EvflowDataError:
+    return EvflowDataError(
+        "EV003", f"times span {t.min()}..{t.max()} {unit}, more than int64 microseconds hold.",
+        "Pass the right time_unit (--time-unit ns).")

@@ -1,0 +1,104 @@
+"""Windows: the pieces of a recording between two frames, from which a camera is estimated.
+
+A window runs from one frame to the first that is at least `min_us` later; the next begins where
+it ends. Only windows that the events cover are used, and none across a dropped frame: there the
+brightness path between its two frames is unknown for too long.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+from collections.abc import Iterator
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.types import Recording, Window
+
+MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
+EDGE_US = 1_000  # the events may begin or end this much inside the first or last frame
+DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowPlan:
+    """pairs: (first, last) frame of each window. skipped: one sentence per window left out."""
+
+    pairs: tuple[tuple[int, int], ...]
+    skipped: tuple[str, ...]
+
+
+def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
+    """Choose the windows of a recording; nothing is cut yet.
+
+    Raises EV001 (no events), EV011 (fewer than two frames), EV012 (frames and events do not
+    overlap), EV020 (min_us < 1).
+    """
+    if operator.index(min_us) < 1:
+        raise EvflowDataError("EV020", f"min_us={min_us}.", "A window takes 1 us or more.")
+    _check_overlap(recording)
+    times = recording.frame_times
+    start, stop = _covered(recording)
+    late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
+    pairs: list[tuple[int, int]] = []
+    skipped: list[str] = []
+    first = 0
+    while (last := int(np.searchsorted(times, times[first] + min_us))) < len(times):
+        gap = late[(late >= first) & (late < last)]
+        outside = times[first] < start or times[last] > stop
+        if len(gap):
+            i = int(gap[0])
+            lost_ms = (times[i + 1] - times[i]) / 1e3
+            skipped.append(
+                f"frames {first}-{last}: no frame for {lost_ms:.1f} ms after frame {i} (dropped?)")
+            first = i + 1
+            continue
+        if outside:
+            skipped.append(f"frames {first}-{last}: not covered by the events")
+        else:
+            pairs.append((first, last))
+        first = first + 1 if times[first] < start else last
+    return WindowPlan(tuple(pairs), tuple(skipped))
+
+
+def iter_windows(recording: Recording, min_us: int = MIN_US) -> Iterator[Window]:
+    """The windows of `plan_windows`, in time order, their events as views.
+
+    Raises what `plan_windows` raises, and EV017 where no window is left.
+    """
+    plan = plan_windows(recording, min_us)
+    if not plan.pairs:
+        why = "; ".join(plan.skipped[:3]) or "the frames span less than that"
+        raise EvflowDataError(
+            "EV017", f"no window of {min_us / 1e3:g} ms or more can be used ({why}).",
+            "Record longer, or lower min_us.")
+    return (_window(recording, pair, index) for index, pair in enumerate(plan.pairs))
+
+
+def _window(recording: Recording, pair: tuple[int, int], index: int) -> Window:
+    t0, t1 = (int(recording.frame_times[i]) for i in pair)
+    frame0, frame1 = (recording.frame_dn(i) for i in pair)
+    return Window(recording.events.slice(t0, t1), frame0, frame1, t0, t1, index)
+
+
+def _covered(recording: Recording) -> tuple[int, int]:
+    """The time range of the events, widened by their median interval or `EDGE_US`."""
+    t = recording.events.t
+    edge = max(EDGE_US, int(np.median(np.diff(t))) if len(t) > 1 else 0)
+    return int(t[0]) - edge, int(t[-1]) + edge
+
+
+def _check_overlap(recording: Recording) -> None:
+    t, times = recording.events.t, recording.frame_times
+    if len(t) == 0:
+        raise EvflowDataError("EV001", "the recording has no events.")
+    if len(times) < 2:
+        raise EvflowDataError(
+            "EV011", f"the recording has {len(times)} frames; a window lies between two.",
+            "Thresholds are measured against intensity: record or add frames.")
+    start, stop = _covered(recording)
+    if times[-1] <= start or times[0] >= stop:
+        raise EvflowDataError(
+            "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but frames {times[0]:,}.."
+            f"{times[-1]:,} us.", "Are both on one clock and in one unit? See time_unit.")

@@ -1,0 +1,163 @@
+"""Whole recordings: windows -> additive statistics -> the camera's summary -> per-pixel maps.
+
+Two passes over the windows, each in bounded memory: the first adds up `Stats`, the second
+estimates every pixel of every window at the final summary and fuses the windows by their
+precision. A pixel that says nothing keeps the camera's summary, with a wide std.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow import io, model
+from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.errors import EvflowDataError
+from evflow.intensity import delta_log_intensity, lin_log
+from evflow.squash import camera_std, squash, unsquash_summary
+from evflow.types import Recording, Window
+from evflow.voxel import voxelize
+from evflow.weights import load_weights
+
+Array = jax.Array
+Progress = Callable[[int, int], None]
+
+VALID_EVENTS = 3  # fewer events in the used windows say next to nothing about a pixel
+FEW_EVENTS = 200  # signal events per polarity below which a threshold is called undetermined
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CameraEstimate:
+    """What was measured.
+
+    camera, std: maps (H, W) and their standard deviations; summary, summary_std: the camera's
+    medians and mismatch (scalars); valid: (H, W) bool, pixels with at least 3 events in the
+    windows used; n_events: (H, W) uint32 events there; windows: how many were used;
+    warnings: what to know before trusting it, a sentence each.
+    """
+
+    camera: Camera
+    std: Camera
+    summary: Summary
+    summary_std: Summary
+    valid: np.ndarray
+    n_events: np.ndarray
+    windows: int
+    warnings: tuple[str, ...]
+
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
+        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events."""
+        extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
+        return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
+                                n_events=self.n_events)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Summary, std and warnings as JSON-ready values."""
+        def floats(s: Summary) -> dict[str, float]:
+            return {k: float(v) for k, v in dataclasses.asdict(s).items()}
+
+        return {"summary": floats(self.summary), "summary_std": floats(self.summary_std),
+                "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
+                "windows": self.windows, "warnings": list(self.warnings)}
+
+
+def estimate_camera(
+    recording_or_path: Recording | str | os.PathLike, params: model.Params | None = None, *,
+    refine: Literal["auto", "off"] = "auto", min_window_us: int = 40_000,
+    progress: Progress | None = None,
+) -> CameraEstimate:
+    """Estimate a camera from a recording with frames.
+
+    Windows run from frame to frame until at least min_window_us long. refine: "auto" applies
+    what is known to lower the error on held-out cameras beyond the network (at present
+    nothing does), "off" never does. progress(done, total) is called after every window.
+    Raises EV011, EV012, EV017 where the recording cannot tell, EV020 on a bad option.
+    """
+    if refine not in ("auto", "off"):
+        raise EvflowDataError("EV020", f"refine={refine!r}.", 'Choose "auto" or "off".')
+    recording = recording_or_path
+    if not isinstance(recording, Recording):
+        recording = io.read_recording(recording)
+    params = load_weights() if params is None else params
+    plan = io.plan_windows(recording, min_window_us)
+    total, done = 2 * len(plan.pairs), 0
+
+    def windows() -> Iterator[Window]:
+        nonlocal done
+        for window in io.iter_windows(recording, min_window_us):
+            yield window
+            done += 1
+            if progress:
+                progress(done, total)
+
+    stats, n_events = _pool(params, windows())
+    summary, summary_std = model.finish(params, stats)
+    camera, std = _fuse(params, windows(), summary)
+    return CameraEstimate(
+        camera, std, summary, summary_std, n_events >= VALID_EVENTS, n_events,
+        len(plan.pairs), (*plan.skipped, *_warnings(stats, n_events)))
+
+
+def window_inputs(window: Window) -> tuple[np.ndarray, Array, dict[str, Array | float]]:
+    """voxels (H, W, 32), dlogI (H, W) and conditions of one window of a recording."""
+    voxels = voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
+    intensity = 0.5 * (lin_log(window.frame0) + lin_log(window.frame1))
+    dlogI = delta_log_intensity(window.frame0, window.frame1)
+    return voxels, dlogI, {"window_s": window.window_s, "intensity": intensity}
+
+
+def _pool(params: model.Params, windows: Iterator[Window]) -> tuple[model.Stats, np.ndarray]:
+    total: model.Stats | None = None
+    n_events: np.ndarray | None = None
+    for window in windows:
+        voxels, dlogI, given = window_inputs(window)
+        stats = model.summarize(params, voxels, dlogI, **given)
+        counts = window.events.count_map().sum(0).astype(np.uint32)
+        total = stats if total is None else total + stats
+        n_events = counts if n_events is None else n_events + counts
+    assert total is not None
+    assert n_events is not None  # iter_windows raises EV017 rather than yield nothing
+    return total, n_events
+
+
+def _fuse(
+    params: model.Params, windows: Iterator[Window], summary: Summary
+) -> tuple[Camera, Camera]:
+    """Product of the windows' posteriors: each is N(y, s^2) and contains the prior (the
+    summary and the mismatch) once, so the prior's precision is taken off all but one."""
+    y6 = unsquash_summary(summary)
+    prior, prior_precision = y6[:4], model.base_std(y6) ** -2.0
+    precision: Array | float = 0.0
+    weighted: Array | float = 0.0
+    for window in windows:
+        voxels, dlogI, given = window_inputs(window)
+        y, s = model.estimate_y(params, voxels, dlogI, summary=summary, **given)
+        gained = jnp.maximum(s**-2.0 - prior_precision, 0.0)
+        # A posterior mean is shrunk towards the prior; (gained) (x - prior) = s^-2 (y - prior)
+        # is the window's own evidence x before shrinkage.
+        weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
+        precision += gained
+    total = prior_precision + precision
+    y = prior + weighted / total
+    camera = squash(y)
+    return camera, camera_std(camera, total**-0.5)
+
+
+def _warnings(stats: model.Stats, n_events: np.ndarray) -> list[str]:
+    found = []
+    for name, events in (("ON", stats.events_on), ("OFF", stats.events_off)):
+        if float(events) < FEW_EVENTS:
+            found.append(f"only {int(events)} {name} events: theta_{name.lower()} is undetermined; "
+                         "its value is the prior's.")
+    active = float((n_events >= VALID_EVENTS).mean())
+    if active < 0.05:
+        found.append(f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
+                     "elsewhere the maps show the camera's summary. Record more motion.")
+    return found

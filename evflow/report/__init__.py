@@ -1,0 +1,1 @@
+"""Pictures and words about an estimated camera (pictures need the extra `viz`)."""

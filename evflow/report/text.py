@@ -1,0 +1,23 @@
+"""An estimate in words."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from evflow.recording import CameraEstimate
+
+LABELS = {
+    "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON (Hz/pixel)",
+    "eta_off": "noise OFF (Hz/pixel)", "sigma_on": "mismatch ON", "sigma_off": "mismatch OFF",
+}
+
+
+def describe(found: CameraEstimate) -> str:
+    """The summary as a table, then what to know before trusting it."""
+    std = dataclasses.asdict(found.summary_std)
+    lines = [f"{LABELS[name]:22} {float(value):7.3f} ± {float(std[name]):.3f}"
+             for name, value in dataclasses.asdict(found.summary).items()]
+    lines.append(f"from {int(found.n_events.sum()):,} events in {found.windows} windows; "
+                 f"{found.valid.mean():.0%} of the pixels have events of their own")
+    lines += [f"note: {warning}" for warning in found.warnings]
+    return "\n".join(lines)

@@ -1,0 +1,73 @@
+"""Released parameters: safetensors files with the model card as metadata.
+
+`load_weights()` reads the weights that ship in the wheel (evflow/weights/default.safetensors).
+A file holds flat names "default/flow/level_0/actnorm/raw"; params is the nested dict.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+
+Params = dict[str, Any]
+
+
+def weights_path(name_or_path: str | os.PathLike = "default") -> Path:
+    """The file of a released name ("default") or the path itself."""
+    path = Path(name_or_path)
+    if path.suffix != ".safetensors":
+        path = Path(str(resources.files("evflow") / "weights" / f"{name_or_path}.safetensors"))
+    if not path.is_file():
+        folder = Path(str(resources.files("evflow") / "weights"))
+        known = sorted(p.stem for p in folder.glob("*.safetensors"))
+        raise EvflowDataError("EV016", f"no weights at {path}.",
+                              f"Released names: {known}; or give a .safetensors path.")
+    return path
+
+
+def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
+    """Parameters as a nested dict of float32 arrays, for `estimate` and the rest of the API."""
+    path = weights_path(name_or_path)
+    params: Params = {}
+    try:
+        with safe_open(path, framework="numpy") as file:
+            for name in file.keys():  # noqa: SIM118 - safe_open is no mapping
+                *parents, leaf = name.split("/")
+                node = params
+                for part in parents:
+                    node = node.setdefault(part, {})
+                node[leaf] = jnp.asarray(file.get_tensor(name))
+    except SafetensorError as e:
+        raise EvflowDataError("EV009", f"{path} is not a readable safetensors file ({e}).") from e
+    return params
+
+
+def save_weights(
+    path: str | os.PathLike, params: Params, card: dict[str, Any], *, overwrite: bool = False
+) -> Path:
+    """Write params and a model card (any JSON-ready dict) as one .safetensors file."""
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    tensors = {"/".join(str(k.key) for k in keys): np.asarray(leaf, np.float32)
+               for keys, leaf in leaves}
+    data = save(tensors, metadata={"card": json.dumps(card, sort_keys=True)})
+    with atomic_write(path, overwrite=overwrite) as temporary:
+        temporary.write_bytes(data)
+    return Path(path)
+
+
+def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
+    """The card that was saved with the weights: command, seed, steps, data, figures."""
+    with safe_open(weights_path(name_or_path), framework="numpy") as file:
+        return json.loads((file.metadata() or {}).get("card", "{}"))

@@ -1,0 +1,36 @@
+"""Shared fixtures. Strict rank promotion is set through the environment, before JAX is imported,
+so that tests of the NumPy-only rooms never load it and subprocesses inherit it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder EVFLOW_DATA, which holds data/ (recordings, formats, images) and goldens/."""
+    folder = os.environ.get("EVFLOW_DATA")
+    if not folder:
+        pytest.skip("EVFLOW_DATA is not set: no real recordings at hand")
+    if not Path(folder).is_dir():
+        pytest.skip(f"EVFLOW_DATA={folder} is not a folder")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def data_file(data_dir: Path) -> Callable[[str], Path]:
+    """data_file("data/recordings/NAME") is its path, or the test is skipped."""
+
+    def find(relative: str) -> Path:
+        path = data_dir / relative
+        if not path.exists():
+            pytest.skip(f"{path} is absent")
+        return path
+
+    return find
