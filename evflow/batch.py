@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from evflow.simulator import scan
 from evflow.simulator.voxels import simulate_window
 
 Array = jax.Array
+Parameters = TypeVar("Parameters", Camera, Summary)
 
 
 @jax.tree_util.register_dataclass
@@ -72,7 +74,7 @@ def _sequence(
 ) -> Batch:
     """One camera on one scene: frames (W*steps + 1, H, W') DN."""
     k_nominal, k_pixels, k_phase, k_sim, k_frame = jax.random.split(key, 5)
-    shape = frames.shape[1:]
+    shape = (frames.shape[1], frames.shape[2])
     nominal = sample_nominal(k_nominal, (), config.prior)
     camera = sample_pixels(k_pixels, nominal, shape, config.prior.eta_spread)
     log_frames = lin_log(frames)
@@ -118,6 +120,6 @@ def _noise_gain(frames: Array, model: SensorModel) -> Array:
     return jnp.mean(noise_factor(i01)) / noise_factor(jnp.mean(i01[0]))
 
 
-def _scale_noise(parameters: Camera | Summary, gain: Array) -> Camera | Summary:
+def _scale_noise(parameters: Parameters, gain: Array) -> Parameters:
     return dataclasses.replace(parameters, eta_on=parameters.eta_on * gain,
                                eta_off=parameters.eta_off * gain)

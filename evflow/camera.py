@@ -11,6 +11,7 @@ import dataclasses
 import json
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,10 +65,10 @@ class Camera:
         prior = prior or CameraPrior()
         k_nominal, k_pixels = jax.random.split(key)
         nominal = sample_nominal(k_nominal, shape[:-2], prior)
-        return sample_pixels(k_pixels, nominal, shape[-2:], prior.eta_spread)
+        return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)
 
     def validate(self) -> Camera:
-        """Return self, or raise EV014 / EV015 (host side; skipped on traced arrays)."""
+        """Return self, or raise EV002, EV014, EV015 (host side; skipped on traced arrays)."""
         leaves = {name: getattr(self, name) for name in PARAMETERS}
         if any(isinstance(v, jax.core.Tracer) for v in leaves.values()):
             return self
@@ -77,6 +78,9 @@ class Camera:
                 "EV015", f"the camera's maps have different shapes: {shapes}.",
                 "All four maps must be (..., H, W) of one sensor.",
             )
+        if len(self.shape) < 2:
+            raise EvflowDataError("EV002", f"the camera's maps have shape {self.shape}.",
+                                  "Expected (..., H, W).")
         for name, value in leaves.items():
             array = np.asarray(value)
             bad = ~np.isfinite(array) | (array <= 0 if name.startswith("theta") else array < 0)
@@ -95,7 +99,7 @@ class Camera:
         """Write an .npz with the four maps, `extra` arrays beside them, and the units."""
         self.validate()
         units = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
-        arrays = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
+        arrays: dict[str, Any] = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
         arrays |= {k: np.asarray(v) for k, v in extra.items()}
         with atomic_write(path, overwrite=overwrite) as temporary, open(temporary, "wb") as f:
             np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
@@ -106,9 +110,14 @@ class Camera:
         """Read the maps written by `save` (pickled arrays are refused)."""
         path = Path(path)
         if not path.is_file():
-            raise EvflowDataError("EV016", f"no camera file at {path}.", "Make one: evflow estimate.")
+            raise EvflowDataError(
+                "EV016", f"no camera file at {path}.", "Make one: evflow estimate.")
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with open(path, "rb") as file:  # np.load leaves damaged archives open
+                data = np.load(file, allow_pickle=False)
+                if not isinstance(data, np.lib.npyio.NpzFile):
+                    raise EvflowDataError("EV008", f"{path} is one array, not an .npz of maps.",
+                                          "Expected a camera.npz written by Camera.save.")
                 missing = [n for n in PARAMETERS if n not in data]
                 if missing:
                     raise EvflowDataError(
@@ -116,7 +125,7 @@ class Camera:
                         "Expected a camera.npz written by evflow estimate or Camera.save.",
                     )
                 maps = [jnp.asarray(data[n], jnp.float32) for n in PARAMETERS]
-        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as e:
+        except (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
             raise EvflowDataError("EV009", f"{path} is not a readable .npz ({e}).") from e
         return Camera(*maps).validate()
 
@@ -204,7 +213,7 @@ def noise_of_threshold(theta: Array) -> Array:
 
     The pole at theta = .0556 lies inside the clip: smaller thresholds get 1 Hz.
     """
-    return jnp.where(theta <= 0.1, 1.0, jnp.clip(4.0 / (90.0 * jnp.maximum(theta, 0.1) - 5.0), 0.1, 1.0))
+    return jnp.clip(4.0 / (90.0 * jnp.maximum(theta, 0.1) - 5.0), 0.1, 1.0)
 
 
 def sample_nominal(key: Array, batch: tuple[int, ...], prior: CameraPrior) -> Summary:

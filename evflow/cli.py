@@ -189,8 +189,8 @@ def _simulate(command: Simulate) -> None:
 
     from evflow import io
     from evflow.camera import Camera, SensorModel
-    from evflow.progress import bar
     from evflow.io.source import open_frames
+    from evflow.progress import bar
     from evflow.simulator import simulate_stream
     from evflow.simulator.interpolate import unzip, upsample
 
@@ -206,6 +206,7 @@ def _simulate(command: Simulate) -> None:
             "EV015", f"the video is {width}x{height}, the camera "
             f"{camera.shape[1]}x{camera.shape[0]}.", "Resize the video to the camera's size.")
     notes: list[str] = []
+    count = 0
     with bar("simulating") as progress, io.DsecWriter(
             command.out, source.size, overwrite=command.overwrite) as writer:
         pairs = source.watched(progress)
@@ -215,7 +216,7 @@ def _simulate(command: Simulate) -> None:
         for events in simulate_stream(jax.random.key(command.seed), *unzip(pairs), camera,
                                       model=sensor):
             writer.append(events)
-        count = writer.n_events
+            count += len(events)
     for note in notes:
         print(note, file=sys.stderr)
     facts = {"out": str(command.out), "events": count, "frames": source.count}

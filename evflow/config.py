@@ -108,10 +108,6 @@ class TrainConfig:
     seed: int = 0
 
 
-def _small_flow(config: FlowConfig) -> FlowConfig:
-    return dataclasses.replace(config, steps=2, hidden=16)
-
-
 PAPER_MODEL = ModelConfig(
     flow=FlowConfig(condition=96, injector=False, asinh=False), piece=6, pool=False,
     code="feature", output="tanh")
@@ -122,14 +118,17 @@ PRESETS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     "paper": TrainConfig(
         model=PAPER_MODEL,
-        loss=LossConfig(change_l1=0.0, inverse_flow=0.5, flow=1.0, summary=0.0, spread=0.0,
-                        confidence=True),
+        loss=LossConfig(
+            change_l1=0.0, inverse_flow=0.5, flow=1.0, summary=0.0, spread=0.0, confidence=True),
         prior=CameraPrior(theta=(0.1, 0.5), mismatch=(0.15, 0.15), noise="eq12"),
-        scene=SceneConfig.preset("paper"), sensors=(SensorModel(eta_intensity=True),),
-        window_s=(0.032, 0.032), steps_per_window=32, windows=1, learning_rate=1e-4, flow_rate=1e-4),
+        scene=SceneConfig.preset("paper"),
+        sensors=(SensorModel(eta_intensity=True),),
+        window_s=(0.032, 0.032), steps_per_window=32, windows=1, learning_rate=1e-4,
+        flow_rate=1e-4),
     "debug": TrainConfig(
-        model=ModelConfig(flow=_small_flow(FlowConfig(condition=41)), summary_hidden=32,
-                          encoder_hidden=32),
+        model=ModelConfig(
+            flow=FlowConfig(condition=41, steps=2, hidden=16), summary_hidden=32,
+            encoder_hidden=32),
         crop=32, scenes=2, cameras=2, windows=2, textures=16, steps=20, warmup=5),
 }
 
@@ -137,7 +136,8 @@ PRESETS: dict[str, TrainConfig] = {
 def preset(name: str) -> TrainConfig:
     """A named configuration; unknown names raise EV020 with the known ones."""
     if name not in PRESETS:
-        raise EvflowDataError("EV020", f"no preset {name!r}.", f"Choose one of {sorted(PRESETS)}.")
+        raise EvflowDataError(
+            "EV020", f"no preset {name!r}.", f"Choose one of {sorted(PRESETS)}.")
     return PRESETS[name]
 
 

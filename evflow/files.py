@@ -16,10 +16,10 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
     """Yield a temporary path beside `path`; rename it into place only if the block succeeds.
 
     Raises EV013 where `path` exists and `overwrite` is false, EV019 where the disk is full or
-    the folder cannot be written. The temporary file is removed on any failure, Ctrl-C included.
+    the path cannot be written. The temporary file is removed on any failure, Ctrl-C included.
     """
     path = Path(path)
-    if path.exists() and not overwrite:
+    if os.path.exists(path) and not overwrite:  # false, not an error, for an impossible path
         raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -28,11 +28,14 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
         os.replace(temporary, path)
     except OSError as e:
         reasons = {errno.ENOSPC: "no space left", errno.EACCES: "permission denied",
-                   errno.EROFS: "read-only file system", errno.ENOTDIR: "not a folder"}
+                   errno.EROFS: "read-only file system",
+                   errno.ENOTDIR: "its folder is a file", errno.EEXIST: "its folder is a file",
+                   errno.EISDIR: "it is a folder", errno.ENAMETOOLONG: "the name is too long"}
         if e.errno in reasons:
             raise EvflowDataError(
                 "EV019", f"{path} was not written ({reasons[e.errno]}).",
                 "Nothing is left behind; free space or choose another output.") from e
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # where even the folder is missing
+            temporary.unlink()

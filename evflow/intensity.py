@@ -11,6 +11,7 @@ from functools import lru_cache
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from evflow.errors import EvflowDataError
 
@@ -21,7 +22,7 @@ LINLOG_SLOPE = float(np.log(LINLOG_KNEE) / LINLOG_KNEE)
 LOG_EPS = 1e-3
 
 
-def lin_log(dn: Array) -> Array:
+def lin_log(dn: ArrayLike) -> Array:
     """v2e's lin-log map of DN in 0..255: I ln(20)/20 up to 20 DN, ln I above. Range 0..5.54."""
     dn = jnp.asarray(dn)
     dn = dn if jnp.issubdtype(dn.dtype, jnp.floating) else dn.astype(jnp.float32)
@@ -35,7 +36,7 @@ def lin_log_inverse(log_i: Array) -> Array:
     return jnp.where(log_i <= LINLOG_KNEE * LINLOG_SLOPE, log_i / LINLOG_SLOPE, above)
 
 
-def log_eps(dn: Array) -> Array:
+def log_eps(dn: ArrayLike) -> Array:
     """ESIM's map ln(I/255 + 1e-3) of DN in 0..255."""
     dn = jnp.asarray(dn)
     dn = dn if jnp.issubdtype(dn.dtype, jnp.floating) else dn.astype(jnp.float32)
@@ -61,7 +62,7 @@ def uint8_table(log_map: str) -> np.ndarray:
     return np.log(dn / 255.0 + LOG_EPS).astype(np.float32)
 
 
-def to_log(frames: Array | np.ndarray, log_map: str = "linlog") -> Array:
+def to_log(frames: ArrayLike, log_map: str = "linlog") -> Array:
     """Log intensity (float32) of uint8 or float DN frames 0..255, or uint16 on 0..65535."""
     frames = jnp.asarray(frames)
     if frames.dtype == jnp.uint8:
@@ -88,7 +89,7 @@ def noise_factor(i01: Array) -> Array:
     return 1.0 - 0.75 * i01
 
 
-def delta_log_intensity(frame0: Array, frame1: Array) -> Array:
+def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
     """Change of lin-log intensity between two frames (..., H, W) of DN 0..255 -> float32."""
     for name, frame in (("frame0", frame0), ("frame1", frame1)):
         if np.ndim(frame) < 2:

@@ -8,8 +8,6 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from evflow.camera import Camera
-
 Array = jax.Array
 
 EPSILON = 1e-3  # of the Charbonnier losses (Eq. 7)
@@ -70,9 +68,9 @@ def event_loss(generated: Array, voxels: Array, dL: Array, sizes: tuple[int, ...
                edge: float) -> Array:
     """L_E (Eq. 9), (..., h, w, 2B) -> (...), averaged over patches and summed over scales.
 
-    generated: asinh of the generated voxels, voxels: true ones. Where edges move, the voxels themselves are compared (Charbonnier on asinh: a pixel's
-    count spans three decades); elsewhere only the events per patch and polarity, as a
-    Gaussian likelihood of variance count + 1.
+    generated: asinh of the generated voxels; voxels: the true ones. Where edges move, they
+    themselves are compared (Charbonnier on asinh: counts span three decades); elsewhere only
+    the events per patch and polarity, as a Gaussian likelihood of variance count + 1.
     """
     error = charbonnier(generated - jnp.arcsinh(voxels))
     events = jnp.sinh(jnp.clip(generated, -COUNT_LIMIT, COUNT_LIMIT))
@@ -119,9 +117,3 @@ def adaptive_weight(loss: Array) -> Array:
     gradient. Losses below 10 keep their weight."""
     size = jnp.maximum(jnp.abs(jax.lax.stop_gradient(loss)), 1e-30)
     return jnp.where(size >= 10.0, 10.0 ** -jnp.floor(jnp.log10(size)), 1.0)
-
-
-def camera_errors(estimate: Camera, truth: Camera) -> dict[str, Array]:
-    """Mean absolute error of each map, over everything."""
-    names = ("theta_on", "theta_off", "eta_on", "eta_off")
-    return {n: jnp.mean(jnp.abs(getattr(estimate, n) - getattr(truth, n))) for n in names}

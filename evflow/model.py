@@ -17,25 +17,22 @@ conditions: window_s, seconds, default .05, a float or (...,); intensity, mean l
 from __future__ import annotations
 
 import dataclasses
-import math
 from functools import partial
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
-from evflow import encoder, flow
+from evflow import encoder, flow, network
 from evflow import summary as pooling
 from evflow.camera import Camera, Summary
-from evflow.config import MODELS, ModelConfig
-from evflow.encoder import IntensityEncoder
+from evflow.config import ModelConfig
 from evflow.errors import EvflowDataError
+from evflow.network import Params, architecture
 from evflow.squash import (
-    SCALE,
     camera_std,
-    per_channel,
     squash,
     squash_summary,
     summary_std,
@@ -45,16 +42,14 @@ from evflow.squash import (
 from evflow.summary import Stats
 
 __all__ = [
-    "Code", "Stats", "architecture", "code_from_video", "encode", "estimate", "estimate_with_std",
-    "finish", "forward", "generate", "init", "inverse", "log_prob", "squash", "summarize",
+    "Code", "Params", "Stats", "code_from_video", "encode", "estimate", "estimate_with_std",
+    "estimate_y", "finish", "forward", "generate", "inverse", "log_prob", "squash", "summarize",
     "unsquash",
 ]
 
 Array = jax.Array
-Params = dict[str, Any]
 
 DEFAULT_WINDOW_S = 0.05
-CHUNK = 2048  # pixels at a time: 16 x 96 encoder activations of a frame would take 550 MB
 
 
 @jax.tree_util.register_dataclass
@@ -72,114 +67,12 @@ class Code:
     context: Array
 
 
-class SpreadNet(nn.Module):
-    """Log standard deviation of y (..., 4) from what a pixel shows and the condition."""
-
-    hidden: int
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        x = nn.relu(nn.Dense(self.hidden)(x))
-        x = nn.relu(nn.Dense(self.hidden)(x))
-        return jnp.clip(nn.Dense(4)(x) - 1.0, -5.0, 2.0)
-
-
-def architecture(params: Params) -> ModelConfig:
-    """The static structure behind params: its name, and the sizes of its leaves."""
-    if len(params) != 1 or next(iter(params)) not in MODELS:
-        raise EvflowDataError(
-            "EV018", f"params have the top-level keys {sorted(params)}.",
-            f"Expected exactly one of {sorted(MODELS)}, as load_weights() returns.")
-    name, net = next(iter(params.items()))
-    base = MODELS[name]
-    steps = net["flow"]["level_0"]["actnorm"]["raw"].shape[0]
-    hidden = net["flow"]["level_0"]["coupling"]["w_2"].shape[-1]
-    return dataclasses.replace(
-        base,
-        flow=dataclasses.replace(base.flow, steps=steps, hidden=hidden),
-        encoder_hidden=net["encoder"]["Dense_0"]["kernel"].shape[-1],
-        summary_hidden=net["summary"]["pixel"]["Dense_0"]["kernel"].shape[-1]
-        if "summary" in net else base.summary_hidden,
-    )
-
-
-def _outputs(config: ModelConfig) -> int:
-    return 1 if config.code == "feature" else 2
-
-
-def _encoder_features(
-    config: ModelConfig, voxels: Array, dlogI: Array, context: Array, y: Array
-) -> Array:
-    """Encoder input: the paper's [E, dlogI], or ours with the contrast that the events carry
-    if the thresholds are the camera's, theta_on E_on and theta_off E_off."""
-    if config.code == "feature":
-        return jnp.concatenate([voxels, dlogI[..., None]], -1)
-    camera = squash(y[..., :4])
-    on, off = jnp.split(voxels, 2, -1)
-    on, off = on * camera.theta_on[..., None], off * camera.theta_off[..., None]
-    missing = dlogI - on.sum(-1) + off.sum(-1)
-    seen = pooling.pixel_features(voxels, dlogI, context)
-    return jnp.concatenate(
-        [seen, jnp.arcsinh(10.0 * on), jnp.arcsinh(10.0 * off), 5.0 * missing[..., None], y], -1)
-
-
-def encode_changes(
-    config: ModelConfig, net: Params, voxels: Array, dlogI: Array, context: Array, y: Array
-) -> tuple[Array, Array]:
-    """Per-pixel changes (..., 2m or feature) and their logits (..., outputs, m)."""
-    features = _encoder_features(config, voxels, dlogI, context, y)
-    logits, hidden = IntensityEncoder(config, _outputs(config)).apply(
-        {"params": net["encoder"]}, features)
-    return hidden if config.code == "feature" else encoder.changes_of_logits(logits), logits
-
-
-def condition(config: ModelConfig, changes: Array, context: Array, y: Array) -> Array:
-    """u (..., condition): the changes in units of the camera's thresholds (events expected
-    per sub-window, in asinh), the summary, the context. The paper's u is the feature alone."""
-    if config.code == "feature":
-        return changes
-    camera = squash(y[..., :4])
-    up, down = jnp.split(changes, 2, -1)
-    expected = [up / camera.theta_on[..., None], down / camera.theta_off[..., None]]
-    return jnp.concatenate([jnp.arcsinh(e) for e in expected] + [y, context], -1)
-
-
-def spread(net: Params, voxels: Array, dlogI: Array, context: Array, u: Array) -> Array:
-    features = jnp.concatenate([pooling.pixel_features(voxels, dlogI, context), u], -1)
-    hidden = net["spread"]["Dense_0"]["kernel"].shape[-1]
-    return jnp.exp(SpreadNet(hidden).apply({"params": net["spread"]}, features))
-
-
-def centre(config: ModelConfig, y: Array) -> Array:
-    """Where y = 0 of the flow lies: at the camera's summary, so that it models the residual."""
-    return y[..., :4] if config.pool else jnp.zeros_like(y[..., :4])
-
-
-def init(key: Array, config: ModelConfig, name: str = "default") -> Params:
-    """Fresh params (the flow's actnorms still want `flow.data_init`)."""
-    k_summary, k_encoder, k_spread, k_flow = jax.random.split(key, 4)
-    shape = (1, 1)
-    voxels, dlogI = jnp.zeros((*shape, 2 * config.bins)), jnp.zeros(shape)
-    context, y = jnp.zeros((*shape, 3)), jnp.zeros((*shape, 6))
-    features = _encoder_features(config, voxels, dlogI, context, y)
-    seen = pooling.pixel_features(voxels, dlogI, context)
-    wide = jnp.zeros((*shape, seen.shape[-1] + config.flow.condition))
-    net = {
-        "encoder": IntensityEncoder(config, _outputs(config)).init(k_encoder, features)["params"],
-        "spread": SpreadNet(config.flow.hidden).init(k_spread, wide)["params"],
-        "flow": flow.init(k_flow, config.flow),
-    }
-    if config.pool:
-        net["summary"] = pooling.init(k_summary, config)
-    return {name: net}
-
-
 def _net(params: Params) -> tuple[ModelConfig, Params]:
     return architecture(params), next(iter(params.values()))
 
 
 def _prepare(
-    config: ModelConfig, voxels: Any, dlogI: Any, window_s: Any, intensity: Any
+    config: ModelConfig, voxels: ArrayLike, dlogI: ArrayLike, window_s: Any, intensity: Any
 ) -> tuple[Array, Array, Array, Array | None]:
     """Checked float32 inputs; window_s (...,), intensity (..., H, W) or None."""
     channels = 2 * config.bins
@@ -211,7 +104,7 @@ def _prepare(
 
 
 def summarize(
-    params: Params, voxels: Array, dlogI: Array, *, window_s: Any = DEFAULT_WINDOW_S,
+    params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None,
 ) -> Stats:
     """Additive statistics (...,) of the pixels; add those of windows and tiles of one camera."""
@@ -241,44 +134,41 @@ def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
 
 
 def encode(
-    params: Params, voxels: Array, dlogI: Array, *, summary: Summary | None = None,
+    params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, summary: Summary | None = None,
     window_s: Any = DEFAULT_WINDOW_S, intensity: Any = None,
 ) -> Code:
     """Code of what was seen: intensity changes predicted per pixel, and the camera's summary
     (estimated from these very pixels unless given)."""
     config, net = _net(params)
     voxels, dlogI, window_s, intensity = _prepare(config, voxels, dlogI, window_s, intensity)
-    summary = _summary_or_estimate(params, config, voxels, dlogI, window_s, intensity, summary)
+    y, _ = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
     context = _context(window_s, intensity, dlogI.shape)
-    y = _over_pixels(unsquash_summary(summary), dlogI.shape)
-    changes, _ = encode_changes(config, net, voxels, dlogI, context, y)
-    return Code(changes, summary, context)
+    over = network.over_pixels(y, dlogI.shape)
+    changes, _ = network.encode_changes(config, net, voxels, dlogI, context, over)
+    return Code(changes, squash_summary(y), context)
 
 
 def _context(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
     return pooling.window_features(window_s[..., None, None], intensity, shape)
 
 
-def _over_pixels(y: Array, shape: tuple[int, ...]) -> Array:
-    """(..., C) of a camera -> (..., H, W, C)."""
-    return jnp.broadcast_to(y[..., None, None, :], (*shape, y.shape[-1]))
-
-
-def _summary_or_estimate(
+def _known_summary(
     params: Params, config: ModelConfig, voxels: Array, dlogI: Array, window_s: Array,
     intensity: Array | None, given: Summary | None,
-) -> Summary:
+) -> tuple[Array, Array]:
+    """y (..., 6) of the camera's summary and its std (0 where it is given)."""
     lead = dlogI.shape[:-2]
     if given is not None:
-        return jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v, jnp.float32), lead), given)
+        known = jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v, jnp.float32), lead), given)
+        return unsquash_summary(known), jnp.zeros((*lead, 6))
     if not config.pool:
-        return squash_summary(jnp.zeros((*lead, 6)))
+        return jnp.zeros((*lead, 6)), jnp.zeros((*lead, 6))
     stats = summarize(params, voxels, dlogI, window_s=window_s, intensity=intensity)
-    return finish(params, stats)[0]
+    return pooling.finish(config, _net(params)[1]["summary"], stats)
 
 
 def code_from_video(
-    params: Params, dL: Array, camera: Camera, *, window_s: Any = DEFAULT_WINDOW_S,
+    params: Params, dL: ArrayLike, camera: Camera, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None,
 ) -> Code:
     """Code without any events: true log-intensity changes dL (..., H, W, m) of the window's m
@@ -312,11 +202,11 @@ def camera_summary(camera: Camera) -> Summary:
 
 
 def _flow_condition(config: ModelConfig, code: Code) -> tuple[Array, Array]:
-    y = _over_pixels(unsquash_summary(code.summary), code.context.shape[:-1])
-    return condition(config, code.changes, code.context, y), centre(config, y)
+    y = network.over_pixels(unsquash_summary(code.summary), code.context.shape[:-1])
+    return network.condition(config, code.changes, code.context, y), network.centre(config, y)
 
 
-def forward(params: Params, voxels: Array, code: Code) -> tuple[Array, Array, Array]:
+def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array, Array]:
     """voxels (..., H, W, 32) -> y (..., H, W, 4), z (..., H, W, 28), log_det (..., H, W) of
     d(y, z)/d voxels at fixed code (Eqs. 3-5)."""
     config, net = _net(params)
@@ -346,33 +236,18 @@ def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
     return inverse(params, y, z, dataclasses.replace(code, summary=known))
 
 
-def base_std(summary_y: Array) -> Array:
-    """Standard deviation (..., 4) of y around the summary: the mismatch sigma/theta, and 0.3
-    in log eta. Floored, so that a camera without mismatch still has a density."""
-    known = squash_summary(summary_y)
-    theta = jnp.stack([known.sigma_on / known.theta_on, known.sigma_off / known.theta_off], -1)
-    theta = jnp.sqrt(theta**2 + 0.05**2)
-    spread = jnp.concatenate([theta, jnp.full_like(theta, 0.3)], -1)
-    return spread / per_channel(SCALE, spread)
-
-
-def log_normal(x: Array, mean: Array | float, std: Array | float) -> Array:
-    """Log density of N(mean, std^2), element-wise."""
-    return -0.5 * ((x - mean) / std) ** 2 - jnp.log(std) - 0.5 * math.log(2 * math.pi)
-
-
-def log_prob(params: Params, voxels: Array, code: Code) -> Array:
+def log_prob(params: Params, voxels: ArrayLike, code: Code) -> Array:
     """Log density (..., H, W) of the voxels given the code (Eq. 3): y ~ N(summary, mismatch^2),
     z ~ N(0, 1), plus the log-det. A density only where the code came from a true video and a
     camera; with an encoded code it is a score."""
     y, z, log_det = forward(params, voxels, code)
-    y6 = _over_pixels(unsquash_summary(code.summary), y.shape[:-1])
-    prior = log_normal(y, y6[..., :4], base_std(y6)).sum(-1)
-    return prior + log_normal(z, 0.0, jnp.ones(())).sum(-1) + log_det
+    y6 = network.over_pixels(unsquash_summary(code.summary), y.shape[:-1])
+    prior = network.log_normal(y, y6[..., :4], network.base_std(y6)).sum(-1)
+    return prior + network.log_normal(z, 0.0, jnp.ones(())).sum(-1) + log_det
 
 
 def estimate(
-    params: Params, voxels: Array, dlogI: Array, *, window_s: Any = DEFAULT_WINDOW_S,
+    params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None, summary: Summary | None = None,
 ) -> Camera:
     """Camera maps (..., H, W) from one window: voxels (..., H, W, 32), dlogI (..., H, W).
@@ -385,7 +260,7 @@ def estimate(
 
 
 def estimate_with_std(
-    params: Params, voxels: Array, dlogI: Array, *, window_s: Any = DEFAULT_WINDOW_S,
+    params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None, summary: Summary | None = None,
 ) -> tuple[Camera, Camera]:
     """`estimate` and the standard deviation of every value, in the same units."""
@@ -395,48 +270,19 @@ def estimate_with_std(
     return camera, camera_std(camera, y_std)
 
 
+_estimate_y = jax.jit(network.estimate_pixels, static_argnames="config")
+
+
 def estimate_y(
-    params: Params, voxels: Array, dlogI: Array, *, window_s: Any = DEFAULT_WINDOW_S,
+    params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None, summary: Summary | None = None,
 ) -> tuple[Array, Array]:
-    """`estimate_with_std` in the coordinates y: (..., H, W, 4) each."""
+    """`estimate_with_std` in the coordinates y: (..., H, W, 4) each. With a given summary the
+    std is that of a pixel in a camera so described; else it includes the summary's own."""
     config, net = _net(params)
     voxels, dlogI, window_s, intensity = _prepare(config, voxels, dlogI, window_s, intensity)
-    known = _summary_or_estimate(params, config, voxels, dlogI, window_s, intensity, summary)
-    return _estimate_y(net, voxels, dlogI, window_s, intensity, unsquash_summary(known), config)
-
-
-def _estimate_pixels(
-    net: Params, voxels: Array, dlogI: Array, window_s: Array, intensity: Array | None, y6: Array,
-    config: ModelConfig,
-) -> tuple[Array, Array]:
-    """Encoder, flow and spread on all pixels, in chunks so that activations stay in cache."""
+    y6, y6_std = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
     context = _context(window_s, intensity, dlogI.shape)
-    rows = [a.reshape(math.prod(dlogI.shape), -1) for a in (
-        voxels, dlogI[..., None], context, _over_pixels(y6, dlogI.shape))]
-    folded = flow.fold(net["flow"], config.flow)
-
-    def pixels(row: tuple[Array, ...]) -> tuple[Array, Array]:
-        voxels, dlogI, context, y = row
-        dlogI = dlogI[..., 0]
-        changes, _ = encode_changes(config, net, voxels, dlogI, context, y)
-        u = condition(config, changes, context, y)
-        residual, _ = flow.forward_folded(folded, voxels, u, config.flow)
-        return residual + centre(config, y), spread(net, voxels, dlogI, context, u)
-
-    y, std = _map_chunks(pixels, rows)
-    return y.reshape(*dlogI.shape, 4), std.reshape(*dlogI.shape, 4)
-
-
-_estimate_y = jax.jit(_estimate_pixels, static_argnames="config")
-
-
-def _map_chunks(f: Any, rows: list[Array]) -> Any:
-    """f over rows (N, C) in chunks of CHUNK, the last one padded with zeros."""
-    n = rows[0].shape[0]
-    if n <= CHUNK:
-        return f(tuple(rows))
-    pad = -n % CHUNK
-    chunks = tuple(jnp.pad(r, ((0, pad), (0, 0))).reshape(-1, CHUNK, r.shape[-1]) for r in rows)
-    out = jax.lax.map(f, chunks)
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:n], out)
+    y, y_std = _estimate_y(net, voxels, dlogI, context, y6, config=config)
+    shared = y6_std[..., None, None, :4]  # an error of the summary moves all pixels alike
+    return y, jnp.sqrt(y_std**2 + shared**2)

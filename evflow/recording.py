@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow import io, model
+from evflow import io, model, network
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.errors import EvflowDataError
 from evflow.intensity import delta_log_intensity, lin_log
-from evflow.squash import camera_std, squash, unsquash_summary
+from evflow.squash import SCALE, camera_std, per_channel, squash, unsquash_summary
 from evflow.types import Recording, Window
 from evflow.voxel import voxelize
 from evflow.weights import load_weights
@@ -99,7 +99,7 @@ def estimate_camera(
 
     stats, n_events = _pool(params, windows())
     summary, summary_std = model.finish(params, stats)
-    camera, std = _fuse(params, windows(), summary)
+    camera, std = _fuse(params, windows(), summary, summary_std)
     return CameraEstimate(
         camera, std, summary, summary_std, n_events >= VALID_EVENTS, n_events,
         len(plan.pairs), (*plan.skipped, *_warnings(stats, n_events)))
@@ -128,14 +128,14 @@ def _pool(params: model.Params, windows: Iterator[Window]) -> tuple[model.Stats,
 
 
 def _fuse(
-    params: model.Params, windows: Iterator[Window], summary: Summary
+    params: model.Params, windows: Iterator[Window], summary: Summary, summary_std: Summary
 ) -> tuple[Camera, Camera]:
     """Product of the windows' posteriors: each is N(y, s^2) and contains the prior (the
-    summary and the mismatch) once, so the prior's precision is taken off all but one."""
-    y6 = unsquash_summary(summary)
-    prior, prior_precision = y6[:4], model.base_std(y6) ** -2.0
-    precision: Array | float = 0.0
-    weighted: Array | float = 0.0
+    summary and the mismatch) once, so the prior's precision is taken off all but one. The
+    summary's own error, which all pixels share, is added to the std at the end."""
+    y6 = unsquash_summary(summary)[None, None]
+    prior, prior_precision = y6[..., :4], network.base_std(y6) ** -2.0
+    precision, weighted = jnp.zeros_like(prior), jnp.zeros_like(prior)
     for window in windows:
         voxels, dlogI, given = window_inputs(window)
         y, s = model.estimate_y(params, voxels, dlogI, summary=summary, **given)
@@ -145,9 +145,10 @@ def _fuse(
         weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
         precision += gained
     total = prior_precision + precision
-    y = prior + weighted / total
-    camera = squash(y)
-    return camera, camera_std(camera, total**-0.5)
+    camera = squash(prior + weighted / total)
+    relative = [getattr(summary_std, n) / getattr(summary, n) for n in PARAMETERS]
+    shared = jnp.stack(relative, -1)[None, None] / per_channel(SCALE, y6)
+    return camera, camera_std(camera, jnp.sqrt(1.0 / total + shared**2))
 
 
 def _warnings(stats: model.Stats, n_events: np.ndarray) -> list[str]:

@@ -34,7 +34,8 @@ def per_channel(values: np.ndarray, like: Array) -> Array:
 def squash(y: Array, output: Output = "log") -> Camera:
     """y (..., 4) -> Camera of maps (...)."""
     y = jnp.asarray(y)
-    values = jnp.tanh(y) if output == "tanh" else jnp.exp(y * per_channel(SCALE, y) + per_channel(CENTRE, y))
+    log_values = y * per_channel(SCALE, y) + per_channel(CENTRE, y)
+    values = jnp.tanh(y) if output == "tanh" else jnp.exp(log_values)
     return Camera(*jnp.moveaxis(values, -1, 0))
 
 

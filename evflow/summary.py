@@ -12,6 +12,7 @@ network chooses, the one place where the scale of theta can come from.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -105,7 +106,8 @@ def pool(
     """Sum over pixels: voxels (..., H, W, 2B), dlogI (..., H, W) -> Stats of (...,)."""
     context = window_features(jnp.asarray(window_s)[..., None, None], intensity, dlogI.shape)
     features = pixel_features(voxels, dlogI, context)
-    active, rates, gates = PixelNet(config).apply({"params": params["pixel"]}, features)
+    outputs: Any = PixelNet(config).apply({"params": params["pixel"]}, features)
+    active, rates, gates = outputs
     n_on, n_off = (half.sum(-1) for half in jnp.split(voxels, 2, -1))
     total = n_on + n_off
     fired = (total > 0).astype(voxels.dtype)
@@ -154,8 +156,8 @@ def pooled_features(stats: Stats) -> Array:
 def finish(config: ModelConfig, params: dict, stats: Stats) -> tuple[Array, Array]:
     """Stats -> y (..., 6) of the summary and its std in y. The variance has a part that falls
     with the amount of data (signal pixels for theta and sigma, exposure for eta) and a rest."""
-    mean, per_data, rest = FinishNet(config).apply(
-        {"params": params["finish"]}, pooled_features(stats))
+    outputs: Any = FinishNet(config).apply({"params": params["finish"]}, pooled_features(stats))
+    mean, per_data, rest = outputs
     signal = SIGNAL_UNIT / (stats.pixels_active + 1.0)
     quiet = EXPOSURE_UNIT / stats.exposure
     scale = jnp.stack([signal, signal, quiet, quiet, signal, signal], -1)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from evflow import encoder, flow, losses, model, summary
+from evflow import encoder, flow, losses, network, summary
 from evflow.batch import Batch, sample_batch
 from evflow.config import LossConfig, TrainConfig
 from evflow.scenes import TextureBank
@@ -79,16 +79,16 @@ def init_state(
     """
     key = jax.random.key(config.seed)
     k_params, k_data, k_run = jax.random.split(key, 3)
-    params = model.init(k_params, config.model, name)
+    params = network.init(k_params, config.model, name)
     batch = jax.jit(sample_batch, static_argnames="config")(k_data, bank, config)
     block = cut_block(k_data, batch, config)
     y = _over(unsquash_summary(batch.nominal), block.y)
     net = params[name]
     changes = encoder.split_sign(block.changes)
     if config.model.code == "feature":
-        changes, _ = model.encode_changes(config.model, net, block.voxels, block.dlogI,
+        changes, _ = network.encode_changes(config.model, net, block.voxels, block.dlogI,
                                           block.context, y)
-    u = model.condition(config.model, changes, block.context, y)
+    u = network.condition(config.model, changes, block.context, y)
     net["flow"] = flow.data_init(net["flow"], block.voxels, u, config.model.flow)
     # A copy: the train step donates its state, and a buffer can be donated only once.
     average = jax.tree.map(jnp.copy, params)
@@ -175,13 +175,13 @@ def pixel_losses(
     k_dequantise, k_latent = jax.random.split(key)
     even = (jnp.arange(known.shape[0]) % 2 == 0)[:, None]
     y6 = _over(jnp.where(even, known, seen), block.y)
-    predicted, logits = model.encode_changes(
+    predicted, logits = network.encode_changes(
         c, net, block.voxels, block.dlogI, block.context, y6)
     changes = predicted
     if c.code == "changes":
         changes = jnp.where(even[:, None, None], encoder.split_sign(block.changes), predicted)
-    u = model.condition(c, changes, block.context, y6)
-    centre = model.centre(c, y6)
+    u = network.condition(c, changes, block.context, y6)
+    centre = network.centre(c, y6)
     # The small noise that keeps L_F finite on zero-inflated counts serves L_P as well: a second
     # pass on clean voxels would cost another third of the step.
     noise = config.loss.dequantise * jax.random.normal(k_dequantise, block.voxels.shape)
@@ -196,9 +196,9 @@ def pixel_losses(
         "condition": losses.condition_loss(logits, encoder.targets(c, block.changes)).mean(),
         "parameter": _parameter_loss(y, block, config),
         "flow": losses.flow_loss(
-            model.log_normal(y, y6[..., :4], model.base_std(y6)).sum(-1) if c.pool
+            network.log_normal(y, y6[..., :4], network.base_std(y6)).sum(-1) if c.pool
             else jnp.zeros(log_det.shape),
-            model.log_normal(z, 0.0, jnp.ones(())).sum(-1), log_det).mean(),
+            network.log_normal(z, 0.0, jnp.ones(())).sum(-1), log_det).mean(),
         "event": losses.event_loss(generated, block.voxels, block.changes.sum(-1),
                                    config.loss.patches, config.loss.edge).mean(),
         "inverse_flow": losses.inverse_flow_loss(inverse_det).mean(),
@@ -206,7 +206,7 @@ def pixel_losses(
     if c.code == "changes":
         error = predicted - encoder.split_sign(block.changes)
         parts["change_l1"] = losses.charbonnier(error).mean()
-        spread = model.spread(net, block.voxels, block.dlogI, block.context, u)
+        spread = network.spread(net, block.voxels, block.dlogI, block.context, u)
         nll = losses.gaussian_nll(jax.lax.stop_gradient(y) - block.y, spread).mean((1, 2, 3))
         parts["spread"] = jnp.where(even[:, 0], 0.0, 2.0 * nll).mean()
     return parts, {"pixel/y": jnp.abs(y - block.y).mean(), "max_z": jnp.abs(z).max()}
@@ -239,7 +239,8 @@ def loss_fn(
     k_block, k_summary, k_pixels = jax.random.split(key, 3)
     known = unsquash_summary(batch.nominal)
     parts: Metrics = {}
-    seen, metrics = known, {}
+    metrics: Metrics = {}
+    seen = known
     if config.model.pool:
         parts["summary"], y, metrics = summary_losses(net, batch, k_summary, config)
         seen = jax.lax.stop_gradient(y)

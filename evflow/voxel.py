@@ -47,9 +47,9 @@ def voxelize_padded(
 ) -> Array:
     """Device events of fixed length N -> float32 (H, W, 2*bins); jit and vmap it.
 
-    x, y, p: integer or bool (N,); t: (N,) relative to the window's start in the unit of
-    `window` (int32 us or float); valid: bool (N,), False for padding. Events outside the
-    window or the sensor count as padding: nothing is clipped to an edge.
+    x, y: integer (N,); p: bool, {0, 1} or {-1, 1} (N,); t: (N,) relative to the window's start
+    in the unit of `window` (int32 us or float); valid: bool (N,), False for padding. Events
+    outside the window or the sensor count as padding: nothing is clipped to an edge.
     """
     height, width = shape
     position = t.astype(jnp.float32) * ((bins - 1) / window)
@@ -57,7 +57,7 @@ def voxelize_padded(
     inside &= (x >= 0) & (x < width) & (y >= 0) & (y < height)
     low = jnp.clip(jnp.floor(position), 0, bins - 2).astype(jnp.int32)
     weight = position - low.astype(jnp.float32)
-    channel = jnp.where(p.astype(bool), 0, bins) + low
+    channel = jnp.where(p > 0, 0, bins) + low
     pixel = y.astype(jnp.int32) * width + x.astype(jnp.int32)
     index = jnp.where(inside, pixel * (2 * bins) + channel, height * width * 2 * bins)
     grid = jnp.zeros(height * width * 2 * bins, jnp.float32)

@@ -108,7 +108,8 @@ def main(options: Options) -> dict[str, Any]:
         found = estimate_camera(recording, progress=progress)
     print(describe(found) if nominal is None else truth_table(nominal, found))
     made = simulate_again(recording, found, options.seed)
-    span = (int(max(recording.events.t[0], made.t[0])), int(min(recording.events.t[-1], made.t[-1])))
+    span = (max(int(e.t[0]) for e in (recording.events, made)),
+            min(int(e.t[-1]) for e in (recording.events, made)))
     result: dict[str, Any] = {
         "estimate": found.as_dict(), "rate_recorded": rates(recording.events, span),
         "rate_remade": rates(made, span)}

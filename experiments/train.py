@@ -96,7 +96,8 @@ def run(
                 log.flush()
                 checkpoints.save(step, state)
     checkpoints.save(step, state)
-    return state, {k: sum(r[k] for r in recent) / len(recent) for k in (recent[-1] if recent else {})}
+    names = recent[-1] if recent else {}
+    return state, {k: sum(r[k] for r in recent) / len(recent) for k in names}
 
 
 def values_of(recent: list[dict[str, float]]) -> float:

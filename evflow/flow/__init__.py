@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from evflow.flow.config import FlowConfig
-from evflow.flow.fold import fold, forward_folded
+from evflow.flow.folding import fold, forward_folded
 from evflow.flow.stack import data_init, forward, init, inverse
 
 __all__ = ["FlowConfig", "data_init", "fold", "forward", "forward_folded", "init", "inverse"]

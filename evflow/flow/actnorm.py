@@ -1,6 +1,6 @@
 """Actnorm: one scale and one bias per channel, set from data before training.
 
-params: base (C,), raw (C,), bias (C,), or stacked (steps, C). scale = exp(base + bound tanh(raw)):
+params: base, raw and bias (C,), stacked over steps in a level. scale = exp(base + bound tanh(raw)):
 `base` is what data_init found and stays (a buffer: its gradient is exactly zero; keep it out of
 weight decay), `raw` is trained from 0. So log-scales cannot drift and the float32 inverse stays
 accurate.
@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from evflow.flow.config import Array, FlowConfig, Params
 
 
-def init(shape: tuple[int, ...]) -> Params:
-    """The identity; `shape` = (..., C)."""
-    return {name: jnp.zeros(shape, jnp.float32) for name in ("base", "raw", "bias")}
+def init(channels: int, config: FlowConfig) -> Params:
+    """One level's steps, stacked: the identity."""
+    return {name: jnp.zeros((config.steps, channels), jnp.float32)
+            for name in ("base", "raw", "bias")}
 
 
 def data_init(h: Array, min_std: Array) -> Params:

@@ -20,19 +20,19 @@ LOG_SCALE_BOUND = 0.2
 
 
 def init(key: Array, channels: int, config: FlowConfig) -> Params:
-    """He-normal hidden layers, zero last layer."""
-    half, hidden, condition = channels // 2, config.hidden, config.condition
-    outputs = half if config.coupling == "additive" else channels
+    """One level's steps, stacked: He-normal hidden layers, zero last layer."""
+    steps, half, hidden = config.steps, channels // 2, config.hidden
+    fan_in, outputs = half + config.condition, half if config.coupling == "additive" else channels
     k_h, k_u, k_2 = jax.random.split(key, 3)
     return {
         # The first layer's weight in two parts: two products beat joining [h_A, u] at every step.
-        "w_h": he_normal(k_h, (half, hidden), half + condition),
-        "w_u": he_normal(k_u, (condition, hidden), half + condition),
-        "b_1": jnp.zeros(hidden, jnp.float32),
-        "w_2": he_normal(k_2, (hidden, hidden), hidden),
-        "b_2": jnp.zeros(hidden, jnp.float32),
-        "w_3": jnp.zeros((hidden, outputs), jnp.float32),
-        "b_3": jnp.zeros(outputs, jnp.float32),
+        "w_h": he_normal(k_h, (steps, half, hidden), fan_in),
+        "w_u": he_normal(k_u, (steps, config.condition, hidden), fan_in),
+        "b_1": jnp.zeros((steps, hidden), jnp.float32),
+        "w_2": he_normal(k_2, (steps, hidden, hidden), hidden),
+        "b_2": jnp.zeros((steps, hidden), jnp.float32),
+        "w_3": jnp.zeros((steps, hidden, outputs), jnp.float32),
+        "b_3": jnp.zeros((steps, outputs), jnp.float32),
     }
 
 

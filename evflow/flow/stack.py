@@ -26,12 +26,9 @@ def init(key: Array, config: FlowConfig) -> Params:
     """New float32 params: a linear flow with identity actnorms. Follow with `data_init`."""
     params: Params = {}
     for index, channels in enumerate(config.level_channels):
-        k_steps, k_injector = jax.random.split(jax.random.fold_in(key, index))
-        keys = jax.random.split(k_steps, config.steps)
-        level = {
-            "actnorm": actnorm.init((config.steps, channels)),
-            "coupling": jax.vmap(coupling.init, in_axes=(0, None, None))(keys, channels, config),
-        }
+        k_coupling, k_injector = jax.random.split(jax.random.fold_in(key, index))
+        level = {"actnorm": actnorm.init(channels, config),
+                 "coupling": coupling.init(k_coupling, channels, config)}
         if config.injector:
             level["injector"] = injector.init(k_injector, channels, config)
         params[f"level_{index}"] = level

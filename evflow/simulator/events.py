@@ -19,15 +19,13 @@ import numpy as np
 from evflow.camera import Camera, SensorModel
 from evflow.errors import EvflowDataError
 from evflow.intensity import to_log
-from evflow.simulator import scan
-from evflow.simulator.noise import GOLDEN
+from evflow.simulator import noise, scan
 from evflow.types import Events
 
 Array = jax.Array
 
 CHUNK_PIXELS = 32 * 346 * 260  # frames x pixels on the device at a time: ~100 MB in flight
 CHUNK_FRAMES = 64
-MAX_NOISE_MEAN = 60.0  # noise events per pixel and interval; beyond it exp(-mean) underflows
 
 
 def simulate(
@@ -66,7 +64,7 @@ def simulate_stream(
     first, time = next(pairs, (None, 0))
     if first is None:
         raise EvflowDataError("EV001", "the video has no frames.", "Give at least two frames.")
-    noisy = scan.is_noisy(model, camera)
+    noisy, rate = scan.is_noisy(model, camera), noise.peak_rate(model, camera)
     state = jax.jit(scan.start, static_argnames="model")(
         key, to_log(first, model.log_map), model=model)
     length = min(max(1, CHUNK_PIXELS // first.size), CHUNK_FRAMES)
@@ -80,7 +78,7 @@ def simulate_stream(
         seconds = (padded[1:] - origin) * 1e-6
         high = seconds.astype(np.float32)
         end_s = np.stack([high, seconds - high], -1).astype(np.float32)
-        _check_noise(model, camera, dt)
+        noise.check_rate(rate, float(dt.max()))
         if len(chunk) < length:
             pad = np.broadcast_to(frames[-1], (length - len(chunk), *frames.shape[1:]))
             frames = np.concatenate([frames, pad])
@@ -102,25 +100,17 @@ def _checked_camera(camera: Camera) -> Camera:
     return jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), camera)
 
 
-def _check_noise(model: SensorModel, camera: Camera, dt: np.ndarray) -> None:
-    rate = float(max(jnp.max(camera.eta_on), jnp.max(camera.eta_off)))
-    if model.eta_intensity:
-        rate *= 4.0  # the noise factor spans 1 to 1/4
-    mean = rate * float(dt.max())
-    if mean > MAX_NOISE_MEAN:
-        raise EvflowDataError(
-            "EV014", f"eta reaches {rate:.3g} Hz: {mean:.3g} events per pixel in one frame "
-            f"interval of {dt.max() * 1e3:.3g} ms.",
-            "Noise rates are in Hz per pixel (typically .01-10); use shorter frame intervals.")
-
-
 def _single_frames(
     frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
     shape: tuple[int, ...],
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Validated (frame, time) pairs, whatever the blocks they came in."""
     dtype, last, index = None, None, 0
-    for block, times in zip(frames_iter, times_iter, strict=True):
+    for block, times in itertools.zip_longest(frames_iter, times_iter):
+        if block is None or times is None:
+            raise EvflowDataError(
+                "EV002", f"the {'frames' if block is None else 'times'} end after {index} frames.",
+                "Give one time per frame, in blocks of the same lengths.")
         block, times = np.asarray(block), np.atleast_1d(np.asarray(times))
         block = block[None] if block.ndim == 2 else block
         _check_block(block, times, shape, dtype, index)
@@ -218,7 +208,7 @@ def _noise_events(counts: np.ndarray, at: np.ndarray, on: bool, model: SensorMod
     step, pixel = np.nonzero(counts)
     number = counts[step, pixel].astype(np.int64)
     k = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
-    fraction = np.mod(np.repeat(at[step, pixel], number) + k * GOLDEN, 1.0)
+    fraction = np.mod(np.repeat(at[step, pixel], number) + k * noise.GOLDEN, 1.0)
     if model.timestamps == "v2e":
         fraction = np.ones_like(fraction)
     return (np.repeat(step, number), np.repeat(pixel, number), fraction.astype(np.float32),

@@ -10,10 +10,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import cv2
 import numpy as np
 
+from evflow.errors import EvflowDataError
+
+MIN_SIDE = 12  # pixels on the longer side; DIS refuses smaller frames
 MAX_STEPS = 64  # frames per pair; beyond it the motion is too fast to trust the flow anyway
 MOTION_QUANTILE = 99.5  # per cent of pixels that must move less than the wanted step
 
@@ -26,12 +30,20 @@ def upsample(
 
     pairs: (frame (H, W) in DN 0..255, time in us). Yields float32 frames; the given ones come
     out unchanged, those between lie evenly in time. `warn` is told, once, where the motion of
-    a pair exceeds MAX_STEPS steps.
+    a pair exceeds MAX_STEPS steps. Raises EV002 (frames too small or of changing size), EV020.
     """
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    if not max_motion_px > 0:
+        raise EvflowDataError("EV020", f"max_motion_px={max_motion_px}.", "It must be > 0.")
+    preset = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
+    flow: Any = cv2.DISOpticalFlow_create(preset)  # type: ignore[attr-defined]
     previous, t0, told = None, 0, False
     for frame, t1 in pairs:
         current = np.asarray(frame, np.float32)
+        shape = current.shape if previous is None else previous.shape
+        if current.ndim != 2 or current.shape != shape or max(shape) < MIN_SIDE:
+            raise EvflowDataError(
+                "EV002", f"frame at {t1} us has shape {current.shape}, the first {shape}.",
+                f"Expected (H, W) of one size, the longer side at least {MIN_SIDE} pixels.")
         if previous is not None:
             there, back = _flow(flow, previous, current), _flow(flow, current, previous)
             wanted = math.ceil(_motion(there) / max_motion_px)
@@ -47,7 +59,7 @@ def upsample(
         previous, t0 = current, int(t1)
 
 
-def _flow(dis: cv2.DISOpticalFlow, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _flow(dis: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Motion (H, W, 2) in pixels (x, y) that carries a into b."""
     return dis.calc(_gray8(a), _gray8(b), None)
 
@@ -73,8 +85,9 @@ def _between(
 def _warp(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
     height, width = image.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    return cv2.remap(image, x + flow[..., 0].astype(np.float32), y + flow[..., 1].astype(np.float32),
-                     cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    to_x, to_y = np.moveaxis(flow.astype(np.float32), -1, 0)
+    return cv2.remap(image, x + to_x, y + to_y, cv2.INTER_LINEAR,
+                     borderMode=cv2.BORDER_REPLICATE)
 
 
 def unzip(

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 
 from evflow.camera import Camera, SensorModel
+from evflow.errors import EvflowDataError
 from evflow.intensity import noise_factor
 
 Array = jax.Array
 
-
 GOLDEN = 0.6180339887498949
+MAX_MEAN = 60.0  # noise events per pixel and interval; beyond it exp(-mean) nears underflow
 
 
 def uniform_pair(key: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
@@ -30,9 +31,12 @@ def uniform_pair(key: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
     return (bits.astype(jnp.float32) + 0.5) * 2.0**-32, (low + 0.5) * 2.0**-12
 
 
-def placed(at: Array, k: Array | int) -> Array:
+def placed(model: SensorModel, at: Array, k: Array | int) -> Array:
     """Time of the k-th noise event of an interval, as a fraction: the first is uniform, further
-    ones follow at the golden ratio (an interval with two is rare: mean = rate x dt)."""
+    ones follow at the golden ratio (an interval with two is rare: mean = rate x dt). v2e puts
+    them all at the frame."""
+    if model.timestamps == "v2e":
+        return jnp.ones_like(at)
     return jnp.mod(at + k * GOLDEN, 1.0)
 
 
@@ -79,14 +83,34 @@ def noise_rates(
     return eta[0], eta[1]
 
 
+def peak_rate(model: SensorModel, camera: Camera) -> float:
+    """Bound on the noise rate (Hz per polarity) of any pixel at any intensity (host side; 0 for
+    traced cameras, of which nothing is known)."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(camera)):
+        return 0.0
+    with jax.ensure_compile_time_eval():
+        dark, bright = jnp.zeros(camera.shape, jnp.float32), jnp.ones((), jnp.float32)
+        return float(jnp.max(jnp.stack(noise_rates(model, camera, dark, bright))))
+
+
+def check_rate(rate_hz: float, dt_s: float) -> None:
+    """Raise EV014 where `rate_hz` is more than the counts of an interval of dt_s can hold."""
+    if rate_hz * dt_s > MAX_MEAN:
+        raise EvflowDataError(
+            "EV014", f"noise reaches {rate_hz:.3g} Hz: {rate_hz * dt_s:.3g} events per pixel in "
+            f"one frame interval of {dt_s * 1e3:.3g} ms.",
+            "Rates (eta, shot_hz) are in Hz per pixel, typically .01-10; or shorten the interval.")
+
+
 def leak_contrast(
     model: SensorModel, theta_on: Array, fixed_pattern: Array, key: Array, dt: Array
 ) -> Array:
     """ON contrast leaked in dt: rate x fixed pattern x (1 - jitter N(0,1)) x theta_on (v2e)."""
-    jitter = 1.0
+    leaked = dt * model.leak_hz * fixed_pattern * theta_on
     if model.leak_jitter > 0:
-        jitter = 1.0 - model.leak_jitter * jax.random.normal(key, theta_on.shape, theta_on.dtype)
-    return dt * model.leak_hz * fixed_pattern * jitter * theta_on
+        normal = jax.random.normal(key, theta_on.shape, theta_on.dtype)
+        leaked = leaked * (1.0 - model.leak_jitter * normal)
+    return leaked
 
 
 def leak_pattern(model: SensorModel, key: Array, shape: tuple[int, ...]) -> Array:

@@ -11,6 +11,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from evflow.camera import Camera, SensorModel
 from evflow.intensity import LOG_MAPS, normalised_intensity
@@ -25,7 +26,8 @@ Array = jax.Array
 class SimState:
     """pixels: PixelState of (H, W) maps; leak_pattern (H, W); reference: mean I01 of frame 0;
     frame: index of the next frame, which alone seeds its noise; time: of the last frame, seconds
-    since frame 0 as a (2,) float32 pair, high and low part (only v2e's slots read it); key: the typed key."""
+    since frame 0 as a (2,) float32 pair, high and low part (only v2e's slots read it); key: the
+    typed key."""
 
     pixels: PixelState
     leak_pattern: Array
@@ -127,9 +129,10 @@ def advance(
 
 def is_noisy(model: SensorModel, camera: Camera) -> bool:
     """False only where no noise event can occur (host side; traced cameras count as noisy)."""
-    if model.shot_hz > 0 or isinstance(camera.eta_on, jax.core.Tracer):
+    etas = (camera.eta_on, camera.eta_off)
+    if model.shot_hz > 0 or any(isinstance(e, jax.core.Tracer) for e in etas):
         return True
-    return bool(jnp.any(camera.eta_on > 0) | jnp.any(camera.eta_off > 0))
+    return any(bool(np.any(np.asarray(eta) > 0)) for eta in etas)
 
 
 @partial(jax.jit, static_argnames=("model", "noisy"))

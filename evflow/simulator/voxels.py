@@ -61,10 +61,12 @@ def _signal_bins(
     spacing = spikes.spacing * length
     if dead is None:
         return hat_sums(low, width, begin + spikes.first * length, spacing, count)
-    # The waiting events come first, `dead` apart, then those that cross in their own time.
-    gain = jnp.maximum(spikes.spacing - dead, 1e-9)
-    waiting = jnp.ceil(jnp.maximum(spikes.earliest - spikes.first, 0.0) / gain)
-    waiting = jnp.clip(waiting, 0.0, count)
+    # The waiting events come first, `dead` apart, then those that cross in their own time; where
+    # crossings are no further apart than `dead`, every event waits for the one before.
+    gain = spikes.spacing - dead
+    lag = jnp.maximum(spikes.earliest - spikes.first, 0.0)
+    waiting = jnp.where(gain > 0, jnp.ceil(lag / jnp.maximum(gain, 1e-9)), count)
+    waiting = jnp.minimum(waiting, count)
     at = spikes.first + waiting * spikes.spacing
     late = hat_sums(low, width, begin + spikes.earliest * length,
                     jnp.zeros_like(count) + dead * length, waiting)
@@ -73,14 +75,14 @@ def _signal_bins(
 
 
 def _noise_bins(
-    interval: Interval, low: Array, begin: Array, length: Array, width: int
+    model: SensorModel, interval: Interval, low: Array, begin: Array, length: Array, width: int
 ) -> list[Array]:
     """Weights (2, H, W) per touched bin of one interval's noise events (ON, OFF). The loop runs
     only where some pixel sends two or more in one interval."""
     counts = jnp.stack([interval.noise_on, interval.noise_off])
 
     def place(k: Array | int) -> list[Array]:
-        s = begin + noise.placed(interval.noise_at, k) * length - low
+        s = begin + noise.placed(model, interval.noise_at, k) * length - low
         struck = jnp.where(counts > k, 1.0, 0.0)
         return [struck * jnp.maximum(0.0, 1.0 - jnp.abs(s - j)) for j in range(width)]
 
@@ -112,10 +114,11 @@ def simulate_window(
         log_i, at, begin = inputs
         end_s = jnp.stack([state.frame.astype(jnp.float32) * dt, jnp.zeros(())])
         state, interval = scan.advance(model, noisy, camera, state, log_i, dt, end_s)
-        weights = _signal_bins(interval, at, begin, jnp.float32(length), width, dead)
+        span = jnp.float32(length)
+        weights = _signal_bins(interval, at, begin, span, width, dead)
         # An interval has one polarity per pixel: its sign marks it, and halves the traffic.
         sign = jnp.sign(interval.spikes.count).astype(jnp.float32)
-        struck = _noise_bins(interval, at, begin, jnp.float32(length), width) if noisy else []
+        struck = _noise_bins(model, interval, at, begin, span, width) if noisy else []
         return state, ([w * sign for w in weights], struck)
 
     inputs = (log_frames, jnp.asarray(low, jnp.float32), jnp.asarray(edges, jnp.float32))
@@ -155,14 +158,20 @@ def simulate_voxels(
     if log_frames.ndim < 3 or log_frames.shape[-3] < 2:
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
                               "Expected (..., T, H, W) with at least two frames.")
-    if not frame_dt_s > 0 or bins < 2:
+    if not 0 < frame_dt_s < math.inf or bins < 2:
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}, bins={bins}.",
                               "Need frame_dt_s > 0 and bins >= 2.")
     if camera.shape[-2:] != log_frames.shape[-2:]:
         raise EvflowDataError(
             "EV015", f"the camera is {camera.shape[-2:]}, the frames {log_frames.shape[-2:]}.")
-    camera.validate()
     lead = log_frames.shape[:-3]
+    if camera.shape[:-2] not in ((), lead):
+        raise EvflowDataError(
+            "EV015", f"the camera's leading axes are {camera.shape[:-2]}, the frames' {lead}.",
+            "Give one camera (H, W) or one for each video.")
+    camera.validate()
+    camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), camera)
+    noise.check_rate(noise.peak_rate(model, camera), frame_dt_s)
     return _voxels(key, log_frames, camera, frame_dt_s=float(frame_dt_s), model=model, bins=bins,
                    noisy=scan.is_noisy(model, camera), lead=lead)
 

@@ -1,0 +1,133 @@
+"""The benchmarks: a table on the terminal, JSON lines on the disk.
+
+    python -m benchmarks                          # everything, some minutes
+    python -m benchmarks --only simulator train   # some subjects (limits are always measured)
+    python -m benchmarks --quick                  # tiny inputs: does it run?
+
+Every case runs in a process of its own, except with --quick. Exit code 1 if a case failed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+from benchmarks import bench_estimate, bench_simulator, bench_train, bench_voxels, limits
+from benchmarks.harness import Case, Record, Setting, compare, facts, isolated, measure
+
+SUBJECTS: dict[str, tuple[Case, ...]] = {
+    "limits": limits.CASES,
+    "simulator": bench_simulator.CASES,
+    "voxels": bench_voxels.CASES,
+    "estimate": bench_estimate.CASES,
+    "train": bench_train.CASES,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Time evflow on this machine, beside its limits and beside peers."""
+
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
+    """Subjects: simulator, voxels, estimate, train (default: all)."""
+    quick: bool = False
+    """Tiny inputs, one repeat, one process: shows that it runs, times mean nothing."""
+    out: Path | None = None
+    """JSON lines (default: benchmarks/results/<date>.jsonl). An existing file is kept."""
+    devices: Literal[1, 2] = 1
+    """JAX CPU devices; the estimate splits its pixels over them."""
+
+
+def main(options: Options) -> int:
+    out = options.out or default_out()
+    if out.exists():
+        raise EvflowDataError("EV013", f"{out} exists.", "Give another --out.")
+    cases = select(options.only)
+    run_facts = facts() | {"quick": options.quick}
+    setting = Setting(options.quick, options.devices)
+    if options.quick and options.devices > 1:  # otherwise each process sets its own number
+        jax.config.update("jax_num_cpu_devices", options.devices)
+    console = Console(stderr=True)
+    records = []
+    for case in cases:
+        console.print(f"{case.subject}: {case.task}, {case.implementation}", highlight=False)
+        records.append((measure if options.quick else isolated)(case, setting))
+    records = compare(records)
+    with atomic_write(out) as temporary:
+        lines = (json.dumps(dataclasses.asdict(r) | {"run": run_facts}) for r in records)
+        temporary.write_text("".join(f"{line}\n" for line in lines))
+    Console(width=None if sys.stdout.isatty() else 150).print(table(records, run_facts))
+    console.print(f"written to {out}")
+    return int(any(r.failed for r in records))
+
+
+def default_out() -> Path:
+    now = datetime.datetime.now(datetime.UTC)
+    return Path(__file__).parent / "results" / f"{now:%Y-%m-%dT%H%M%S}.jsonl"
+
+
+def select(only: tuple[str, ...]) -> list[Case]:
+    """The cases of the named subjects, the limits first. Unknown names raise EV020."""
+    unknown = sorted(set(only) - set(SUBJECTS))
+    if unknown:
+        raise EvflowDataError("EV020", f"no benchmark {unknown}.", f"Choose from {list(SUBJECTS)}.")
+    return [case for name, cases in SUBJECTS.items() if not only or name in {"limits", *only}
+            for case in cases]
+
+
+def table(records: list[Record], run: dict[str, Any]) -> Table:
+    """One row per record; a line between subjects."""
+    title = f"{run['cpu']}, {run['cpus']} cores, load {run['load_before']} before; " + ", ".join(
+        f"{name} {version}" for name, version in run["versions"].items())
+    shown = Table(title=title, caption="x first: time against the first case of the same task, "
+                  "above 1 = slower. % of sgemm, copy: of the best measured in this run.")
+    for name in ("task", "implementation", "median s", "min s", "per second", "% sgemm", "% copy",
+                 "x first", "peak MB"):
+        shown.add_column(name, justify="left" if name in ("task", "implementation") else "right")
+    for r, following in zip(records, [*records[1:], None], strict=True):
+        shown.add_row(*row(r), end_section=following is None or following.subject != r.subject)
+    return shown
+
+
+def row(r: Record) -> tuple[str, ...]:
+    split = f", {r.devices} devices" if r.devices > 1 else ""
+    start = (f"{r.subject}: {r.task}", r.implementation + split)
+    if r.seconds is None or r.fastest is None:
+        return (*start, r.skipped)
+    rates = "\n".join(f"{quantity(rate)} {unit}" for unit, rate in r.rates.items()
+                      if unit != "GB" or r.subject == "limits")
+    shares = (f"{100 * r.of_limit[k]:.1f}" if k in r.of_limit else "" for k in ("sgemm", "copy"))
+    return (*start, f"{r.seconds:.3g}", f"{r.fastest:.3g}", rates, *shares,
+            "" if r.relative is None else f"{r.relative:.2f}",
+            "" if r.peak_mb is None else f"{r.peak_mb:.0f}")
+
+
+def quantity(value: float) -> str:
+    """1234567.0 -> "1.23 M"."""
+    for scale, prefix in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
+        if value >= scale:
+            return f"{value / (1e3 if prefix == 'k' else scale):.3g} {prefix}"
+    return f"{value:.4g}"
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")  # inherited by the cases' processes
+    try:
+        sys.exit(main(tyro.cli(Options, description=__doc__)))
+    except EvflowDataError as e:
+        sys.exit(str(e))

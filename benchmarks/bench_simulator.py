@@ -1,0 +1,105 @@
+"""Frames to events and to voxels: evflow against a one-thread numba loop.
+
+The video is made here: a photograph of scikit-image under a smooth similarity motion, 346x260 at
+1000 frames per second. "noise on" is v2e's noisy pixel: low-pass at 30 Hz, leak .1 Hz, shot noise
+5 Hz, each noise event resetting the memory. Events are delivered as one sorted list in memory.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+
+from benchmarks.harness import Case, Setting, Workload
+from evflow.camera import Camera, SensorModel
+from evflow.intensity import to_log, uint8_table
+from evflow.scenes.photos import load_photos
+from evflow.simulator import simulate, simulate_voxels
+
+CUTOFF_HZ, LEAK_HZ, SHOT_HZ = 30.0, 0.1, 5.0
+THETA, DT_US, BINS = 0.2, 1000, 16
+WINDOW_FRAMES = 50  # intervals per voxel grid: 50 ms
+
+
+def video(setting: Setting, frames: int) -> np.ndarray:
+    """uint8 (frames, H, W): about .13 px, .02 degrees and .01 % of zoom per frame."""
+    width, height = (48, 36) if setting.quick else (346, 260)
+    sharp = load_photos()["brick" if setting.quick else "camera"]
+    photo = cv2.GaussianBlur(255 * sharp, (0, 0), 0.8)
+    centre = (photo.shape[1] / 2, photo.shape[0] / 2)
+    corner = (width / 2 - centre[0], height / 2 - centre[1])
+    out = np.empty((frames, height, width), np.uint8)
+    for i in range(frames):
+        move = cv2.getRotationMatrix2D(centre, 0.02 * i, 1 + 1e-4 * i)
+        move[:, 2] += (corner[0] - 0.12 * i, corner[1] - 3 * np.sin(i / 40))
+        out[i] = np.rint(cv2.warpAffine(photo, move, (width, height), flags=cv2.INTER_LINEAR,
+                                        borderMode=cv2.BORDER_REFLECT_101))
+    return out
+
+
+def _sensor(noisy: bool) -> SensorModel:
+    if not noisy:
+        return SensorModel()
+    return SensorModel(cutoff_hz=CUTOFF_HZ, leak_hz=LEAK_HZ, shot_hz=SHOT_HZ,
+                       noise_resets_memory=True)
+
+
+def events_evflow(setting: Setting, noisy: bool) -> Workload:
+    frames = video(setting, 20 if setting.quick else 300)
+    times = np.arange(len(frames)) * DT_US
+    camera, model = Camera.constant(frames.shape[1:], THETA, THETA), _sensor(noisy)
+    return Workload(lambda: simulate(jax.random.key(0), frames, times, camera, model=model),
+                    lambda events: _work(frames, len(events)))
+
+
+def events_numba(setting: Setting, noisy: bool) -> Workload:
+    from benchmarks import peer_numba
+
+    frames, table = video(setting, 20 if setting.quick else 300), uint8_table("linlog")
+    pixel = peer_numba.Pixel(THETA, DT_US, noisy, CUTOFF_HZ, LEAK_HZ, SHOT_HZ)
+    return Workload(lambda: peer_numba.simulate(frames, table, pixel),
+                    lambda events: _work(frames, len(events[0])))
+
+
+def _work(frames: np.ndarray, events: int) -> dict[str, float]:
+    return {"frames": len(frames) - 1, "events": events,
+            "GB": 1e-9 * (frames.nbytes + 13 * events)}  # an event: 2 + 2 + 8 + 1 bytes
+
+
+def voxels_evflow(setting: Setting, noisy: bool) -> Workload:
+    frames = video(setting, (10 if setting.quick else WINDOW_FRAMES) + 1)
+    camera, model = Camera.constant(frames.shape[1:], THETA, THETA), _sensor(noisy)
+    return Workload(
+        lambda: simulate_voxels(jax.random.key(0), to_log(frames), camera,
+                                frame_dt_s=DT_US * 1e-6, model=model, bins=BINS),
+        partial(_voxel_work, frames))
+
+
+def voxels_numba(setting: Setting, noisy: bool) -> Workload:
+    from benchmarks import peer_numba
+
+    frames = video(setting, (10 if setting.quick else WINDOW_FRAMES) + 1)
+    pixel = peer_numba.Pixel(THETA, DT_US, noisy, CUTOFF_HZ, LEAK_HZ, SHOT_HZ)
+    table = uint8_table("linlog")
+    return Workload(lambda: peer_numba.simulate_voxels(frames, table, pixel, BINS),
+                    partial(_voxel_work, frames))
+
+
+def _voxel_work(frames: np.ndarray, grid: Any) -> dict[str, float]:
+    return {"frames": len(frames) - 1, "events": float(np.asarray(grid).sum(dtype=np.float64)),
+            "GB": 1e-9 * (frames.nbytes + grid.nbytes)}
+
+
+CASES = tuple(
+    Case("simulator", f"{output}, noise {'on' if noisy else 'off'}", implementation,
+         partial(prepare, noisy=noisy), needs)
+    for output, pair in (("events", (events_evflow, events_numba)),
+                         (f"voxels, {BINS} bins", (voxels_evflow, voxels_numba)))
+    for noisy in (False, True)
+    for implementation, prepare, needs in (("evflow", pair[0], ""),
+                                           ("numba, 1 thread", pair[1], "numba"))
+)

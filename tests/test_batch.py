@@ -1,0 +1,80 @@
+"""Training data: what the network is told is what happened."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow.batch import Batch, sample_batch
+from evflow.camera import CameraPrior, SensorModel
+from evflow.scenes import SceneConfig, TextureBank, make_bank
+from tests.networks import small_config
+
+
+@pytest.fixture(scope="module")
+def bank() -> TextureBank:
+    return make_bank(jax.random.key(0), 4, photos=False, size=64, cutout_size=32)
+
+
+@pytest.fixture(scope="module")
+def batch(bank: TextureBank) -> Batch:
+    config = small_config(scene=SceneConfig(speed_px_s=(100.0, 300.0), static_fraction=0.0))
+    return jax.jit(sample_batch, static_argnames="config")(jax.random.key(1), bank, config)
+
+
+def test_shapes(batch: Batch) -> None:
+    assert batch.voxels.shape == (4, 2, 16, 16, 32)
+    assert batch.dlogI.shape == batch.intensity.shape == (4, 2, 16, 16)
+    assert batch.changes.shape == (4, 2, 16, 16, 16)
+    assert batch.camera.shape == (4, 16, 16)
+    assert batch.window_s.shape == batch.nominal.theta_on.shape == (4,)
+
+
+def test_events_carry_the_change(bank: TextureBank) -> None:
+    """Noise-free, theta x events over all windows tracks the true change within two thresholds:
+    the phase at the start and the remainder at the end."""
+    config = small_config(prior=CameraPrior(noise="none"), sensors=(SensorModel(),) * 2)
+    batch = sample_batch(jax.random.key(2), bank, config)
+    on, off = jnp.split(batch.voxels, 2, -1)
+    camera = batch.camera
+    carried = on.sum((1, -1)) * camera.theta_on - off.sum((1, -1)) * camera.theta_off
+    true = batch.changes.sum((1, -1))
+    assert float(jnp.abs(carried).max()) > 0.3
+    limit = camera.theta_on + camera.theta_off + 1e-3
+    assert bool((jnp.abs(carried - true) <= limit).all())
+
+
+def test_frames_see_the_same_change_up_to_their_noise(batch: Batch) -> None:
+    # Half a DN of noise and rounding is .03 in the linear part of the log map, per frame.
+    error = batch.dlogI - batch.changes.sum(-1)
+    assert float(jnp.abs(error).mean()) < 0.05
+    assert float(jnp.abs(error).max()) > 1e-4
+
+
+def test_cameras_share_scenes_not_parameters(batch: Batch) -> None:
+    np.testing.assert_array_equal(batch.changes[0], batch.changes[2])
+    assert float(jnp.abs(batch.camera.theta_on[0] - batch.camera.theta_on[2]).min()) > 0
+
+
+def test_key_decides_everything(bank: TextureBank) -> None:
+    config = small_config()
+    one, same, other = (sample_batch(jax.random.key(k), bank, config) for k in (3, 3, 4))
+    jax.tree.map(np.testing.assert_array_equal, one, same)
+    assert not np.array_equal(one.voxels, other.voxels)
+
+
+def test_noise_target_is_the_rate_that_was_simulated(bank: TextureBank) -> None:
+    """With Eq. 12's intensity dependence the target is the mean rate over the sequence."""
+    prior = CameraPrior(theta=(5.0, 5.0), mismatch=(0.0, 0.0), noise="independent",
+                        eta=(40.0, 40.0))
+    config = dataclasses.replace(
+        small_config(prior=prior, sensors=(SensorModel(eta_intensity=True),) * 2), crop=48,
+        windows=4, window_s=(0.1, 0.1))
+    batch = sample_batch(jax.random.key(5), bank, config)
+    rate = batch.voxels.sum((1, 2, 3, 4)) / (4 * 0.1 * 48 * 48)
+    expected = batch.nominal.eta_on + batch.nominal.eta_off
+    np.testing.assert_allclose(rate, expected, rtol=0.03)

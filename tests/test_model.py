@@ -1,0 +1,203 @@
+"""The public network API: exactness, shapes, transformations, errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow import model
+from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.config import MODELS
+from evflow.errors import EvflowDataError
+from evflow.squash import squash, squash_summary, unsquash, unsquash_summary
+from evflow.weights import load_weights
+from tests.networks import seen, small_params
+
+
+@pytest.fixture(scope="module")
+def shipped() -> dict[str, Any]:
+    return load_weights()
+
+
+@pytest.fixture(scope="module")
+def code() -> model.Code:
+    voxels, dL, _ = seen()
+    return model.encode(small_params(), voxels, dL.sum(-1))
+
+
+def test_inverse_undoes_forward(code: model.Code) -> None:
+    voxels, _, _ = seen()
+    y, z, _ = model.forward(small_params(), voxels, code)
+    np.testing.assert_allclose(model.inverse(small_params(), y, z, code), voxels, atol=1e-4)
+
+
+def test_inverse_undoes_forward_on_trained_weights(shipped: dict[str, Any]) -> None:
+    voxels, dL, camera = seen((24, 32))
+    for code in (model.encode(shipped, voxels, dL.sum(-1)),
+                 model.code_from_video(shipped, dL, camera)):
+        y, z, _ = model.forward(shipped, voxels, code)
+        back = model.inverse(shipped, y, z, code)
+        assert float(jnp.abs(back - voxels).max()) <= 1e-3
+
+
+def test_log_det_is_that_of_the_jacobian(shipped: dict[str, Any]) -> None:
+    voxels, dL, camera = seen()
+    for params in (shipped, small_params()):
+        code = model.code_from_video(params, dL, camera)
+        one = jax.tree.map(lambda a: a[:1, :1] if a.ndim >= 2 else a, code)
+
+        def joined(x: Any, params: Any = params, one: Any = one) -> Any:
+            y, z, _ = model.forward(params, x.reshape(1, 1, 32), one)
+            return jnp.concatenate([y, z], -1).reshape(32)
+
+        jacobian = jax.jacobian(joined)(voxels[0, 0])
+        _, _, log_det = model.forward(params, voxels[:1, :1], one)
+        expected = np.linalg.slogdet(np.asarray(jacobian, np.float64))[1]
+        assert float(log_det[0, 0]) == pytest.approx(expected, abs=1e-4)
+
+
+def test_estimate_agrees_with_forward(shipped: dict[str, Any]) -> None:
+    voxels, dL, _ = seen()
+    code = model.encode(shipped, voxels, dL.sum(-1))
+    y, _, _ = model.forward(shipped, voxels, code)
+    camera, expected = model.estimate(shipped, voxels, dL.sum(-1)), squash(y)
+    for name in PARAMETERS:
+        np.testing.assert_allclose(getattr(camera, name), getattr(expected, name), rtol=1e-3)
+
+
+def test_estimate_on_leading_axes_is_each_alone() -> None:
+    voxels, dL, _ = seen()
+    dlogI = dL.sum(-1)
+    batch = jnp.stack([voxels, voxels[::-1]])[None], jnp.stack([dlogI, dlogI[::-1]])[None]
+    both = model.estimate(small_params(), *batch)
+    assert both.theta_on.shape == (1, 2, *dlogI.shape)
+    alone = model.estimate(small_params(), voxels[::-1], dlogI[::-1])
+    mapped = jax.vmap(lambda v, d: model.estimate(small_params(), v, d))(batch[0][0], batch[1][0])
+    for name in PARAMETERS:
+        np.testing.assert_allclose(getattr(both, name)[0, 1], getattr(alone, name), rtol=2e-5)
+        np.testing.assert_allclose(getattr(mapped, name)[1], getattr(alone, name), rtol=2e-5)
+
+
+def test_estimate_takes_per_sequence_conditions() -> None:
+    voxels, dL, _ = seen()
+    dlogI = dL.sum(-1)
+    window = jnp.array([0.02, 0.08])
+    both = model.estimate(small_params(), jnp.stack([voxels] * 2), jnp.stack([dlogI] * 2),
+                          window_s=window, intensity=jnp.array([3.0, 5.0]))
+    one = model.estimate(small_params(), voxels, dlogI, window_s=0.08,
+                         intensity=jnp.full(dlogI.shape, 5.0))
+    np.testing.assert_allclose(both.theta_on[1], one.theta_on, rtol=2e-5)
+    assert not np.allclose(both.theta_on[0], both.theta_on[1])
+
+
+def test_estimate_passes_through_jit_and_grad() -> None:
+    voxels, dL, _ = seen()
+    dlogI = dL.sum(-1)
+    jitted = jax.jit(model.estimate)(small_params(), voxels, dlogI)
+    np.testing.assert_allclose(jitted.eta_on, model.estimate(small_params(), voxels, dlogI).eta_on,
+                               rtol=2e-5)
+    grads = jax.grad(lambda d: model.estimate(small_params(), voxels, d).theta_on.mean())(dlogI)
+    assert np.isfinite(grads).all()
+    assert float(jnp.abs(grads).max()) > 0
+
+
+def test_estimate_compiles_once_per_shape() -> None:
+    voxels, dL, _ = seen()
+    dlogI = dL.sum(-1)
+    model.estimate(small_params(), voxels, dlogI)
+    before = model._estimate_y._cache_size()
+    for scale in (1.0, 2.0):
+        model.estimate(small_params(), scale * voxels, scale * dlogI, window_s=0.03 * scale)
+    assert model._estimate_y._cache_size() == before
+
+
+def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    voxels, dL, _ = seen()
+    context = jnp.zeros((*dL.shape[:2], 3))
+    from evflow import network
+
+    config, net = model.architecture(small_params()), next(iter(small_params().values()))
+    whole = network.estimate_pixels(net, voxels, dL.sum(-1), context, jnp.zeros(6), config)
+    monkeypatch.setattr(network, "CHUNK", 7)
+    cut = network.estimate_pixels(net, voxels, dL.sum(-1), context, jnp.zeros(6), config)
+    for a, b in zip(whole, cut, strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+def test_stats_of_tiles_add_up_to_the_whole() -> None:
+    voxels, dL, _ = seen()
+    dlogI = dL.sum(-1)
+    whole = model.summarize(small_params(), voxels, dlogI)
+    parts = [model.summarize(small_params(), voxels[rows], dlogI[rows])
+             for rows in (slice(0, 5), slice(5, None))]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4),
+                 parts[0] + parts[1], whole)
+    a, b = (model.finish(small_params(), s)[0] for s in (whole, parts[0] + parts[1]))
+    jax.tree.map(lambda u, v: np.testing.assert_allclose(u, v, rtol=1e-4), a, b)
+
+
+def test_more_windows_shrink_the_std() -> None:
+    voxels, dL, _ = seen()
+    stats = model.summarize(small_params(), voxels, dL.sum(-1))
+    many = jax.tree.map(lambda a: 100.0 * a, stats)
+    one_std, many_std = (model.finish(small_params(), s)[1] for s in (stats, many))
+    assert float(many_std.theta_on) < float(one_std.theta_on)
+    assert float(many_std.eta_off) < float(one_std.eta_off)
+
+
+def test_generate_replaces_the_summary() -> None:
+    voxels, dL, camera = seen()
+    code = model.code_from_video(small_params(), dL, camera)
+    other = Camera.constant(camera.shape, 0.5, 0.4, 0.1, 0.1)
+    key = jax.random.key(5)
+    made = model.generate(small_params(), key, other, code)
+    assert made.shape == voxels.shape
+    z = jax.random.normal(key, (*camera.shape, 28))
+    swapped = dataclasses.replace(code, summary=Summary(
+        *(jnp.float32(v) for v in (0.5, 0.4, 0.1, 0.1, 0.0, 0.0))))
+    np.testing.assert_allclose(
+        made, model.inverse(small_params(), unsquash(other), z, swapped), atol=1e-5)
+
+
+def test_log_prob_is_finite_and_per_pixel(shipped: dict[str, Any]) -> None:
+    voxels, dL, camera = seen()
+    score = model.log_prob(shipped, voxels, model.code_from_video(shipped, dL, camera))
+    assert score.shape == camera.shape
+    assert np.isfinite(score).all()
+
+
+def test_squash_and_unsquash_are_inverse() -> None:
+    y = jax.random.normal(jax.random.key(0), (5, 6, 4))
+    np.testing.assert_allclose(unsquash(squash(y)), y, atol=1e-5)
+    y6 = 0.5 * jax.random.normal(jax.random.key(1), (7, 6))
+    np.testing.assert_allclose(unsquash_summary(squash_summary(y6)), y6, atol=1e-5)
+    p = Camera.constant((2, 2), 0.3, 0.2, 0.5, 0.0)
+    back = squash(unsquash(p, "tanh"), "tanh")
+    np.testing.assert_allclose(back.theta_on, 0.3, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("code", "call"), [
+    ("EV002", lambda p, v, d: model.estimate(p, v[..., :31], d)),
+    ("EV002", lambda p, v, d: model.estimate(p, v, d[:-1])),
+    ("EV002", lambda p, v, d: model.estimate(p, v[0], d[0])),
+    ("EV007", lambda p, v, d: model.estimate(p, v.at[0, 0, 0].set(jnp.nan), d)),
+    ("EV007", lambda p, v, d: model.estimate(p, v, d.at[0, 0].set(jnp.inf))),
+    ("EV020", lambda p, v, d: model.estimate(p, v, d, window_s=0.0)),
+    ("EV018", lambda p, v, d: model.estimate({"other": {}}, v, d)),
+    ("EV002", lambda p, v, d: model.code_from_video(p, d, Camera.constant(d.shape))),
+])
+def test_bad_input_is_named(code: str, call: Any) -> None:
+    voxels, dL, _ = seen()
+    with pytest.raises(EvflowDataError) as caught:
+        call(small_params(), voxels, dL.sum(-1))
+    assert caught.value.code == code
+
+
+def test_architecture_is_read_from_the_weights(shipped: dict[str, Any]) -> None:
+    assert model.architecture(shipped) == MODELS["default"]
+    assert model.architecture(small_params()).flow.steps == 2

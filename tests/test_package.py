@@ -1,0 +1,47 @@
+"""The package as a whole: public names, documentation, imports that run downward."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from pathlib import Path
+
+import pytest
+
+import evflow
+
+ROOT = Path(evflow.__file__).parent
+# From the bottom up; a module may import from its own floor or below.
+FLOORS = (
+    ("errors", "checks", "files"), ("types", "progress"), ("io",), ("camera",), ("intensity",),
+    ("voxel",), ("flow", "scenes", "simulator"), ("config",), ("squash",), ("encoder", "summary"),
+    ("network", "losses", "batch"), ("model",), ("weights", "checkpoint"), ("train", "recording"),
+    ("report",), ("cli",),
+)
+
+
+def floor(module: str) -> int:
+    room = module.removeprefix("evflow").lstrip(".").split(".")[0]
+    return next((i for i, rooms in enumerate(FLOORS) if room in rooms), -1)
+
+
+@pytest.mark.parametrize("name", [n for n in evflow.__all__ if n != "__version__"])
+def test_public_names_exist_and_are_documented(name: str) -> None:
+    assert inspect.getdoc(getattr(evflow, name))
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_run_downward(path: Path) -> None:
+    module = ".".join(("evflow", *path.relative_to(ROOT).with_suffix("").parts))
+    if module == "evflow.__init__":
+        return
+    here = floor(module)
+    assert here >= 0, f"{module} has no floor"
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("evflow"):
+            names = ([f"evflow.{a.name}" for a in node.names] if node.module == "evflow"
+                     else [node.module])
+        for name in names:
+            if name != "evflow.__version__":
+                assert floor(name) <= here, f"{module} imports {name}, which is above it"

@@ -1,0 +1,105 @@
+"""From a whole recording to a camera."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow import Camera, Events, Recording, estimate_camera, load_weights, simulate
+from evflow.camera import PARAMETERS, CameraPrior, sample_nominal, sample_pixels
+from evflow.errors import EvflowDataError
+from evflow.scenes import SceneConfig, make_bank, render, sample_scene
+
+SHAPE = (48, 64)
+
+
+def hidden(seed: int, ms: int = 240) -> tuple[Recording, Camera]:
+    """A camera with thresholds .15-.4 watches a lively scene; frames every 40 ms."""
+    k_bank, k_scene, k_nominal, k_pixels, k_events = jax.random.split(jax.random.key(seed), 5)
+    scenes = SceneConfig(speed_px_s=(60.0, 200.0), static_fraction=0.0, contrast=(0.6, 1.0))
+    scene = sample_scene(k_scene, make_bank(k_bank, 8, photos=False), scenes, SHAPE)
+    times = np.arange(ms + 1)
+    frames = np.asarray(jax.jit(lambda t: render(scene, t, SHAPE))(jnp.asarray(times / 1e3)))
+    nominal = sample_nominal(k_nominal, (), CameraPrior(theta=(0.15, 0.4)))
+    camera = sample_pixels(k_pixels, nominal, SHAPE)
+    events = simulate(k_events, frames, times * 1000, camera)
+    gray = np.clip(np.rint(frames[::40]), 0, 255).astype(np.uint8)
+    return Recording(events, gray, times[::40] * 1000), camera
+
+
+@pytest.fixture(scope="module")
+def watched() -> tuple[Recording, Camera]:
+    return hidden(11)
+
+
+def test_a_hidden_camera_is_found(watched: tuple[Recording, Camera]) -> None:
+    recording, camera = watched
+    calls: list[tuple[int, int]] = []
+    found = estimate_camera(recording, progress=lambda *c: calls.append(c))
+    for name in ("theta_on", "theta_off"):
+        truth = float(jnp.median(getattr(camera, name)))
+        assert float(getattr(found.summary, name)) == pytest.approx(truth, abs=0.08)
+        assert 0 < float(getattr(found.summary_std, name)) < 0.2
+    assert calls[-1] == (2 * found.windows, 2 * found.windows)
+    assert found.windows == 6
+
+
+def test_maps_have_the_camera_in_the_quiet_and_width_everywhere(
+    watched: tuple[Recording, Camera]
+) -> None:
+    found = estimate_camera(watched[0])
+    assert found.camera.shape == found.std.shape == SHAPE == found.valid.shape
+    for name in PARAMETERS:
+        assert np.isfinite(getattr(found.camera, name)).all()
+        assert (np.asarray(getattr(found.std, name)) > 0).all()
+    inside = watched[0].events.slice(0, int(watched[0].frame_times[-1]))
+    assert found.n_events.sum() == len(inside)
+    assert (found.valid == (found.n_events >= 3)).all()
+
+
+def test_saved_and_loaded(watched: tuple[Recording, Camera], tmp_path: Path) -> None:
+    found = estimate_camera(watched[0])
+    path = found.save(tmp_path / "camera.npz")
+    loaded = Camera.load(path)
+    np.testing.assert_array_equal(loaded.theta_off, found.camera.theta_off)
+    with np.load(path) as data:
+        assert {"theta_on_std", "eta_off_std", "valid", "n_events"} <= set(data)
+    with pytest.raises(EvflowDataError, match="EV013"):
+        found.save(path)
+
+
+def test_polarity_without_events_is_said_to_be_undetermined(
+    watched: tuple[Recording, Camera]
+) -> None:
+    events = watched[0].events
+    on = events.p
+    only_on = Events(events.x[on], events.y[on], events.t[on], events.p[on], events.size)
+    found = estimate_camera(dataclasses.replace(watched[0], events=only_on))
+    assert any("theta_off is undetermined" in w for w in found.warnings)
+
+
+def test_refusals(watched: tuple[Recording, Camera]) -> None:
+    recording, params = watched[0], load_weights()
+    bare = Recording.of_events(recording.events)
+    for code, call in (
+        ("EV011", lambda: estimate_camera(bare, params)),
+        ("EV020", lambda: estimate_camera(recording, params, refine="always")),
+        ("EV016", lambda: estimate_camera("/nonexistent.aedat4", params)),
+    ):
+        with pytest.raises(EvflowDataError, match=code):
+            call()
+
+
+def test_a_real_davis346(data_file) -> None:
+    """Newton's cradle: thresholds near those of a frame regression (.35 / .41)."""
+    found = estimate_camera(
+        data_file("data/recordings/newton_cradle_davis346.aedat4"))
+    assert found.camera.shape == (260, 346)
+    assert found.windows == 12
+    for name in ("theta_on", "theta_off"):
+        assert 0.1 < float(getattr(found.summary, name)) < 0.7

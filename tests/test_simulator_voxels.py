@@ -1,0 +1,139 @@
+"""Voxels made without events are the voxels of the events, under jit, vmap and leading axes."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from videos import SHAPE, drifting
+
+from evflow.camera import Camera, CameraPrior, SensorModel
+from evflow.intensity import to_log
+from evflow.simulator import simulate, simulate_voxels
+from evflow.simulator.voxels import _voxels, hat_sums
+from evflow.types import Events
+from evflow.voxel import voxelize
+
+KEY = jax.random.key(0)
+PRIOR = CameraPrior(theta=(0.15, 0.3), mismatch=(0.03, 0.03), noise="none")
+QUIET = Camera.sample(jax.random.key(1), SHAPE, PRIOR)
+NOISY = dataclasses.replace(QUIET, eta_on=QUIET.eta_on + 30.0, eta_off=QUIET.eta_off + 15.0)
+SENSITIVE = Camera.constant(SHAPE, 0.06, 0.09)
+ALL_ON = SensorModel(cutoff_hz=200.0, leak_hz=20.0, leak_jitter=0.2, leak_fpn_decades=0.2,
+                     shot_hz=40.0, eta_intensity=True, noise_resets_memory=True)
+FRAMES = drifting(33)
+
+
+def both(camera: Camera, model: SensorModel, frames: np.ndarray, dt_us: int,
+         bins: int = 16) -> tuple[np.ndarray, np.ndarray, Events]:
+    """(voxels of the events, voxels without events, the events). Event times are rounded up to
+    the next microsecond and lie in (t_prev, t]; one less puts them into the half-open window."""
+    times = dt_us * np.arange(len(frames))
+    events = simulate(KEY, frames, times, camera, model=model)
+    events = dataclasses.replace(events, t=events.t - 1)
+    direct = simulate_voxels(KEY, to_log(frames, model.log_map), camera, frame_dt_s=dt_us * 1e-6,
+                             model=model, bins=bins)
+    return voxelize(events, 0, int(times[-1]), bins), np.asarray(direct), events
+
+
+def agree(a: np.ndarray, b: np.ndarray, events: Events, window_us: int, bins: int = 16) -> None:
+    """Each event may be off by a microsecond: a bin by (bins - 1) / window for each event that
+    touches it, and those number at most its own weight and its two neighbours'."""
+    assert (a.shape, b.shape, b.dtype) == ((*SHAPE, 2 * bins),) * 2 + (np.float32,)
+    grid = np.pad(a.reshape(*SHAPE, 2, bins), ((0, 0), (0, 0), (0, 0), (1, 1)))
+    touching = (grid[..., :-2] + grid[..., 1:-1] + grid[..., 2:]).reshape(a.shape)
+    excess = np.abs(a - b) - (bins - 1) / window_us * touching
+    assert excess.max() < 2e-4
+    counts = np.moveaxis(b.reshape(*SHAPE, 2, bins).sum(-1), -1, 0)
+    np.testing.assert_allclose(counts, events.count_map(), atol=1e-3)
+
+
+@pytest.mark.parametrize(("camera", "model"), [
+    (QUIET, SensorModel()), (NOISY, SensorModel()), (QUIET, SensorModel(timestamps="v2e")),
+    (NOISY, ALL_ON), (NOISY, dataclasses.replace(ALL_ON, timestamps="v2e"))])
+def test_voxels_are_those_of_the_events(camera: Camera, model: SensorModel) -> None:
+    ours, direct, events = both(camera, model, FRAMES, 1000)
+    assert len(events) > 1000
+    assert min(events.p.sum(), (~events.p).sum()) > 300
+    agree(ours, direct, events, 32_000)
+
+
+@pytest.mark.parametrize(("count", "dt_us", "bins", "refractory_s"), [
+    (65, 500, 16, 4e-4), (11, 3000, 16, 4e-4), (2, 30_000, 2, 2.5e-3)])
+def test_any_number_of_frames_and_bins_and_dead_times(
+    count: int, dt_us: int, bins: int, refractory_s: float
+) -> None:
+    """Many events per interval, so that pixels wait: late, on time, and from late to on time."""
+    frames = drifting(count, speed=4.0 / count + 0.5)
+    ours, direct, events = both(SENSITIVE, SensorModel(refractory_s=refractory_s), frames, dt_us,
+                                bins)
+    assert len(events) > 500
+    agree(ours, direct, events, dt_us * (count - 1), bins)
+
+
+def test_noise_with_several_events_an_interval() -> None:
+    """Mean 2 per interval and polarity, where the loop over further events runs."""
+    camera = Camera.constant(SHAPE, 0.2, 0.2, 2000.0, 2000.0)
+    ours, direct, events = both(camera, SensorModel(), FRAMES, 1000)
+    assert len(events) > 2 * 32 * 1.9 * np.prod(SHAPE)
+    agree(ours, direct, events, 32_000)
+
+
+LOG = to_log(FRAMES[:9])
+call = partial(simulate_voxels, frame_dt_s=1e-3, bins=4)
+
+
+def test_leading_axes_are_independent_videos() -> None:
+    """(2, 2) videos with a camera each, then with one for all; each has its own noise."""
+    frames = jnp.stack([LOG + 0.1 * i for i in range(4)]).reshape(2, 2, *LOG.shape)
+    cameras = Camera.constant((2, 2, *SHAPE), 0.2, 0.2, 200.0, 200.0)
+    grids = call(KEY, frames, cameras)
+    assert grids.shape == (2, 2, *SHAPE, 8)
+    one = jax.tree.map(lambda m: m[0, 0], cameras)
+    np.testing.assert_array_equal(call(KEY, frames, one), grids)
+    for i, key in enumerate(jax.random.split(KEY, 4)):
+        single = call(key, frames[i // 2, i % 2], one)
+        np.testing.assert_allclose(grids[i // 2, i % 2], single, atol=1e-5)
+    still = call(KEY, jnp.full_like(frames, 4.0), one).reshape(4, -1)
+    assert (jnp.abs(still[1:] - still[:-1]).mean(1) > 0.1).all()
+
+
+def test_vmap_over_cameras_and_jit_are_the_plain_call() -> None:
+    """A traced camera might be noisy, so it takes the noisy path, and a silent one stays silent."""
+    drawn = Camera.sample(jax.random.key(3), (2, *SHAPE), CameraPrior(eta_spread=0.2))
+    cameras = jax.tree.map(lambda two, quiet: jnp.concatenate([two, quiet[None]]), drawn, QUIET)
+    grids = jax.jit(jax.vmap(lambda c: call(KEY, LOG, c)))(cameras)
+    for i, grid in enumerate(grids):
+        alone = call(KEY, LOG, Camera(*(leaf[i] for leaf in jax.tree.leaves(cameras))))
+        np.testing.assert_allclose(grid, alone, atol=1e-5)
+    closed_over = jax.jit(lambda frames: call(KEY, frames, QUIET))(LOG)
+    np.testing.assert_allclose(closed_over, grids[2], atol=1e-5)
+
+
+def test_same_key_same_bytes_and_no_second_compilation() -> None:
+    grids = [call(KEY, LOG, NOISY)]
+    before = _voxels._cache_size()
+    grids += [call(KEY, LOG, NOISY), call(jax.random.key(7), LOG, NOISY)]
+    call(KEY, 0.9 * LOG, Camera.constant(SHAPE, 0.3, 0.2, 1.0, 2.0))
+    call(KEY, np.asarray(LOG), jax.tree.map(np.asarray, NOISY))
+    assert _voxels._cache_size() == before
+    np.testing.assert_array_equal(grids[0], grids[1])
+    assert not np.array_equal(grids[0], grids[2])
+
+
+@pytest.mark.parametrize(("first", "spacing", "count", "width"), [
+    (0.3, 0.21, 5, 3), (2.0, 0.0, 7, 4), (0.0, 0.5, 5, 3), (1.999, 0.001, 2, 4), (0.0, 1.0, 4, 4),
+    (0.7, 0.3, 0, 2)])
+def test_sums_of_hat_weights_are_those_of_the_single_events(
+    first: float, spacing: float, count: int, width: int
+) -> None:
+    for low in (0, 5):
+        at = low + first + spacing * np.arange(count)
+        expected = [np.maximum(0.0, 1.0 - np.abs(at - low - j)).sum() for j in range(width)]
+        sums = hat_sums(jnp.float32(low), width, jnp.float32(low + first), jnp.float32(spacing),
+                        jnp.float32(count))
+        np.testing.assert_allclose(np.stack(sums), expected, atol=2e-5)
