@@ -143,9 +143,16 @@ def encode(
     voxels, dlogI, window_s, intensity = _prepare(config, voxels, dlogI, window_s, intensity)
     y, _ = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
     context = _context(window_s, intensity, dlogI.shape)
-    over = network.over_pixels(y, dlogI.shape)
-    changes, _ = network.encode_changes(config, net, voxels, dlogI, context, over)
+    changes = _encode(net, voxels, dlogI, context, y, config=config)
     return Code(changes, squash_summary(y), context)
+
+
+@partial(jax.jit, static_argnames="config")
+def _encode(
+    net: Params, voxels: Array, dlogI: Array, context: Array, y: Array, *, config: ModelConfig
+) -> Array:
+    over = network.over_pixels(y, dlogI.shape)
+    return network.encode_changes(config, net, voxels, dlogI, context, over)[0]
 
 
 def _context(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
@@ -210,16 +217,28 @@ def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array
     """voxels (..., H, W, 32) -> y (..., H, W, 4), z (..., H, W, 28), log_det (..., H, W) of
     d(y, z)/d voxels at fixed code (Eqs. 3-5)."""
     config, net = _net(params)
-    u, middle = _flow_condition(config, code)
-    y, z, log_det = flow.forward(net["flow"], jnp.asarray(voxels, jnp.float32), u, config.flow)
-    return y + middle, z, log_det
+    return _forward(net, jnp.asarray(voxels, jnp.float32), code, config=config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _forward(
+    net: Params, voxels: Array, code: Code, *, config: ModelConfig
+) -> tuple[Array, Array, Array]:
+    u, centre = _flow_condition(config, code)
+    y, z, log_det = flow.forward(net["flow"], voxels, u, config.flow)
+    return y + centre, z, log_det
 
 
 def inverse(params: Params, y: Array, z: Array, code: Code) -> Array:
     """(y, z) -> voxels, the exact inverse of `forward` at the same code."""
     config, net = _net(params)
-    u, middle = _flow_condition(config, code)
-    return flow.inverse(net["flow"], y - middle, z, u, config.flow)[0]
+    return _inverse(net, y, z, code, config=config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _inverse(net: Params, y: Array, z: Array, code: Code, *, config: ModelConfig) -> Array:
+    u, centre = _flow_condition(config, code)
+    return flow.inverse(net["flow"], y - centre, z, u, config.flow)[0]
 
 
 def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:

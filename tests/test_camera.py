@@ -257,9 +257,11 @@ def test_pixels_spread_around_the_nominal_value(sigma: float) -> None:
 
 
 def test_leading_axes_are_independent_cameras() -> None:
-    camera = Camera.sample(jax.random.key(7), (3, 2, 40, 50), CameraPrior())
-    assert camera.shape == (3, 2, 40, 50)
-    medians = np.median(camera.theta_on, axis=(-2, -1)).ravel()
-    assert np.abs(np.diff(np.sort(medians))).min() > 1e-4
+    camera = Camera.sample(jax.random.key(7), (2, *SHAPE), CameraPrior(mismatch=(0.01, 0.01)))
+    assert camera.shape == (2, *SHAPE)
+    for theta in (camera.theta_on, camera.theta_off):
+        medians = np.median(theta, axis=(-2, -1))
+        assert abs(medians[0] - medians[1]) > 0.02  # 10 sd of what mismatch alone could do
+        assert not np.allclose(theta[0] - medians[0], theta[1] - medians[1], atol=1e-3)
     eta = np.asarray(camera.eta_on)
     np.testing.assert_array_equal(eta, np.broadcast_to(eta[..., :1, :1], eta.shape))

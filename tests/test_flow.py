@@ -20,6 +20,7 @@ DEFAULT = FlowConfig()
 AFFINE = FlowConfig(coupling="affine")
 N = 512  # pixels; one size throughout saves compilations
 SMALL = FlowConfig(channels=8, levels=2, steps=3, hidden=16, condition=5)
+ONE_LEVEL = dataclasses.replace(SMALL, levels=1, remat=False)
 VARIANTS = {
     f"{coupling}{'' if injector else '-noinjector'}{'' if front else '-noasinh'}":
         dataclasses.replace(SMALL, coupling=coupling, injector=injector, asinh=front)
@@ -89,7 +90,7 @@ def to_x64(tree: Params) -> Params:
 
 @pytest.mark.parametrize("make", [new_params, trained_params], ids=["new", "trained"])
 @pytest.mark.parametrize("config", [
-    DEFAULT, AFFINE, dataclasses.replace(SMALL, levels=1, remat=False),
+    DEFAULT, AFFINE, ONE_LEVEL,
 ], ids=["additive", "affine", "one level"])
 def test_inverse_undoes_forward(config, make):
     params, width = make(config), config.level_channels[-1]
@@ -135,18 +136,8 @@ def test_log_det_is_that_of_the_jacobian(config):
         expected = np.linalg.slogdet(jacobian)[1]
         np.testing.assert_allclose(log_det, expected, rtol=0, atol=1e-10)
         assert np.abs(expected).min() > 1e-3  # a log-det of 0 would be right by accident
-
-
-def test_only_injector_and_asinh_let_volume_differ_between_pixels():
-    x, u = counts((20, 8)), condition((20, 5))
-
-    def spread(name: str) -> float:
-        config = VARIANTS[name]
-        return float(jnp.ptp(forward(trained_params(config), x, u, config)[2]))
-
-    assert spread("additive-noinjector-noasinh") == 0.0
-    assert spread("additive-noasinh") > 0.1
-    assert spread("additive-noinjector") > 0.1
+        varies = config.injector or config.asinh or config.coupling == "affine"
+        assert np.ptp(log_det) > 0.01 if varies else np.ptp(log_det) == 0.0
 
 
 def test_asinh_is_exact_from_tiny_to_huge():
@@ -194,9 +185,8 @@ def test_silent_channels_are_magnified_once():
 
 
 @pytest.mark.parametrize(("config", "chunk"), [
-    (DEFAULT, 100), (SMALL, 1000), (VARIANTS["affine"], 128),
-    (VARIANTS["additive-noinjector-noasinh"], 100),
-], ids=["default", "one chunk", "affine", "bare"])
+    (DEFAULT, 100), (SMALL, None), (VARIANTS["affine-noinjector-noasinh"], 128),
+], ids=["default", "chunk by platform", "affine"])
 def test_folded_is_the_same_function(config, chunk):
     params = trained_params(config)
     x, u = counts((16, 32, config.channels)), condition((16, 32, config.condition))
@@ -208,28 +198,23 @@ def test_folded_is_the_same_function(config, chunk):
     np.testing.assert_allclose(got_z, z, rtol=0, atol=5e-6 * size)
 
 
-def test_jit_vmap_and_batch_agree():
+def test_jit_changes_nothing():
+    params, x, u = trained_params(ONE_LEVEL), counts((N, 8)), condition((N, 5))
+    expected = forward(params, x, u, ONE_LEVEL)
+    with jax.disable_jit():
+        got = flow.forward(params, x, u, ONE_LEVEL)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5), got, expected)
+
+
+def test_vmap_and_batch_agree():
     params = trained_params(SMALL)
     x, u = counts((3, 4, 8)), condition((3, 4, 5))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5)
     run = functools.partial(flow.forward, params, config=SMALL)
-    back = functools.partial(flow.inverse, params, config=SMALL)
     expected = forward(params, x, u, SMALL)
-    with jax.disable_jit():
-        jax.tree.map(close, run(x, u), expected)
     jax.tree.map(close, jax.jit(jax.vmap(jax.vmap(run)))(x, u), expected)
     jax.tree.map(close, forward(params, x[1, 2], u[1, 2], SMALL), tuple(a[1, 2] for a in expected))
-    jax.tree.map(close, jax.jit(jax.vmap(back))(*expected[:2], u),
-                 inverse(params, *expected[:2], u, SMALL))
     assert [a.shape for a in forward(params, x[:0], u[:0], SMALL)] == [(0, 4, 4), (0, 4, 4), (0, 4)]
-
-
-def test_remat_changes_no_gradient():
-    x, u = counts((16, 8)), condition((16, 5))
-    params = trained_params(SMALL)
-    grads = [jax.jit(jax.grad(scalar_loss), static_argnums=3)(params, x, u, config)
-             for config in (SMALL, dataclasses.replace(SMALL, remat=False))]
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), *grads)
 
 
 def scalar_loss(params: Params, x: Array, u: Array, config: FlowConfig) -> Array:
@@ -244,12 +229,13 @@ def scalar_loss_inverse(params: Params, x: Array, u: Array, config: FlowConfig) 
     return jnp.sum(again * condition(again.shape, 7)) + jnp.sum(log_det)
 
 
-@pytest.mark.parametrize("loss", [scalar_loss, scalar_loss_inverse])
-@pytest.mark.parametrize("name", ["additive", "affine"])
+@pytest.mark.parametrize(("name", "loss"), [
+    ("additive", scalar_loss), ("affine", scalar_loss_inverse)], ids=["forward", "inverse"])
 def test_every_parameter_learns_but_the_buffer(name, loss):
-    config = VARIANTS[name]
+    config, plain = VARIANTS[name], dataclasses.replace(VARIANTS[name], remat=False)
     x, u = condition((64, 8), 9), condition((64, 5))
-    grads = jax.jit(jax.grad(loss), static_argnums=3)(trained_params(config), x, u, config)
+    gradient = jax.jit(jax.grad(loss), static_argnums=3)
+    grads = gradient(trained_params(config), x, u, config)
     for path, grad in jax.tree_util.tree_leaves_with_path(grads):
         where = jax.tree_util.keystr(path)
         assert np.isfinite(grad).all(), where
@@ -259,14 +245,18 @@ def test_every_parameter_learns_but_the_buffer(name, loss):
             assert grad.any(), where
         else:  # every one of the stacked steps
             assert all(step.any() for step in grad), where
+    if loss is scalar_loss:
+        stored = gradient(trained_params(config), x, u, plain)
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4),
+                     grads, stored)
 
 
-def test_new_flow_is_the_identity_up_to_order():
-    config = VARIANTS["additive-noasinh"]
-    x, u = counts((10, 8)), condition((10, 5))
-    y, z, log_det = forward(flow.init(jax.random.key(3), config), x, u, config)
-    np.testing.assert_array_equal(np.sort(jnp.concatenate([y, z], axis=1)), np.sort(x))
-    np.testing.assert_array_equal(log_det, 0.0)
+def test_new_flow_only_reorders():
+    x, u = counts((N, 8)), condition((N, 5))
+    y, z, log_det = forward(flow.init(jax.random.key(3), SMALL), x, u, SMALL)
+    h, expected = asinh.forward(x.T)
+    np.testing.assert_allclose(np.sort(jnp.concatenate([y, z], axis=1)), np.sort(h.T), rtol=1e-6)
+    np.testing.assert_allclose(log_det, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_init_draws_every_step_apart():
