@@ -95,9 +95,10 @@ def table(records: list[Record], run: dict[str, Any]) -> Table:
     title = f"{run['cpu']}, {run['cpus']} cores, load {run['load_before']} before; " + ", ".join(
         f"{name} {version}" for name, version in run["versions"].items())
     shown = Table(title=title, caption="x first: time against the first case of the same task, "
-                  "above 1 = slower. % of sgemm, copy: of the best measured in this run.")
+                  "above 1 = slower. % of sgemm, copy: of the best measured in this run. "
+                  "others: cores busy with other processes meanwhile.")
     for name in ("task", "implementation", "median s", "min s", "per second", "% sgemm", "% copy",
-                 "x first", "peak MB"):
+                 "x first", "peak MB", "others"):
         shown.add_column(name, justify="left" if name in ("task", "implementation") else "right")
     for r, following in zip(records, [*records[1:], None], strict=True):
         shown.add_row(*row(r), end_section=following is None or following.subject != r.subject)
@@ -114,7 +115,8 @@ def row(r: Record) -> tuple[str, ...]:
     shares = (f"{100 * r.of_limit[k]:.1f}" if k in r.of_limit else "" for k in ("sgemm", "copy"))
     return (*start, f"{r.seconds:.3g}", f"{r.fastest:.3g}", rates, *shares,
             "" if r.relative is None else f"{r.relative:.2f}",
-            "" if r.peak_mb is None else f"{r.peak_mb:.0f}")
+            "" if r.peak_mb is None else f"{r.peak_mb:.0f}",
+            "" if r.others is None else f"{r.others:.2f}")
 
 
 def quantity(value: float) -> str:

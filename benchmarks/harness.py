@@ -73,6 +73,8 @@ class Record:
     seconds: median of `repeats` calls; fastest: the least; first_call: the first, compilation
     included. peak_mb: highest resident memory during the timed calls, less that before the first
     call (so it holds what compilation leaves behind); None where the system cannot tell.
+    others: CPU cores that other processes kept busy meanwhile, on average; above ~.1 the times are
+    theirs too (None where the system cannot tell).
     rates: work per second of the median. of_limit: share of the best "sgemm" and "copy" of the
     same run. relative: seconds over those of the task's first case (above 1 = slower).
     devices: JAX devices that shared the pixels. skipped: why there are no figures; failed:
@@ -87,6 +89,7 @@ class Record:
     first_call: float | None = None
     repeats: int = 0
     peak_mb: float | None = None
+    others: float | None = None
     work: dict[str, float] = dataclasses.field(default_factory=dict)
     rates: dict[str, float] = dataclasses.field(default_factory=dict)
     of_limit: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -112,17 +115,18 @@ def measure(case: Case, setting: Setting) -> Record:
     least, most = (1, 1) if setting.quick else (REPEATS, MOST_REPEATS)
     _reset_peak()
     times: list[float] = []
+    start = _clocks()
     while len(times) < least or (len(times) < most and sum(times) < BUDGET_S):
         del result  # or two results would be alive at once, and counted
         began = time.perf_counter()
         result = jax.block_until_ready(workload.call())
         times.append(time.perf_counter() - began)
-    peak = resident_mb("VmHWM")
+    peak, others = resident_mb("VmHWM"), _others(start, _clocks())
     work, seconds = workload.count(result), statistics.median(times)
     return Record(
         *name, seconds=seconds, fastest=min(times), first_call=first, repeats=len(times),
         peak_mb=None if before is None or peak is None else max(peak - before, 0.0),
-        work=work, rates={unit: amount / seconds for unit, amount in work.items()},
+        others=others, work=work, rates={unit: amount / seconds for unit, amount in work.items()},
         devices=setting.devices, note=workload.note)
 
 
@@ -171,6 +175,24 @@ def _reset_peak() -> None:
     control = Path("/proc/self/clear_refs")
     if control.exists():
         control.write_text("5")
+
+
+def _clocks() -> tuple[float, float, float | None]:
+    """Seconds: wall clock, CPU time of this process, CPU time of all (Linux) since it started."""
+    stat, busy = Path("/proc/stat"), None
+    if stat.exists():
+        user, nice, system, _, _, irq, softirq, *_ = map(int, stat.read_text().split()[1:9])
+        busy = (user + nice + system + irq + softirq) / os.sysconf("SC_CLK_TCK")
+    return time.perf_counter(), time.process_time(), busy
+
+
+def _others(start: tuple[float, float, float | None], end: tuple[float, float, float | None],
+            ) -> float | None:
+    """Cores busy with other processes between two `_clocks`; None below .1 s (a tick is .01 s)."""
+    wall, own = end[0] - start[0], end[1] - start[1]
+    if start[2] is None or end[2] is None or wall < 0.1:
+        return None
+    return max(end[2] - start[2] - own, 0.0) / wall
 
 
 def facts() -> dict[str, Any]:

@@ -193,6 +193,18 @@ class CameraPrior:
     eta: tuple[float, float] = (0.02, 1.0)
     eta_spread: float = 0.0
 
+    def __post_init__(self) -> None:
+        if self.noise not in ("eq12", "independent", "mixed", "none"):
+            raise EvflowDataError("EV020", f"CameraPrior(noise={self.noise!r}).",
+                                  "Choose 'eq12', 'independent', 'mixed' or 'none'.")
+        lowest = {"theta": np.nextafter(0.0, 1.0), "mismatch": 0.0, "eta": np.nextafter(0.0, 1.0)}
+        for name, bound in lowest.items():
+            low, high = getattr(self, name)
+            if not bound <= low <= high < np.inf:
+                raise EvflowDataError(
+                    "EV020", f"CameraPrior({name}={(low, high)}).",
+                    f"Give (low, high), low <= high, {'>=' if bound == 0 else '>'} 0.")
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

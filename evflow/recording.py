@@ -19,6 +19,7 @@ import numpy as np
 
 from evflow import io, model, network
 from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.config import PRESETS
 from evflow.errors import EvflowDataError
 from evflow.intensity import delta_log_intensity, lin_log
 from evflow.squash import SCALE, camera_std, per_channel, squash, unsquash_summary
@@ -102,7 +103,7 @@ def estimate_camera(
     camera, std = _fuse(params, windows(), summary, summary_std)
     return CameraEstimate(
         camera, std, summary, summary_std, n_events >= VALID_EVENTS, n_events,
-        len(plan.pairs), (*plan.skipped, *_warnings(stats, n_events)))
+        len(plan.pairs), (*_condensed(plan.skipped), *_warnings(stats, n_events, summary)))
 
 
 def window_inputs(window: Window) -> tuple[np.ndarray, Array, dict[str, Array | float]]:
@@ -151,12 +152,29 @@ def _fuse(
     return camera, camera_std(camera, jnp.sqrt(1.0 / total + shared**2))
 
 
-def _warnings(stats: model.Stats, n_events: np.ndarray) -> list[str]:
+def _condensed(skipped: tuple[str, ...]) -> list[str]:
+    """What was skipped, windows of one reason in one sentence ("frames 3-5: reason")."""
+    reasons: dict[str, list[str]] = {}
+    for sentence in skipped:
+        frames, _, reason = sentence.partition(": ")
+        reasons.setdefault(reason, []).append(frames)
+    return [f"{frames[0]} skipped: {reason}" if len(frames) == 1 else
+            f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {reason}"
+            for reason, frames in reasons.items()]
+
+
+def _warnings(stats: model.Stats, n_events: np.ndarray, summary: Summary) -> list[str]:
     found = []
-    for name, events in (("ON", stats.events_on), ("OFF", stats.events_off)):
+    low, high = PRESETS["default"].prior.theta
+    for name, events in (("on", stats.events_on), ("off", stats.events_off)):
+        theta = float(getattr(summary, f"theta_{name}"))
         if float(events) < FEW_EVENTS:
-            found.append(f"only {int(events)} {name} events: theta_{name.lower()} is undetermined; "
-                         "its value is the prior's.")
+            found.append(f"only {int(events)} {name.upper()} events: theta_{name} is "
+                         "undetermined; its value is the prior's.")
+        elif not low <= theta <= high:
+            found.append(f"theta_{name} = {theta:.2f} lies outside the {low}-{high} that the "
+                         "network was trained on: an extrapolation. Frames with a gamma or an "
+                         "offset stretch the scale.")
     active = float((n_events >= VALID_EVENTS).mean())
     if active < 0.05:
         found.append(f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "

@@ -79,7 +79,7 @@ def init_state(
     """
     key = jax.random.key(config.seed)
     k_params, k_data, k_run = jax.random.split(key, 3)
-    params = network.init(k_params, config.model, name)
+    params = jax.jit(network.init, static_argnums=(1, 2))(k_params, config.model, name)
     batch = jax.jit(sample_batch, static_argnames="config")(k_data, bank, config)
     block = cut_block(k_data, batch, config)
     y = _over(unsquash_summary(batch.nominal), block.y)

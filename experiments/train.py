@@ -75,8 +75,8 @@ def run(
     the last hundred steps."""
     step_fn = jax.jit(make_run_step(config, tx), donate_argnums=0)
     stop: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: stop.append(n))
+    before = {n: signal.signal(n, lambda n, _: stop.append(n))
+              for n in (signal.SIGINT, signal.SIGTERM)}
     started, recent, step = time.monotonic(), [], int(state.step)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                TimeRemainingColumn())
@@ -95,6 +95,8 @@ def run(
             if step % options.save_every == 0:
                 log.flush()
                 checkpoints.save(step, state)
+    for number, handler in before.items():
+        signal.signal(number, handler)
     checkpoints.save(step, state)
     names = recent[-1] if recent else {}
     return state, {k: sum(r[k] for r in recent) / len(recent) for k in names}

@@ -8,11 +8,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from evflow import network
-from evflow.camera import Camera
+from evflow import Recording, network, simulate
+from evflow.camera import Camera, CameraPrior, sample_nominal, sample_pixels
 from evflow.config import PRESETS, TrainConfig
+from evflow.scenes import SceneConfig, make_bank, render, sample_scene
 from evflow.simulator import simulate_voxels
+
+SHAPE = (48, 64)  # of hidden recordings
 
 
 def small_config(**changes: Any) -> TrainConfig:
@@ -24,8 +28,8 @@ def small_config(**changes: Any) -> TrainConfig:
 @cache
 def small_params() -> dict[str, Any]:
     """A small network whose flow is far from the identity (couplings drawn at random)."""
-    params = network.init(jax.random.key(0), PRESETS["debug"].model)
-    return jiggle(params, 0.1)
+    init = jax.jit(network.init, static_argnums=1)
+    return jax.jit(jiggle)(init(jax.random.key(0), PRESETS["debug"].model), 0.1)
 
 
 def jiggle(params: Any, scale: float) -> Any:
@@ -45,3 +49,19 @@ def seen(shape: tuple[int, int] = (12, 10), frames: int = 17) -> tuple[Any, Any,
     camera = Camera.sample(jax.random.key(3), shape)
     voxels = simulate_voxels(jax.random.key(4), log_frames, camera, frame_dt_s=0.05 / (frames - 1))
     return voxels, jnp.moveaxis(jnp.diff(log_frames, axis=0), 0, -1), camera
+
+
+def hidden(seed: int, ms: int = 280) -> tuple[Recording, Camera]:
+    """A camera with thresholds .15-.4 watches a lively scene; frames every 40 ms, the
+    first at 20 ms: events cover all six windows."""
+    k_bank, k_scene, k_nominal, k_pixels, k_events = jax.random.split(jax.random.key(seed), 5)
+    scenes = SceneConfig(speed_px_s=(60.0, 200.0), static_fraction=0.0, contrast=(0.6, 1.0))
+    scene = sample_scene(k_scene, make_bank(k_bank, 8, photos=False), scenes, SHAPE)
+    times = np.arange(ms + 1)
+    frames = np.asarray(jax.jit(lambda t: render(scene, t, SHAPE))(jnp.asarray(times / 1e3)))
+    nominal = sample_nominal(k_nominal, (), CameraPrior(theta=(0.15, 0.4)))
+    camera = sample_pixels(k_pixels, nominal, SHAPE)
+    events = simulate(k_events, frames, times * 1000, camera)
+    kept = slice(20, None, 40)
+    gray = np.clip(np.rint(frames[kept]), 0, 255).astype(np.uint8)
+    return Recording(events, gray, times[kept] * 1000), camera

@@ -8,11 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from networks import small_config
 
-from evflow.batch import Batch, sample_batch
+from evflow.batch import Batch
+from evflow.batch import sample_batch as sample_batch_eagerly
 from evflow.camera import CameraPrior, SensorModel
 from evflow.scenes import SceneConfig, TextureBank, make_bank
-from tests.networks import small_config
+
+
+sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +27,7 @@ def bank() -> TextureBank:
 @pytest.fixture(scope="module")
 def batch(bank: TextureBank) -> Batch:
     config = small_config(scene=SceneConfig(speed_px_s=(100.0, 300.0), static_fraction=0.0))
-    return jax.jit(sample_batch, static_argnames="config")(jax.random.key(1), bank, config)
+    return sample_batch(jax.random.key(1), bank, config=config)
 
 
 def test_shapes(batch: Batch) -> None:
@@ -38,7 +42,7 @@ def test_events_carry_the_change(bank: TextureBank) -> None:
     """Noise-free, theta x events over all windows tracks the true change within two thresholds:
     the phase at the start and the remainder at the end."""
     config = small_config(prior=CameraPrior(noise="none"), sensors=(SensorModel(),) * 2)
-    batch = sample_batch(jax.random.key(2), bank, config)
+    batch = sample_batch(jax.random.key(2), bank, config=config)
     on, off = jnp.split(batch.voxels, 2, -1)
     camera = batch.camera
     carried = on.sum((1, -1)) * camera.theta_on - off.sum((1, -1)) * camera.theta_off
@@ -62,7 +66,7 @@ def test_cameras_share_scenes_not_parameters(batch: Batch) -> None:
 
 def test_key_decides_everything(bank: TextureBank) -> None:
     config = small_config()
-    one, same, other = (sample_batch(jax.random.key(k), bank, config) for k in (3, 3, 4))
+    one, same, other = (sample_batch(jax.random.key(k), bank, config=config) for k in (3, 3, 4))
     jax.tree.map(np.testing.assert_array_equal, one, same)
     assert not np.array_equal(one.voxels, other.voxels)
 
@@ -74,7 +78,7 @@ def test_noise_target_is_the_rate_that_was_simulated(bank: TextureBank) -> None:
     config = dataclasses.replace(
         small_config(prior=prior, sensors=(SensorModel(eta_intensity=True),) * 2), crop=48,
         windows=4, window_s=(0.1, 0.1))
-    batch = sample_batch(jax.random.key(5), bank, config)
+    batch = sample_batch(jax.random.key(5), bank, config=config)
     rate = batch.voxels.sum((1, 2, 3, 4)) / (4 * 0.1 * 48 * 48)
     expected = batch.nominal.eta_on + batch.nominal.eta_off
     np.testing.assert_allclose(rate, expected, rtol=0.03)

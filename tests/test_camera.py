@@ -265,3 +265,11 @@ def test_leading_axes_are_independent_cameras() -> None:
         assert not np.allclose(theta[0] - medians[0], theta[1] - medians[1], atol=1e-3)
     eta = np.asarray(camera.eta_on)
     np.testing.assert_array_equal(eta, np.broadcast_to(eta[..., :1, :1], eta.shape))
+
+
+@pytest.mark.parametrize("bad", [
+    {"noise": "x"}, {"theta": (0.0, 0.5)}, {"theta": (0.5, 0.1)}, {"mismatch": (-0.1, 0.1)},
+    {"eta": (0.0, 1.0)}])
+def test_bad_priors_are_named(bad: dict) -> None:
+    with pytest.raises(EvflowDataError, match="EV020"):
+        CameraPrior(**bad)

@@ -10,16 +10,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from networks import hidden
 
 from evflow import Camera, Recording, read_events, write_events
 from evflow.cli import main
-from tests.test_recording import hidden
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rec") / "flight.h5"
-    write_events(path, hidden(12)[0])
+    write_events(path, hidden(15)[0])
     return path
 
 

@@ -88,11 +88,11 @@ def to_x64(tree: Params) -> Params:
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float64), tree)
 
 
-@pytest.mark.parametrize("make", [new_params, trained_params], ids=["new", "trained"])
-@pytest.mark.parametrize("config", [
-    DEFAULT, AFFINE, ONE_LEVEL,
-], ids=["additive", "affine", "one level"])
-def test_inverse_undoes_forward(config, make):
+@pytest.mark.parametrize(("make", "config"), [
+    (new_params, DEFAULT), (trained_params, DEFAULT), (new_params, AFFINE),
+    (trained_params, AFFINE), (trained_params, ONE_LEVEL),
+], ids=["new", "trained", "new affine", "trained affine", "one level"])
+def test_inverse_undoes_forward(make, config):
     params, width = make(config), config.level_channels[-1]
     x, u = counts((N, config.channels), 3), condition((N, config.condition), 4)
     y, z, log_det = forward(params, x, u, config)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from networks import seen, small_params
 
 from evflow import model
 from evflow.camera import PARAMETERS, Camera, Summary
@@ -16,7 +17,6 @@ from evflow.config import MODELS
 from evflow.errors import EvflowDataError
 from evflow.squash import squash, squash_summary, unsquash, unsquash_summary
 from evflow.weights import load_weights
-from tests.networks import seen, small_params
 
 
 @pytest.fixture(scope="module")

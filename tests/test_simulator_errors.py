@@ -120,3 +120,10 @@ LOG = jnp.full((3, *SHAPE), 4.0)
 def test_simulate_voxels_refuses_bad_input(changed: dict[str, Any], code: str) -> None:
     given = {"log_frames": LOG, "camera": CAMERA, "frame_dt_s": 1e-3} | changed
     assert code_of(lambda: simulate_voxels(KEY, **given)) == code
+
+
+def test_nan_log_frames_are_refused() -> None:
+    frames = np.zeros((3, 4, 5), np.float32)
+    frames[1, 2, 3] = np.nan
+    with pytest.raises(EvflowDataError, match="EV007"):
+        simulate_voxels(jax.random.key(0), frames, Camera.constant((4, 5)), frame_dt_s=1e-3)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from networks import small_config
 
 from evflow import config as configs
 from evflow.batch import sample_batch
@@ -15,7 +16,6 @@ from evflow.checkpoint import Checkpoints
 from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank, make_bank
 from evflow.train import TrainState, init_state, loss_fn, make_run_step, optimiser
-from tests.networks import small_config
 
 CONFIG = small_config(steps=40, warmup=2)
 TX = optimiser(CONFIG)

@@ -7,10 +7,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from networks import small_params
 
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card, save_weights, weights_path
-from tests.networks import small_params
 
 
 def test_round_trip(tmp_path: Path) -> None:

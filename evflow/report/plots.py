@@ -106,8 +106,8 @@ def comparison(
 ) -> None:
     """One page: a frame, real and re-made events of the same instant, event rates, maps and
     histograms."""
-    figure = _figure(16, 11)
-    axes = figure.subplots(3, 4)
+    figure = _figure(16, 9.6)
+    axes = figure.subplots(3, 4, height_ratios=(1.1, 1.0, 0.8))
     axes[0, 0].imshow(frame, cmap="gray", vmin=0, vmax=255)
     axes[0, 0].set_title("frame")
     for axis, events, title in ((axes[0, 1], real, "recorded events"),

@@ -1,0 +1,73 @@
+"""The experiment scripts, small: they run, resume, and write what they say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+from evflow.errors import EvflowDataError
+from evflow.weights import load_weights, model_card
+from experiments import calibrate, evaluate, quickstart, train
+
+
+def test_quickstart_draws_truth_beside_estimate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = quickstart.Options(out=tmp_path, width=64, height=48, milliseconds=150)
+    result = quickstart.main(options)
+    text = capsys.readouterr().out
+    assert "truth" in text
+    assert "threshold ON" in text
+    page = cv2.imread(str(tmp_path / "quickstart.png"))
+    assert page is not None
+    assert min(page.shape[:2]) > 600
+    saved = json.loads((tmp_path / "result.json").read_text())
+    assert saved["result"] == result
+    assert saved["config"]["seed"] == options.seed
+    for polarity in ("on", "off"):
+        ratio = result["rate_remade"][polarity] / result["rate_recorded"][polarity]
+        assert 0.5 < ratio < 2.0
+
+
+@pytest.mark.slow
+def test_train_stops_resumes_and_calibrates(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    train.main(train.Options(out=out, preset="debug", steps=4))
+    weights = out / "weights.safetensors"
+    assert model_card(weights)["steps"] == 4
+    assert len((out / "metrics.jsonl").read_text().splitlines()) == 4
+    with pytest.raises(EvflowDataError, match="EV013"):
+        train.main(train.Options(out=out, preset="debug", steps=4))
+    calibrate.main(calibrate.Options(weights=weights, out=tmp_path / "final.safetensors", steps=2))
+    before, after = load_weights(weights), load_weights(tmp_path / "final.safetensors")
+    same = {part: all(np.array_equal(a, b) for a, b in zip(
+        *(jax.tree.leaves(p["default"][part]) for p in (before, after)), strict=True))
+        for part in before["default"]}
+    assert same == {"encoder": True, "flow": True, "spread": False, "summary": True}
+
+
+@pytest.mark.slow
+def test_interrupted_training_equals_straight_training(tmp_path: Path) -> None:
+    straight, halves = tmp_path / "straight", tmp_path / "halves"
+    train.main(train.Options(out=straight, preset="debug", steps=3))
+    train.main(train.Options(out=halves, preset="debug", steps=3, max_seconds=0.0))
+    train.main(train.Options(out=halves, preset="debug", steps=3, resume=True))
+    a, b = (load_weights(p / "weights.safetensors") for p in (straight, halves))
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.mark.slow
+def test_evaluate_prints_the_paper_beside_ours(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = evaluate.main(evaluate.Options(out=tmp_path))
+    assert "0.023" in capsys.readouterr().out
+    assert set(results) == {"0.03", "0.15"}
+    row = results["0.03"]["theta_on"]
+    assert 0 < row["summary"] < row["constant"]
+    assert row["constant_truth"] == pytest.approx(0.024, abs=0.003)
