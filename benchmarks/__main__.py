@@ -57,23 +57,32 @@ def main(options: Options) -> int:
     out = options.out or default_out()
     if out.exists():
         raise EvflowDataError("EV013", f"{out} exists.", "Give another --out.")
-    cases = select(options.only)
-    run_facts = facts() | {"quick": options.quick}
-    setting = Setting(options.quick, options.devices)
-    if options.quick and options.devices > 1:  # otherwise each process sets its own number
-        jax.config.update("jax_num_cpu_devices", options.devices)
+    cases, run_facts = select(options.only), facts() | {"quick": options.quick}
     console = Console(stderr=True)
-    records = []
-    for case in cases:
-        console.print(f"{case.subject}: {case.task}, {case.implementation}", highlight=False)
-        records.append((measure if options.quick else isolated)(case, setting))
+    records, complete = run(cases, options, console)
     records = compare(records)
     with atomic_write(out) as temporary:
         lines = (json.dumps(dataclasses.asdict(r) | {"run": run_facts}) for r in records)
         temporary.write_text("".join(f"{line}\n" for line in lines))
     Console(width=None if sys.stdout.isatty() else 150).print(table(records, run_facts))
     console.print(f"written to {out}")
-    return int(any(r.failed for r in records))
+    return int(any(r.failed for r in records)) if complete else 130
+
+
+def run(cases: list[Case], options: Options, console: Console) -> tuple[list[Record], bool]:
+    """The records, and whether they are all: Ctrl-C ends the run and keeps what it has."""
+    setting = Setting(options.quick, options.devices)
+    if options.quick and options.devices > 1:  # otherwise each process sets its own number
+        jax.config.update("jax_num_cpu_devices", options.devices)
+    records: list[Record] = []
+    try:
+        for case in cases:
+            console.print(f"{case.subject}: {case.task}, {case.implementation}", highlight=False)
+            records.append((measure if options.quick else isolated)(case, setting))
+    except KeyboardInterrupt:
+        console.print(f"interrupted after {len(records)} of {len(cases)} cases")
+        return records, False
+    return records, True
 
 
 def default_out() -> Path:

@@ -15,7 +15,6 @@ from evflow.batch import sample_batch as sample_batch_eagerly
 from evflow.camera import CameraPrior, SensorModel
 from evflow.scenes import SceneConfig, TextureBank, make_bank
 
-
 sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
 
 
