@@ -161,7 +161,8 @@ def simulate_voxels(
     if not 0 < frame_dt_s < math.inf or bins < 2:
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}, bins={bins}.",
                               "Need frame_dt_s > 0 and bins >= 2.")
-    if not isinstance(log_frames, jax.core.Tracer) and not bool(jnp.isfinite(log_frames).all()):
+    known = not isinstance(log_frames, jax.core.Tracer)
+    if known and not np.isfinite(np.asarray(log_frames)).all():
         raise EvflowDataError("EV007", "log_frames holds NaN or infinite values.",
                               "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")
     if camera.shape[-2:] != log_frames.shape[-2:]:
