@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera, SensorModel, Summary, sample_nominal, sample_pixels
-from evflow.config import TrainConfig
+from evflow.config import NuisanceConfig, TrainConfig
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
 from evflow.scenes import TextureBank, render, sample_scene
 from evflow.simulator import scan
@@ -53,34 +53,65 @@ def sample_batch(key: Array, bank: TextureBank, config: TrainConfig) -> Batch:
     low, high = np.log(config.window_s[0]), np.log(config.window_s[1])
     window_s = jnp.exp(jax.random.uniform(k_window, (config.scenes,), minval=low, maxval=high))
 
-    def scene_frames(key: Array, window_s: Array) -> Array:
-        scene = sample_scene(key, bank, config.scene, shape)
+    def scene_frames(key: Array, window_s: Array) -> tuple[Array, Array]:
+        k_scene, k_seen = jax.random.split(key)
+        scene = sample_scene(k_scene, bank, config.scene, shape)
         times = (jnp.arange(steps + 1) - 0.5 * steps) * (window_s / config.steps_per_window)
-        return render(scene, times, shape)
+        exposed = _exposures(k_seen, times[:: config.steps_per_window], config.nuisances)
+        seen = render(scene, exposed.reshape(-1), shape).reshape(*exposed.shape, *shape).mean(1)
+        return render(scene, times, shape), seen
 
-    frames = jax.vmap(scene_frames)(jax.random.split(k_scene, config.scenes), window_s)
-    parts = []
-    for index, model in enumerate(config.sensors):
-        keys = jax.random.split(jax.random.fold_in(k_camera, index),
-                                (config.cameras // len(config.sensors), config.scenes))
-        see = partial(_sequence, model=model, config=config)
-        parts.append(jax.vmap(jax.vmap(see), in_axes=(0, None, None))(keys, frames, window_s))
-    batch = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), batch)
+    frames, seen = jax.vmap(scene_frames)(jax.random.split(k_scene, config.scenes), window_s)
+    group = min(config.cameras, len(config.sensors))
+    k_group, *k_sensors = jax.random.split(k_camera, group + 1)
+
+    def look(*models: SensorModel) -> Batch:
+        parts = []
+        for key, model in zip(k_sensors, models, strict=True):
+            keys = jax.random.split(key, (config.cameras // group, config.scenes))
+            see = partial(_sequence, model=model, config=config)
+            axes = (0, None, None, None)
+            parts.append(jax.vmap(jax.vmap(see), in_axes=axes)(keys, frames, seen, window_s))
+        batch = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), batch)
+
+    groups = [config.sensors[i:i + group] for i in range(0, len(config.sensors), group)]
+    # One group of pixel models a step: the branch not taken costs nothing.
+    index = jax.random.randint(k_group, (), 0, len(groups))
+    return jax.lax.switch(index, [partial(look, *models) for models in groups])
+
+
+def _exposures(key: Array, times: Array, nuisances: NuisanceConfig) -> Array:
+    """Instants (T, E) that the frames at `times` (T,) average: exposed for a while, and not quite
+    when their time stamps say. Half of the scenes have neither fault."""
+    k_some, k_span, k_late, k_frame = jax.random.split(key, 4)
+    some = jax.random.bernoulli(k_some, 0.5, (2,))
+    span = some[0] * nuisances.exposure_s * jax.random.uniform(k_span)
+    late = some[1] * nuisances.jitter_s * jax.random.uniform(k_late)
+    inside = (jnp.arange(nuisances.exposures) + 0.5) / nuisances.exposures - 0.5
+    centre = times + late * jnp.clip(jax.random.normal(k_frame, times.shape), -2.0, 2.0)
+    return centre[:, None] + span * inside[None]
 
 
 def _sequence(
-    key: Array, frames: Array, window_s: Array, *, model: SensorModel, config: TrainConfig
+    key: Array, frames: Array, seen: Array, window_s: Array, *, model: SensorModel,
+    config: TrainConfig,
 ) -> Batch:
-    """One camera on one scene: frames (W*steps + 1, H, W') DN."""
+    """One camera on one scene: frames (W*steps + 1, H, W') DN for the events, seen (W+1, H, W')
+    what the frame camera makes of them."""
     k_nominal, k_pixels, k_phase, k_sim, k_frame = jax.random.split(key, 5)
     shape = (frames.shape[1], frames.shape[2])
-    nominal = sample_nominal(k_nominal, (), config.prior)
+    reference = noise_factor(jnp.mean(normalised_intensity(frames[0])))
+    nominal = sample_nominal(k_nominal, (), config.prior, reference)
     camera = sample_pixels(k_pixels, nominal, shape, config.prior.eta_spread)
+    camera = _with_hot_pixels(jax.random.fold_in(k_pixels, 1), camera, config.nuisances)
     log_frames = lin_log(frames)
-    # A window is cut from a running camera: each pixel is somewhere between its thresholds.
+    # A window is cut from a running camera, each pixel somewhere between its thresholds; or it
+    # is the start of a simulation, whose memory is the first frame.
+    k_phase, k_fresh = jax.random.split(k_phase)
+    running = jax.random.bernoulli(k_fresh, 1.0 - config.nuisances.fresh).astype(jnp.float32)
     phase = jax.random.uniform(k_phase, shape)
-    phase = phase * (camera.theta_on + camera.theta_off) - camera.theta_off
+    phase = running * (phase * (camera.theta_on + camera.theta_off) - camera.theta_off)
     state = scan.start(k_sim, log_frames[0], model, phase)
     windows = log_frames[1:].reshape(config.windows, config.steps_per_window, *shape)
     dt = window_s / config.steps_per_window
@@ -89,8 +120,7 @@ def _sequence(
         return simulate_window(model, True, camera, state, log_frames, dt, config.model.bins)
 
     _, voxels = jax.lax.scan(window, state, windows)
-    seen = frames[:: config.steps_per_window]
-    seen = seen + config.frame_noise_dn * jax.random.normal(k_frame, seen.shape)
+    seen = seen + config.nuisances.frame_noise_dn * jax.random.normal(k_frame, seen.shape)
     seen = lin_log(jnp.clip(jnp.round(seen), 0.0, 255.0))
     gain = _noise_gain(frames, model)  # targets are rates at the sequence's mean intensity
     return Batch(
@@ -102,6 +132,17 @@ def _sequence(
         camera=_scale_noise(camera, gain),
         nominal=_scale_noise(nominal, gain),
     )
+
+
+def _with_hot_pixels(key: Array, camera: Camera, nuisances: NuisanceConfig) -> Camera:
+    """Some cameras have pixels that fire by themselves, ON or OFF, at tens of Hz."""
+    k_some, k_where, k_rate = jax.random.split(key, 3)
+    share = nuisances.hot_pixels * jnp.maximum(0.0, jax.random.uniform(k_some, (), minval=-1.0))
+    hot = jax.random.bernoulli(k_where, share, (2, *camera.eta_on.shape))
+    low, high = np.log(nuisances.hot_hz[0]), np.log(nuisances.hot_hz[1])
+    rate = jnp.exp(jax.random.uniform(k_rate, camera.eta_on.shape, minval=low, maxval=high))
+    return dataclasses.replace(camera, eta_on=jnp.where(hot[0], rate, camera.eta_on),
+                               eta_off=jnp.where(hot[1], rate, camera.eta_off))
 
 
 def _changes(log_frames: Array, config: TrainConfig) -> Array:

@@ -182,8 +182,9 @@ class CameraPrior:
     theta: range of the nominal threshold, uniform, drawn apart for ON and OFF (paper: .1-.5).
     mismatch: range of the per-pixel standard deviation (v2e's default .03; the paper .15).
     noise: "eq12" ties the rate to the threshold, eta = g R(theta) with g uniform in
-        [F, 1] (the intensity factor of Eq. 12); "independent" draws it log-uniform in
-        `eta`; "mixed" takes either with equal chance; "none" is silent.
+        [F, 1] (the intensity factor of Eq. 12) or, where the scene's intensity is known, half
+        of the time exactly that factor; "independent" draws it log-uniform in `eta`; "mixed"
+        takes either with equal chance; "none" is silent.
     eta_spread: standard deviation of log eta from pixel to pixel.
     """
 
@@ -228,13 +229,20 @@ def noise_of_threshold(theta: Array) -> Array:
     return jnp.clip(4.0 / (90.0 * jnp.maximum(theta, 0.1) - 5.0), 0.1, 1.0)
 
 
-def sample_nominal(key: Array, batch: tuple[int, ...], prior: CameraPrior) -> Summary:
-    """Draw the camera-wide values, each of shape `batch`."""
+def sample_nominal(
+    key: Array, batch: tuple[int, ...], prior: CameraPrior, factor: Array | None = None
+) -> Summary:
+    """Draw the camera-wide values, each of shape `batch`. factor: the intensity factor of Eq. 12
+    of the scene that will be seen, where it is known."""
     k_theta, k_sigma, k_gain, k_free, k_link = jax.random.split(key, 5)
     theta = jax.random.uniform(k_theta, (2, *batch), minval=prior.theta[0], maxval=prior.theta[1])
     sigma = jax.random.uniform(
         k_sigma, (2, *batch), minval=prior.mismatch[0], maxval=prior.mismatch[1])
-    tied = noise_of_threshold(theta) * jax.random.uniform(k_gain, (2, *batch), minval=0.25)
+    gain = jax.random.uniform(k_gain, (2, *batch), minval=0.25)
+    if factor is not None:
+        gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), 0.5, batch),
+                         factor, gain)
+    tied = noise_of_threshold(theta) * gain
     lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])
     free = jnp.exp(jax.random.uniform(k_free, (2, *batch), minval=lo, maxval=hi))
     either = jnp.where(jax.random.bernoulli(k_link, 0.5, batch), tied, free)

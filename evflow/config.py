@@ -14,6 +14,8 @@ from evflow.errors import EvflowDataError
 from evflow.flow.config import FlowConfig
 from evflow.scenes.config import SceneConfig
 
+PARTS = ("summary", "encoder", "flow", "spread")
+
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
@@ -72,6 +74,33 @@ class LossConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class NuisanceConfig:
+    """What real recordings add to the model; drawn anew for every sequence or scene.
+
+    fresh: share of sequences whose pixel memory starts at the first frame, as in a simulation.
+    hot_pixels, hot_hz: largest share of hot pixels per polarity (half of the cameras have
+        none), and their rates.
+    jitter_s: largest standard deviation of the frame times' error; exposure_s: longest
+        exposure, averaged over `exposures` instants.
+    frame_noise_dn: standard deviation of the frames' noise before rounding to 8 bits.
+    """
+
+    fresh: float = 0.3
+    hot_pixels: float = 0.002
+    hot_hz: tuple[float, float] = (5.0, 100.0)
+    jitter_s: float = 0.001
+    exposure_s: float = 0.01
+    exposures: int = 4
+    frame_noise_dn: float = 0.5
+
+    @staticmethod
+    def none() -> NuisanceConfig:
+        """Frames as they are meant to be, of a camera that has been running."""
+        return NuisanceConfig(fresh=0.0, hot_pixels=0.0, jitter_s=0.0, exposure_s=0.0,
+                              exposures=1)
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """One training run. Content of step i depends on (config, seed, i) alone.
 
@@ -79,7 +108,11 @@ class TrainConfig:
     windows: windows per sequence; window_s: range of their length (log-uniform).
     steps_per_window: rendered frames per window; motion stays near 1 px per frame.
     block: pixels (h, w) of each crop that the flow sees; the summary sees the whole crop.
-    sensors: pixel models; the cameras of a step are split evenly among them.
+    sensors: pixel models; a step draws as many neighbours among them as it has cameras, and
+        splits the cameras evenly.
+    parts: of the network that learn ("summary", "encoder", "flow", "spread"); the losses that
+        touch none of them are not computed. The pixels' parts train without the summary on the
+        true one plus N(0, summary_noise^2) in its coordinates y.
     """
 
     model: ModelConfig = ModelConfig()
@@ -88,15 +121,19 @@ class TrainConfig:
         theta=(0.05, 0.6), mismatch=(0.0, 0.15), noise="mixed", eta=(0.02, 2.0), eta_spread=0.1)
     scene: SceneConfig = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
     sensors: tuple[SensorModel, ...] = (
-        SensorModel(eta_intensity=True), SensorModel(noise_resets_memory=True))
+        SensorModel(eta_intensity=True), SensorModel(noise_resets_memory=True),
+        SensorModel(timestamps="v2e", noise_resets_memory=True),
+        SensorModel(cutoff_hz=200.0, refractory_s=5e-4, leak_hz=0.1, noise_resets_memory=True))
+    nuisances: NuisanceConfig = NuisanceConfig()
+    parts: tuple[str, ...] = PARTS
+    summary_noise: float = 0.1
     crop: int = 64
     block: tuple[int, int] = (8, 16)
     scenes: int = 8
     cameras: int = 2
     windows: int = 3
-    window_s: tuple[float, float] = (0.03, 0.1)
+    window_s: tuple[float, float] = (0.02, 0.1)
     steps_per_window: int = 16
-    frame_noise_dn: float = 0.5
     textures: int = 192
     steps: int = 3000
     warmup: int = 100
@@ -122,9 +159,9 @@ PRESETS: dict[str, TrainConfig] = {
             change_l1=0.0, inverse_flow=0.5, flow=1.0, summary=0.0, spread=0.0, confidence=True),
         prior=CameraPrior(theta=(0.1, 0.5), mismatch=(0.15, 0.15), noise="eq12"),
         scene=SceneConfig.preset("paper"),
-        sensors=(SensorModel(eta_intensity=True),),
-        window_s=(0.032, 0.032), steps_per_window=32, windows=1, learning_rate=1e-4,
-        flow_rate=1e-4),
+        sensors=(SensorModel(eta_intensity=True),), nuisances=NuisanceConfig.none(),
+        parts=("encoder", "flow", "spread"), window_s=(0.032, 0.032), steps_per_window=32,
+        windows=1, learning_rate=1e-4, flow_rate=1e-4),
     "debug": TrainConfig(
         model=ModelConfig(
             flow=FlowConfig(condition=41, steps=2, hidden=16), summary_hidden=32,

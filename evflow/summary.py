@@ -4,9 +4,11 @@ Every pixel gives features and weights; only their *sums* are kept (`Stats`), so
 tiles of one camera simply add, tiling equals the whole, and the std shrinks with the data.
 `finish` turns the sums into six medians and mismatches with their standard deviations.
 
-Besides learned features the sums hold learned-weighted normal equations of the event model
-dL = theta_on n_on - theta_off n_off: a least-squares calibration whose pixel weights the
-network chooses, the one place where the scale of theta can come from.
+The scale of theta comes from the event model dL = theta_on n_on - theta_off n_off + phase, of
+which the sums hold two calibrations with learned pixel weights: normal equations (least
+squares), and instrumental variables. The latter add the equation over the pixels that got
+brighter and over those that got darker: ON-OFF pairs of a path unseen between two frames and
+the counts' quantisation, which bias least squares, cancel in the sums.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from evflow.squash import CENTRE, SCALE, per_channel
 Array = jax.Array
 
 RIDGE, RIDGE_THETA = 0.5, 0.22  # pseudo-observations that hold an empty calibration at .22
+DEAD_CHANGE = 0.03  # log units: smaller changes are frame noise and do not choose a side
 SIGNAL_UNIT, EXPOSURE_UNIT = 1000.0, 100.0  # pixels with events, pixel seconds: scales of the std
 
 
@@ -33,13 +36,15 @@ class Stats:
     """Additive statistics of one camera, each (..., channels) or (...,) float32.
 
     active: features summed over pixels with events; rates: positive features over all pixels;
-    normal: (..., gates, 5) weighted normal equations; pixels, pixels_active, exposure
+    normal: (..., gates, 5) weighted normal equations; balance: (..., gates, 2, 3) weighted
+    n_on, n_off, dL over brighter and darker pixels; pixels, pixels_active, exposure
     (pixel seconds), events_on, events_off: plain counts. `a + b` adds two windows or tiles.
     """
 
     active: Array
     rates: Array
     normal: Array
+    balance: Array
     pixels: Array
     pixels_active: Array
     exposure: Array
@@ -71,7 +76,7 @@ def pixel_features(voxels: Array, dlogI: Array, context: Array) -> Array:
 
 
 class PixelNet(nn.Module):
-    """Per-pixel part: features (..., F) -> active (A), rates (R) > 0, gate weights (G) > 0."""
+    """Per-pixel part: features (..., F) -> active (A), rates (R) > 0, gate weights (3 G) > 0."""
 
     config: ModelConfig
 
@@ -82,7 +87,7 @@ class PixelNet(nn.Module):
             x = nn.relu(nn.Dense(c.summary_hidden)(x))
         active = nn.Dense(c.summary_features)(x)
         rates = nn.softplus(nn.Dense(c.rate_features)(x))
-        return active, rates, nn.softplus(nn.Dense(c.gates)(x))
+        return active, rates, nn.softplus(nn.Dense(3 * c.gates)(x))
 
 
 class FinishNet(nn.Module):
@@ -115,11 +120,16 @@ def pool(
         [n_on * n_on, n_off * n_off, n_on * n_off, n_on * dlogI, n_off * dlogI], -1)
     # 1/(1+n): otherwise the few pixels at the clamp, with most of the events, decide alone.
     weights = gates / (1.0 + total)[..., None]
+    squares, brighter, darker = jnp.split(weights, 3, -1)
+    rise = jnp.stack([nn.relu(dlogI - DEAD_CHANGE), nn.relu(-dlogI - DEAD_CHANGE)], -1)
+    sides = jnp.stack([brighter, darker], -1) * rise[..., None, :]
+    terms = jnp.stack([n_on, n_off, dlogI], -1)
     pixels = jnp.full(dlogI.shape[:-2], float(dlogI.shape[-1] * dlogI.shape[-2]), voxels.dtype)
     return Stats(
         active=jnp.sum(active * fired[..., None], (-3, -2)),
         rates=jnp.sum(rates, (-3, -2)),
-        normal=jnp.einsum("...hwg,...hwm->...gm", weights, moments, precision="highest"),
+        normal=jnp.einsum("...hwg,...hwm->...gm", squares, moments, precision="highest"),
+        balance=jnp.einsum("...hwgs,...hwm->...gsm", sides, terms, precision="highest"),
         pixels=pixels,
         pixels_active=jnp.sum(fired, (-2, -1)),
         exposure=pixels * window_s,
@@ -137,6 +147,17 @@ def least_squares(normal: Array) -> Array:
     return jnp.stack([(d * x + cross * y) / det, (a * y + cross * x) / det], -1)
 
 
+def balance(sums: Array) -> Array:
+    """Thresholds (..., 2) that balance dL = theta_on n_on - theta_off n_off over the brighter and
+    over the darker pixels (..., 2, 3), ridge-regularised towards .22."""
+    (a, b, up), (c, d, down) = (jnp.moveaxis(row, -1, 0) for row in jnp.moveaxis(sums, -2, 0))
+    a, d = a + RIDGE, d + RIDGE
+    up, down = up + RIDGE * RIDGE_THETA, -down + RIDGE * RIDGE_THETA
+    # ON events of darker pixels and OFF events of brighter ones are the few: det > 0 in practice.
+    det = jnp.maximum(a * d - b * c, 0.05 * a * d)
+    return jnp.stack([(d * up + b * down) / det, (a * down + c * up) / det], -1)
+
+
 def pooled_features(stats: Stats) -> Array:
     """Scale-free description of the sums: means, log rates, calibrations, (..., F)."""
     def log_rate(events: Array) -> Array:
@@ -144,7 +165,8 @@ def pooled_features(stats: Stats) -> Array:
 
     mean_active = stats.active / (stats.pixels_active + 1.0)[..., None]
     log_rates = jnp.log((stats.rates + 1e-3) / stats.exposure[..., None])
-    theta = jnp.clip(least_squares(stats.normal), 0.01, 2.0)
+    theta = jnp.concatenate([least_squares(stats.normal), balance(stats.balance)], -2)
+    theta = jnp.clip(theta, 0.01, 2.0)
     theta_y = (jnp.log(theta) - per_channel(CENTRE[:2], theta)) / per_channel(SCALE[:2], theta)
     scalars = jnp.stack(
         [jnp.log((stats.pixels_active + 0.5) / stats.pixels), log_rate(stats.events_on),
@@ -169,7 +191,7 @@ def init(key: Array, config: ModelConfig) -> dict:
     """Parameters of both parts."""
     k_pixel, k_finish = jax.random.split(key)
     features = jnp.zeros((1, 2 * config.bins + 9))
-    width = (config.summary_features + config.rate_features + 2 * config.gates + 4)
+    width = (config.summary_features + config.rate_features + 4 * config.gates + 4)
     return {
         "pixel": PixelNet(config).init(k_pixel, features)["params"],
         "finish": FinishNet(config).init(k_finish, jnp.zeros((1, width)))["params"],

@@ -67,7 +67,8 @@ def optimiser(config: TrainConfig) -> optax.GradientTransformation:
         return {name: {k: jax.tree.map(lambda _, k=k: k, v) for k, v in net.items()}
                 for name, net in params.items()}
 
-    return optax.partition({k: part(rate) for k, rate in rates.items()}, labels)
+    return optax.partition({k: part(rate) if k in config.parts else optax.set_to_zero()
+                            for k, rate in rates.items()}, labels)
 
 
 def init_state(
@@ -240,16 +241,18 @@ def loss_fn(
     known = unsquash_summary(batch.nominal)
     parts: Metrics = {}
     metrics: Metrics = {}
-    seen = known
-    if config.model.pool:
+    if "summary" in config.parts:
         parts["summary"], y, metrics = summary_losses(net, batch, k_summary, config)
         seen = jax.lax.stop_gradient(y)
-    block = cut_block(k_block, batch, config)
-    pixel_parts, pixel_metrics = pixel_losses(net, block, known, seen, k_pixels, config)
-    parts |= pixel_parts
+    else:
+        seen = known + config.summary_noise * jax.random.normal(k_summary, known.shape)
+    if set(config.parts) - {"summary"}:
+        block = cut_block(k_block, batch, config)
+        pixel_parts, pixel_metrics = pixel_losses(net, block, known, seen, k_pixels, config)
+        parts |= pixel_parts
+        metrics |= pixel_metrics
     total = total_loss(parts, config.loss)
-    return total, {"loss": total, **{f"loss/{k}": v for k, v in parts.items()}, **metrics,
-                   **pixel_metrics}
+    return total, {"loss": total, **{f"loss/{k}": v for k, v in parts.items()}, **metrics}
 
 
 def make_train_step(

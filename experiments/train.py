@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -24,7 +25,7 @@ from evflow.config import TrainConfig, as_dict, preset
 from evflow.errors import EvflowDataError
 from evflow.scenes import make_bank
 from evflow.train import TrainState, init_state, make_run_step, optimiser
-from evflow.weights import save_weights
+from evflow.weights import load_weights, save_weights
 from experiments.common import provenance
 
 
@@ -37,6 +38,10 @@ class Options:
     preset: Literal["default", "paper", "debug"] = "default"
     steps: int | None = None
     """Number of steps (default: the preset's)."""
+    parts: tuple[str, ...] | None = None
+    """Parts that learn, of: summary encoder flow spread (default: the preset's, all)."""
+    start: str | None = None
+    """Weights (a name or a file) whose parts of equal shape are the starting point."""
     seed: int = 0
     max_seconds: float = float("inf")
     """Stop after this long, with a checkpoint; the schedule still spans all steps."""
@@ -49,10 +54,14 @@ def main(options: Options) -> dict[str, Any]:
     config = dataclasses.replace(preset(options.preset), seed=options.seed)
     if options.steps is not None:
         config = dataclasses.replace(config, steps=options.steps)
+    if options.parts is not None:
+        config = dataclasses.replace(config, parts=options.parts)
     name = "paper" if options.preset == "paper" else "default"
     tx = optimiser(config)
     bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures)
     state = init_state(config, tx, bank, name)
+    if options.start is not None:
+        state = started_from(state, options.start)
     with Checkpoints(options.out) as checkpoints:
         if options.resume:
             state = checkpoints.restore(state)
@@ -65,6 +74,20 @@ def main(options: Options) -> dict[str, Any]:
             "training_figures": figures, "config": as_dict(config), **provenance()}
     save_weights(options.out / "weights.safetensors", state.average, card, overwrite=True)
     return figures
+
+
+def started_from(state: TrainState, weights: str) -> TrainState:
+    """The fresh state with every part of the network whose shapes agree taken from `weights`."""
+    (name, fresh), = state.params.items()
+    known = load_weights(weights).get(name, {})
+    taken = {k: known[k] if k in known and shapes(known[k]) == shapes(v) else v
+             for k, v in fresh.items()}
+    return dataclasses.replace(
+        state, params={name: taken}, average=jax.tree.map(jnp.copy, {name: taken}))
+
+
+def shapes(tree: Any) -> Any:
+    return jax.tree.map(jnp.shape, tree)
 
 
 def run(
