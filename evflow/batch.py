@@ -16,6 +16,7 @@ import numpy as np
 
 from evflow.camera import Camera, SensorModel, Summary, sample_nominal, sample_pixels
 from evflow.config import NuisanceConfig, TrainConfig
+from evflow.distributed import by_shard
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
 from evflow.scenes import TextureBank, render, sample_scene
 from evflow.simulator import scan
@@ -46,12 +47,24 @@ class Batch:
 
 
 def sample_batch(key: Array, bank: TextureBank, config: TrainConfig) -> Batch:
-    """Render `scenes` scenes, see each with `cameras` cameras; B = scenes x cameras."""
+    """Render `scenes` scenes, see each with `cameras` cameras; B = scenes x cameras, the cameras
+    of one scene side by side. Under a mesh every device makes its own scenes."""
+    def make(common: tuple[Array, TextureBank], numbers: Array) -> Batch:
+        return _sample_scenes(*common, numbers, config)
+
+    return by_shard(make)((key, bank), jnp.arange(config.scenes))
+
+
+def _sample_scenes(key: Array, bank: TextureBank, numbers: Array, config: TrainConfig) -> Batch:
+    """The sequences of the scenes `numbers` (S,) of a batch. A scene depends on the key and its
+    number alone, so that any share of a batch can be made anywhere."""
+    each = jax.vmap(jax.random.fold_in, (None, 0))
     k_scene, k_window, k_camera = jax.random.split(key, 3)
     shape = (config.crop, config.crop)
     steps = config.windows * config.steps_per_window
     low, high = np.log(config.window_s[0]), np.log(config.window_s[1])
-    window_s = jnp.exp(jax.random.uniform(k_window, (config.scenes,), minval=low, maxval=high))
+    window_s = jnp.exp(jax.vmap(lambda k: jax.random.uniform(k, minval=low, maxval=high))(
+        each(k_window, numbers)))
 
     def scene_frames(key: Array, window_s: Array) -> tuple[Array, Array]:
         k_scene, k_seen = jax.random.split(key)
@@ -61,18 +74,18 @@ def sample_batch(key: Array, bank: TextureBank, config: TrainConfig) -> Batch:
         seen = render(scene, exposed.reshape(-1), shape).reshape(*exposed.shape, *shape).mean(1)
         return render(scene, times, shape), seen
 
-    frames, seen = jax.vmap(scene_frames)(jax.random.split(k_scene, config.scenes), window_s)
+    frames, seen = jax.vmap(scene_frames)(each(k_scene, numbers), window_s)
     group = min(config.cameras, len(config.sensors))
     k_group, *k_sensors = jax.random.split(k_camera, group + 1)
 
     def look(*models: SensorModel) -> Batch:
         parts = []
         for key, model in zip(k_sensors, models, strict=True):
-            keys = jax.random.split(key, (config.cameras // group, config.scenes))
-            see = partial(_sequence, model=model, config=config)
-            axes = (0, None, None, None)
-            parts.append(jax.vmap(jax.vmap(see), in_axes=axes)(keys, frames, seen, window_s))
-        batch = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+            keys = jax.vmap(lambda k: jax.random.split(k, config.cameras // group))(
+                each(key, numbers))
+            see = jax.vmap(partial(_sequence, model=model, config=config), (0, None, None, None))
+            parts.append(jax.vmap(see)(keys, frames, seen, window_s))
+        batch = jax.tree.map(lambda *a: jnp.concatenate(a, 1), *parts)
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), batch)
 
     groups = [config.sensors[i:i + group] for i in range(0, len(config.sensors), group)]

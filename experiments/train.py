@@ -1,18 +1,27 @@
 """Train the network; writes checkpoints, metrics.jsonl, and weights.safetensors at the end.
 
     python -m experiments.train --preset default --out runs/default --max-seconds 2400
-    python -m experiments.train --preset default --out runs/default --resume
+    srun python -m experiments.train --out runs/default      # every device of every process
+    python -m experiments.train --out runs/default --coordinator HOST:PORT --processes 2 \
+        --process-id 0                                       # and so on, one command a process
 
-Ctrl-C (or SIGTERM) saves a checkpoint and stops; --resume goes on bit for bit.
+One path for any number of devices and processes, which see the same global batches; --out is a
+folder that the processes share. Ctrl-C (or SIGTERM to any process) saves a checkpoint and stops;
+the same command goes on, bit for bit on as many devices. Where a process dies, the others end with
+an error within half a minute, and the last complete checkpoint counts.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import math
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any, Literal
 
 import jax
@@ -20,13 +29,18 @@ import jax.numpy as jnp
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from evflow import distributed
 from evflow.checkpoint import Checkpoints
 from evflow.config import TrainConfig, as_dict, preset
 from evflow.errors import EvflowDataError
-from evflow.scenes import make_bank
+from evflow.files import atomic_write
+from evflow.scenes import TextureBank, make_bank
 from evflow.train import TrainState, init_state, make_run_step, optimiser
 from evflow.weights import load_weights, save_weights
 from experiments.common import provenance
+
+RECENT = 100  # steps whose mean metrics are a run's figures
+Metrics = dict[str, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,42 +52,79 @@ class Options:
     preset: Literal["default", "paper", "debug"] = "default"
     steps: int | None = None
     """Number of steps (default: the preset's)."""
+    scenes: int | None = None
+    """Scenes per step, a multiple of the number of devices (default: the preset's)."""
     parts: tuple[str, ...] | None = None
     """Parts that learn, of: summary encoder flow spread (default: the preset's, all)."""
     start: str | None = None
     """Weights (a name or a file) whose parts of equal shape are the starting point."""
     seed: int = 0
-    max_seconds: float = float("inf")
+    max_seconds: float = math.inf
     """Stop after this long, with a checkpoint; the schedule still spans all steps."""
-    resume: bool = False
+    resume: Literal["auto", "never", "must"] = "auto"
+    """Go on with the run in --out: if there is one (its configuration must be this one), never
+    (there must be none), or always (there must be one)."""
     save_every: int = 200
     """Steps between checkpoints."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, where several processes train without Slurm or Open MPI."""
+    processes: int | None = None
+    """How many they are."""
+    process_id: int | None = None
+    """Which of them this is, from 0."""
 
 
-def main(options: Options) -> dict[str, Any]:
-    config = dataclasses.replace(preset(options.preset), seed=options.seed)
-    if options.steps is not None:
-        config = dataclasses.replace(config, steps=options.steps)
-    if options.parts is not None:
-        config = dataclasses.replace(config, parts=options.parts)
-    name = "paper" if options.preset == "paper" else "default"
+def main(options: Options) -> Metrics:
+    """One run; returns the mean metrics of its last hundred steps."""
+    distributed.initialise(options.coordinator, options.processes, options.process_id)
+    mesh = distributed.make_mesh()
+    config = configuration(options, mesh.size)
     tx = optimiser(config)
-    bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures)
-    state = init_state(config, tx, bank, name)
-    if options.start is not None:
-        state = started_from(state, options.start)
-    with Checkpoints(options.out) as checkpoints:
-        if options.resume:
+    with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
+        resumed = goes_on(checkpoints, config, options)
+        bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures)
+        name = "paper" if options.preset == "paper" else "default"
+        state = init_state(config, tx, bank, name)
+        if options.start is not None:
+            state = started_from(state, options.start)
+        state, bank = distributed.replicate((state, bank), mesh)
+        if resumed:
             state = checkpoints.restore(state)
-        elif checkpoints.latest is not None:
-            raise EvflowDataError("EV013", f"{options.out} already holds a run.",
-                                  "Pass --resume to go on with it, or another --out.")
-        checkpoints.write_config(as_dict(config))
-        state, figures = run(state, bank, config, tx, options, checkpoints)
+        step = distributed.parallel(make_run_step(config, tx), mesh)
+        with Log(options.out / "metrics.jsonl", config.steps, int(state.step)) as log:
+            state = run(step, state, bank, config, options, checkpoints, log, requests)
     card = {"preset": options.preset, "steps": int(state.step), "seed": config.seed,
-            "training_figures": figures, "config": as_dict(config), **provenance()}
-    save_weights(options.out / "weights.safetensors", state.average, card, overwrite=True)
-    return figures
+            "devices": mesh.size, "training_figures": log.figures, "config": as_dict(config),
+            **provenance()}
+    if distributed.is_main():
+        save_weights(options.out / "weights.safetensors", state.average, card, overwrite=True)
+    distributed.agree(True)  # leave together: a process that ends alone is a dead one to the others
+    return log.figures
+
+
+def configuration(options: Options, devices: int) -> TrainConfig:
+    """The preset with the options' changes; EV020 where its scenes cannot be shared out."""
+    changes = {k: getattr(options, k) for k in ("seed", "steps", "scenes", "parts")}
+    config = dataclasses.replace(
+        preset(options.preset), **{k: v for k, v in changes.items() if v is not None})
+    if config.scenes % devices:
+        raise EvflowDataError(
+            "EV020", f"{config.scenes} scenes a step do not divide among {devices} devices.",
+            f"Pass --scenes {math.ceil(config.scenes / devices) * devices}, or use fewer devices.")
+    return config
+
+
+def goes_on(checkpoints: Checkpoints, config: TrainConfig, options: Options) -> bool:
+    """Whether the run in the folder is continued; else the folder is made this run's."""
+    if options.resume == "never" and checkpoints.latest is not None:
+        raise EvflowDataError("EV013", f"{options.out} already holds a run.",
+                              "Pass --resume auto to go on with it, or another --out.")
+    if options.resume == "must" or checkpoints.latest is not None:
+        checkpoints.check_config(as_dict(config))
+        return True
+    if distributed.is_main():
+        checkpoints.write_config(as_dict(config))
+    return False
 
 
 def started_from(state: TrainState, weights: str) -> TrainState:
@@ -91,45 +142,94 @@ def shapes(tree: Any) -> Any:
 
 
 def run(
-    state: TrainState, bank: Any, config: TrainConfig, tx: Any, options: Options,
-    checkpoints: Checkpoints,
-) -> tuple[TrainState, dict[str, float]]:
-    """Steps until the end, the time limit or a signal; returns the state and mean metrics of
-    the last hundred steps."""
-    step_fn = jax.jit(make_run_step(config, tx), donate_argnums=0)
-    stop: list[int] = []
-    before = {n: signal.signal(n, lambda n, _: stop.append(n))
-              for n in (signal.SIGINT, signal.SIGTERM)}
-    started, recent, step = time.monotonic(), [], int(state.step)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-               TimeRemainingColumn())
-    with Progress(*columns) as bar, open(options.out / "metrics.jsonl", "a") as log:
-        task = bar.add_task("training", total=config.steps, completed=step)
-        while step < config.steps and not stop:
-            if time.monotonic() - started > options.max_seconds:
-                break
-            state, metrics = step_fn(state, bank)
-            step += 1
-            values = {k: float(v) for k, v in metrics.items()}
-            recent = [*recent[-99:], values]
-            log.write(json.dumps({"step": step, "time": time.monotonic() - started, **values})
-                      + "\n")
-            bar.update(task, completed=step, description=f"theta {values_of(recent):.4f}")
-            if step % options.save_every == 0:
-                log.flush()
-                checkpoints.save(step, state)
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    step_fn: Any, state: TrainState, bank: TextureBank, config: TrainConfig, options: Options,
+    checkpoints: Checkpoints, log: Log, requests: list[int],
+) -> TrainState:
+    """Steps until the end, the time limit or a signal; the last step is saved."""
+    started, step = time.monotonic(), int(state.step)
+    # All processes must stop after the same step, but neither signals nor clocks are the same.
+    while step < config.steps and not distributed.agree(
+            bool(requests) or time.monotonic() - started > options.max_seconds):
+        state, metrics = step_fn(state, bank)
+        step += 1
+        values = {k: float(v) for k, v in jax.device_get(metrics).items()}
+        log.add(step, time.monotonic() - started, values)
+        if step % options.save_every == 0:
+            checkpoints.save(step, state)
     checkpoints.save(step, state)
-    names = recent[-1] if recent else {}
-    return state, {k: sum(r[k] for r in recent) / len(recent) for k in names}
+    return state
 
 
-def values_of(recent: list[dict[str, float]]) -> float:
-    """Mean summary error of theta over the recent steps (0 where the preset has none)."""
-    keys = ("summary/theta_on", "summary/theta_off")
-    return sum(r.get(k, 0.0) for r in recent for k in keys) / (2 * len(recent))
+@contextlib.contextmanager
+def stop_requests() -> Iterator[list[int]]:
+    """A list that SIGINT and SIGTERM add themselves to; a second signal acts as usual."""
+    requests: list[int] = []
+
+    def ask(number: int, _: FrameType | None) -> None:
+        requests.append(number)
+        signal.signal(number, before[number])
+
+    before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield requests
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class Log:
+    """metrics.jsonl, one line per step, and the progress bar; only the main process has them.
+
+    Lines beyond `step`, where the run goes on from, are dropped: no step is logged twice.
+    """
+
+    def __init__(self, path: Path, steps: int, step: int) -> None:
+        self._main = distributed.is_main()
+        self._recent: list[Metrics] = []
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+                   TimeRemainingColumn())
+        self._open = contextlib.ExitStack()
+        self._bar = self._open.enter_context(Progress(*columns, disable=not self._main))
+        self._task = self._bar.add_task("training", total=steps, completed=step)
+        if self._main:
+            kept = list(lines_until(path, step))
+            with atomic_write(path, overwrite=True) as temporary:
+                temporary.write_text("".join(f"{line}\n" for line in kept))
+            # By lines: a step is logged before its checkpoint is written.
+            self._file = self._open.enter_context(path.open("a", buffering=1))
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def add(self, step: int, seconds: float, values: Metrics) -> None:
+        """One step's metrics; seconds since the run (or its last resumption) started."""
+        self._recent = [*self._recent[1 - RECENT:], values]
+        if self._main:
+            self._file.write(json.dumps({"step": step, "time": seconds, **values}) + "\n")
+        theta = [self.figures.get(f"summary/theta_{p}", 0.0) for p in ("on", "off")]
+        self._bar.update(self._task, completed=step, description=f"theta {sum(theta) / 2:.4f}")
+
+    @property
+    def figures(self) -> Metrics:
+        """Mean metrics of the recent steps of this process."""
+        names = self._recent[-1] if self._recent else {}
+        return {k: sum(r[k] for r in self._recent) / len(self._recent) for k in names}
+
+
+def lines_until(path: Path, step: int) -> Iterator[str]:
+    """The lines of a log up to `step`; none where there is no log. A line that a crash cut short
+    lies beyond the last checkpoint."""
+    for line in path.read_text().splitlines() if path.exists() else ():
+        with contextlib.suppress(json.JSONDecodeError):
+            if json.loads(line)["step"] <= step:
+                yield line
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    try:
+        main(tyro.cli(Options, description=__doc__))
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None

@@ -59,8 +59,9 @@ def test_frames_see_the_same_change_up_to_their_noise(batch: Batch) -> None:
 
 
 def test_cameras_share_scenes_not_parameters(batch: Batch) -> None:
-    np.testing.assert_array_equal(batch.changes[0], batch.changes[2])
-    assert float(jnp.abs(batch.camera.theta_on[0] - batch.camera.theta_on[2]).min()) > 0
+    np.testing.assert_array_equal(batch.changes[0], batch.changes[1])
+    # Not the minimum: thresholds are clamped at .01, where any two cameras may meet.
+    assert float(jnp.median(jnp.abs(batch.camera.theta_on[0] - batch.camera.theta_on[1]))) > 0
 
 
 def test_key_decides_everything(bank: TextureBank) -> None:

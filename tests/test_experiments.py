@@ -42,7 +42,7 @@ def test_train_stops_resumes_and_calibrates(tmp_path: Path) -> None:
     assert model_card(weights)["steps"] == 4
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 4
     with pytest.raises(EvflowDataError, match="EV013"):
-        train.main(train.Options(out=out, preset="debug", steps=4))
+        train.main(train.Options(out=out, preset="debug", steps=4, resume="never"))
     calibrate.main(calibrate.Options(weights=weights, out=tmp_path / "final.safetensors", steps=2))
     before, after = load_weights(weights), load_weights(tmp_path / "final.safetensors")
     same = {part: all(np.array_equal(a, b) for a, b in zip(
@@ -56,7 +56,7 @@ def test_interrupted_training_equals_straight_training(tmp_path: Path) -> None:
     straight, halves = tmp_path / "straight", tmp_path / "halves"
     train.main(train.Options(out=straight, preset="debug", steps=3))
     train.main(train.Options(out=halves, preset="debug", steps=3, max_seconds=0.0))
-    train.main(train.Options(out=halves, preset="debug", steps=3, resume=True))
+    train.main(train.Options(out=halves, preset="debug", steps=3, resume="must"))
     a, b = (load_weights(p / "weights.safetensors") for p in (straight, halves))
     jax.tree.map(np.testing.assert_array_equal, a, b)
 

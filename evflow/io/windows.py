@@ -17,7 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.types import Recording, Window
 
 MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
-EDGE_US = 1_000  # the events may begin or end this much inside the first or last frame
+EDGE_US = 5_000  # the events may begin or end this much inside the first or last frame
 DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
 
 

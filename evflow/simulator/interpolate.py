@@ -34,8 +34,7 @@ def upsample(
     """
     if not max_motion_px > 0:
         raise EvflowDataError("EV020", f"max_motion_px={max_motion_px}.", "It must be > 0.")
-    preset = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
-    flow: Any = cv2.DISOpticalFlow_create(preset)  # type: ignore[attr-defined]
+    interpolator = Interpolator()
     previous, t0, told = None, 0, False
     for frame, t1 in pairs:
         current = np.asarray(frame, np.float32)
@@ -45,12 +44,12 @@ def upsample(
                 "EV002", f"frame at {t1} us has shape {current.shape}, the first {shape}.",
                 f"Expected (H, W) of one size, the longer side at least {MIN_SIDE} pixels.")
         if previous is not None:
-            there, back = _flow(flow, previous, current), _flow(flow, current, previous)
-            wanted = math.ceil(_motion(there) / max_motion_px)
+            there, back, motion = interpolator.motion(previous, current)
+            wanted = math.ceil(motion / max_motion_px)
             steps = int(np.clip(wanted, 1, min(MAX_STEPS, max(1, t1 - t0))))
             if wanted > MAX_STEPS and warn and not told:
                 told = True
-                warn(f"motion of {_motion(there):.0f} px between the frames at {t0} and {t1} us "
+                warn(f"motion of {motion:.0f} px between the frames at {t0} and {t1} us "
                      f"is too fast to interpolate well; {steps} steps were used.")
             for k in range(1, steps):
                 s = k / steps
@@ -59,9 +58,24 @@ def upsample(
         previous, t0 = current, int(t1)
 
 
-def _flow(dis: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Motion (H, W, 2) in pixels (x, y) that carries a into b."""
-    return dis.calc(_gray8(a), _gray8(b), None)
+class Interpolator:
+    """Motion between two frames (H, W) in DN 0..255, and the frames in between."""
+
+    def __init__(self) -> None:
+        preset = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
+        self._dis: Any = cv2.DISOpticalFlow_create(preset)  # type: ignore[attr-defined]
+
+    def motion(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Motion (H, W, 2) in pixels (x, y) that carries a into b, that which carries b into a,
+        and how far the fast pixels move."""
+        first, second = _gray8(a), _gray8(b)
+        there, back = (self._dis.calc(*pair, None) for pair in ((first, second), (second, first)))
+        return there, back, _motion(there)
+
+    def between(self, a: np.ndarray, b: np.ndarray, steps: int) -> tuple[list[np.ndarray], float]:
+        """The steps - 1 frames evenly between a and b, and how far the fast pixels move."""
+        there, back, motion = self.motion(a, b)
+        return [_between(a, b, there, back, k / steps) for k in range(1, steps)], motion
 
 
 def _gray8(frame: np.ndarray) -> np.ndarray:

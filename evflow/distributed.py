@@ -1,0 +1,126 @@
+"""Data parallelism: one program for a CPU, a GPU, many devices, many hosts.
+
+All devices of all processes lie on one mesh axis, "data". The state is replicated, a batch is
+sharded by scene: XLA partitions the step and adds up the gradients. The code of the step stays
+global (it sees whole batches); only loops over sequences, which XLA would run whole on every
+device, are run under `by_shard`. The mesh is ambient while a `parallel` function runs; where
+none is set, everything runs as written. `initialise` comes before any other use of JAX.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from evflow.errors import EvflowDataError
+
+AXIS = "data"
+# A process that dies ends the others within the heartbeat; one that fails waits for them at exit
+# until the shutdown's limit and dies then: 25 s at most, where JAX's defaults make 400.
+HEARTBEAT_S, SHUTDOWN_S = 10, 15
+# What each launcher sets, the last naming the number of processes it started.
+LAUNCHERS = (
+    ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_PROCID", "SLURM_LOCALID", "SLURM_NTASKS"),
+    ("OMPI_MCA_orte_hnp_uri", "OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
+)
+Common = TypeVar("Common")
+Shard = TypeVar("Shard")
+Result = TypeVar("Result")
+
+
+def launched(environ: Mapping[str, str]) -> bool:
+    """Whether Slurm (srun) or Open MPI (mpirun) started this process as one of several."""
+    return any(all(name in environ for name in names) and int(environ[names[-1]]) > 1
+               for names in LAUNCHERS)
+
+
+def initialise(
+    coordinator: str | None = None, processes: int | None = None, process_id: int | None = None
+) -> None:
+    """Join the other processes of this run: those named by the options, else the launcher's; a
+    process on its own does nothing.
+
+    coordinator: HOST:PORT of process 0. Raises EV020 where the options are incomplete or wrong.
+    """
+    # SIGTERM belongs to the training loop.
+    jax.config.update("jax_enable_preemption_service", False)
+    given = (coordinator, processes, process_id)
+    join = partial(jax.distributed.initialize, heartbeat_timeout_seconds=HEARTBEAT_S,
+                   shutdown_timeout_seconds=SHUTDOWN_S)
+    if given == (None, None, None):
+        if launched(os.environ):
+            join()
+        return
+    if coordinator is None or processes is None or process_id is None:
+        raise EvflowDataError(
+            "EV020", f"coordinator, processes and process id are {given}.", "Give all three.")
+    host, _, port = coordinator.rpartition(":")
+    if not (host and port.isdecimal() and 0 <= process_id < processes):
+        raise EvflowDataError(
+            "EV020", f"coordinator {coordinator!r}, process {process_id} of {processes}.",
+            "The coordinator is HOST:PORT of process 0; processes count from 0.")
+    join(*given, cluster_detection_method="deactivate")
+
+
+def is_main() -> bool:
+    """Whether this is the process that writes logs and prints."""
+    return jax.process_index() == 0
+
+
+def agree(vote: bool) -> bool:
+    """Whether any process votes yes: the same answer on all, which wait here for each other."""
+    if jax.process_count() == 1:
+        return vote
+    return bool(np.any(multihost_utils.process_allgather(np.asarray(vote))))
+
+
+def make_mesh() -> Mesh:
+    """All devices of all processes on the axis "data". Auto: XLA chooses the inner shardings."""
+    return jax.make_mesh((jax.device_count(),), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def replicate(tree: Result, mesh: Mesh) -> Result:
+    """A pytree that every process computed for itself, on all devices."""
+    sharding = NamedSharding(mesh, P())
+
+    def put(leaf: Any) -> jax.Array:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(
+                put(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
+        host = np.asarray(leaf)
+        return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
+
+    return jax.tree.map(put, tree)
+
+
+def parallel(step: Callable[..., Any], mesh: Mesh) -> jax.stages.Wrapped:
+    """step(state, ...) jitted for the mesh: replicated results, the state's buffers reused."""
+    def meshed(*args: Any) -> Any:
+        with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
+            return step(*args)
+
+    return jax.jit(meshed, donate_argnums=0, out_shardings=NamedSharding(mesh, P()))
+
+
+def by_shard(
+    f: Callable[[Common, Shard], Result],
+) -> Callable[[Common, Shard], Result]:
+    """f(common, shard) -> result, run by every device on its share of the leading axis; f itself
+    where no mesh is set.
+
+    common: replicated pytree; shard, result: pytrees whose leaves are split along axis 0. XLA
+    left to itself runs a loop over sequences (and renders their scenes) whole on every device.
+    """
+    if jax.sharding.get_abstract_mesh().empty:
+        return f
+    # check_vma: f's scans start from constants, which would all have to be marked as varying.
+    return jax.shard_map(f, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False)

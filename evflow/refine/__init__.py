@@ -1,0 +1,20 @@
+"""Refinement by simulation: the recording's own video, simulated with the estimated camera.
+
+    frames --optical flow--> path (fine log frames)      path.py
+    recorded events, simulated events --> Trace          trace.py
+    Trace + path --> Moments, additive                   moments.py
+    recorded against simulated Moments --> the summary   fit.py
+    recorded events on the path --> each pixel's theta   pixels.py
+
+A network sees windows; this sees what the recording would look like were the estimate true, and
+moves the estimate until the two agree. Each pixel is compared only after its first event, where
+its memory is known: nothing depends on what happened before the recording began.
+"""
+
+from evflow.refine.fit import Refined, fused, refine_summary
+from evflow.refine.path import Chunk, make_chunk, plan_chunks
+from evflow.refine.pixels import pixel_posterior
+
+__all__ = [
+    "Chunk", "Refined", "fused", "make_chunk", "pixel_posterior", "plan_chunks", "refine_summary",
+]

@@ -1,0 +1,245 @@
+"""From moments to the camera's summary: a few Gauss-Newton steps, then a small fusion network.
+
+The steps move log theta until the balance of the simulated recording equals that of the recorded
+one, held by the network's estimate where the data say little; the noise rates follow from the
+quiet pixels. What is left over (every residual, how many events carry it, how fast things move)
+goes into `FusionNet`, trained on simulated recordings, which corrects the estimate and says how
+sure it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import THETA_MIN, Camera, Summary, noise_of_threshold
+from evflow.intensity import lin_log_inverse, noise_factor, normalised_intensity
+from evflow.refine.moments import Moments, measure
+from evflow.refine.path import STEPS, Chunk
+from evflow.refine.trace import trace_of_camera
+from evflow.squash import squash_summary, summary_std, unsquash_summary
+
+Array = jax.Array
+
+OFFSETS = (0.2, 0.08, 0.05)  # log theta: finite differences of the passes
+LONGEST_STEP = 0.5  # log theta per pass
+MODEL_ERROR = 0.04  # of a balance residual, beside the counts' own: what interpolation leaves
+EMPTY = 0.3  # balance weight below which there is no residual to speak of
+FRESH_ODDS = 2.0  # log odds that it takes to call a start fresh: few recordings do
+FURTHEST_NOISE = 1.5  # standard deviations of the network's log eta
+SIGNAL_ERROR = 0.3  # relative error of the signal expected among quiet pixels
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refined:
+    """summary, std: the camera; features: (F,) float32, what the fusion saw; fresh: whether the
+    recording starts as a simulation does, with the memory at its first frame."""
+
+    summary: Summary
+    std: Summary
+    features: np.ndarray
+    fresh: bool
+
+
+class FusionNet(nn.Module):
+    """features (F,) -> correction of y (6,) and log std of y (6,)."""
+
+    width: int = 64
+
+    @nn.compact
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        for _ in range(2):
+            x = nn.relu(nn.Dense(self.width)(x))
+        out = nn.Dense(12, kernel_init=nn.initializers.zeros)(x)
+        return out[..., :6], out[..., 6:] - 1.0
+
+
+@partial(jax.jit, static_argnames="steps")
+def _simulated(
+    key: Array, path: Array, dt_s: Array, bright: Array, values: Array, fresh: Array, steps: int
+) -> Moments:
+    """Moments of V cameras on one chunk, leading axis V. values (V, 6): theta, eta, sigma; all see
+    the same random numbers, so that their differences are the cameras'."""
+    k_pixels, k_trace = jax.random.split(key)
+    draws = jax.random.normal(k_pixels, (2, *path.shape[1:]))
+
+    def one(row: tuple[Array, Array]) -> Moments:
+        (on, off, eta_on, eta_off, sigma_on, sigma_off), start = row[0], row[1]
+        full = jnp.ones_like(draws[0])
+        camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
+                        jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
+                        eta_on * full, eta_off * full)
+        trace = trace_of_camera(k_trace, path, dt_s, camera, start, steps)
+        return measure(trace, path, dt_s, bright, steps)
+
+    return jax.lax.map(one, (values, fresh))
+
+
+@partial(jax.jit, static_argnames="steps")
+def _recorded(trace: Any, path: Array, dt_s: Array, bright: Array, steps: int) -> Moments:
+    return measure(trace, path, dt_s, bright, steps)
+
+
+def _total(parts: list[Moments]) -> Moments:
+    return jax.tree.map(lambda *leaves: np.sum([np.asarray(a) for a in leaves], 0), *parts)
+
+
+def balance_residual(moments: Moments, theta: np.ndarray) -> np.ndarray:
+    """Relative excess of what the events carry over dL, (..., lags, 2 sides), at theta (..., 2)."""
+    on, off = theta[..., 0, None, None], theta[..., 1, None, None]
+    a, b, d, size = np.moveaxis(np.asarray(moments.balance), -1, 0)
+    return np.array([1.0, -1.0]) * (on * a - off * b - d) / (size + EMPTY)
+
+
+def square_residual(moments: Moments, theta: np.ndarray) -> np.ndarray:
+    """Mean squared remainder (..., 2 sides) in units of theta_on theta_off."""
+    on, off = theta[..., 0, None], theta[..., 1, None]
+    aa, bb, ab, ad, bd, dd, one = np.moveaxis(np.asarray(moments.squares), -1, 0)
+    square = (on**2 * aa + off**2 * bb - 2 * on * off * ab - 2 * on * ad + 2 * off * bd + dd)
+    return (np.maximum(square, 0.0) / (on * off) + EMPTY) / (one + EMPTY)
+
+
+class _Fit:
+    """The passes over one recording's chunks; holds what they share."""
+
+    def __init__(self, chunks: list[Chunk], start: Summary, std: Summary, seed: int) -> None:
+        self.chunks, self.key = chunks, jax.random.key(seed)
+        self.names = [f.name for f in dataclasses.fields(Summary)]
+        self.prior = np.array([float(getattr(start, n)) for n in self.names])
+        relative = np.array([float(getattr(std, n)) for n in self.names]) / np.maximum(
+            self.prior, 1e-3)
+        self.prior_std = np.clip(relative, 0.02, 2.0)
+        self.values = self.prior.copy()
+        self.fresh = 0.0
+        self.recorded = _total([_recorded(c.recorded, c.path, c.dt_s, c.bright, STEPS)
+                                for c in chunks])
+
+    def simulate(self, values: np.ndarray, fresh: list[float]) -> Moments:
+        """Summed moments, leading axis V; `fresh` holds for the first chunk alone."""
+        rows = jnp.asarray(values, jnp.float32)
+        parts = []
+        for i, c in enumerate(self.chunks):
+            start = jnp.asarray(fresh if i == 0 else [0.0] * len(fresh), jnp.float32)
+            parts.append(_simulated(jax.random.fold_in(self.key, i), c.path, c.dt_s, c.bright,
+                                    rows, start, STEPS))
+        return _total(parts)
+
+    def choose_start(self) -> None:
+        """Does the recording start as a simulation does? Whichever start makes the number of
+        pixels that fire at once the likelier (Poisson)."""
+        both = self.simulate(np.stack([self.values] * 2), [0.0, 1.0])
+        made = np.asarray(both.early) + 0.5
+        seen = float(self.recorded.early)
+        log_likelihood = seen * np.log(made) - made
+        self.fresh = float(log_likelihood[1] > log_likelihood[0] + FRESH_ODDS)
+
+    def step(self, offset: float) -> None:
+        """One Gauss-Newton step of log theta, and the noise rates of the quiet pixels."""
+        values = np.stack([self.values] * 3)
+        values[1, 0] *= np.exp(offset)
+        values[2, 1] *= np.exp(offset)
+        moments = self.simulate(values, [self.fresh] * 3)
+        excess = (balance_residual(self.recorded, values[:, :2])
+                  - balance_residual(moments, values[:, :2]))[:, :3].mean(1)  # lags 1, 2, 4
+        jacobian = ((excess[1:] - excess[0]) / offset).T
+        size = np.asarray(self.recorded.balance)[1, :, 3]
+        precision = np.diag(1.0 / (MODEL_ERROR**2 + 0.2 / (size + EMPTY)))
+        held = np.diag(self.prior_std[:2] ** -2.0)
+        away = np.log(self.values[:2] / self.prior[:2])
+        curvature = jacobian.T @ precision @ jacobian + held
+        gradient = jacobian.T @ precision @ excess[0] + held @ away
+        change = -np.linalg.solve(curvature, gradient)
+        self.values[:2] *= np.exp(np.clip(change, -LONGEST_STEP, LONGEST_STEP))
+        self.values[:2] = np.clip(self.values[:2], 0.02, 2.0)
+        self.values[2:4] = self.noise(jax.tree.map(lambda a: a.mean(0), moments))
+
+    def noise(self, simulated: Moments) -> np.ndarray:
+        """Noise rates: of each quiet stratum, recorded events less the simulated signal, weighed
+        by how well each is known, the network's estimate among them."""
+        seen, made = np.asarray(self.recorded.quiet), np.asarray(simulated.quiet)
+        seconds = seen[:, 2:] + 1e-6
+        signal = np.maximum(made[:, :2] - self.values[None, 2:4] * made[:, 2:], 0.0)
+        rate = np.maximum(seen[:, :2] - signal, 0.0) / seconds
+        variance = (seen[:, :2] + 1.0 + (SIGNAL_ERROR * signal) ** 2) / seconds**2
+        prior = (self.prior_std[2:4] * self.prior[2:4]) ** 2 + 1e-6
+        weight = 1.0 / variance
+        found = (rate * weight).sum(0) + self.prior[2:4] / prior
+        found = np.maximum(found / (weight.sum(0) + 1.0 / prior), 2e-3)
+        # Where the path misses a motion, its signal passes for noise: the network's word limits.
+        furthest = np.exp(FURTHEST_NOISE * self.prior_std[2:4])
+        return np.clip(found, self.prior[2:4] / furthest, self.prior[2:4] * furthest)
+
+    def features(self) -> np.ndarray:
+        """Everything the fusion sees, (F,), at the final values."""
+        made = jax.tree.map(lambda a: a[0], self.simulate(self.values[None], [self.fresh]))
+        seen, theta = self.recorded, self.values[:2]
+
+        def ratio(name: str) -> np.ndarray:
+            return np.log((getattr(seen, name) + 1.0) / (getattr(made, name) + 1.0))
+
+        residual = balance_residual(seen, theta) - balance_residual(made, theta)
+        n, expected = seen.quiet[:, :2], made.quiet[:, :2]
+        size = seen.balance[..., 3]
+        motion = np.concatenate([c.motion_px for c in self.chunks])
+        light = np.mean([c.path[0].mean() for c in self.chunks])
+        tie = np.log(np.asarray(noise_of_threshold(jnp.asarray(theta))) * self.factor())
+        pixels = max(float(seen.pixels), 1.0)
+        parts = [
+            np.log(self.values / self.prior)[:4], np.log(self.prior_std),
+            np.log(self.values[:4]), np.log(self.values[4:] + 0.01), residual.ravel(),
+            ratio("roots"), ratio("active"), ratio("events"), [ratio("early")],
+            np.log(square_residual(seen, theta) / square_residual(made, theta)),
+            np.log(size[[0, -1]] + EMPTY).ravel(), np.log(seen.events + 1.0),
+            np.log((seen.active + 1.0) / pixels), np.log(seen.quiet[:, 2] + 1.0),
+            ((n - expected) / np.sqrt(n + expected + 1.0)).ravel(),
+            tie, tie - np.log(self.values[2:4]), np.log([float(seen.exposure) + 1.0, pixels]),
+            [np.log(motion.mean() + 0.1), np.log(motion.max() + 0.1), light, self.fresh,
+             np.log(np.mean([c.dt_s.mean() for c in self.chunks]) / 0.025)],
+        ]
+        return np.concatenate([np.asarray(p, np.float64).ravel() for p in parts]).astype(
+            np.float32)
+
+    def factor(self) -> float:
+        """Mean intensity factor of Eq. 12 over the frames."""
+        factors = [np.asarray(noise_factor(normalised_intensity(lin_log_inverse(
+            jnp.asarray(c.path[::STEPS]))))).mean() for c in self.chunks]
+        return float(np.mean(factors))
+
+
+def refine_summary(
+    chunks: list[Chunk], summary: Summary, std: Summary, fusion: dict[str, Any] | None = None,
+    *, seed: int = 0,
+) -> Refined:
+    """The camera's summary, from the chunks of a recording and the network's estimate.
+
+    fusion: {"net": parameters of FusionNet, "mean", "scale", "low", "high": (F,) of the features
+    it was trained on}; without it the result is that of the Gauss-Newton steps alone, and std
+    the network's.
+    """
+    fit = _Fit(chunks, summary, std, seed)
+    fit.choose_start()
+    for offset in OFFSETS:
+        fit.step(offset)
+    features = fit.features()
+    stepped = Summary(*(jnp.float32(v) for v in fit.values))
+    if fusion is None:
+        return Refined(stepped, std, features, fit.fresh > 0)
+    y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
+    result = squash_summary(y)
+    return Refined(result, summary_std(result, y_std), features, fit.fresh > 0)
+
+
+def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:
+    """y (..., 6) corrected, and its std; features beyond those of training are held at its
+    edge, so that a longer recording is taken for the longest known."""
+    inside = jnp.clip(features, fusion["low"], fusion["high"])
+    outputs: Any = FusionNet().apply(
+        {"params": fusion["net"]}, (inside - fusion["mean"]) / fusion["scale"])
+    correction, log_std = outputs
+    return y + correction, jnp.exp(log_std)

@@ -1,0 +1,82 @@
+"""The brightness path between frames: chunks of frames -> fine log frames, on the host.
+
+The frames of a recording are 10-50 ms apart; motion-compensated frames (OpenCV DIS flow) fill
+the gaps, so that what moves between them crosses the pixels in between. A chunk is the unit of
+the refinement: its pixels start anew, so chunks are independent and memory stays bounded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from evflow.intensity import lin_log
+from evflow.refine.pixels import pixel_equations
+from evflow.refine.trace import Trace, trace_of_events
+from evflow.simulator.interpolate import Interpolator
+from evflow.types import Recording
+
+INTERVALS = 8  # frame intervals per chunk: 200 ms at 40 Hz
+STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 px a step
+CHUNK_PIXELS = 8 * 346 * 260  # pixels of all chunks used, of a long recording
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Chunk:
+    """One stretch of a recording, K frame intervals.
+
+    path: (K * steps + 1, H, W) float32 log intensity, the frames at every `steps`-th;
+    bright: (H, W) bool, pixels whose frames are neither near black nor saturated; dt_s: (K,)
+    interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
+    equations: (7, H, W) of each pixel's regression, see pixels.py.
+    """
+
+    path: np.ndarray
+    bright: np.ndarray
+    dt_s: np.ndarray
+    motion_px: np.ndarray
+    recorded: Trace
+    equations: np.ndarray
+
+
+DARK_DN, SATURATED_DN = 15.0, 252.0  # below, half a DN of noise is .03 in log; above, it clips
+
+
+def plan_chunks(recording: Recording, intervals: list[int]) -> list[list[int]]:
+    """Runs of up to INTERVALS consecutive usable frame intervals, evenly thinned to the budget.
+
+    intervals: indices i of usable intervals (frame i to i+1), ascending.
+    """
+    runs: list[list[int]] = []
+    for i in intervals:
+        if runs and runs[-1][-1] == i - 1 and len(runs[-1]) < INTERVALS:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+    longest = max((len(run) for run in runs), default=0)
+    runs = [run for run in runs if len(run) == longest]
+    width, height = recording.events.size
+    most = max(1, CHUNK_PIXELS // (width * height))
+    if len(runs) > most:
+        runs = [runs[round(k)] for k in np.linspace(0, len(runs) - 1, most)]
+    return runs
+
+
+def make_chunk(recording: Recording, run: list[int], steps: int = STEPS) -> Chunk:
+    """Interpolate the frames of a run of intervals and count its events."""
+    frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
+    times = recording.frame_times[run[0]:run[-1] + 2]
+    interpolator = Interpolator()
+    path, motion = [frames[0]], []
+    for a, b in itertools.pairwise(frames):
+        between, moved = interpolator.between(a, b, steps)
+        path += [*between, b]
+        motion.append(moved)
+    stack, fine = np.stack(frames), np.asarray(lin_log(np.stack(path)))
+    bright = (stack.min(0) >= DARK_DN) & (stack.max(0) <= SATURATED_DN)
+    return Chunk(
+        fine, bright, np.diff(times).astype(np.float32) * 1e-6, np.array(motion, np.float32),
+        trace_of_events(recording.events, times, steps),
+        pixel_equations(recording.events, times, fine, steps))

@@ -1,0 +1,82 @@
+"""Held-out recordings of hidden cameras, as a user would bring them: events and 8-bit frames.
+
+Scenes are rendered at 1000 frames/s and simulated on the host; the recording keeps every n-th
+frame. Everything follows from the key.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow import Recording, simulate
+from evflow.camera import Camera, CameraPrior, SensorModel, Summary, sample_nominal, sample_pixels
+from evflow.intensity import noise_factor, normalised_intensity
+from evflow.scenes import Scene, TextureBank, render, sample_scene
+from evflow.scenes.config import SceneConfig
+
+Array = jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """What the recordings are like. fresh: the events begin at the first frame, with its
+    brightness in the memory; else the camera has been running for 20 ms."""
+
+    prior: CameraPrior = CameraPrior()
+    scene: SceneConfig = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
+    model: SensorModel = SensorModel(eta_intensity=True)
+    shape: tuple[int, int] = (64, 64)
+    frame_ms: int = 25
+    intervals: int = 8
+    frame_noise_dn: float = 0.5
+    fresh: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hidden:
+    """A recording and the truth behind it: nominal at the recording's mean intensity."""
+
+    recording: Recording
+    camera: Camera
+    nominal: Summary
+
+
+BLOCK = 64  # frames rendered at a time: one compiled program for recordings of any length
+
+
+_scene = jax.jit(sample_scene, static_argnames=("config", "shape"))
+
+
+def _frames(scene: Scene, shape: tuple[int, int], count: int) -> np.ndarray:
+    """(count, H, W) DN at 1000 frames/s, the scene's reference instant in the middle."""
+    blocks = -(-count // BLOCK)
+    times = (np.arange(blocks * BLOCK, dtype=np.float32) - 0.5 * count) * 1e-3
+    parts = [np.asarray(render(scene, t, shape)) for t in times.reshape(blocks, BLOCK)]
+    return np.concatenate(parts)[:count]
+
+
+def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidden:
+    """Draw a scene and a camera; simulate the recording."""
+    k_scene, k_nominal, k_pixels, k_events, k_noise = jax.random.split(key, 5)
+    lead = 0 if protocol.fresh else 20
+    length = lead + protocol.frame_ms * protocol.intervals + 1
+    scene = _scene(k_scene, bank, protocol.scene, protocol.shape)
+    frames = _frames(scene, protocol.shape, length)
+    light = noise_factor(normalised_intensity(jnp.asarray(frames)).mean((1, 2)))
+    nominal = sample_nominal(k_nominal, (), protocol.prior, light[0])
+    camera = sample_pixels(k_pixels, nominal, protocol.shape, protocol.prior.eta_spread)
+    times = np.arange(length) * 1000
+    events = simulate(k_events, frames, times, camera, model=protocol.model)
+    kept = np.arange(lead, length, protocol.frame_ms)
+    noise = protocol.frame_noise_dn * jax.random.normal(k_noise, (len(kept), *protocol.shape))
+    gray = np.clip(np.rint(frames[kept] + np.asarray(noise)), 0, 255).astype(np.uint8)
+    gain = light.mean() / light[0] if protocol.model.eta_intensity else 1.0
+    seen = {n: getattr(nominal, n) * gain for n in ("eta_on", "eta_off")}
+    return Hidden(
+        Recording(events, gray, times[kept]),
+        dataclasses.replace(camera, eta_on=camera.eta_on * gain, eta_off=camera.eta_off * gain),
+        dataclasses.replace(nominal, **seen))

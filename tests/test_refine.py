@@ -1,0 +1,170 @@
+"""Refinement by simulation: recorded and simulated traces agree where they must, sums add, and
+the thresholds of a known path come back."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from networks import hidden
+
+from evflow import Recording, simulate
+from evflow.camera import Camera, CameraPrior, Summary
+from evflow.intensity import lin_log
+from evflow.io import plan_windows
+from evflow.recording import refinement_chunks
+from evflow.refine import fused, pixel_posterior, plan_chunks, refine_summary
+from evflow.refine.fit import FusionNet
+from evflow.refine.moments import measure
+from evflow.refine.pixels import pixel_equations
+from evflow.refine.trace import NEVER, trace_of_camera, trace_of_events
+from evflow.types import Events
+
+SHAPE = (12, 16)
+STEPS, INTERVALS = 8, 3
+SILENT = CameraPrior(theta=(0.15, 0.3), mismatch=(0.03, 0.03), noise="none")
+
+
+@pytest.fixture(scope="module")
+def video() -> tuple[np.ndarray, np.ndarray]:
+    """(frames DN, times us): smooth random brightness, a frame every ms."""
+    walk = np.cumsum(np.random.default_rng(0).normal(size=(STEPS * INTERVALS + 1, *SHAPE)), 0)
+    return (110 + 12 * walk).clip(30, 240).astype(np.float32), 1000 * np.arange(len(walk))
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    return Camera.sample(jax.random.key(0), SHAPE, SILENT)
+
+
+@pytest.fixture(scope="module")
+def events(video: tuple[np.ndarray, np.ndarray], camera: Camera) -> Events:
+    return simulate(jax.random.key(1), *video, camera)
+
+
+def test_simulated_trace_is_the_trace_of_the_simulated_events(
+    video: tuple[np.ndarray, np.ndarray], camera: Camera, events: Events
+) -> None:
+    frames, times = video
+    dt_s = jnp.full(INTERVALS, STEPS * 1e-3)
+    made = trace_of_camera(jax.random.key(2), lin_log(frames), dt_s, camera, jnp.ones(()), STEPS)
+    seen = trace_of_events(events, times[::STEPS], STEPS)
+    np.testing.assert_array_equal(made.counts, seen.counts)
+    np.testing.assert_array_equal(made.first_on, seen.first_on)
+    fired = np.asarray(seen.step) != NEVER
+    assert fired.mean() > 0.5
+    when = np.asarray(made.step) + np.asarray(made.fraction)
+    np.testing.assert_allclose(when[fired], (seen.step + seen.fraction)[fired], atol=2e-3)
+    np.testing.assert_array_equal(np.asarray(made.step)[~fired], NEVER)
+
+
+def test_every_event_is_counted_once(events: Events) -> None:
+    edges = np.arange(INTERVALS + 1) * STEPS * 1000
+    trace = trace_of_events(events, edges, STEPS)
+    np.testing.assert_array_equal(np.asarray(trace.counts).sum(0), events.count_map())
+
+
+def test_after_the_first_event_the_balance_is_exact(
+    video: tuple[np.ndarray, np.ndarray], camera: Camera, events: Events
+) -> None:
+    """On the true path the remainder of every pixel stays between the thresholds."""
+    frames, times = video
+    path = lin_log(frames)
+    trace = trace_of_events(events, times[::STEPS], STEPS)
+    step = np.where(np.asarray(trace.step) == NEVER, 0, trace.step)
+    rows = np.indices(SHAPE)
+    start = np.asarray(path)[step, *rows]
+    origin = start + trace.fraction * (np.asarray(path)[step + 1, *rows] - start)
+    counts = np.asarray(trace.counts).sum(0)
+    on, off = counts[0] - trace.first_on, counts[1] - ~np.asarray(trace.first_on)
+    carried = on * camera.theta_on - off * camera.theta_off
+    remainder = np.asarray(path[-1] - origin - carried)
+    fired = np.asarray(trace.step) != NEVER
+    inside = (remainder < np.asarray(camera.theta_on) + 2e-3) & (
+        remainder > -np.asarray(camera.theta_off) - 2e-3)
+    assert inside[fired].all()
+
+
+def test_moments_add_over_the_sensor(
+    video: tuple[np.ndarray, np.ndarray], events: Events
+) -> None:
+    frames, times = video
+    path, dt_s = lin_log(frames), jnp.full(INTERVALS, STEPS * 1e-3)
+    trace = trace_of_events(events, times[::STEPS], STEPS)
+
+    def of(rows: slice) -> object:
+        part = dataclasses.replace(
+            trace, step=trace.step[rows], fraction=trace.fraction[rows],
+            first_on=trace.first_on[rows], counts=trace.counts[:, :, rows])
+        bright = jnp.ones((rows.stop - rows.start, SHAPE[1]), bool)
+        return measure(part, path[:, rows], dt_s, bright, STEPS)
+
+    whole = of(slice(0, SHAPE[0]))
+    halves = [of(slice(0, 5)), of(slice(5, SHAPE[0]))]
+    jax.tree.map(lambda w, a, b: np.testing.assert_allclose(w, a + b, rtol=1e-4, atol=1e-4),
+                 whole, *halves)
+
+
+def test_regression_finds_each_pixels_thresholds(
+    video: tuple[np.ndarray, np.ndarray], camera: Camera, events: Events
+) -> None:
+    """True path, no noise: far better than the prior; without events, the prior."""
+    frames, times = video
+    equations = pixel_equations(events, times[::STEPS], np.asarray(lin_log(frames)), STEPS)
+    np.testing.assert_array_equal(equations[6], events.count_map().sum(0))
+    known = Summary(*(jnp.float32(v) for v in (0.22, 0.22, 0.0, 0.0, 0.08, 0.08)))
+    theta, std = pixel_posterior(equations, known)
+    true = np.stack([camera.theta_on, camera.theta_off])
+    many = events.count_map().min(0) >= 3
+    assert many.sum() > 20
+    assert np.abs(theta - true)[:, many].mean() < 0.3 * np.abs(0.22 - true)[:, many].mean()
+    assert (np.abs(theta - true) < 3 * std).mean() > 0.97
+    empty, wide = pixel_posterior(np.zeros_like(equations), known)
+    np.testing.assert_allclose(empty, 0.22, rtol=1e-5)
+    np.testing.assert_allclose(wide, 0.08, rtol=1e-5)
+
+
+def test_chunks_are_runs_of_equal_length() -> None:
+    recording = Recording(
+        Events(np.zeros(2, int), np.zeros(2, int), np.array([0, 1_000_000]), np.ones(2, bool),
+               (16, 12)), np.zeros((41, 12, 16), np.uint8), np.arange(41) * 25_000)
+    runs = plan_chunks(recording, [*range(8), *range(10, 29), 35])
+    assert runs == [list(range(8)), list(range(10, 18)), list(range(18, 26))]
+    assert plan_chunks(recording, [3, 4, 9]) == [[3, 4]]
+    assert plan_chunks(recording, []) == []
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_steps_find_the_thresholds_from_a_wrong_start(seed: int) -> None:
+    """A start 25 % off, 3-8 px of motion between frames: half of the error goes at least (the
+    steps keep a bias of some per cent, which the fusion knows)."""
+    recording, camera = hidden(seed)
+    true = Summary(*(jnp.median(m) for m in (
+        camera.theta_on, camera.theta_off, camera.eta_on, camera.eta_off)), *jnp.full(2, 0.03))
+    start = dataclasses.replace(true, theta_on=1.25 * true.theta_on,
+                                theta_off=0.8 * true.theta_off)
+    std = jax.tree.map(lambda v: 0.3 * v, start)
+    chunks = refinement_chunks(recording, plan_windows(recording).pairs)
+    found = refine_summary(chunks, start, std)
+    again = refine_summary(chunks, start, std)
+    for name in ("theta_on", "theta_off"):
+        assert float(getattr(found.summary, name)) == pytest.approx(
+            float(getattr(true, name)), rel=0.12)
+    np.testing.assert_array_equal(found.features, again.features)
+    assert np.isfinite(found.features).all()
+
+
+def test_fusion_holds_features_inside_what_it_knows() -> None:
+    features = jnp.linspace(-1.0, 1.0, 5)
+    net = FusionNet().init(jax.random.key(0), features)["params"]
+    net = jax.tree.map(lambda p: p + 0.1, net)
+    fusion = {"net": net, "mean": jnp.zeros(5), "scale": jnp.ones(5), "low": jnp.full(5, -1.0),
+              "high": jnp.ones(5)}
+    y = jnp.zeros(6)
+    inside, std = fused(fusion, features, y)
+    beyond, _ = fused(fusion, features.at[-1].set(9.0), y)
+    np.testing.assert_array_equal(inside, beyond)
+    assert bool((std > 0).all())
