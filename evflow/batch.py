@@ -70,9 +70,12 @@ def _sample_scenes(key: Array, bank: TextureBank, numbers: Array, config: TrainC
         k_scene, k_seen = jax.random.split(key)
         scene = sample_scene(k_scene, bank, config.scene, shape)
         times = (jnp.arange(steps + 1) - 0.5 * steps) * (window_s / config.steps_per_window)
-        exposed = _exposures(k_seen, times[:: config.steps_per_window], config.nuisances)
+        frames, edges = render(scene, times, shape), slice(None, None, config.steps_per_window)
+        if config.nuisances.sharp:
+            return frames, frames[edges]
+        exposed = _exposures(k_seen, times[edges], config.nuisances)
         seen = render(scene, exposed.reshape(-1), shape).reshape(*exposed.shape, *shape).mean(1)
-        return render(scene, times, shape), seen
+        return frames, seen
 
     frames, seen = jax.vmap(scene_frames)(each(k_scene, numbers), window_s)
     group = min(config.cameras, len(config.sensors))

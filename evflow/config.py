@@ -93,6 +93,11 @@ class NuisanceConfig:
     exposures: int = 4
     frame_noise_dn: float = 0.5
 
+    @property
+    def sharp(self) -> bool:
+        """Whether the frames show exactly the instants of their time stamps."""
+        return self.jitter_s == 0 and self.exposure_s == 0
+
     @staticmethod
     def none() -> NuisanceConfig:
         """Frames as they are meant to be, of a camera that has been running."""
@@ -166,6 +171,7 @@ PRESETS: dict[str, TrainConfig] = {
         model=ModelConfig(
             flow=FlowConfig(condition=41, steps=2, hidden=16), summary_hidden=32,
             encoder_hidden=32),
+        sensors=TrainConfig.sensors[:2], nuisances=NuisanceConfig.none(),
         crop=32, scenes=2, cameras=2, windows=2, textures=16, steps=20, warmup=5),
 }
 

@@ -24,7 +24,14 @@ from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.config import PRESETS
 from evflow.errors import EvflowDataError
 from evflow.intensity import delta_log_intensity, lin_log
-from evflow.refine import Chunk, make_chunk, pixel_posterior, plan_chunks, refine_summary
+from evflow.refine import (
+    Chunk,
+    hot_pixels,
+    make_chunk,
+    pixel_posterior,
+    plan_chunks,
+    refine_summary,
+)
 from evflow.simulator.interpolate import MIN_SIDE
 from evflow.squash import SCALE, camera_std, per_channel, squash, unsquash_summary
 from evflow.types import Recording, Window
@@ -44,8 +51,9 @@ class CameraEstimate:
 
     camera, std: maps (H, W) and their standard deviations; summary, summary_std: the camera's
     medians and mismatch (scalars); valid: (H, W) bool, pixels with at least 3 events in the
-    windows used; n_events: (H, W) uint32 events there; windows: how many were used;
-    warnings: what to know before trusting it, a sentence each.
+    windows used that are not hot; n_events: (H, W) uint32 events there; hot: (H, W) bool, pixels
+    that fire by themselves; windows: how many were used; warnings: what to know before
+    trusting it, a sentence each.
     """
 
     camera: Camera
@@ -54,6 +62,7 @@ class CameraEstimate:
     summary_std: Summary
     valid: np.ndarray
     n_events: np.ndarray
+    hot: np.ndarray
     windows: int
     warnings: tuple[str, ...]
 
@@ -61,7 +70,7 @@ class CameraEstimate:
         """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events."""
         extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
         return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
-                                n_events=self.n_events)
+                                n_events=self.n_events, hot=self.hot)
 
     def as_dict(self) -> dict[str, Any]:
         """Summary, std and warnings as JSON-ready values."""
@@ -70,6 +79,7 @@ class CameraEstimate:
 
         return {"summary": floats(self.summary), "summary_std": floats(self.summary_std),
                 "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
+                "hot_pixels": [[int(x), int(y)] for y, x in np.argwhere(self.hot)],
                 "windows": self.windows, "warnings": list(self.warnings)}
 
 
@@ -106,7 +116,10 @@ def estimate_camera(
     stats, n_events = _pool(params, windows())
     summary, summary_std = model.finish(params, stats)
     chunks = refinement_chunks(recording, plan.pairs) if refine == "auto" else []
+    hot = np.zeros(n_events.shape, bool)
     if chunks:
+        hot = hot_pixels(chunks, float(summary.eta_on + summary.eta_off))
+        chunks = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
         fusion = next(iter(params.values())).get("fusion")
         refined = refine_summary(chunks, summary, summary_std, fusion)
         summary, summary_std = refined.summary, refined.std
@@ -114,8 +127,8 @@ def estimate_camera(
     if chunks:
         camera, std = _with_regression(camera, std, chunks, summary, summary_std)
     return CameraEstimate(
-        camera, std, summary, summary_std, n_events >= VALID_EVENTS, n_events,
-        len(plan.pairs), (*_condensed(plan.skipped), *_warnings(stats, n_events, summary)))
+        camera, std, summary, summary_std, (n_events >= VALID_EVENTS) & ~hot, n_events, hot,
+        len(plan.pairs), (*_condensed(plan.skipped), *_warnings(stats, n_events, summary, hot)))
 
 
 def window_inputs(window: Window) -> tuple[np.ndarray, Array, dict[str, Array | float]]:
@@ -206,8 +219,14 @@ def _condensed(skipped: tuple[str, ...]) -> list[str]:
             for reason, frames in reasons.items()]
 
 
-def _warnings(stats: model.Stats, n_events: np.ndarray, summary: Summary) -> list[str]:
+def _warnings(
+    stats: model.Stats, n_events: np.ndarray, summary: Summary, hot: np.ndarray
+) -> list[str]:
     found = []
+    if hot.any():
+        y, x = np.argwhere(hot)[0]
+        found.append(f"{hot.sum()} hot pixels, the first at x={x}, y={y}: they fire while nothing "
+                     "moves, and were left out of the refinement.")
     low, high = PRESETS["default"].prior.theta
     for name, events in (("on", stats.events_on), ("off", stats.events_off)):
         theta = float(getattr(summary, f"theta_{name}"))

@@ -44,6 +44,13 @@ class Hidden:
     camera: Camera
     nominal: Summary
 
+    def signal_events(self) -> np.ndarray:
+        """ON and OFF events (2,) less those that noise is expected to send."""
+        events = self.recording.events
+        seconds = 1e-6 * events.duration_us
+        noise = [float(m.sum()) * seconds for m in (self.camera.eta_on, self.camera.eta_off)]
+        return np.array([events.p.sum(), (~events.p).sum()]) - np.array(noise)
+
 
 BLOCK = 64  # frames rendered at a time: one compiled program for recordings of any length
 

@@ -13,6 +13,7 @@ from networks import small_config
 from evflow.batch import Batch
 from evflow.batch import sample_batch as sample_batch_eagerly
 from evflow.camera import CameraPrior, SensorModel
+from evflow.config import PRESETS
 from evflow.scenes import SceneConfig, TextureBank, make_bank
 
 sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
@@ -82,3 +83,23 @@ def test_noise_target_is_the_rate_that_was_simulated(bank: TextureBank) -> None:
     rate = batch.voxels.sum((1, 2, 3, 4)) / (4 * 0.1 * 48 * 48)
     expected = batch.nominal.eta_on + batch.nominal.eta_off
     np.testing.assert_allclose(rate, expected, rtol=0.03)
+
+
+@pytest.mark.slow
+def test_nuisances_touch_what_they_say(bank: TextureBank) -> None:
+    """Every sensor model and nuisance of the default preset: finite data, frames that differ from
+    the true changes by more than their noise, some hot pixels, cameras that start fresh."""
+    default = PRESETS["default"]
+    plain = small_config(sensors=default.sensors)
+    nuisances = dataclasses.replace(default.nuisances, hot_pixels=0.2, fresh=1.0)
+    config = dataclasses.replace(plain, nuisances=nuisances)
+    batches = [[sample_batch(jax.random.key(k), bank, config=c) for k in range(4)]
+               for c in (plain, config)]
+    assert all(bool(jnp.isfinite(leaf).all()) for b in batches[1] for leaf in jax.tree.leaves(b))
+
+    def error(group: list[Batch]) -> float:
+        return float(np.mean([jnp.abs(b.dlogI - b.changes.sum(-1)).mean() for b in group]))
+
+    assert error(batches[1]) > 1.2 * error(batches[0])
+    hottest = [max(float(b.camera.eta_on.max()) for b in group) for group in batches]
+    assert hottest[0] < 5 < hottest[1]

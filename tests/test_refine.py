@@ -16,7 +16,7 @@ from evflow.camera import Camera, CameraPrior, Summary
 from evflow.intensity import lin_log
 from evflow.io import plan_windows
 from evflow.recording import refinement_chunks
-from evflow.refine import fused, pixel_posterior, plan_chunks, refine_summary
+from evflow.refine import fused, hot_pixels, pixel_posterior, plan_chunks, refine_summary
 from evflow.refine.fit import FusionNet
 from evflow.refine.moments import measure
 from evflow.refine.pixels import pixel_equations
@@ -162,9 +162,25 @@ def test_fusion_holds_features_inside_what_it_knows() -> None:
     net = FusionNet().init(jax.random.key(0), features)["params"]
     net = jax.tree.map(lambda p: p + 0.1, net)
     fusion = {"net": net, "mean": jnp.zeros(5), "scale": jnp.ones(5), "low": jnp.full(5, -1.0),
-              "high": jnp.ones(5)}
+              "high": jnp.ones(5), "widen": jnp.ones(6)}
     y = jnp.zeros(6)
     inside, std = fused(fusion, features, y)
     beyond, _ = fused(fusion, features.at[-1].set(9.0), y)
     np.testing.assert_array_equal(inside, beyond)
     assert bool((std > 0).all())
+
+
+def test_hot_pixels_are_those_that_fire_while_nothing_moves() -> None:
+    """Static scene, .3 Hz of noise everywhere, two pixels at 100 Hz."""
+    rng = np.random.default_rng(1)
+    shape, edges = (24, 32), np.arange(9) * 25_000
+    camera = Camera.constant(shape, eta_on=0.15, eta_off=0.15)
+    hot = np.zeros(shape, bool)
+    hot[3, 5] = hot[20, 30] = True
+    camera = dataclasses.replace(camera, eta_on=jnp.where(hot, 100.0, camera.eta_on))
+    scene = rng.uniform(40, 200, shape).astype(np.float32)
+    times = np.arange(201) * 1000
+    events = simulate(jax.random.key(3), np.broadcast_to(scene, (201, *shape)), times, camera)
+    recording = Recording(events, np.broadcast_to(scene, (9, *shape)).astype(np.uint8), edges)
+    chunks = refinement_chunks(recording, ((0, 2), (2, 4), (4, 6), (6, 8)))
+    np.testing.assert_array_equal(hot_pixels(chunks, 0.3), hot)

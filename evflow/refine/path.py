@@ -30,7 +30,8 @@ class Chunk:
     path: (K * steps + 1, H, W) float32 log intensity, the frames at every `steps`-th;
     bright: (H, W) bool, pixels whose frames are neither near black nor saturated; dt_s: (K,)
     interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
-    equations: (7, H, W) of each pixel's regression, see pixels.py.
+    equations: (7, H, W) of each pixel's regression, see pixels.py; quiet: (2, H, W) events in
+    intervals in which the pixel's path stays within QUIET, and their seconds.
     """
 
     path: np.ndarray
@@ -39,8 +40,11 @@ class Chunk:
     motion_px: np.ndarray
     recorded: Trace
     equations: np.ndarray
+    quiet: np.ndarray
 
 
+QUIET = 0.05  # log units: less than the smallest threshold of any use
+HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
 DARK_DN, SATURATED_DN = 15.0, 252.0  # below, half a DN of noise is .03 in log; above, it clips
 
 
@@ -76,7 +80,23 @@ def make_chunk(recording: Recording, run: list[int], steps: int = STEPS) -> Chun
         motion.append(moved)
     stack, fine = np.stack(frames), np.asarray(lin_log(np.stack(path)))
     bright = (stack.min(0) >= DARK_DN) & (stack.max(0) <= SATURATED_DN)
+    dt_s = np.diff(times).astype(np.float32) * 1e-6
+    trace = trace_of_events(recording.events, times, steps)
     return Chunk(
-        fine, bright, np.diff(times).astype(np.float32) * 1e-6, np.array(motion, np.float32),
-        trace_of_events(recording.events, times, steps),
-        pixel_equations(recording.events, times, fine, steps))
+        fine, bright, dt_s, np.array(motion, np.float32), trace,
+        pixel_equations(recording.events, times, fine, steps), _quiet(fine, trace, dt_s, steps))
+
+
+def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, steps: int) -> np.ndarray:
+    inner = path[1:].reshape(len(dt_s), steps, *path.shape[1:])
+    still = inner.max(1) - inner.min(1) < QUIET
+    events = (np.asarray(trace.counts).sum(1) * still).sum(0)
+    return np.stack([events, (dt_s[:, None, None] * still).sum(0)])
+
+
+def hot_pixels(chunks: list[Chunk], rate_hz: float) -> np.ndarray:
+    """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
+    happens in front of them; less than one in a million by chance."""
+    events, seconds = np.sum([c.quiet for c in chunks], 0)
+    expected = HOT_FACTOR * rate_hz * seconds
+    return events > expected + 5.0 * np.sqrt(expected) + HOT_EVENTS
