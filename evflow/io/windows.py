@@ -17,7 +17,8 @@ from evflow.errors import EvflowDataError
 from evflow.types import Recording, Window
 
 MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
-EDGE_US = 5_000  # the events may begin or end this much inside the first or last frame
+EDGE_US = 1_000  # the events may begin or end this much inside the first or last frame
+EDGE_EVENTS = 10  # or this many of the intervals at which events come there
 DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
 
 
@@ -83,10 +84,13 @@ def _window(recording: Recording, pair: tuple[int, int], index: int) -> Window:
 
 
 def _covered(recording: Recording) -> tuple[int, int]:
-    """The time range of the events, widened by their median interval or `EDGE_US`."""
+    """The time range of the events, widened by `EDGE_US` or a few of the intervals at which they
+    come near its ends: a slow scene has its first event some time after the camera started."""
     t = recording.events.t
-    edge = max(EDGE_US, int(np.median(np.diff(t))) if len(t) > 1 else 0)
-    return int(t[0]) - edge, int(t[-1]) + edge
+    if len(t) < 2:
+        return int(t[0]) - EDGE_US, int(t[-1]) + EDGE_US
+    first, last = (EDGE_EVENTS * int(np.median(np.diff(part))) for part in (t[:100], t[-100:]))
+    return int(t[0]) - max(EDGE_US, first), int(t[-1]) + max(EDGE_US, last)
 
 
 def _check_overlap(recording: Recording) -> None:
