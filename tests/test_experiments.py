@@ -65,9 +65,9 @@ def test_interrupted_training_equals_straight_training(tmp_path: Path) -> None:
 def test_evaluate_prints_the_paper_beside_ours(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    results = evaluate.main(evaluate.Options(out=tmp_path))
+    results = evaluate.main(evaluate.Options(out=tmp_path, sequences=4))
     assert "0.023" in capsys.readouterr().out
-    assert set(results) == {"0.03", "0.15"}
+    assert {"0.03", "0.15"} < set(results)
     row = results["0.03"]["theta_on"]
     assert 0 < row["summary"] < row["constant"]
     assert row["constant_truth"] == pytest.approx(0.024, abs=0.003)

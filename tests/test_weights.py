@@ -40,5 +40,7 @@ def test_shipped_weights_are_small_finite_and_explained() -> None:
     assert weights_path().stat().st_size <= 6e6
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(load_weights()))
     card = model_card()
-    assert card["steps"] > 100
-    assert {"config", "seed", "preset", "training_figures", "versions"} <= set(card)
+    for part in ("pixels", "summary"):
+        assert card[part]["steps"] > 100
+        assert {"config", "seed", "preset", "training_figures", "versions"} <= set(card[part])
+    assert card["fusion"]["recordings"] > 100
