@@ -14,7 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import Camera, SensorModel, Summary, sample_nominal, sample_pixels
+from evflow.camera import (
+    THETA_MIN,
+    Camera,
+    SensorModel,
+    Summary,
+    sample_nominal,
+    sample_pixels,
+)
 from evflow.config import NuisanceConfig, TrainConfig
 from evflow.distributed import by_shard
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
@@ -120,6 +127,7 @@ def _sequence(
     reference = noise_factor(jnp.mean(normalised_intensity(frames[0])))
     nominal = sample_nominal(k_nominal, (), config.prior, reference)
     camera = sample_pixels(k_pixels, nominal, shape, config.prior.eta_spread)
+    camera = _with_odd_pixels(jax.random.fold_in(k_pixels, 2), camera, config.nuisances)
     camera = _with_hot_pixels(jax.random.fold_in(k_pixels, 1), camera, config.nuisances)
     log_frames = lin_log(frames)
     # A window is cut from a running camera, each pixel somewhere between its thresholds; or it
@@ -148,6 +156,20 @@ def _sequence(
         camera=_scale_noise(camera, gain),
         nominal=_scale_noise(nominal, gain),
     )
+
+
+def _with_odd_pixels(key: Array, camera: Camera, nuisances: NuisanceConfig) -> Camera:
+    """Some pixels' thresholds, both of them, are far from the camera's."""
+    if nuisances.odd_pixels == 0:
+        return camera
+    k_where, k_factor = jax.random.split(key)
+    odd = jax.random.bernoulli(k_where, nuisances.odd_pixels, camera.theta_on.shape)
+    low, high = np.log(nuisances.odd_factor[0]), np.log(nuisances.odd_factor[1])
+    factor = jnp.exp(jax.random.uniform(k_factor, odd.shape, minval=low, maxval=high))
+    factor = jnp.where(odd, factor, 1.0)
+    return dataclasses.replace(
+        camera, theta_on=jnp.maximum(camera.theta_on * factor, THETA_MIN),
+        theta_off=jnp.maximum(camera.theta_off * factor, THETA_MIN))
 
 
 def _with_hot_pixels(key: Array, camera: Camera, nuisances: NuisanceConfig) -> Camera:

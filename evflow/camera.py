@@ -181,10 +181,10 @@ class CameraPrior:
 
     theta: range of the nominal threshold, uniform, drawn apart for ON and OFF (paper: .1-.5).
     mismatch: range of the per-pixel standard deviation (v2e's default .03; the paper .15).
-    noise: "eq12" ties the rate to the threshold, eta = g R(theta) with g uniform in
-        [F, 1] (the intensity factor of Eq. 12) or, where the scene's intensity is known, half
-        of the time exactly that factor; "independent" draws it log-uniform in `eta`; "mixed"
-        takes either with equal chance; "none" is silent.
+    noise: "eq12" ties the rate to the threshold, eta = g R(theta) with the intensity factor g
+        of Eq. 12, uniform in [F, 1] where the scene's intensity is not known; "independent"
+        draws it log-uniform in `eta`; "mixed" takes either with equal chance, and a g that is
+        not the scene's in half of the tied cameras; "none" is silent.
     eta_spread: standard deviation of log eta from pixel to pixel.
     """
 
@@ -240,7 +240,8 @@ def sample_nominal(
         k_sigma, (2, *batch), minval=prior.mismatch[0], maxval=prior.mismatch[1])
     gain = jax.random.uniform(k_gain, (2, *batch), minval=0.25)
     if factor is not None:
-        gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), 0.5, batch),
+        loose = 0.5 if prior.noise == "mixed" else 0.0
+        gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), 1.0 - loose, batch),
                          factor, gain)
     tied = noise_of_threshold(theta) * gain
     lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])

@@ -1,4 +1,5 @@
-"""Frozen configurations and their presets: `paper` (as printed), `default` (ours), `debug`.
+"""Frozen configurations and their presets: `paper` (as printed), `default` and its `pixels`
+(ours), `debug`.
 
 A configuration is hashable (a static argument of jit), overridden with dataclasses.replace or
 from the command line, and saved as JSON with every result.
@@ -54,6 +55,7 @@ class LossConfig:
     confidence: weight L_P by the sample's share of the batch's events (lambda of Eq. 7).
     inverse_flow: weight of L_F' (Eq. 10). It is minus the log-det part of L_F, so it cancels
         or runs away unless small: 0 by default.
+    events: what L_E compares: "rate" the expected events, "edges" the paper's Eq. 9.
     patches: side lengths of the local patches of Eq. 9; edge: the log-intensity gradient per
         pixel at which a patch counts as an edge.
     """
@@ -61,14 +63,15 @@ class LossConfig:
     condition: float = 1.0
     change_l1: float = 1.0
     parameter: float = 1.0
-    flow: float = 0.02
+    flow: float = 0.1
     event: float = 1.0
     inverse_flow: float = 0.0
     summary: float = 2.0
     spread: float = 0.2
     adaptive: bool = True
     confidence: bool = False
-    dequantise: float = 0.02
+    dequantise: float = 0.01
+    events: Literal["rate", "edges"] = "rate"
     patches: tuple[int, ...] = (4, 8)
     edge: float = 0.1
 
@@ -78,6 +81,8 @@ class NuisanceConfig:
     """What real recordings add to the model; drawn anew for every sequence or scene.
 
     fresh: share of sequences whose pixel memory starts at the first frame, as in a simulation.
+    odd_pixels, odd_factor: share of pixels whose thresholds are off by a factor, whatever the
+        camera's mismatch.
     hot_pixels, hot_hz: largest share of hot pixels per polarity (half of the cameras have
         none), and their rates.
     jitter_s: largest standard deviation of the frame times' error; exposure_s: longest
@@ -86,6 +91,8 @@ class NuisanceConfig:
     """
 
     fresh: float = 0.3
+    odd_pixels: float = 0.0
+    odd_factor: tuple[float, float] = (0.4, 2.5)
     hot_pixels: float = 0.002
     hot_hz: tuple[float, float] = (5.0, 100.0)
     jitter_s: float = 0.001
@@ -158,10 +165,15 @@ MODELS = {"default": ModelConfig(), "paper": PAPER_MODEL}
 
 PRESETS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
+    # The default's parts that see pixels one by one: many small scenes rather than few large ones.
+    "pixels": TrainConfig(
+        nuisances=NuisanceConfig(odd_pixels=0.05), parts=("encoder", "flow", "spread"), crop=32,
+        block=(8, 8), windows=1, scenes=16, steps=4500),
     "paper": TrainConfig(
         model=PAPER_MODEL,
         loss=LossConfig(
-            change_l1=0.0, inverse_flow=0.5, flow=1.0, summary=0.0, spread=0.0, confidence=True),
+            events="edges", change_l1=0.0, inverse_flow=0.5, flow=1.0, summary=0.0, spread=0.0,
+            confidence=True),
         prior=CameraPrior(theta=(0.1, 0.5), mismatch=(0.15, 0.15), noise="eq12"),
         scene=SceneConfig.preset("paper"),
         sensors=(SensorModel(eta_intensity=True),), nuisances=NuisanceConfig.none(),

@@ -12,6 +12,8 @@ Array = jax.Array
 
 EPSILON = 1e-3  # of the Charbonnier losses (Eq. 7)
 COUNT_LIMIT = 6.0  # asinh(200): events per bin above it are no camera's, only an untrained flow's
+RARE = 0.1  # events per bin below which errors count alike
+FAR = 30.0  # standard deviations: pixels at the threshold's clamp fire a hundred times as often
 
 
 def condition_loss(logits: Array, target: Array, beta: float = 2.0) -> Array:
@@ -70,18 +72,44 @@ def event_loss(generated: Array, voxels: Array, dL: Array, sizes: tuple[int, ...
 
     generated: asinh of the generated voxels; voxels: the true ones. Where edges move, they
     themselves are compared (Charbonnier on asinh: counts span three decades); elsewhere only
-    the events per patch and polarity, as a Gaussian likelihood of variance count + 1.
+    the events per patch and polarity.
     """
     error = charbonnier(generated - jnp.arcsinh(voxels))
-    events = jnp.sinh(jnp.clip(generated, -COUNT_LIMIT, COUNT_LIMIT))
+    events = linear(generated)
     total = jnp.zeros(voxels.shape[:-3])
     for size in sizes:
         moving = edge_weight(dL, size, edge)
         values = _patches(error, size).mean((-3, -2, -1))
-        counts, true = _counts(jax.nn.elu(events), size), _counts(voxels, size)
-        noise = (0.5 * (counts - true) ** 2 / (true + 1.0)).mean(-1) / size**2
+        noise = dispersion(_counts(events, size), _counts(voxels, size), 1.0).mean(-1) / size**2
         total += (moving * values + (1.0 - moving) * noise).mean(-1)
     return total
+
+
+def rate_loss(generated: Array, voxels: Array, sizes: tuple[int, ...]) -> Array:
+    """L_E for generated voxels that are *expected* events: (..., h, w, 2B) -> (...).
+
+    Charbonnier errors (Eq. 9) pull towards the median, which for rare events is none at all;
+    these pull towards the mean, bin by bin and in the counts per patch and polarity.
+    """
+    events = linear(generated)
+    total = dispersion(events, voxels, RARE).mean((-3, -2, -1))
+    for size in sizes:
+        counts = dispersion(_counts(events, size), _counts(voxels, size), 1.0)
+        total += counts.mean((-2, -1)) / size**2
+    return total
+
+
+def linear(generated: Array) -> Array:
+    """Events of their asinh, within what a camera can send."""
+    return jnp.sinh(jnp.clip(generated, -COUNT_LIMIT, COUNT_LIMIT))
+
+
+def dispersion(made: Array, true: Array, floor: float) -> Array:
+    """(made - true)^2 over twice the variance that `made` predicts, linear beyond FAR deviations.
+    The weight must not know `true`: divided by true + 1, it would favour too few events."""
+    deviation = jnp.sqrt(jax.nn.relu(jax.lax.stop_gradient(made)) + floor)
+    error = (made - true) / deviation
+    return FAR**2 * (jnp.sqrt(1.0 + (error / FAR) ** 2) - 1.0)
 
 
 def _patches(x: Array, size: int) -> Array:

@@ -26,6 +26,7 @@ from evflow.errors import EvflowDataError
 from evflow.intensity import delta_log_intensity, lin_log
 from evflow.refine import (
     Chunk,
+    dead_pixels,
     hot_pixels,
     make_chunk,
     pixel_posterior,
@@ -51,9 +52,9 @@ class CameraEstimate:
 
     camera, std: maps (H, W) and their standard deviations; summary, summary_std: the camera's
     medians and mismatch (scalars); valid: (H, W) bool, pixels with at least 3 events in the
-    windows used that are not hot; n_events: (H, W) uint32 events there; hot: (H, W) bool, pixels
-    that fire by themselves; windows: how many were used; warnings: what to know before
-    trusting it, a sentence each.
+    windows used that are not hot; n_events: (H, W) uint32 events there; hot, dead: (H, W) bool,
+    pixels that fire by themselves, and pixels that never do amid others that do; windows: how
+    many were used; warnings: what to know before trusting it, a sentence each.
     """
 
     camera: Camera
@@ -63,6 +64,7 @@ class CameraEstimate:
     valid: np.ndarray
     n_events: np.ndarray
     hot: np.ndarray
+    dead: np.ndarray
     windows: int
     warnings: tuple[str, ...]
 
@@ -70,16 +72,19 @@ class CameraEstimate:
         """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events."""
         extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
         return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
-                                n_events=self.n_events, hot=self.hot)
+                                n_events=self.n_events, hot=self.hot, dead=self.dead)
 
     def as_dict(self) -> dict[str, Any]:
         """Summary, std and warnings as JSON-ready values."""
         def floats(s: Summary) -> dict[str, float]:
             return {k: float(v) for k, v in dataclasses.asdict(s).items()}
 
+        def places(mask: np.ndarray) -> list[list[int]]:
+            return [[int(x), int(y)] for y, x in np.argwhere(mask)]
+
         return {"summary": floats(self.summary), "summary_std": floats(self.summary_std),
                 "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
-                "hot_pixels": [[int(x), int(y)] for y, x in np.argwhere(self.hot)],
+                "hot_pixels": places(self.hot), "dead_pixels": places(self.dead),
                 "windows": self.windows, "warnings": list(self.warnings)}
 
 
@@ -107,7 +112,7 @@ def estimate_camera(
 
     def windows() -> Iterator[Window]:
         nonlocal done
-        for window in io.iter_windows(recording, min_window_us):
+        for window in io.iter_windows(recording, min_window_us, plan):
             yield window
             done += 1
             if progress:
@@ -126,9 +131,11 @@ def estimate_camera(
     camera, std = _fuse(params, windows(), summary, summary_std)
     if chunks:
         camera, std = _with_regression(camera, std, chunks, summary, summary_std)
+    dead = dead_pixels(n_events)
     return CameraEstimate(
-        camera, std, summary, summary_std, (n_events >= VALID_EVENTS) & ~hot, n_events, hot,
-        len(plan.pairs), (*_condensed(plan.skipped), *_warnings(stats, n_events, summary, hot)))
+        camera, std, summary, summary_std, (n_events >= VALID_EVENTS) & ~hot, n_events, hot, dead,
+        len(plan.pairs),
+        (*_condensed(plan.skipped), *_warnings(stats, n_events, summary, hot, dead)))
 
 
 def window_inputs(window: Window) -> tuple[np.ndarray, Array, dict[str, Array | float]]:
@@ -220,13 +227,17 @@ def _condensed(skipped: tuple[str, ...]) -> list[str]:
 
 
 def _warnings(
-    stats: model.Stats, n_events: np.ndarray, summary: Summary, hot: np.ndarray
+    stats: model.Stats, n_events: np.ndarray, summary: Summary, hot: np.ndarray, dead: np.ndarray
 ) -> list[str]:
     found = []
-    if hot.any():
-        y, x = np.argwhere(hot)[0]
-        found.append(f"{hot.sum()} hot pixels, the first at x={x}, y={y}: they fire while nothing "
-                     "moves, and were left out of the refinement.")
+    for name, mask, what in (
+        ("hot", hot, "they fire while nothing moves, and were left out of the refinement."),
+        ("dead", dead, "they never fire while all around them do; the maps show the camera's "
+         "summary there."),
+    ):
+        if mask.any():
+            y, x = np.argwhere(mask)[0]
+            found.append(f"{mask.sum()} {name} pixels, the first at x={x}, y={y}: {what}")
     low, high = PRESETS["default"].prior.theta
     for name, events in (("on", stats.events_on), ("off", stats.events_off)):
         theta = float(getattr(summary, f"theta_{name}"))

@@ -175,15 +175,41 @@ def pixel_losses(
     code and summary, odd ones on the predicted: otherwise the flow fitted to predicted codes
     and its inverse at true codes would be two different maps.
     """
-    c, flow_config = config.model, config.model.flow
-    k_dequantise, k_latent = jax.random.split(key)
+    c = config.model
     even = (jnp.arange(known.shape[0]) // config.cameras % 2 == 0)[:, None]
     y6 = _over(jnp.where(even, known, seen), block.y)
     predicted, logits = network.encode_changes(
         c, net, block.voxels, block.dlogI, block.context, y6)
+    parts = {"condition": losses.condition_loss(
+        logits, encoder.targets(c, block.changes)).mean()}
     changes = predicted
     if c.code == "changes":
-        changes = jnp.where(even[:, None, None], encoder.split_sign(block.changes), predicted)
+        parts["change_l1"] = _change_loss(predicted, block.changes)
+        # The encoder answers to the true changes alone: what would serve the flow better is no
+        # change of intensity any more, and a video could not supply it.
+        changes = jnp.where(even[:, None, None], encoder.split_sign(block.changes),
+                            jax.lax.stop_gradient(predicted))
+    if config.parts == ("encoder",) and c.code == "changes":
+        return parts, {}
+    flow_parts, metrics = _flow_losses(net, block, changes, y6, even, key, config)
+    return parts | flow_parts, metrics
+
+
+def _change_loss(predicted: Array, changes: Array) -> Array:
+    """Charbonnier of rises and falls in each part of the window, and of what they add up to."""
+    up, down = jnp.split(predicted, 2, -1)
+    off = jnp.cumsum(up - down - changes, -1)
+    return (losses.charbonnier(predicted - encoder.split_sign(changes)).mean()
+            + losses.charbonnier(off).mean())
+
+
+def _flow_losses(
+    net: dict[str, Any], block: Block, changes: Array, y6: Array, even: Array, key: Array,
+    config: TrainConfig,
+) -> tuple[Metrics, Metrics]:
+    """Losses of the flow at the given changes, forward and inverse, and of the spread."""
+    c, flow_config = config.model, config.model.flow
+    k_dequantise, k_latent = jax.random.split(key)
     u = network.condition(c, changes, block.context, y6)
     centre = network.centre(c, y6)
     # The small noise that keeps L_F finite on zero-inflated counts serves L_P as well: a second
@@ -197,23 +223,26 @@ def pixel_losses(
     if not flow_config.asinh:
         generated = jnp.arcsinh(generated)
     parts = {
-        "condition": losses.condition_loss(logits, encoder.targets(c, block.changes)).mean(),
         "parameter": _parameter_loss(y, block, config),
         "flow": losses.flow_loss(
             network.log_normal(y, y6[..., :4], network.base_std(y6)).sum(-1) if c.pool
             else jnp.zeros(log_det.shape),
             network.log_normal(z, 0.0, jnp.ones(())).sum(-1), log_det).mean(),
-        "event": losses.event_loss(generated, block.voxels, block.changes.sum(-1),
-                                   config.loss.patches, config.loss.edge).mean(),
+        "event": _event_loss(generated, block, config.loss),
         "inverse_flow": losses.inverse_flow_loss(inverse_det).mean(),
     }
     if c.code == "changes":
-        error = predicted - encoder.split_sign(block.changes)
-        parts["change_l1"] = losses.charbonnier(error).mean()
         spread = network.spread(net, block.voxels, block.dlogI, block.context, u)
         nll = losses.gaussian_nll(jax.lax.stop_gradient(y) - block.y, spread).mean((1, 2, 3))
         parts["spread"] = jnp.where(even[:, 0], 0.0, 2.0 * nll).mean()
     return parts, {"pixel/y": jnp.abs(y - block.y).mean(), "max_z": jnp.abs(z).max()}
+
+
+def _event_loss(generated: Array, block: Block, config: LossConfig) -> Array:
+    if config.events == "rate":
+        return losses.rate_loss(generated, block.voxels, config.patches).mean()
+    return losses.event_loss(generated, block.voxels, block.changes.sum(-1), config.patches,
+                             config.edge).mean()
 
 
 def _parameter_loss(y: Array, block: Block, config: TrainConfig) -> Array:

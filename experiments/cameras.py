@@ -7,6 +7,7 @@ frame. Everything follows from the key.
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import numpy as np
 
 from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior, SensorModel, Summary, sample_nominal, sample_pixels
+from evflow.config import PRESETS
 from evflow.intensity import noise_factor, normalised_intensity
 from evflow.scenes import Scene, TextureBank, render, sample_scene
 from evflow.scenes.config import SceneConfig
@@ -43,6 +45,10 @@ class Hidden:
     recording: Recording
     camera: Camera
     nominal: Summary
+
+    video: np.ndarray
+    """(T, H, W) DN at 1000 frames/s, of which the recording keeps the frames `kept` (K+1,)."""
+    kept: np.ndarray
 
     def signal_events(self) -> np.ndarray:
         """ON and OFF events (2,) less those that noise is expected to send."""
@@ -86,4 +92,24 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
     return Hidden(
         Recording(events, gray, times[kept]),
         dataclasses.replace(camera, eta_on=camera.eta_on * gain, eta_off=camera.eta_off * gain),
-        dataclasses.replace(nominal, **seen))
+        dataclasses.replace(nominal, **seen), frames, kept)
+
+
+FRAME_MS = (10, 20, 25, 25, 33, 40)
+INTERVALS = (8, 8, 8, 16, 24)
+
+
+def draw_protocol(rng: np.random.Generator) -> Protocol:
+    """One of the whole training distribution: frame rates of 25-100 Hz, .08-1 s, every sensor
+    model, both starts."""
+    config = PRESETS["default"]
+    mismatch = float(rng.choice([0.03, rng.uniform(*config.prior.mismatch), 0.15]))
+    prior = dataclasses.replace(config.prior, mismatch=(mismatch, mismatch))
+    if rng.random() < 0.5:  # half as in the paper, where accuracy is compared
+        tied: Literal["eq12", "independent"] = "eq12" if rng.random() < 0.5 else "independent"
+        prior = CameraPrior(mismatch=(mismatch, mismatch), noise=tied)
+    return Protocol(
+        prior=prior, scene=config.scene,
+        model=config.sensors[int(rng.choice(len(config.sensors), p=[0.4, 0.2, 0.3, 0.1]))],
+        frame_ms=int(rng.choice(FRAME_MS)), intervals=int(rng.choice(INTERVALS)),
+        frame_noise_dn=float(rng.choice([0.0, 0.5])), fresh=bool(rng.random() < 0.4))

@@ -49,7 +49,7 @@ class Options:
 
     out: Path
     """Folder of the run."""
-    preset: Literal["default", "paper", "debug"] = "default"
+    preset: Literal["default", "pixels", "paper", "debug"] = "default"
     steps: int | None = None
     """Number of steps (default: the preset's)."""
     scenes: int | None = None

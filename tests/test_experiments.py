@@ -12,7 +12,18 @@ import pytest
 
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card
-from experiments import calibrate, evaluate, quickstart, train
+from experiments import (
+    ablate,
+    calibrate,
+    changes,
+    coverage,
+    curves,
+    evaluate,
+    generate,
+    limits,
+    quickstart,
+    train,
+)
 
 
 def test_quickstart_draws_truth_beside_estimate(
@@ -71,3 +82,51 @@ def test_evaluate_prints_the_paper_beside_ours(
     row = results["0.03"]["theta_on"]
     assert 0 < row["summary"] < row["constant"]
     assert row["constant_truth"] == pytest.approx(0.024, abs=0.003)
+
+
+@pytest.mark.slow
+def test_limits_give_ratios(tmp_path: Path) -> None:
+    result = limits.main(limits.Options(out=tmp_path, sequences=3))
+    row = result["0.03"]["theta_on, all"]
+    assert row["ratio"] == pytest.approx(row["ours"] / row["limit"])
+    assert 0 < result["0.03 free noise"]["eta_on, all"]["limit"] < 0.1
+
+
+@pytest.mark.slow
+def test_coverage_counts_what_it_says(tmp_path: Path) -> None:
+    result = coverage.main(coverage.Options(out=tmp_path, recordings=6))
+    for curves_of in result["curves"].values():
+        for curve in curves_of.values():
+            assert (np.diff(curve) >= 0).all()
+    counted = sum(v["recordings"] for k, v in result["strata"].items()
+                  if k.startswith("theta_on, seconds"))
+    assert counted == result["cameras"]
+    assert cv2.imread(str(tmp_path / "coverage.png")) is not None
+
+
+@pytest.mark.slow
+def test_curves_are_drawn(tmp_path: Path) -> None:
+    result = curves.main(curves.Options(out=tmp_path, recordings=1))
+    assert {"frame interval [ms]", "duration [ms]", "signal events"} < set(result)
+    assert cv2.imread(str(tmp_path / "curves.png")) is not None
+
+
+@pytest.mark.slow
+def test_generated_events_are_compared_with_simulated_ones(tmp_path: Path) -> None:
+    result = generate.main(generate.Options(out=tmp_path, scenes=2, shape=(32, 32)))
+    assert {"as it is", "ON halved", "single pixels doubled", "auroc"} < set(result)
+    assert 0 < result["as it is"]["two simulations"] <= 1
+
+
+@pytest.mark.slow
+def test_the_encoder_is_scored_beside_frames_and_events(tmp_path: Path) -> None:
+    result = changes.main(changes.Options(out=tmp_path, batches=1))
+    assert result["frames alone"]["log"] < result["no change"]["log"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", ["losses", "steps", "networks"])
+def test_ablations_train_and_score(study: ablate.Study, tmp_path: Path) -> None:
+    result = ablate.main(ablate.Options(study, out=tmp_path, steps=2, batches=1))
+    assert len(result) == 2
+    assert all(np.isfinite(row["pixel/theta_on"]) for row in result.values())

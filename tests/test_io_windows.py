@@ -111,3 +111,51 @@ def test_real_windows(data_file: Callable[[str], Path]) -> None:
     slider = read_recording(data_file("data/recordings/ijrr_slider_depth"))
     plan = plan_windows(slider)  # 38.8 ms apart: two intervals each; frame 0 is 3.8 ms too early
     assert plan.pairs == ((1, 3),)
+
+
+def filmed(frames: np.ndarray, share: float = 0.0) -> Recording:
+    """Frames 40 ms apart; a share of the pixels has an event after every frame."""
+    count, height, width = frames.shape
+    y, x = np.nonzero(np.random.default_rng(0).random((height, width)) < share)
+    t = np.repeat(np.arange(count - 1) * 40_000 + 10_000, len(x))
+    ends = np.array([0, (count - 1) * 40_000])
+    x, y = (np.concatenate([np.tile(a, count - 1), [0, 0]]) for a in (x, y))
+    t = np.concatenate([t, ends])
+    order = np.argsort(t, kind="stable")
+    events = Events(x[order], y[order], t[order], np.ones(len(t), bool), (width, height))
+    return Recording(events, frames.astype(np.uint8), np.arange(count) * 40_000)
+
+
+def texture(count: int) -> np.ndarray:
+    """A bright square that moves over a random picture, (count, 48, 64)."""
+    still = np.random.default_rng(1).integers(40, 160, (48, 64))
+    frames = np.repeat(still[None], count, 0)
+    for i in range(count):
+        frames[i, 10:30, 3 * i:3 * i + 20] = 200
+    return frames
+
+
+def test_a_moving_scene_has_no_faults() -> None:
+    plan = plan_windows(filmed(texture(8)))
+    assert len(plan.pairs) == 7
+    assert plan.skipped == ()
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_windows_at_a_black_or_white_frame_are_left_out(level: int) -> None:
+    frames = texture(8)
+    frames[3] = level
+    plan = plan_windows(filmed(frames))
+    assert plan.pairs == ((0, 1), (1, 2), (4, 5), (5, 6), (6, 7))
+    assert len(plan.skipped) == 1
+    assert "glitch" in plan.skipped[0]
+
+
+def test_exposure_changes_are_left_out_and_changes_of_light_are_not() -> None:
+    frames = texture(6)
+    frames[3:] = np.rint(frames[3:] * 1.2)
+    plan = plan_windows(filmed(frames))
+    assert plan.pairs == ((0, 1), (1, 2), (3, 4), (4, 5))
+    assert "+20%" in plan.skipped[0]
+    assert "auto-exposure" in plan.skipped[0]
+    assert len(plan_windows(filmed(frames, share=0.8)).pairs) == 5

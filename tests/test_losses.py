@@ -58,6 +58,31 @@ def test_event_loss_survives_wild_flows() -> None:
     assert np.isfinite(grad(jnp.full((4, 4, 32), 200.0))).all()
 
 
+@pytest.mark.parametrize("mean", [0.05, 0.7, 20.0])
+def test_dispersion_is_least_at_the_mean(mean: float) -> None:
+    """Rare events have median 0, and weights that know the truth would favour fewer."""
+    true = jnp.asarray(np.random.default_rng(0).poisson(mean, 200_000), jnp.float32)
+    slope = jax.vmap(jax.grad(lambda made: losses.dispersion(made, true, 0.1).mean()))
+    tried = jnp.linspace(0.5 * mean, 1.5 * mean, 201)
+    best = tried[jnp.argmin(jnp.abs(slope(tried)))]
+    assert float(best) == pytest.approx(mean, rel=0.03)
+
+
+def test_rate_loss_wants_expected_events_in_every_bin() -> None:
+    voxels = jnp.asarray(np.random.default_rng(1).poisson(0.3, (2000, 4, 4, 32)), jnp.float32)
+
+    def loss(made: jax.Array) -> jax.Array:
+        return losses.rate_loss(jnp.broadcast_to(jnp.arcsinh(made), voxels.shape), voxels,
+                                (4,)).mean()
+
+    even = jnp.full((32,), 0.3)
+    assert float(loss(even)) < float(loss(0.7 * even))
+    assert float(loss(even)) < float(loss(1.3 * even))
+    # The right total at the wrong times is worse.
+    assert float(loss(even)) < float(loss(even.at[:16].mul(0.5).at[16:].mul(1.5)))
+    assert np.isfinite(jax.grad(loss)(jnp.full((32,), 1e4))).all()
+
+
 @pytest.mark.parametrize(("loss", "weight"), [
     (2.3e3, 1e-3), (-47.0, 0.1), (9.99, 1.0), (0.01, 1.0), (10.0, 0.1)])
 def test_adaptive_weight(loss: float, weight: float) -> None:

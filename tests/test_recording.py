@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from networks import SHAPE, hidden
+from scipy import ndimage
 
 from evflow import Camera, Events, Recording, estimate_camera, load_weights
 from evflow.camera import PARAMETERS
@@ -45,6 +46,7 @@ def test_maps_have_the_camera_in_the_quiet_and_width_everywhere(
     assert found.n_events.sum() == len(inside)
     assert (found.valid == ((found.n_events >= 3) & ~found.hot)).all()
     assert found.hot.mean() < 0.01
+    assert found.dead.mean() < 0.01
 
 
 def test_saved_and_loaded(watched: tuple[Recording, Camera], tmp_path: Path) -> None:
@@ -66,6 +68,18 @@ def test_polarity_without_events_is_said_to_be_undetermined(
     only_on = Events(events.x[on], events.y[on], events.t[on], events.p[on], events.size)
     found = estimate_camera(dataclasses.replace(watched[0], events=only_on))
     assert any("theta_off is undetermined" in w for w in found.warnings)
+
+
+def test_a_dead_pixel_is_listed(watched: tuple[Recording, Camera]) -> None:
+    events = watched[0].events
+    around = ndimage.median_filter(events.count_map().sum(0), 5)
+    y, x = np.unravel_index(np.argmax(around), SHAPE)
+    kept = ~((events.x == x) & (events.y == y))
+    rest = Events(events.x[kept], events.y[kept], events.t[kept], events.p[kept], events.size)
+    found = estimate_camera(dataclasses.replace(watched[0], events=rest), refine="off")
+    assert found.dead[y, x]
+    assert [int(x), int(y)] in found.as_dict()["dead_pixels"]
+    assert any("dead pixels" in w for w in found.warnings)
 
 
 def test_refusals(watched: tuple[Recording, Camera]) -> None:

@@ -1,8 +1,8 @@
 """Windows: the pieces of a recording between two frames, from which a camera is estimated.
 
 A window runs from one frame to the first that is at least `min_us` later; the next begins where
-it ends. Only windows that the events cover are used, and none across a dropped frame: there the
-brightness path between its two frames is unknown for too long.
+it ends. Only windows that the events cover are used, and none across a dropped or a faulty frame:
+there the brightness path between its two frames is unknown for too long, or wrong.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.glitches import faulty_frames
 from evflow.types import Recording, Window
 
 MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
@@ -42,6 +43,7 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     times = recording.frame_times
     start, stop = _covered(recording)
     late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
+    glitches, steps = faulty_frames(recording)
     pairs: list[tuple[int, int]] = []
     skipped: list[str] = []
     first = 0
@@ -55,6 +57,12 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
                 f"frames {first}-{last}: no frame for {lost_ms:.1f} ms after frame {i} (dropped?)")
             first = i + 1
             continue
+        faults = [(i, why) for i, why in glitches.items() if first <= i <= last] + [
+            (i, why) for i, why in steps.items() if first <= i < last]
+        if faults:
+            skipped += [f"frames {first}-{last}: {why}" for _, why in faults[:1]]
+            first = max(i for i, _ in faults) + 1
+            continue
         if outside:
             skipped.append(f"frames {first}-{last}: not covered by the events")
         else:
@@ -63,12 +71,15 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     return WindowPlan(tuple(pairs), tuple(skipped))
 
 
-def iter_windows(recording: Recording, min_us: int = MIN_US) -> Iterator[Window]:
-    """The windows of `plan_windows`, in time order, their events as views.
+def iter_windows(
+    recording: Recording, min_us: int = MIN_US, plan: WindowPlan | None = None
+) -> Iterator[Window]:
+    """The windows of `plan_windows` (or of a plan made before), in time order, their events as
+    views.
 
     Raises what `plan_windows` raises, and EV017 where no window is left.
     """
-    plan = plan_windows(recording, min_us)
+    plan = plan_windows(recording, min_us) if plan is None else plan
     if not plan.pairs:
         why = "; ".join(plan.skipped[:3]) or "the frames span less than that"
         raise EvflowDataError(

@@ -1,10 +1,10 @@
 """From moments to the camera's summary: a few Gauss-Newton steps, then a small fusion network.
 
 The steps move log theta until the balance of the simulated recording equals that of the recorded
-one, held by the network's estimate where the data say little; the noise rates follow from the
-quiet pixels. What is left over (every residual, how many events carry it, how fast things move)
-goes into `FusionNet`, trained on simulated recordings, which corrects the estimate and says how
-sure it is.
+one, held by the network's estimate where the data say little; the noise rates come from the quiet
+pixels (noise.py). What is left over (every residual, how many events carry it, how fast things
+move) goes into `FusionNet`, trained on simulated recordings, which corrects the estimate and says
+how sure it is.
 """
 
 from __future__ import annotations
@@ -18,9 +18,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import THETA_MIN, Camera, Summary, noise_of_threshold
+from evflow.camera import THETA_MIN, Camera, Summary
+from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log_inverse, noise_factor, normalised_intensity
 from evflow.refine.moments import Moments, measure
+from evflow.refine.noise import (
+    combined_rate,
+    quiet_events,
+    rate_error,
+    stratum_rates,
+    tied_probability,
+    tied_rates,
+)
 from evflow.refine.path import STEPS, Chunk
 from evflow.refine.trace import trace_of_camera
 from evflow.squash import squash_summary, summary_std, unsquash_summary
@@ -32,8 +41,7 @@ LONGEST_STEP = 0.5  # log theta per pass
 MODEL_ERROR = 0.04  # of a balance residual, beside the counts' own: what interpolation leaves
 EMPTY = 0.3  # balance weight below which there is no residual to speak of
 FRESH_ODDS = 2.0  # log odds that it takes to call a start fresh: few recordings do
-FURTHEST_NOISE = 1.5  # standard deviations of the network's log eta
-SIGNAL_ERROR = 1.0  # relative error of the signal expected among quiet pixels: the path is a guess
+THETA_ERROR = 0.05  # relative error of the stepped thresholds, for the noise that follows them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -116,6 +124,8 @@ class _Fit:
             self.prior, 1e-3)
         self.prior_std = np.clip(relative, 0.02, 2.0)
         self.values = self.prior.copy()
+        self.quiet = np.sum([quiet_events(c, STEPS) for c in chunks], 0)
+        self.values[2:4] = combined_rate(self.quiet, self.prior[2:4], self.prior_std[2:4])
         self.fresh = 0.0
         self.recorded = _total([_recorded(c.recorded, c.path, c.dt_s, c.bright, STEPS)
                                 for c in chunks])
@@ -140,7 +150,7 @@ class _Fit:
         self.fresh = float(log_likelihood[1] > log_likelihood[0] + FRESH_ODDS)
 
     def step(self, offset: float) -> None:
-        """One Gauss-Newton step of log theta, and the noise rates of the quiet pixels."""
+        """One Gauss-Newton step of log theta."""
         values = np.stack([self.values] * 3)
         values[1, 0] *= np.exp(offset)
         values[2, 1] *= np.exp(offset)
@@ -157,23 +167,6 @@ class _Fit:
         change = -np.linalg.solve(curvature, gradient)
         self.values[:2] *= np.exp(np.clip(change, -LONGEST_STEP, LONGEST_STEP))
         self.values[:2] = np.clip(self.values[:2], 0.02, 2.0)
-        self.values[2:4] = self.noise(jax.tree.map(lambda a: a.mean(0), moments))
-
-    def noise(self, simulated: Moments) -> np.ndarray:
-        """Noise rates: of each quiet stratum, recorded events less the simulated signal, weighed
-        by how well each is known, the network's estimate among them."""
-        seen, made = np.asarray(self.recorded.quiet), np.asarray(simulated.quiet)
-        seconds = seen[:, 2:] + 1e-6
-        signal = np.maximum(made[:, :2] - self.values[None, 2:4] * made[:, 2:], 0.0)
-        rate = np.maximum(seen[:, :2] - signal, 0.0) / seconds
-        variance = (seen[:, :2] + 1.0 + (SIGNAL_ERROR * signal) ** 2) / seconds**2
-        prior = (self.prior_std[2:4] * self.prior[2:4]) ** 2 + 1e-6
-        weight = 1.0 / variance
-        found = (rate * weight).sum(0) + self.prior[2:4] / prior
-        found = np.maximum(found / (weight.sum(0) + 1.0 / prior), 2e-3)
-        # Where the path misses a motion, its signal passes for noise: the network's word limits.
-        furthest = np.exp(FURTHEST_NOISE * self.prior_std[2:4])
-        return np.clip(found, self.prior[2:4] / furthest, self.prior[2:4] * furthest)
 
     def features(self) -> np.ndarray:
         """Everything the fusion sees, (F,), at the final values."""
@@ -184,11 +177,9 @@ class _Fit:
             return np.log((getattr(seen, name) + 1.0) / (getattr(made, name) + 1.0))
 
         residual = balance_residual(seen, theta) - balance_residual(made, theta)
-        n, expected = seen.quiet[:, :2], made.quiet[:, :2]
         size = seen.balance[..., 3]
         motion = np.concatenate([c.motion_px for c in self.chunks])
         light = np.mean([c.path[0].mean() for c in self.chunks])
-        tie = np.log(np.asarray(noise_of_threshold(jnp.asarray(theta))) * self.factor())
         pixels = max(float(seen.pixels), 1.0)
         parts = [
             np.log(self.values / self.prior)[:4], np.log(self.prior_std),
@@ -196,14 +187,23 @@ class _Fit:
             ratio("roots"), ratio("active"), ratio("events"), [ratio("early")],
             np.log(square_residual(seen, theta) / square_residual(made, theta)),
             np.log(size[[0, -1]] + EMPTY).ravel(), np.log(seen.events + 1.0),
-            np.log((seen.active + 1.0) / pixels), np.log(seen.quiet[:, 2] + 1.0),
-            ((n - expected) / np.sqrt(n + expected + 1.0)).ravel(),
-            tie, tie - np.log(self.values[2:4]), np.log([float(seen.exposure) + 1.0, pixels]),
+            np.log((seen.active + 1.0) / pixels), *self.noise_features(),
+            np.log([float(seen.exposure) + 1.0, pixels]),
             [np.log(motion.mean() + 0.1), np.log(motion.max() + 0.1), light, self.fresh,
              np.log(np.mean([c.dt_s.mean() for c in self.chunks]) / 0.025)],
         ]
         return np.concatenate([np.asarray(p, np.float64).ravel() for p in parts]).astype(
             np.float32)
+
+    def noise_features(self) -> list[np.ndarray]:
+        """What the strata say beside their combination, and whether the noise follows Eq. 12."""
+        rates = stratum_rates(self.quiet, self.prior[2:4], self.prior_std[2:4])
+        theta, found = self.values[:2], np.log(self.values[2:4])
+        foretold, error = tied_rates(theta, THETA_ERROR * theta, self.factor())
+        away = found - np.log(foretold)
+        tied = tied_probability(away, np.hypot(error, rate_error(self.quiet)))
+        return [np.log(rates) - found, np.log(self.quiet + 1.0), np.clip(away, -2.0, 2.0),
+                tied * away, np.array([tied])]
 
     def factor(self) -> float:
         """Mean intensity factor of Eq. 12 over the frames."""
@@ -230,6 +230,11 @@ def refine_summary(
     stepped = Summary(*(jnp.float32(v) for v in fit.values))
     if fusion is None:
         return Refined(stepped, std, features, fit.fresh > 0)
+    if fusion["mean"].shape != features.shape:
+        raise EvflowDataError(
+            "EV018", f"the weights' fusion sees {fusion['mean'].size} features of a recording, "
+            f"this version has {features.size}.",
+            'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
     y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
     result = squash_summary(y)
     return Refined(result, summary_std(result, y_std), features, fit.fresh > 0)

@@ -6,7 +6,6 @@ events, dL = theta_on n_on - theta_off n_off + remainder. Sums of the three term
 got brighter, and over those that got darker, do not care what the brightness did between the
 frames (pairs of ON and OFF cancel): they hold the scale of theta where motion is too fast to
 interpolate. Root counts and active pixels do care, and are the more precise where it is slow.
-Quiet pixels, where the path says that nothing happened, hold the noise rates.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ Array = jax.Array
 
 LAGS = (1, 2, 4, 0)  # frames between the ends of dL; 0: from the first event on
 DEAD, FULL = 0.1, 0.5  # log units: changes below do not choose a side, above weigh no more
-STRATA = (0.03, 0.08, 0.2)  # range of the path in an interval: upper edges of the quiet strata
 
 
 @jax.tree_util.register_dataclass
@@ -33,8 +31,8 @@ class Moments:
     balance: (lags, 2 sides, 4) weighted n_on, n_off, dL, |dL|; squares: (2 sides, 7) weighted
     n_on², n_off², n_on n_off, n_on dL, n_off dL, dL², 1, from the first event to each frame;
     roots, active, events: (2,) sum of sqrt(count), pixels with events, events, per polarity;
-    early: pixels that fire within the first quarter of the first interval; quiet: (strata, 3)
-    n_on, n_off, pixel seconds; pixels, exposure: pixels, pixel seconds.
+    early: pixels that fire within the first quarter of the first interval; pixels, exposure:
+    pixels, pixel seconds.
     """
 
     balance: Array
@@ -43,7 +41,6 @@ class Moments:
     active: Array
     events: Array
     early: Array
-    quiet: Array
     pixels: Array
     exposure: Array
 
@@ -71,7 +68,6 @@ def measure(trace: Trace, path: Array, dt_s: Array, bright: Array, steps: int) -
         active=(total > 0).sum((1, 2)).astype(path.dtype),
         events=total.sum((1, 2)),
         early=(known & (step < steps // 4)).sum().astype(path.dtype),
-        quiet=_quiet(counts, path, dt_s, used, steps),
         pixels=used.sum(), exposure=used.sum() * dt_s.sum())
 
 
@@ -99,18 +95,3 @@ def _sides(n: Array, dL: Array, known: Array, *, squares: bool) -> Array:
              else [on, off, dL, jnp.abs(dL)])
     sides = [weight * jnp.clip(s * dL - DEAD, 0.0, FULL) for s in (1.0, -1.0)]
     return jnp.stack([jnp.stack([(z * term).sum() for term in terms]) for z in sides])
-
-
-def _quiet(counts: Array, path: Array, dt_s: Array, used: Array, steps: int) -> Array:
-    """(strata, 3): events and pixel seconds by how far the path ranges within an interval."""
-    shape = path.shape[1:]
-    inner = path[1:].reshape(dt_s.shape[0], steps, *shape)
-    start = path[:-1:steps]
-    span = (jnp.maximum(inner.max(1), start) - jnp.minimum(inner.min(1), start))
-    rows, low = [], 0.0
-    for high in STRATA:
-        here = ((span >= low) & (span < high)).astype(path.dtype) * used[None]
-        rows.append(jnp.stack([(counts[:, 0] * here).sum(), (counts[:, 1] * here).sum(),
-                               (here * dt_s[:, None, None]).sum()]))
-        low = high
-    return jnp.stack(rows)

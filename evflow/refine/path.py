@@ -44,7 +44,6 @@ class Chunk:
 
 
 QUIET = 0.05  # log units: less than the smallest threshold of any use
-HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
 DARK_DN, SATURATED_DN = 15.0, 252.0  # below, half a DN of noise is .03 in log; above, it clips
 
 
@@ -92,11 +91,3 @@ def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, steps: int) -> np.n
     still = inner.max(1) - inner.min(1) < QUIET
     events = (np.asarray(trace.counts).sum(1) * still).sum(0)
     return np.stack([events, (dt_s[:, None, None] * still).sum(0)])
-
-
-def hot_pixels(chunks: list[Chunk], rate_hz: float) -> np.ndarray:
-    """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
-    happens in front of them; less than one in a million by chance."""
-    events, seconds = np.sum([c.quiet for c in chunks], 0)
-    expected = HOT_FACTOR * rate_hz * seconds
-    return events > expected + 5.0 * np.sqrt(expected) + HOT_EVENTS

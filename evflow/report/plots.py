@@ -31,14 +31,16 @@ def require() -> None:
                               'pip install "evflow-jax[viz]", or pass --no-plots.') from e
 
 
-def _figure(width: float, height: float) -> Any:
+def new_figure(width: float, height: float) -> Any:
+    """An off-screen figure of width x height inches; EV010 without matplotlib."""
     require()
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _save(figure: Any, path: str | os.PathLike) -> None:
+def save_figure(figure: Any, path: str | os.PathLike) -> None:
+    """Write it as PNG; an existing file is replaced."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     with atomic_write(path, overwrite=True) as temporary:
@@ -65,12 +67,12 @@ def _map(axis: Any, values: np.ndarray, title: str) -> None:
 
 def camera_maps(found: CameraEstimate, path: str | os.PathLike) -> None:
     """The four maps above their standard deviations."""
-    figure = _figure(15, 6.2)
+    figure = new_figure(15, 6.2)
     axes = figure.subplots(2, 4)
     for column, name in enumerate(PARAMETERS):
         _map(axes[0, column], np.asarray(getattr(found.camera, name)), TITLES[name])
         _map(axes[1, column], np.asarray(getattr(found.std, name)), f"std of {TITLES[name]}")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _histogram(axis: Any, found: CameraEstimate, name: str, truth: Camera | None) -> None:
@@ -94,10 +96,10 @@ def camera_histograms(
     found: CameraEstimate, path: str | os.PathLike, truth: Camera | None = None
 ) -> None:
     """Histograms of the four maps; the truth beside them where it is known."""
-    figure = _figure(14, 3.2)
+    figure = new_figure(14, 3.2)
     for axis, name in zip(figure.subplots(1, 4), PARAMETERS, strict=True):
         _histogram(axis, found, name, truth)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def comparison(
@@ -106,7 +108,7 @@ def comparison(
 ) -> None:
     """One page: a frame, real and re-made events of the same instant, event rates, maps and
     histograms."""
-    figure = _figure(16, 9.6)
+    figure = new_figure(16, 9.6)
     axes = figure.subplots(3, 4, height_ratios=(1.1, 1.0, 0.8))
     axes[0, 0].imshow(frame, cmap="gray", vmin=0, vmax=255)
     axes[0, 0].set_title("frame")
@@ -121,7 +123,7 @@ def comparison(
     for column, name in enumerate(PARAMETERS):
         _map(axes[1, column], np.asarray(getattr(found.camera, name)), f"{TITLES[name]}, estimated")
         _histogram(axes[2, column], found, name, truth)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _rates(axis: Any, real: Events, made: Events, step_us: int = 5_000) -> None:

@@ -1,0 +1,65 @@
+"""Frames that do not show what the pixels saw: flashes and black frames, exposure changes.
+
+A recording's frames come from another circuit than its events. Where the frame camera alone
+stumbles, the change of brightness between two frames says nothing about thresholds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.types import Recording
+
+DARK_DN, LEAST = 15.0, 0.1  # pixels below do not count; so many of all must be brighter
+STRIDE = 4  # every 4th pixel of every 4th row tells a whole frame's fault
+JUMP = 0.15  # log units: more than frame noise
+GLITCH_SHARE = 0.3  # of the pixels: a moving object seldom fills as much and is gone again
+EXPOSURE = 0.08  # log units: change that most pixels share
+ALIKE, ALIKE_SHARE = 0.05, 0.6  # log units, share of pixels
+LIT_SHARE = 0.3  # of the pixels have events where the light itself changed
+
+
+def faulty_frames(recording: Recording) -> tuple[dict[int, str], dict[int, str]]:
+    """({frame: fault}, {i: fault of the step from frame i to i + 1}), a short reason each."""
+    glitches: dict[int, str] = {}
+    steps: dict[int, str] = {}
+    shown: list[np.ndarray] = []
+    for i in range(len(recording.frame_times)):
+        small = recording.frame_dn(i)[::STRIDE, ::STRIDE]
+        shown = [*shown[-2:], np.log(np.maximum(small, 1.0))]
+        if len(shown) == 3 and _glitch(*shown):
+            glitches[i - 1] = "a frame unlike the one before and the one after (a glitch?)"
+        if len(shown) > 1 and (shift := _exposure(*shown[-2:])) and not _lit(recording, i - 1):
+            steps[i - 1] = (f"all of the frame changes by {np.expm1(shift):+.0%} and no events "
+                            "say so (auto-exposure?)")
+    return glitches, steps
+
+
+def _glitch(before: np.ndarray, frame: np.ndarray, after: np.ndarray) -> bool:
+    """Much of the frame differs from both neighbours alike, which agree."""
+    bright = _bright(before, after)
+    there, back = (frame - before)[bright], (frame - after)[bright]
+    odd = (np.minimum(np.abs(there), np.abs(back)) > JUMP) & (there * back > 0)
+    agree = np.abs(after - before)[bright] < 0.5 * JUMP
+    return bool((odd & agree).sum() > max(GLITCH_SHARE * bright.sum(), LEAST * bright.size))
+
+
+def _exposure(before: np.ndarray, after: np.ndarray) -> float:
+    """The log change that most pixels share, 0 where there is none."""
+    bright = _bright(before, after)
+    if bright.mean() < LEAST:
+        return 0.0
+    change = (after - before)[bright]
+    shift = float(np.median(change))
+    alike = (np.abs(change - shift) < ALIKE).mean() > ALIKE_SHARE
+    return shift if abs(shift) > EXPOSURE and alike else 0.0
+
+
+def _bright(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.minimum(a, b) > np.log(DARK_DN)
+
+
+def _lit(recording: Recording, i: int) -> bool:
+    """Whether many pixels fire between frames i and i + 1."""
+    t0, t1 = (int(t) for t in recording.frame_times[i:i + 2])
+    return bool((recording.events.slice(t0, t1).count_map().sum(0) > 0).mean() > LIT_SHARE)

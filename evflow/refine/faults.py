@@ -1,0 +1,26 @@
+"""Pixels that do not measure the scene: hot ones fire by themselves, dead ones never."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from evflow.refine.path import Chunk
+
+HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
+AROUND = 5  # pixels: side of the neighbourhood that a dead pixel is compared with
+DEAD_EVENTS = 12  # median there: e^-12 by chance alone, and room for a high threshold
+
+
+def hot_pixels(chunks: list[Chunk], rate_hz: float) -> np.ndarray:
+    """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
+    happens in front of them; less than one in a million by chance."""
+    events, seconds = np.sum([c.quiet for c in chunks], 0)
+    expected = HOT_FACTOR * rate_hz * seconds
+    return events > expected + 5.0 * np.sqrt(expected) + HOT_EVENTS
+
+
+def dead_pixels(n_events: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels without a single event amid pixels with many; n_events (H, W)."""
+    around = cv2.medianBlur(np.minimum(n_events, 255).astype(np.uint8), AROUND)
+    return (n_events == 0) & (around >= DEAD_EVENTS)

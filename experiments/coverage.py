@@ -1,0 +1,139 @@
+"""Are the intervals honest? Coverage over many simulated cameras, by events and duration.
+
+    python -m experiments.coverage --preset full --workers 2
+
+Cameras, scenes and sensors of the whole training distribution, none of them seen in training.
+An interval of probability p should hold the truth in a share p of the cases: for the camera's
+summary over recordings, and for the maps over pixels. Draws the calibration curve.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from jax.scipy.stats import norm
+
+from evflow import estimate_camera
+from evflow.camera import PARAMETERS
+from evflow.report import plots
+from evflow.report.plots import TITLES
+from experiments.cameras import Hidden, Protocol, draw_protocol
+from experiments.common import write_result
+from experiments.many import Setup, scores
+
+LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
+EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf), "seconds": (0, 0.15, 0.25, 0.5, 2.0)}
+Rows = list[dict[str, Any]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure the coverage of the estimate's intervals."""
+
+    weights: str = "default"
+    preset: Literal["debug", "full"] = "debug"
+    out: Path = Path("out/coverage")
+    seed: int = 5_000_077
+    recordings: int | None = None
+    """Number of cameras (default: the preset's)."""
+    workers: int = 1
+
+
+def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, Any] | None:
+    """Errors in units of their std: of the summary, and for each level the share of pixels whose
+    interval holds the truth."""
+    recording = hidden.recording
+    if len(recording.events) < 10:
+        return None
+    found = estimate_camera(recording, params)
+    signal = hidden.signal_events()
+    row: dict[str, Any] = {"seconds": protocol.frame_ms * protocol.intervals * 1e-3}
+    for i, name in enumerate(PARAMETERS):
+        true = float(getattr(hidden.nominal, name))
+        guess, std = (float(getattr(s, name)) for s in (found.summary, found.summary_std))
+        error = np.abs(np.asarray(getattr(found.camera, name)) - getattr(hidden.camera, name))
+        away = error / np.asarray(getattr(found.std, name))
+        row |= {f"signal/{name}": float(signal[i % 2]), f"summary/{name}": abs(guess - true) / std,
+                f"pixels/{name}": (away[..., None] < deviations()).mean((0, 1)),
+                f"valid/{name}": (away[found.valid][:, None] < deviations()).mean(0)
+                if found.valid.any() else np.full(len(LEVELS), np.nan)}
+    return row
+
+
+def deviations() -> np.ndarray:
+    """Half-widths in standard deviations of the central intervals of probability LEVELS."""
+    return np.asarray(norm.ppf(0.5 + 0.5 * LEVELS))
+
+
+def curves(rows: Rows) -> dict[str, dict[str, list[float]]]:
+    """Coverage at LEVELS per parameter: of the summary, of all pixels, of valid ones."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for name in PARAMETERS:
+        away = np.array([r[f"summary/{name}"] for r in rows])
+        found[name] = {"summary": (away[:, None] < deviations()).mean(0).tolist()}
+        for kind in ("pixels", "valid"):
+            found[name][kind] = np.nanmean([r[f"{kind}/{name}"] for r in rows], 0).tolist()
+    return found
+
+
+def strata(rows: Rows) -> dict[str, dict[str, float]]:
+    """Coverage of the summary's 68 % and 95 % intervals by stratum."""
+    found = {}
+    for name in PARAMETERS:
+        away = np.array([r[f"summary/{name}"] for r in rows])
+        values = {"signal events": np.array([r[f"signal/{name}"] for r in rows]),
+                  "seconds": np.array([r["seconds"] for r in rows])}
+        for label, value in values.items():
+            for low, high in itertools.pairwise(EDGES[label]):
+                used = (np.maximum(value, 0.0) >= low) & (value < high)
+                if used.any():
+                    found[f"{name}, {label} {low}-{high}"] = {
+                        "recordings": int(used.sum()), "inside 68": float((away[used] < 1).mean()),
+                        "inside 95": float((away[used] < 1.96).mean())}
+    return found
+
+
+def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
+    figure = plots.new_figure(12, 3.4)
+    for i, name in enumerate(PARAMETERS):
+        axis = figure.add_subplot(1, 4, i + 1)
+        axis.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+        for kind, label in (("summary", "camera's summary"), ("pixels", "pixels"),
+                            ("valid", "valid pixels")):
+            axis.plot(LEVELS, found[name][kind], marker="o", markersize=3, label=label)
+        axis.set(title=TITLES[name], xlabel="interval", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+        if i == 0:
+            axis.set_ylabel("share that holds the truth")
+            axis.legend(frameon=False, fontsize=8)
+    plots.save_figure(figure, path)
+
+
+def main(options: Options) -> dict[str, Any]:
+    count = options.recordings or {"debug": 12, "full": 1000}[options.preset]
+    jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i)))) for i in range(count)]
+    made = scores(score, Setup(options.weights, options.seed), jobs, options.workers, "cameras")
+    rows = [row for row in made if row is not None]
+    found = curves(rows)
+    result = {"levels": LEVELS.tolist(), "cameras": len(rows), "curves": found,
+              "strata": strata(rows)}
+    lines = ["| parameter, stratum | recordings | in 68 % | in 95 % |", "|---|---|---|---|"]
+    i68, i95 = (int(np.argmin(np.abs(LEVELS - level))) for level in (0.68, 0.95))
+    lines += [f"| {name}, {kind} | {len(rows)} | {c[i68]:.0%} | {c[i95]:.0%} |"
+              for name, kinds in found.items() for kind, c in kinds.items()]
+    lines += [f"| {name} | {s['recordings']} | {s['inside 68']:.0%} | {s['inside 95']:.0%} |"
+              for name, s in result["strata"].items()]
+    text = "\n".join(lines)
+    print(text)
+    write_result(options.out / "coverage.json", result, dataclasses.asdict(options))
+    (options.out / "coverage.md").write_text(text + "\n")
+    draw(found, options.out / "coverage.png")
+    return result
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,146 @@
+"""How the error falls with data: window length, duration, events, frame rate, speed.
+
+    python -m experiments.curves --preset full --workers 2
+
+Recordings of the paper's cameras (mismatch .03), one setting changed at a time. Mean |summary -
+true| of the refined estimate and of the network alone, over polarities with at least 200 signal
+events; draws a page of curves. The paper reports .023 / .022 (theta) and .045 / .027 Hz (eta).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from evflow import estimate_camera, finish
+from evflow.camera import CameraPrior
+from evflow.recording import pool_recording
+from evflow.report import plots
+from experiments.cameras import Hidden, Protocol
+from experiments.common import write_result
+from experiments.evaluate import ENOUGH
+from experiments.many import Setup, scores
+
+BASE = Protocol(prior=CameraPrior(mismatch=(0.03, 0.03)))
+# 200 ms at other frame rates, other durations at 25 ms, other speeds; (frame_ms, intervals).
+RATES = ((5, 40), (10, 20), (20, 10), (25, 8), (40, 5), (50, 4), (100, 2))
+DURATIONS = ((25, 2), (25, 4), (25, 8), (25, 16), (25, 32))
+SPEEDS = ((5.0, 15.0), (15.0, 50.0), (50.0, 150.0), (150.0, 350.0))
+WINDOWS_US = (25_000, 50_000, 100_000)
+EVENTS = (0, 50, 200, 1000, 3000, 10_000, 1_000_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure the error against the amount and kind of data."""
+
+    weights: str = "default"
+    preset: Literal["debug", "full"] = "debug"
+    out: Path = Path("out/curves")
+    seed: int = 6_000_011
+    recordings: int | None = None
+    """Recordings per point (default: the preset's)."""
+    workers: int = 1
+
+
+def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
+    """Errors (4,) of the refined summary and of the network alone with each window length."""
+    if len(hidden.recording.events) < 10:
+        return None
+    names = ("theta_on", "theta_off", "eta_on", "eta_off")
+
+    def errors(summary: Any) -> np.ndarray:
+        return np.array([abs(float(getattr(summary, n)) - float(getattr(hidden.nominal, n)))
+                         for n in names])
+
+    row = {"refined": errors(estimate_camera(hidden.recording, params).summary),
+           "signal": np.tile(hidden.signal_events(), 2)}
+    for length in WINDOWS_US:
+        if length <= hidden.recording.events.duration_us:
+            stats, _ = pool_recording(params, hidden.recording, length)
+            row[f"network {length // 1000}"] = errors(finish(params, stats)[0])
+    return row
+
+
+def point(rows: list[dict[str, np.ndarray]], key: str, low: float = ENOUGH,
+          high: float = np.inf) -> dict[str, float]:
+    """Mean error of theta and of eta over polarities with low <= signal events < high."""
+    rows = [r for r in rows if key in r]
+    errors, signal = (np.array([r[k] for r in rows]).reshape(-1, 4) for k in (key, "signal"))
+    used = (np.maximum(signal, 0.0) >= low) & (signal < high)
+    return {"recordings": len(rows), **{
+        name: float(errors[:, part][used[:, part]].mean()) if used[:, part].any() else np.nan
+        for name, part in (("theta", slice(0, 2)), ("eta", slice(2, 4)))}}
+
+
+def main(options: Options) -> dict[str, Any]:
+    count = options.recordings or {"debug": 2, "full": 60}[options.preset]
+    settings: dict[str, dict[Any, Protocol]] = {
+        "frame interval [ms]": {ms: dataclasses.replace(BASE, frame_ms=ms, intervals=n)
+                                for ms, n in RATES},
+        "duration [ms]": {ms * n: dataclasses.replace(BASE, frame_ms=ms, intervals=n)
+                          for ms, n in DURATIONS},
+        "speed up to [px/s]": {s[1]: dataclasses.replace(
+            BASE, scene=dataclasses.replace(BASE.scene, speed_px_s=s)) for s in SPEEDS}}
+    if options.preset == "debug":
+        settings = {name: dict(list(points.items())[-2:]) for name, points in settings.items()}
+    result: dict[str, Any] = {}
+    base: list[dict[str, np.ndarray]] = []
+    for name, points in settings.items():
+        result[name] = {}
+        for value, protocol in points.items():
+            jobs = [(i, protocol) for i in range(count)]
+            setup = Setup(options.weights, options.seed)
+            made = scores(score, setup, jobs, options.workers, f"{name} {value}")
+            rows = [row for row in made if row is not None]
+            result[name][value] = {"refined": point(rows, "refined"),
+                                   "network": point(rows, "network 50")}
+            base += rows
+    result["signal events"] = {
+        high: {k: point(base, f, low, high) for k, f in (("refined", "refined"),
+                                                         ("network", "network 50"))}
+        for low, high in itertools.pairwise(EVENTS)}
+    result["window [ms]"] = {us // 1000: {"network": point(base, f"network {us // 1000}")}
+                             for us in WINDOWS_US}
+    text = table(result)
+    print(text)
+    write_result(options.out / "curves.json", result, dataclasses.asdict(options))
+    (options.out / "curves.md").write_text(text + "\n")
+    draw(result, options.out / "curves.png")
+    return result
+
+
+def table(result: dict[str, Any]) -> str:
+    lines = ["| setting | value | recordings | theta, refined | theta, network | eta, refined | "
+             "eta, network |", "|" + "---|" * 7]
+    for name, points in result.items():
+        for value, kinds in points.items():
+            figures = [kinds.get(kind, {}).get(p, np.nan)
+                       for p in ("theta", "eta") for kind in ("refined", "network")]
+            lines.append(f"| {name} | {value} | {kinds['network']['recordings']} | " + " | ".join(
+                f"{v:.4f}" for v in figures) + " |")
+    return "\n".join(lines) + "\n\nPaper: theta .023 / .022, eta .045 / .027."
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    figure = plots.new_figure(3.2 * len(result), 5.6)
+    for i, (name, points) in enumerate(result.items()):
+        for j, parameter in enumerate(("theta", "eta")):
+            axis = figure.add_subplot(2, len(result), j * len(result) + i + 1)
+            for kind in ("refined", "network"):
+                shown = {v: k[kind][parameter] for v, k in points.items() if kind in k}
+                axis.plot(list(shown), list(shown.values()), marker="o", markersize=3, label=kind)
+            axis.set(xscale="log", ylim=(0, None), xlabel=name if j else None)
+            if i == 0:
+                axis.set_ylabel(f"|{'θ' if parameter == 'theta' else 'η'} − true|")
+                axis.legend(frameon=False, fontsize=8)
+    plots.save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

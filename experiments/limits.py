@@ -1,0 +1,148 @@
+"""What the recordings allow: the best known estimates when the video between the frames is known.
+
+    python -m experiments.limits --preset full
+
+The recordings of `experiments.evaluate`, refined with the true 1000 frames/s video in place of
+frames 25 ms apart. What then remains for theta is the counts' own noise; no method that sees the
+frames alone can do better. The limit of a pixel's theta is its regression on the true video; that
+of eta, that every noise event is known as such (Poisson, all pixels and all of the time). Every
+figure is printed beside that of `estimate_camera` and as their ratio, by number of signal events
+and by speed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+import tyro
+
+from evflow import estimate_camera, finish, io
+from evflow.intensity import lin_log
+from evflow.recording import pool_recording, refinement_chunks
+from evflow.refine import Chunk, pixel_posterior, refine_summary
+from evflow.refine.path import STEPS
+from evflow.refine.pixels import pixel_equations
+from experiments.cameras import Hidden, Protocol
+from experiments.common import write_result
+from experiments.evaluate import ENOUGH, protocols
+from experiments.many import Setup, scores
+
+EDGES = {"signal": (200, 1000, 5000, np.inf), "speed": (0, 2, 6, np.inf)}
+NAMES = ("theta_on", "theta_off")
+FAR = 20.0  # times the network's std
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Compare the estimate with what a known video allows."""
+
+    weights: str = "default"
+    preset: Literal["debug", "full"] = "debug"
+    out: Path = Path("out/limits")
+    seed: int = 1_000_003
+    """The recordings of `experiments.evaluate`."""
+    sequences: int | None = None
+    """Recordings per row (default: the preset's)."""
+    workers: int = 1
+
+
+def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
+    """The chunk whose first frame is frame `first` of the recording, with the true video between
+    its frames (linear between its milliseconds)."""
+    kept = hidden.kept[first:first + len(chunk.dt_s) + 1]
+    at = np.concatenate([np.linspace(a, b, STEPS, endpoint=False)
+                         for a, b in itertools.pairwise(kept)] + [kept[-1:]])
+    low = np.minimum(at.astype(int), len(hidden.video) - 2)
+    log_video = np.asarray(lin_log(hidden.video[low[0]:low[-1] + 2]))
+    step, part = low - low[0], (at - low)[:, None, None].astype(np.float32)
+    path = log_video[step] * (1 - part) + log_video[step + 1] * part
+    times = hidden.recording.frame_times[first:first + len(kept)]
+    equations = pixel_equations(hidden.recording.events, times, path, STEPS)
+    return dataclasses.replace(chunk, path=path.astype(np.float32), equations=equations)
+
+
+def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] | None:
+    recording = hidden.recording
+    if len(recording.events) <= ENOUGH:
+        return None
+    pairs = io.plan_windows(recording).pairs
+    chunks = refinement_chunks(recording, pairs)
+    starts = np.cumsum([pairs[0][0], *(len(c.dt_s) for c in chunks)])
+    known = [known_path(hidden, c, i) for c, i in zip(chunks, starts, strict=False)]
+    stats, _ = pool_recording(params, recording)
+    start, std = finish(params, stats)
+    unsure = jax.tree.map(lambda s: FAR * s, std)  # what is known must not hold it back
+    best = refine_summary(known, start, unsure).summary
+    maps, _ = pixel_posterior(np.sum([c.equations for c in known], 0), best)
+    found = estimate_camera(recording, params)
+    signal, counts = hidden.signal_events(), recording.events.count_map()
+    exposure = 1e-6 * recording.events.duration_us * counts[0].size
+    result = {"speed": float(np.mean(np.concatenate([c.motion_px for c in chunks])))}
+    for i, name in enumerate(NAMES):
+        true, pixels = float(getattr(hidden.nominal, name)), getattr(hidden.camera, name)
+        fired = counts[i] > 0
+        eta = f"eta_{name[6:]}"
+        noise = float(getattr(hidden.nominal, eta))
+        result |= {
+            f"signal/{name}": float(signal[i]),
+            f"ours/{name}": abs(float(getattr(found.summary, name)) - true),
+            f"limit/{name}": abs(float(getattr(best, name)) - true),
+            f"ours/{name} of pixels that fired": _mean(np.abs(
+                np.asarray(getattr(found.camera, name)) - pixels)[fired]),
+            f"limit/{name} of pixels that fired": _mean(np.abs(maps[i] - pixels)[fired]),
+            f"ours/{eta}": abs(float(getattr(found.summary, eta)) - noise),
+            f"limit/{eta}": float(np.sqrt(2 / np.pi * noise / exposure))}
+    return result
+
+
+def _mean(values: Any) -> float:
+    return float(np.mean(values)) if len(values) else np.nan
+
+
+def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Ours, the limit and their ratio, per figure; all recordings with enough events, then by
+    stratum."""
+    found: dict[str, dict[str, float]] = {}
+    for figure in [k.split("/")[1] for k in rows[0] if k.startswith("ours/")]:
+        polarity = "off" if "off" in figure else "on"
+        signal = np.array([r[f"signal/theta_{polarity}"] for r in rows])
+        speed = np.array([r["speed"] for r in rows])
+        ours, limit = (np.array([r[f"{k}/{figure}"] for r in rows]) for k in ("ours", "limit"))
+        choices = {"all": signal >= ENOUGH}
+        for name, value in (("signal", signal), ("speed", speed)):
+            for low, high in itertools.pairwise(EDGES[name]):
+                choices[f"{name} {low}-{high}"] = (
+                    (signal >= ENOUGH) & (value >= low) & (value < high))
+        for label, used in choices.items():
+            if used.any():
+                a, b = float(np.nanmean(ours[used])), float(np.nanmean(limit[used]))
+                found[f"{figure}, {label}"] = {
+                    "recordings": int(used.sum()), "ours": a, "limit": b, "ratio": a / b}
+    return found
+
+
+def main(options: Options) -> dict[str, Any]:
+    sequences = options.sequences or {"debug": 4, "full": 100}[options.preset]
+    setup = Setup(options.weights, options.seed)
+    result: dict[str, Any] = {}
+    lines = ["| protocol | figure, stratum | recordings | ours | limit | ratio |", "|" + "---|" * 6]
+    for name, protocol in protocols().items():
+        jobs = [(i, protocol) for i in range(sequences)]
+        rows = [r for r in scores(score, setup, jobs, options.workers, name) if r is not None]
+        result[name] = strata(rows)
+        lines += [f"| {name} | {k} | {v['recordings']} | {v['ours']:.4f} | {v['limit']:.4f} | "
+                  f"{v['ratio']:.2f} |" for k, v in result[name].items()]
+    text = "\n".join(lines)
+    print(text)
+    write_result(options.out / "limits.json", result, dataclasses.asdict(options))
+    (options.out / "limits.md").write_text(text + "\n")
+    return result
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
