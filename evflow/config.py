@@ -63,7 +63,7 @@ class LossConfig:
     condition: float = 1.0
     change_l1: float = 1.0
     parameter: float = 1.0
-    flow: float = 0.1
+    flow: float = 0.05
     event: float = 1.0
     inverse_flow: float = 0.0
     summary: float = 2.0

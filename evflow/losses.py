@@ -72,7 +72,7 @@ def event_loss(generated: Array, voxels: Array, dL: Array, sizes: tuple[int, ...
 
     generated: asinh of the generated voxels; voxels: the true ones. Where edges move, they
     themselves are compared (Charbonnier on asinh: counts span three decades); elsewhere only
-    the events per patch and polarity.
+    the events per patch and polarity, against a variance of as many events as were made.
     """
     error = charbonnier(generated - jnp.arcsinh(voxels))
     events = linear(generated)
@@ -80,21 +80,24 @@ def event_loss(generated: Array, voxels: Array, dL: Array, sizes: tuple[int, ...
     for size in sizes:
         moving = edge_weight(dL, size, edge)
         values = _patches(error, size).mean((-3, -2, -1))
-        noise = dispersion(_counts(events, size), _counts(voxels, size), 1.0).mean(-1) / size**2
+        made = _counts(events, size)
+        noise = dispersion(made, _counts(voxels, size), jax.nn.relu(made) + 1.0).mean(-1) / size**2
         total += (moving * values + (1.0 - moving) * noise).mean(-1)
     return total
 
 
-def rate_loss(generated: Array, voxels: Array, sizes: tuple[int, ...]) -> Array:
+def rate_loss(generated: Array, voxels: Array, expected: Array, sizes: tuple[int, ...]) -> Array:
     """L_E for generated voxels that are *expected* events: (..., h, w, 2B) -> (...).
 
     Charbonnier errors (Eq. 9) pull towards the median, which for rare events is none at all;
-    these pull towards the mean, bin by bin and in the counts per patch and polarity.
+    these pull towards the mean, bin by bin and in the counts per patch and polarity. expected:
+    about how many events there should be, which sets the variance that errors are measured by.
     """
     events = linear(generated)
-    total = dispersion(events, voxels, RARE).mean((-3, -2, -1))
+    total = dispersion(events, voxels, expected + RARE).mean((-3, -2, -1))
     for size in sizes:
-        counts = dispersion(_counts(events, size), _counts(voxels, size), 1.0)
+        variance = _counts(expected, size) + 1.0
+        counts = dispersion(_counts(events, size), _counts(voxels, size), variance)
         total += counts.mean((-2, -1)) / size**2
     return total
 
@@ -104,11 +107,11 @@ def linear(generated: Array) -> Array:
     return jnp.sinh(jnp.clip(generated, -COUNT_LIMIT, COUNT_LIMIT))
 
 
-def dispersion(made: Array, true: Array, floor: float) -> Array:
-    """(made - true)^2 over twice the variance that `made` predicts, linear beyond FAR deviations.
-    The weight must not know `true`: divided by true + 1, it would favour too few events."""
-    deviation = jnp.sqrt(jax.nn.relu(jax.lax.stop_gradient(made)) + floor)
-    error = (made - true) / deviation
+def dispersion(made: Array, true: Array, variance: Array | float) -> Array:
+    """(made - true)^2 over twice the variance, linear beyond FAR deviations. The variance (no
+    gradient) must not follow `true`, nor the latents' noise in `made` where that is large: divided
+    by true + 1, say, the least error would lie at too few events."""
+    error = (made - true) / jnp.sqrt(jax.lax.stop_gradient(variance))
     return FAR**2 * (jnp.sqrt(1.0 + (error / FAR) ** 2) - 1.0)
 
 

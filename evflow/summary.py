@@ -27,6 +27,7 @@ Array = jax.Array
 
 RIDGE, RIDGE_THETA = 0.5, 0.22  # pseudo-observations that hold an empty calibration at .22
 DEAD_CHANGE = 0.03  # log units: smaller changes are frame noise and do not choose a side
+WINDOW_S = 0.05  # window length about which the network's input is centred
 SIGNAL_UNIT, EXPOSURE_UNIT = 1000.0, 100.0  # pixels with events, pixel seconds: scales of the std
 
 
@@ -57,7 +58,7 @@ class Stats:
 
 def window_features(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
     """(..., 3): log window length, log intensity about its middle, whether it was given."""
-    window = jnp.broadcast_to(jnp.log(window_s / 0.05), shape)
+    window = jnp.broadcast_to(jnp.log(window_s / WINDOW_S), shape)
     if intensity is None:
         zero = jnp.zeros(shape, window.dtype)
         return jnp.stack([window, zero, zero], -1)

@@ -20,7 +20,7 @@ from evflow.batch import Batch, sample_batch
 from evflow.config import LossConfig, TrainConfig
 from evflow.distributed import by_shard
 from evflow.scenes import TextureBank
-from evflow.squash import squash_summary, unsquash, unsquash_summary
+from evflow.squash import squash, squash_summary, unsquash, unsquash_summary
 from evflow.summary import Stats
 
 Array = jax.Array
@@ -240,9 +240,22 @@ def _flow_losses(
 
 def _event_loss(generated: Array, block: Block, config: LossConfig) -> Array:
     if config.events == "rate":
-        return losses.rate_loss(generated, block.voxels, config.patches).mean()
+        return losses.rate_loss(
+            generated, block.voxels, _expected(block), config.patches).mean()
     return losses.event_loss(generated, block.voxels, block.changes.sum(-1), config.patches,
                              config.edge).mean()
+
+
+def _expected(block: Block) -> Array:
+    """Events that each bin holds on average, (B, h, w, 2m): a pixel's changes in units of its
+    thresholds, and its noise."""
+    camera = squash(block.y)
+    up, down = jnp.split(encoder.split_sign(block.changes), 2, -1)
+    bins = block.changes.shape[-1]
+    bin_s = summary.WINDOW_S * jnp.exp(block.context[..., 0]) / bins
+    on = up / camera.theta_on[..., None] + (camera.eta_on * bin_s)[..., None]
+    off = down / camera.theta_off[..., None] + (camera.eta_off * bin_s)[..., None]
+    return jnp.concatenate([on, off], -1)
 
 
 def _parameter_loss(y: Array, block: Block, config: TrainConfig) -> Array:

@@ -44,6 +44,7 @@ SCALES = {  # of theta_on, theta_off
     "as it is": (1.0, 1.0), "halved": (0.5, 0.5), "doubled": (2.0, 2.0),
     "ON halved": (0.5, 1.0), "ON doubled": (2.0, 1.0),
     "OFF halved": (1.0, 0.5), "OFF doubled": (1.0, 2.0)}
+ENOUGH = 20  # events of a scene below which its correlation says nothing
 SINGLE_PIXELS = 0.1  # share of pixels whose thresholds change at an unchanged summary
 
 
@@ -105,34 +106,33 @@ def variants(key: Array, camera: Camera) -> dict[str, tuple[Camera, Array]]:
 
 
 def compare(made: Array, one: Array, two: Array, where: Array) -> Row:
-    """Sums that add over scenes: generated voxels against two simulations of the same camera."""
+    """Sums that add over scenes: generated voxels against two simulations of the same camera.
+    Correlations are those of a scene with at least ENOUGH events."""
     def counts(voxels: Array) -> Array:
         on, off = jnp.split(voxels, 2, -1)
-        return jnp.stack([on.sum(-1), off.sum(-1)]) * where
+        return jnp.stack([on.sum(-1), off.sum(-1)])
+
+    def correlation(a: Array, b: Array) -> Array:
+        return jnp.corrcoef(jnp.stack([a[:, where].ravel(), b[:, where].ravel()]))[0, 1]
 
     made_n, one_n, two_n = counts(made), counts(one), counts(two)
     empty = where & (one.sum(-1) + two.sum(-1) == 0)
-    products = [(u * v).sum() for u, v in ((made_n, one_n), (one_n, two_n))]
-    squares = [(u * u).sum() for u in (made_n, one_n, two_n)]
-    return jax.tree.map(np.asarray, {
-        "made": made_n.sum((1, 2)), "one": one_n.sum((1, 2)), "two": two_n.sum((1, 2)),
-        "empty": (jnp.abs(made) * empty[..., None]).sum(), "n_empty": empty.sum() * made.shape[-1],
-        "products": jnp.stack(products), "squares": jnp.stack(squares),
-        "n": 2 * where.sum(), "sums": jnp.stack([made_n.sum(), one_n.sum(), two_n.sum()])})
+    used = float(one_n[:, where].sum()) >= ENOUGH
+    pair = [correlation(made_n, one_n), correlation(one_n, two_n), 1.0] if used else [0.0] * 3
+    return {"made": np.asarray((made_n * where).sum((1, 2))),
+            "simulated": np.asarray(0.5 * ((one_n + two_n) * where).sum((1, 2))),
+            "empty": np.array([(jnp.abs(made) * empty[..., None]).sum(),
+                               empty.sum() * made.shape[-1]]),
+            "correlations": np.array(pair)}
 
 
 def figures(total: Row) -> dict[str, float]:
     """Ratios of the added sums."""
-    mean = total["sums"] / total["n"]
-    variance = total["squares"] / total["n"] - mean**2
-    with_one, between = (
-        (total["products"][i] / total["n"] - mean[a] * mean[b]) / np.sqrt(variance[a] * variance[b])
-        for i, (a, b) in enumerate(((0, 1), (1, 2))))
-    simulated_n = 0.5 * (total["one"] + total["two"])
-    return {"on": float(total["made"][0] / simulated_n[0]),
-            "off": float(total["made"][1] / simulated_n[1]),
-            "empty": float(total["empty"] / total["n_empty"]),
-            "correlation": float(with_one), "two simulations": float(between),
+    with_one, between, scenes = total["correlations"]
+    ratio = total["made"] / total["simulated"]
+    return {"on": float(ratio[0]), "off": float(ratio[1]),
+            "empty": float(total["empty"][0] / total["empty"][1]),
+            "correlation": float(with_one / scenes), "two simulations": float(between / scenes),
             "relative": float(with_one / between)}
 
 

@@ -17,6 +17,7 @@ from evflow.refine.noise import (
     stratum_rates,
     tied_probability,
     tied_rates,
+    with_tie,
 )
 from evflow.refine.path import Chunk
 from evflow.refine.trace import Trace
@@ -105,6 +106,22 @@ def test_the_tie_is_recognised() -> None:
     assert tied_probability(np.array([0.0, 6 * error[1]]), error) < 0.01
     # Too wide an error says nothing: back to the odds before any data, or less.
     assert tied_probability(np.zeros(2), np.full(2, 3.0)) < 0.5
+
+
+def test_rates_are_drawn_to_the_tie_only_where_they_may_follow_it() -> None:
+    theta, std = np.array([0.2, 0.3]), np.array([0.004, 0.006])
+    foretold, _ = tied_rates(theta, std, 0.7)
+    wide, near = np.full(2, 0.3), np.log(foretold) + np.array([0.2, -0.2])
+    drawn, drawn_std = with_tie(theta, std, near, wide, 0.7)
+    assert (np.abs(drawn - np.log(foretold)) < 0.5 * np.abs(near - np.log(foretold))).all()
+    assert (drawn_std < wide).all()
+    far = np.log(foretold) + np.array([2.0, -1.0])
+    kept, kept_std = with_tie(theta, std, far, wide, 0.7)
+    np.testing.assert_allclose(kept, far, atol=1e-3)
+    np.testing.assert_allclose(kept_std, wide, rtol=1e-2)
+    # Where both are about as likely, the std says that it may be either.
+    _, torn = with_tie(theta, std, np.log(foretold) + 0.55, np.full(2, 0.2), 0.7)
+    assert (torn > 0.2).any()
 
 
 @pytest.mark.parametrize("theta", [0.05, 0.1, 0.5, 1.0])

@@ -13,7 +13,8 @@ from evflow.types import Recording
 DARK_DN, LEAST = 15.0, 0.1  # pixels below do not count; so many of all must be brighter
 STRIDE = 4  # every 4th pixel of every 4th row tells a whole frame's fault
 JUMP = 0.15  # log units: more than frame noise
-GLITCH_SHARE = 0.3  # of the pixels: a moving object seldom fills as much and is gone again
+GLITCH_SHARE = 0.3  # of the pixels, all brighter or all darker: fast textures are both
+OTHER_SHARE = 0.02
 EXPOSURE = 0.08  # log units: change that most pixels share
 ALIKE, ALIKE_SHARE = 0.05, 0.6  # log units, share of pixels
 LIT_SHARE = 0.3  # of the pixels have events where the light itself changed
@@ -27,7 +28,7 @@ def faulty_frames(recording: Recording) -> tuple[dict[int, str], dict[int, str]]
     for i in range(len(recording.frame_times)):
         small = recording.frame_dn(i)[::STRIDE, ::STRIDE]
         shown = [*shown[-2:], np.log(np.maximum(small, 1.0))]
-        if len(shown) == 3 and _glitch(*shown):
+        if len(shown) == 3 and _glitch(*shown) and not _lit(recording, i - 1):
             glitches[i - 1] = "a frame unlike the one before and the one after (a glitch?)"
         if len(shown) > 1 and (shift := _exposure(*shown[-2:])) and not _lit(recording, i - 1):
             steps[i - 1] = (f"all of the frame changes by {np.expm1(shift):+.0%} and no events "
@@ -36,12 +37,15 @@ def faulty_frames(recording: Recording) -> tuple[dict[int, str], dict[int, str]]
 
 
 def _glitch(before: np.ndarray, frame: np.ndarray, after: np.ndarray) -> bool:
-    """Much of the frame differs from both neighbours alike, which agree."""
+    """Much of the frame is brighter, or darker, than both neighbours, which agree."""
     bright = _bright(before, after)
     there, back = (frame - before)[bright], (frame - after)[bright]
-    odd = (np.minimum(np.abs(there), np.abs(back)) > JUMP) & (there * back > 0)
     agree = np.abs(after - before)[bright] < 0.5 * JUMP
-    return bool((odd & agree).sum() > max(GLITCH_SHARE * bright.sum(), LEAST * bright.size))
+    brighter = (agree & (np.minimum(there, back) > JUMP)).sum()
+    darker = (agree & (np.maximum(there, back) < -JUMP)).sum()
+    most, least = max(brighter, darker), min(brighter, darker)
+    return bool(most > max(GLITCH_SHARE * bright.sum(), LEAST * bright.size)
+                and least < OTHER_SHARE * bright.size)
 
 
 def _exposure(before: np.ndarray, after: np.ndarray) -> float:

@@ -29,6 +29,7 @@ from evflow.refine.noise import (
     stratum_rates,
     tied_probability,
     tied_rates,
+    with_tie,
 )
 from evflow.refine.path import STEPS, Chunk
 from evflow.refine.trace import trace_of_camera
@@ -237,7 +238,21 @@ def refine_summary(
             'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
     y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
     result = squash_summary(y)
-    return Refined(result, summary_std(result, y_std), features, fit.fresh > 0)
+    result, result_std = _tied(result, summary_std(result, y_std), fit.factor())
+    return Refined(result, result_std, features, fit.fresh > 0)
+
+
+def _tied(summary: Summary, std: Summary, factor: float) -> tuple[Summary, Summary]:
+    """The noise rates drawn to those of Eq. 12 where they may well follow it."""
+    def both(s: Summary, name: str) -> np.ndarray:
+        return np.array([float(getattr(s, f"{name}_{p}")) for p in ("on", "off")])
+
+    eta = both(summary, "eta")
+    log_eta, log_std = with_tie(both(summary, "theta"), both(std, "theta"), np.log(eta),
+                                both(std, "eta") / eta, factor)
+    rates = dict(zip(("eta_on", "eta_off"), jnp.float32(np.exp(log_eta)), strict=True))
+    errors = dict(zip(rates, jnp.float32(np.exp(log_eta) * log_std), strict=True))
+    return dataclasses.replace(summary, **rates), dataclasses.replace(std, **errors)
 
 
 def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:

@@ -46,7 +46,7 @@ LEAST_PRIOR, MOST_PRIOR = 1.0, 30.0  # events that the network's word on a noise
 
 # Of "does the noise follow Eq. 12?": free rates are log-uniform over a factor of a hundred.
 FREE_RANGE = np.log(100.0)
-TIED_ODDS = 0.5  # before any data
+TIED_ODDS = 0.2  # before any data: not more, as it costs where the noise is free
 TIED_ERROR = 0.05  # log units: of the intensity factor
 
 
@@ -135,3 +135,19 @@ def tied_probability(away: np.ndarray, error: np.ndarray) -> float:
     log_odds = np.log(TIED_ODDS) + (
         -0.5 * (away / error) ** 2 - np.log(error * np.sqrt(2 * np.pi) / FREE_RANGE)).sum()
     return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+
+
+def with_tie(
+    theta: np.ndarray, theta_std: np.ndarray, log_eta: np.ndarray, log_std: np.ndarray,
+    factor: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """log noise rates (2,) and their std: a mixture of "the noise follows Eq. 12 at these
+    thresholds (2,)" and "it is free", each as probable as the measured rates make it."""
+    rates, error = tied_rates(theta, theta_std, factor)
+    foretold = np.log(rates)
+    tied = tied_probability(log_eta - foretold, np.hypot(error, log_std))
+    precision = error**-2.0 + log_std**-2.0
+    both = (foretold * error**-2.0 + log_eta * log_std**-2.0) / precision
+    variance = (tied / precision + (1 - tied) * log_std**2
+                + tied * (1 - tied) * (both - log_eta) ** 2)
+    return tied * both + (1 - tied) * log_eta, np.sqrt(variance)
