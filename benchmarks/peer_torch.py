@@ -49,7 +49,7 @@ def flow(net: Weights, x: Tensor, u: Tensor, config: FlowConfig) -> tuple[Tensor
             part = level["injector"]
             hidden = F.relu(linear(part["w_1"], part["b_1"], u))
             raw, shift = linear(part["w_2"], part["b_2"], hidden).chunk(2, 1)
-            s = config.injector_bound * torch.tanh(raw)
+            s = config.injector_limit * torch.tanh(raw)
             x, log_det = x * torch.exp(s) + shift, log_det + s.sum(1)
         norm = level["actnorm"]
         s = norm["base"] + config.log_scale_bound * torch.tanh(norm["raw"])

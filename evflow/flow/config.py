@@ -73,6 +73,12 @@ class FlowConfig:
                     "It must be > 0 and finite.")
 
     @property
+    def injector_limit(self) -> float:
+        """The bound in use: with affine couplings .5 at most, as both together take the inverse
+        of an N(0, 1) draw beyond what float32 holds (measured at 2)."""
+        return min(self.injector_bound, 0.5) if self.coupling == "affine" else self.injector_bound
+
+    @property
     def level_channels(self) -> tuple[int, ...]:
         """Channels of each level, (32, 16, 8, 4) by default; the last is the width of y."""
         return tuple(self.channels >> level for level in range(self.levels))

@@ -1,7 +1,7 @@
 """Conditional injector: h exp(s(u)) + t(u), at the head of a level.
 
 With additive couplings the volume is the same at every pixel; the injector alone lets it differ
-between empty and active pixels. s = bound tanh(.) and t come from one MLP u -> hidden -> 2C
+between empty and active pixels. s = limit tanh(.) and t come from one MLP u -> hidden -> 2C
 whose last layer starts at zero (the identity).
 """
 
@@ -39,4 +39,4 @@ def inverse(params: Params, h: Array, u: Array, config: FlowConfig) -> tuple[Arr
 def _scale_and_shift(params: Params, u: Array, config: FlowConfig) -> tuple[Array, Array]:
     hidden = jax.nn.relu(dense(params["w_1"], params["b_1"], u))
     raw, t = jnp.split(dense(params["w_2"], params["b_2"], hidden), 2)
-    return config.injector_bound * jnp.tanh(raw), t
+    return config.injector_limit * jnp.tanh(raw), t
