@@ -240,8 +240,8 @@ def sample_nominal(
         k_sigma, (2, *batch), minval=prior.mismatch[0], maxval=prior.mismatch[1])
     gain = jax.random.uniform(k_gain, (2, *batch), minval=0.25)
     if factor is not None:
-        loose = 0.5 if prior.noise == "mixed" else 0.0
-        gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), 1.0 - loose, batch),
+        exact = 0.5 if prior.noise == "mixed" else 1.0
+        gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), exact, batch),
                          factor, gain)
     tied = noise_of_threshold(theta) * gain
     lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])

@@ -97,7 +97,7 @@ def estimate_camera(
 
     Windows run from frame to frame until at least min_window_us long. refine: "auto" simulates
     stretches of the recording with the estimate and corrects it, which takes the error of
-    theta on held-out cameras from .025 to .014; "off" leaves it to the network alone.
+    theta on held-out cameras from .022 to .011; "off" leaves it to the network alone.
     progress(done, total) is called after every window.
     Raises EV011, EV012, EV017 where the recording cannot tell, EV020 on a bad option.
     """

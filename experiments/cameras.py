@@ -40,14 +40,16 @@ class Protocol:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hidden:
-    """A recording and the truth behind it: nominal at the recording's mean intensity."""
+    """A recording and the truth behind it.
+
+    nominal: at the recording's mean intensity; video: (T, H, W) DN at 1000 frames/s, of which the
+    recording keeps the frames `kept` (K+1,).
+    """
 
     recording: Recording
     camera: Camera
     nominal: Summary
-
     video: np.ndarray
-    """(T, H, W) DN at 1000 frames/s, of which the recording keeps the frames `kept` (K+1,)."""
     kept: np.ndarray
 
     def signal_events(self) -> np.ndarray:

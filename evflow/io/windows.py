@@ -60,7 +60,7 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
         faults = [(i, why) for i, why in glitches.items() if first <= i <= last] + [
             (i, why) for i, why in steps.items() if first <= i < last]
         if faults:
-            skipped += [f"frames {first}-{last}: {why}" for _, why in faults[:1]]
+            skipped.append(f"frames {first}-{last}: {faults[0][1]}")
             first = max(i for i, _ in faults) + 1
             continue
         if outside:

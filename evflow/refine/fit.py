@@ -128,6 +128,7 @@ class _Fit:
         self.quiet = np.sum([quiet_events(c, STEPS) for c in chunks], 0)
         self.values[2:4] = combined_rate(self.quiet, self.prior[2:4], self.prior_std[2:4])
         self.fresh = 0.0
+        self.factor = _mean_factor(chunks)
         self.recorded = _total([_recorded(c.recorded, c.path, c.dt_s, c.bright, STEPS)
                                 for c in chunks])
 
@@ -200,17 +201,18 @@ class _Fit:
         """What the strata say beside their combination, and whether the noise follows Eq. 12."""
         rates = stratum_rates(self.quiet, self.prior[2:4], self.prior_std[2:4])
         theta, found = self.values[:2], np.log(self.values[2:4])
-        foretold, error = tied_rates(theta, THETA_ERROR * theta, self.factor())
+        foretold, error = tied_rates(theta, THETA_ERROR * theta, self.factor)
         away = found - np.log(foretold)
         tied = tied_probability(away, np.hypot(error, rate_error(self.quiet)))
         return [np.log(rates) - found, np.log(self.quiet + 1.0), np.clip(away, -2.0, 2.0),
                 tied * away, np.array([tied])]
 
-    def factor(self) -> float:
-        """Mean intensity factor of Eq. 12 over the frames."""
-        factors = [np.asarray(noise_factor(normalised_intensity(lin_log_inverse(
-            jnp.asarray(c.path[::STEPS]))))).mean() for c in self.chunks]
-        return float(np.mean(factors))
+
+def _mean_factor(chunks: list[Chunk]) -> float:
+    """Mean intensity factor of Eq. 12 over the frames."""
+    factors = [np.asarray(noise_factor(normalised_intensity(lin_log_inverse(
+        jnp.asarray(c.path[::STEPS]))))).mean() for c in chunks]
+    return float(np.mean(factors))
 
 
 def refine_summary(
@@ -238,7 +240,7 @@ def refine_summary(
             'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
     y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
     result = squash_summary(y)
-    result, result_std = _tied(result, summary_std(result, y_std), fit.factor())
+    result, result_std = _tied(result, summary_std(result, y_std), fit.factor)
     return Refined(result, result_std, features, fit.fresh > 0)
 
 
