@@ -26,7 +26,7 @@ from evflow.config import NuisanceConfig, TrainConfig
 from evflow.distributed import by_shard
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
 from evflow.scenes import TextureBank, render, sample_scene
-from evflow.simulator import scan
+from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
 
 Array = jax.Array
@@ -136,12 +136,13 @@ def _sequence(
     running = jax.random.bernoulli(k_fresh, 1.0 - config.nuisances.fresh).astype(jnp.float32)
     phase = jax.random.uniform(k_phase, shape)
     phase = running * (phase * (camera.theta_on + camera.theta_off) - camera.theta_off)
-    state = scan.start(k_sim, log_frames[0], model, phase)
+    medians = noise.nominal_thresholds(model, camera)
+    pixels, state = sensor.start(k_sim, log_frames[0], camera, model, medians, phase)
     windows = log_frames[1:].reshape(config.windows, config.steps_per_window, *shape)
     dt = window_s / config.steps_per_window
 
-    def window(state: scan.SimState, log_frames: Array) -> tuple[scan.SimState, Array]:
-        return simulate_window(model, True, camera, state, log_frames, dt, config.model.bins)
+    def window(state: sensor.SimState, log_frames: Array) -> tuple[sensor.SimState, Array]:
+        return simulate_window(model, pixels, state, log_frames, dt, config.model.bins)
 
     _, voxels = jax.lax.scan(window, state, windows)
     seen = seen + config.nuisances.frame_noise_dn * jax.random.normal(k_frame, seen.shape)

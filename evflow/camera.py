@@ -149,7 +149,7 @@ class SensorModel:
         False adds it to the stream (the paper).
     """
 
-    kind: Literal["v2e"] = "v2e"
+    kind: Literal["v2e", "esim"] = "v2e"
     timestamps: Literal["crossing", "v2e"] = "crossing"
     log_map: Literal["linlog", "log_eps"] = "linlog"
     cutoff_hz: float = 0.0
@@ -162,7 +162,7 @@ class SensorModel:
     noise_resets_memory: bool = False
 
     def __post_init__(self) -> None:
-        allowed = {"kind": ("v2e",), "timestamps": ("crossing", "v2e"),
+        allowed = {"kind": ("v2e", "esim"), "timestamps": ("crossing", "v2e"),
                    "log_map": ("linlog", "log_eps")}
         for name, values in allowed.items():
             if getattr(self, name) not in values:
@@ -173,6 +173,11 @@ class SensorModel:
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise EvflowDataError(
                     "EV020", f"SensorModel({name}={getattr(self, name)}).", "It must be >= 0.")
+
+    @property
+    def waits(self) -> bool:
+        """Whether an event that comes within the refractory period of another fires later."""
+        return self.refractory_s > 0 and self.timestamps == "crossing" and self.kind == "v2e"
 
 
 @dataclasses.dataclass(frozen=True)

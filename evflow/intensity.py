@@ -66,7 +66,7 @@ def to_log(frames: ArrayLike, log_map: str = "linlog") -> Array:
     """Log intensity (float32) of uint8 or float DN frames 0..255, or uint16 on 0..65535."""
     frames = jnp.asarray(frames)
     if frames.dtype == jnp.uint8:
-        return jnp.take(jnp.asarray(uint8_table(log_map)), frames, axis=0)
+        return jnp.take(jnp.asarray(uint8_table(log_map)), frames, axis=0, mode="clip")
     if frames.dtype == jnp.uint16:
         frames = frames.astype(jnp.float32) * (255.0 / 65535.0)
     return LOG_MAPS[log_map][0](frames.astype(jnp.float32))

@@ -30,7 +30,7 @@ from evflow.intensity import lin_log, noise_factor, normalised_intensity
 from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank, render, sample_scene
 from evflow.scenes.config import SceneConfig
-from evflow.simulator import scan
+from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
 from experiments.common import write_result
 
@@ -84,9 +84,10 @@ def simulated(key: Array, frames: Array, camera: Camera, window_s: float) -> Arr
     k_phase, k_sim = jax.random.split(key)
     phase = jax.random.uniform(k_phase, camera.theta_on.shape)
     phase = phase * (camera.theta_on + camera.theta_off) - camera.theta_off
-    state = scan.start(k_sim, frames[0], MODEL, phase)
+    nominal = noise.nominal_thresholds(MODEL, camera)
+    pixels, state = sensor.start(k_sim, frames[0], camera, MODEL, nominal, phase)
     dt = jnp.float32(window_s / (len(frames) - 1))
-    return simulate_window(MODEL, True, camera, state, frames[1:], dt, BINS)[1]
+    return simulate_window(MODEL, pixels, state, frames[1:], dt, BINS)[1]
 
 
 def scaled(camera: Camera, on: Array | float, off: Array | float) -> Camera:

@@ -13,7 +13,7 @@ from networks import small_config
 from evflow.batch import Batch
 from evflow.batch import sample_batch as sample_batch_eagerly
 from evflow.camera import CameraPrior, SensorModel
-from evflow.config import PRESETS
+from evflow.config import PRESETS, NuisanceConfig
 from evflow.scenes import SceneConfig, TextureBank, make_bank
 
 sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
@@ -88,10 +88,12 @@ def test_noise_target_is_the_rate_that_was_simulated(bank: TextureBank) -> None:
 @pytest.mark.slow
 def test_nuisances_touch_what_they_say(bank: TextureBank) -> None:
     """Every sensor model and nuisance of the default preset: finite data, frames that differ from
-    the true changes by more than their noise, some hot pixels, cameras that start fresh."""
+    the true changes (without noise, as it would hide that), some hot pixels, fresh cameras."""
     default = PRESETS["default"]
-    plain = small_config(sensors=default.sensors)
-    nuisances = dataclasses.replace(default.nuisances, hot_pixels=0.2, fresh=1.0)
+    silent = dataclasses.replace(NuisanceConfig.none(), frame_noise_dn=0.0)
+    plain = small_config(sensors=default.sensors, nuisances=silent)
+    nuisances = dataclasses.replace(
+        default.nuisances, hot_pixels=0.2, fresh=1.0, frame_noise_dn=0.0)
     config = dataclasses.replace(plain, nuisances=nuisances)
     batches = [[sample_batch(jax.random.key(k), bank, config=c) for k in range(4)]
                for c in (plain, config)]

@@ -15,8 +15,8 @@ from videos import SHAPE, by_pixel, drifting, milliseconds
 from evflow.camera import Camera, CameraPrior, SensorModel
 from evflow.intensity import LOG_MAPS, to_log
 from evflow.simulator import simulate, simulate_stream
+from evflow.simulator.active import step
 from evflow.simulator.pixel import floor_divide
-from evflow.simulator.scan import advance_chunk
 from evflow.types import Events
 
 KEY = jax.random.key(0)
@@ -54,7 +54,7 @@ def test_the_clock_may_start_anywhere(model: SensorModel, start: int) -> None:
 
 @pytest.mark.parametrize("model", [EVERYTHING, V2E])
 def test_one_key_gives_the_same_bytes_for_any_chunking(model: SensorModel) -> None:
-    """70 frames: more than one device chunk (64), so padding is met too."""
+    """70 frames are no multiple of a block (8), so padding is met too."""
     frames, times = drifting(70), milliseconds(70)
     whole = simulate(KEY, frames, times, NOISY, model=model)
     for length in (1, 7, 33):
@@ -71,20 +71,21 @@ def test_one_key_gives_the_same_bytes_for_any_chunking(model: SensorModel) -> No
 def test_chunks_are_consecutive_and_the_future_changes_nothing() -> None:
     frames, times = drifting(70), milliseconds(70)
     chunks = list(simulate_stream(KEY, [frames], [times], NOISY, model=EVERYTHING))
-    assert len(chunks) == 2
-    assert chunks[0].t[-1] <= 64_000 < chunks[1].t[0]
+    assert len(chunks) == 9
+    for i, (one, two) in enumerate(itertools.pairwise(chunks), 1):
+        assert one.t[-1] <= 8_000 * i < two.t[0]
     first = simulate(KEY, frames[:41], times[:41], NOISY, model=EVERYTHING)
     equal(first, Events.concatenate(chunks).slice(0, 40_001))
 
 
 def test_streams_are_lazy() -> None:
-    """The first events come out after one device chunk, of a video that never ends."""
+    """The first events come out after a few blocks, of a video that never ends."""
     def forever() -> itertools.count:
         return itertools.cycle(drifting(8))
 
     stream = simulate_stream(KEY, forever(), itertools.count(0, 1000), QUIET)
-    assert next(stream).t[-1] <= 64_000
-    assert next(stream).t[0] > 64_000
+    assert next(stream).t[-1] <= 8_000
+    assert next(stream).t[0] > 8_000
 
 
 def test_keys_matter_only_where_something_is_random() -> None:
@@ -95,10 +96,10 @@ def test_keys_matter_only_where_something_is_random() -> None:
 
 def test_video_length_does_not_recompile() -> None:
     simulate(KEY, drifting(5), milliseconds(5), QUIET)
-    before = advance_chunk._cache_size()
+    before = step._cache_size()
     for count in (3, 40, 70):
         simulate(KEY, drifting(count), milliseconds(count), Camera.constant(SHAPE, 0.3, 0.4))
-    assert advance_chunk._cache_size() == before
+    assert step._cache_size() == before
 
 
 def ramps(edges: np.ndarray, log_map: str) -> tuple[np.ndarray, np.ndarray]:

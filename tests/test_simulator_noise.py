@@ -16,7 +16,7 @@ from videos import by_pixel
 
 from evflow.camera import Camera, CameraPrior, SensorModel
 from evflow.simulator import simulate
-from evflow.simulator.noise import poisson, uniform_pair
+from evflow.simulator.noise import draw, event, further, pixel_words, poisson, salts, uniform
 from evflow.types import Events
 
 SHAPE = (64, 64)
@@ -179,16 +179,36 @@ def test_rare_events_keep_their_probability(mean: float) -> None:
     np.testing.assert_array_equal(poisson(u, jnp.float32(mean)), [1.0, 1.0, 0.0, 0.0])
 
 
-def test_uniform_pair_is_two_uniforms() -> None:
-    """2^22 draws: means to 4 sd; the second stays uniform where the first is small."""
-    u, at = (np.asarray(a, np.float64) for a in uniform_pair(jax.random.key(8), (1 << 22,)))
-    for value in (u, at):
-        assert value.min() > 0
-        assert value.max() <= 1
-        assert value.mean() == pytest.approx(0.5, abs=4 * 0.2887 / 2048)
-        assert value.var() == pytest.approx(1 / 12, rel=0.002)
-    rare = at[u < 0.005]
-    assert len(rare) == pytest.approx(0.005 * (1 << 22), rel=0.03)
-    counts = np.histogram(rare, 16, (0, 1))[0]
-    chi2 = ((counts - len(rare) / 16) ** 2 / (len(rare) / 16)).sum()
-    assert chi2 < 15 + 5 * np.sqrt(30)
+def test_draws_are_uniform_and_independent() -> None:
+    """2^22 draws of 4096 pixels in 1024 intervals: moments to 4 sd, by pixel, interval and draw."""
+    k_words, k_salts = jax.random.split(jax.random.key(8))
+    words = pixel_words(k_words, 4096)
+    drawn = jax.vmap(lambda salt: draw(words, salt))(salts(k_salts, jnp.arange(1024)))
+    every = jnp.broadcast_to(words, drawn.shape)
+    values = [uniform(drawn), *(further(every, drawn, jnp.uint32(n)) for n in (0, 1, 2))]
+    for u in (np.asarray(v, np.float64) for v in values):
+        assert u.min() > 0
+        assert u.max() <= 1
+        assert u.mean() == pytest.approx(0.5, abs=4 * 0.2887 / 2048)
+        assert u.var() == pytest.approx(1 / 12, rel=0.003)
+        for axis, n in ((0, 1024), (1, 4096)):  # means of each pixel, of each interval
+            assert u.mean(axis).std() == pytest.approx(0.2887 / np.sqrt(n), rel=0.1)
+        assert abs(np.mean((u[1:] - 0.5) * (u[:-1] - 0.5))) < 4 / 12 / 2048
+        assert abs(np.mean((u[:, 1:] - 0.5) * (u[:, :-1] - 0.5))) < 4 / 12 / 2048
+    first, *others = (np.asarray(v, np.float64) for v in values)
+    for other in others:  # uniform where the first is small, as in the pixels that noise strikes
+        rare = other[first < 0.005]
+        assert len(rare) == pytest.approx(0.005 * (1 << 22), rel=0.03)
+        counts = np.histogram(rare, 16, (0, 1))[0]
+        chi2 = ((counts - len(rare) / 16) ** 2 / (len(rare) / 16)).sum()
+        assert chi2 < 15 + 5 * np.sqrt(30)
+
+
+def test_host_and_device_place_events_alike() -> None:
+    words = pixel_words(jax.random.key(1), 1000)
+    salt = salts(jax.random.key(2), jnp.arange(1))[0]
+    drawn, k = draw(words, salt), np.arange(1000, dtype=np.uint32) % 5
+    share = jnp.full(1000, 0.3)
+    for theirs, ours in zip(event(ETA, words, drawn, jnp.asarray(k), share),
+                            event(ETA, *map(np.asarray, (words, drawn, k, share))), strict=True):
+        np.testing.assert_array_equal(ours, theirs)

@@ -1,8 +1,8 @@
 """Frames and a camera in, events or voxels out.
 
-pixel.py one pixel's step · noise.py Poisson noise and leak · scan.py pixels vmapped, frames
-scanned · events.py sorted event lists on the host · voxels.py voxel grids on the device ·
-interpolate.py slow videos to fast ones.
+pixel.py one interval of one pixel · noise.py Poisson noise and leak · sensor.py all pixels,
+vmapped · to events: frames.py what comes in, active.py the pixels that may fire, pack.py sorted
+lists, events.py the stream · to voxels: bins.py, voxels.py · interpolate.py slow videos to fast.
 """
 
 from evflow.simulator.events import simulate, simulate_stream

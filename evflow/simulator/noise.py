@@ -1,96 +1,216 @@
-"""Noise events: Poisson counts per pixel, polarity and interval, and the leak of the memory.
+"""Noise events: a Poisson process per pixel and polarity, and the leak of the memory.
 
-Rates follow the camera's eta maps and, where asked for, v2e's shot noise. A rate is exact at
-any interval length: counts are Poisson, not one Bernoulli draw per frame.
+Rates follow the camera's eta maps and, where asked for, v2e's shot noise. What a pixel draws in
+an interval is a hash of (key, pixel, interval): nothing is stored, a few pixels can be asked for
+alone, and every program finds the same events; the functions from `scramble` to `next_tail` take
+NumPy arrays as well, so that the host can place the few events there are. Counts are exact at any
+interval length; the events of an interval are independent of each other and uniform in it.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from evflow.camera import Camera, SensorModel
 from evflow.errors import EvflowDataError
 from evflow.intensity import noise_factor
 
 Array = jax.Array
+Values = Any  # jax.Array or np.ndarray
 
-GOLDEN = 0.6180339887498949
-MAX_MEAN = 60.0  # noise events per pixel and interval; beyond it exp(-mean) nears underflow
+MAX_MEAN = 70.0  # noise events per pixel and interval; beyond ~85 exp(-mean) underflows
+GOLDEN = np.uint32(0x9E3779B9)  # 2^32 / golden ratio: distinct numbers far apart
+JITTER = 1 << 30  # what the leak's draws are numbered from; those of events count from 0
 
 
-def uniform_pair(key: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Two float32 uniforms in (0, 1) from one 32-bit draw per element.
+def scramble(x: Values) -> Values:
+    """A bijection of uint32 under which neighbours become unrelated: xor-shift and multiply,
+    twice, with the constants of C. Wellons' hash prospector."""
+    x = (x ^ (x >> 16)) * np.uint32(0x21F0AAAD)
+    x = (x ^ (x >> 15)) * np.uint32(0xD35A2D97)
+    return x ^ (x >> 15)
 
-    The first has 2^-32 resolution near zero (jax.random.uniform's 2^-23 is too coarse for a
-    probability of 1e-6 per pixel and frame) and decides the count; the second is made of the
-    low 12 bits, which stay uniform given that the first is small, and places the event in time.
+
+def pixel_words(key: Array, count: int) -> Array:
+    """uint32 (count,): each pixel's own word."""
+    return jax.random.bits(key, (count,), jnp.uint32)
+
+
+def salts(key: Array, intervals: Array) -> Array:
+    """uint32 (T, 2): a multiplier and an offset for each frame interval, from its index alone."""
+    def salt(interval: Array) -> Array:
+        bits = jax.random.bits(jax.random.fold_in(key, interval), (2,), jnp.uint32)
+        return bits | jnp.array([1, 0], jnp.uint32)  # an odd multiplier loses no bit
+
+    return jax.vmap(salt)(intervals)
+
+
+def draw(words: Array, salt: Array) -> Array:
+    """uint32 per pixel: what it draws in the interval of this salt (2,). The multiply-add alone
+    makes any two pixels independent; the hash breaks up what is left of its structure."""
+    return scramble(words * salt[0] + salt[1])
+
+
+def further(words: Values, drawn: Values, number: Values) -> Values:
+    """Uniforms in (0, 1], the interval's draw of this number (uint32) beside `drawn`."""
+    return uniform(scramble(drawn + words + (number + np.uint32(1)) * GOLDEN))
+
+
+def uniform(bits: Values) -> Values:
+    """float32 in (0, 1] of uint32. Near zero the resolution is 2^-32 (that of
+    jax.random.uniform, 2^-23, is too coarse for a probability of 1e-6 per interval)."""
+    return (bits.astype(np.float32) + np.float32(0.5)) * np.float32(2.0**-32)
+
+
+def event(
+    model: SensorModel, words: Values, drawn: Values, k: Values, share: Values
+) -> tuple[Values, Values]:
+    """The k-th (uint32) noise event of an interval: where it falls, a fraction (v2e puts it at
+    the frame), and whether it is ON, as `share` of them are."""
+    at, mark = (further(words, drawn, np.uint32(2) * k + np.uint32(i)) for i in (0, 1))
+    return at if model.timestamps == "crossing" else at * 0 + 1, mark <= share
+
+
+Tail = tuple[Values, Values, Values]
+
+
+def some(mean: Array) -> Array:
+    """P(N > 0) of a Poisson count N: 1 - exp(-mean), by its series below .03."""
+    series = mean * (1.0 - mean / 2.0 * (1.0 - mean / 3.0 * (1.0 - mean / 4.0)))
+    return jnp.where(mean < 0.03, series, 1.0 - jnp.exp(-mean))
+
+
+def next_tail(mean: Values, current: Tail) -> Tail:
+    """From P(N > k) and P(N = k) to those of k + 1.
+
+    A pixel sends its event k (0, 1, ...) where the interval's uniform lies below P(N > k). What
+    remains of it where P(N = k) < 1e-12 is rounding, and is cut: that ends any loop.
     """
-    bits = jax.random.bits(key, shape, jnp.uint32)
-    low = (bits & 0xFFF).astype(jnp.float32)
-    return (bits.astype(jnp.float32) + 0.5) * 2.0**-32, (low + 0.5) * 2.0**-12
-
-
-def placed(model: SensorModel, at: Array, k: Array | int) -> Array:
-    """Time of the k-th noise event of an interval, as a fraction: the first is uniform, further
-    ones follow at the golden ratio (an interval with two is rare: mean = rate x dt). v2e puts
-    them all at the frame."""
-    if model.timestamps == "v2e":
-        return jnp.ones_like(at)
-    return jnp.mod(at + k * GOLDEN, 1.0)
+    more, equal, k = current
+    k = k + np.float32(1.0)
+    equal = equal * mean / k
+    return (more - equal) * ((equal > 1e-12) | (k < mean)), equal, k
 
 
 def poisson(u: Array, mean: Array) -> Array:
-    """Poisson counts (float32) by inversion of the upper tail: exact for small means.
+    """Poisson counts (float32) by inversion of the upper tail: exact for small means. The cost
+    follows the largest count (jax.random.poisson is ~20x slower here)."""
+    def unfinished(carry: tuple[Array, Tail]) -> Array:
+        return jnp.any(u < carry[1][0])
 
-    Loops until no pixel is left, so the cost follows the largest count (jax.random.poisson
-    is ~20x slower here). Means above 80 underflow exp(-mean) in float32 and are refused on
-    the host; counts beyond mean + 8 sd + 12 (probability < 1e-10) lie in the rounding error of
-    the tail and end the loop.
+    def step(carry: tuple[Array, Tail]) -> tuple[Array, Tail]:
+        return carry[0] + (u < carry[1][0]), next_tail(mean, carry[1])
+
+    mean = mean + jnp.zeros_like(u)
+    tail = some(mean), jnp.exp(-mean), jnp.zeros((), u.dtype)
+    return jax.lax.while_loop(unfinished, step, (jnp.zeros_like(u), tail))[0]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Rates:
+    """Noise rates in Hz, ON and OFF maps each: rate = steady + varying x noise_factor(I01).
+    varying: None where intensity does not matter."""
+
+    steady: tuple[Array, Array]
+    varying: tuple[Array, Array] | None
+
+    def at(self, i01: Array) -> tuple[Array, Array]:
+        """(ON, OFF) rates at normalised intensity i01."""
+        (on, off), factor = self.steady, noise_factor(i01)
+        if self.varying is None:
+            return on, off
+        return on + self.varying[0] * factor, off + self.varying[1] * factor
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Odds:
+    """Of an interval, per pixel: the mean number of noise events, the probabilities of any and of
+    none, and the share of ON among them."""
+
+    mean: Array
+    some: Array
+    none: Array
+    share: Array
+
+    def tail(self) -> Tail:
+        """(P(N > 0), P(N = 0), k = 0), the start of `next_tail`."""
+        return self.some, self.none, np.float32(0.0)
+
+
+def odds(rates: Rates, i01: Array, dt: Array) -> Odds:
+    """The odds of an interval of dt seconds at normalised intensity i01."""
+    on, off = rates.at(i01)
+    mean = dt * (on + off)
+    return Odds(mean, some(mean), jnp.exp(-mean), on / jnp.maximum(on + off, 1e-30))
+
+
+def rates(model: SensorModel, camera: Camera, reference: Array, nominal: Array) -> Rates:
+    """The camera's noise rates.
+
+    reference: the I01 at which eta is given (the mean of the first frame). nominal: the median
+    thresholds (ON, OFF); v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta.
     """
-    limit = mean + 8.0 * jnp.sqrt(mean) + 12.0
-
-    def unfinished(carry: tuple[Array, Array, Array, Array]) -> Array:
-        return jnp.any(u < carry[2])
-
-    def count_one(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        count, k, tail, term = carry
-        more = u < tail
-        term = term * mean / k
-        tail = jnp.where(more & (k < limit), tail - term, 0.0)
-        return count + more, k + 1.0, tail, term
-
-    zero = jnp.zeros_like(u + mean)
-    start = (zero, jnp.ones((), zero.dtype), -jnp.expm1(-mean) + zero, jnp.exp(-mean) + zero)
-    return jax.lax.while_loop(unfinished, count_one, start)[0]
-
-
-def noise_rates(
-    model: SensorModel, camera: Camera, i01: Array, reference: Array
-) -> tuple[Array, Array]:
-    """Noise rates (ON, OFF) in Hz per pixel at normalised intensity i01.
-
-    reference: the I01 at which eta is given (the mean of the first frame). v2e's shot noise
-    adds R/2 ((F-1) I01 + 1) theta_median / theta per polarity.
-    """
-    eta = jnp.stack([camera.eta_on, camera.eta_off])
+    eta = (camera.eta_on, camera.eta_off)
+    if not model.eta_intensity and model.shot_hz <= 0:
+        return Rates(eta, None)
+    zero = jnp.zeros_like(camera.eta_on)
+    steady, varying = eta, (zero, zero)
     if model.eta_intensity:
-        eta = eta * (noise_factor(i01) / noise_factor(reference))[None]
+        gain = 1.0 / noise_factor(reference)
+        steady, varying = varying, (eta[0] * gain, eta[1] * gain)
     if model.shot_hz > 0:
-        theta = jnp.stack([camera.theta_on, camera.theta_off])
-        median = jnp.median(theta.reshape(2, -1), axis=1).reshape(2, *[1] * (theta.ndim - 1))
-        eta = eta + 0.5 * model.shot_hz * noise_factor(i01)[None] * (median / theta)
-    return eta[0], eta[1]
+        half = 0.5 * model.shot_hz
+        varying = (varying[0] + half * (nominal[0] / camera.theta_on),
+                   varying[1] + half * (nominal[1] / camera.theta_off))
+    return Rates(steady, varying)
 
 
-def peak_rate(model: SensorModel, camera: Camera) -> float:
-    """Bound on the noise rate (Hz per polarity) of any pixel at any intensity (host side; 0 for
-    traced cameras, of which nothing is known)."""
+def nominal_thresholds(model: SensorModel, camera: Camera) -> Array:
+    """Median thresholds (ON, OFF) that shot noise refers to, (2, ...) for maps (..., H, W).
+
+    A median is a sort, 17 ms on the device for a sensor of 346x260 and 1 ms on the host: call
+    it outside jit where the camera is known. Models without shot noise do not look.
+    """
+    theta = (camera.theta_on, camera.theta_off)
+    lead = camera.shape[:-2]
+    if model.shot_hz <= 0:
+        return jnp.ones((2, *lead), jnp.float32)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in theta):
+        return jnp.median(jnp.stack(theta).reshape(2, *lead, -1), axis=-1)
+    maps = np.stack([np.asarray(t) for t in theta])
+    return jnp.asarray(np.median(maps.reshape(2, *lead, -1), axis=-1))
+
+
+def is_noisy(model: SensorModel, camera: Camera) -> bool:
+    """False only where no noise event can occur (host side; traced cameras count as noisy)."""
+    etas = (camera.eta_on, camera.eta_off)
+    if model.shot_hz > 0 or any(isinstance(e, jax.core.Tracer) for e in etas):
+        return True
+    return any(bool(np.any(np.asarray(eta) > 0)) for eta in etas)
+
+
+def peak(rates: Rates) -> Array:
+    """Bound on each pixel's rate, both polarities together, at any intensity (Hz)."""
+    on, off = rates.at(jnp.zeros((), rates.steady[0].dtype))
+    return on + off
+
+
+def most_rate(model: SensorModel, camera: Camera, nominal: Array) -> float:
+    """Bound on the rate of any pixel at any intensity and reference, Hz (host side; 0 for traced
+    cameras, of which nothing is known)."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(camera)):
         return 0.0
     with jax.ensure_compile_time_eval():
-        dark, bright = jnp.zeros(camera.shape, jnp.float32), jnp.ones((), jnp.float32)
-        return float(jnp.max(jnp.stack(noise_rates(model, camera, dark, bright))))
+        nominal = jnp.reshape(nominal, (*nominal.shape, 1, 1))
+        brightest = jnp.ones((), jnp.float32)
+        return float(jnp.max(peak(rates(model, camera, brightest, nominal))))
 
 
 def check_rate(rate_hz: float, dt_s: float) -> None:
@@ -102,15 +222,18 @@ def check_rate(rate_hz: float, dt_s: float) -> None:
             "Rates (eta, shot_hz) are in Hz per pixel, typically .01-10; or shorten the interval.")
 
 
-def leak_contrast(
-    model: SensorModel, theta_on: Array, fixed_pattern: Array, key: Array, dt: Array
-) -> Array:
-    """ON contrast leaked in dt: rate x fixed pattern x (1 - jitter N(0,1)) x theta_on (v2e)."""
-    leaked = dt * model.leak_hz * fixed_pattern * theta_on
-    if model.leak_jitter > 0:
-        normal = jax.random.normal(key, theta_on.shape, theta_on.dtype)
-        leaked = leaked * (1.0 - model.leak_jitter * normal)
-    return leaked
+def leak_rates(model: SensorModel, theta_on: Array, pattern: Array) -> Array:
+    """Contrast that leaks into ON per second: rate x fixed pattern x theta_on (v2e)."""
+    return model.leak_hz * pattern * theta_on
+
+
+def leak(model: SensorModel, leaking: Array, words: Array, drawn: Array, dt: Array) -> Array:
+    """Contrast leaked in an interval: `leak_rates` x dt x (1 - jitter N(0,1)) (v2e)."""
+    if model.leak_jitter <= 0:
+        return leaking * dt
+    u, v = (further(words, drawn, jnp.uint32(JITTER + i)) for i in (0, 1))
+    normal = jnp.sqrt(-2.0 * jnp.log(u)) * jnp.cos(2 * jnp.pi * v)
+    return leaking * dt * (1.0 - model.leak_jitter * normal)
 
 
 def leak_pattern(model: SensorModel, key: Array, shape: tuple[int, ...]) -> Array:

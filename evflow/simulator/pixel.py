@@ -1,4 +1,4 @@
-"""One pixel, one frame interval: v2e's model as a pure step, to be vmapped over pixels.
+"""One pixel, one frame interval: pure functions of scalars, to be vmapped over pixels.
 
 The low-passed log intensity `lp` moves linearly from its old to its new value during the
 interval; the memory `base` holds the value at the last event. An event fires each time
@@ -14,7 +14,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from evflow.camera import SensorModel
+from evflow.camera import Camera, SensorModel
 
 Array = jax.Array
 
@@ -33,16 +33,40 @@ class PixelState:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Spikes:
-    """Signal events of one interval. count: int32, positive ON, negative OFF.
+    """Signal events of one interval. count: float32, positive ON, negative OFF.
 
     The k-th event (k = 0, 1, ...) falls at max(first + k spacing, earliest + k dead), in
-    fractions of the interval, where dead = refractory / dt.
+    fractions of the interval, where dead = refractory / dt; earliest is None where pixels never
+    wait, and the first term alone counts.
     """
 
     count: Array
     first: Array
     spacing: Array
-    earliest: Array
+    earliest: Array | None
+
+
+def never_fired(model: SensorModel) -> float:
+    """`PixelState.last` of a pixel that has not fired yet."""
+    return 1e6 if model.timestamps == "crossing" else -model.refractory_s
+
+
+def coarse(camera: Camera) -> Camera:
+    """Thresholds rounded to 16 significant bits (a change below 8e-6 of their value).
+
+    k theta is then exact in float32 for k <= 256: whether a compiler fuses multiply and add
+    cannot decide the exact ties that 8-bit video is full of, and all programs count alike.
+    """
+    def rounded(theta: Array) -> Array:
+        if theta.dtype != jnp.float32:
+            return theta
+        bits = jax.lax.bitcast_convert_type(theta, jnp.uint32)
+        even = (bits >> 8) & 1
+        return jax.lax.bitcast_convert_type(
+            (bits + even + jnp.uint32(0x7F)) & jnp.uint32(0xFFFFFF00), jnp.float32)
+
+    return dataclasses.replace(camera, theta_on=rounded(camera.theta_on),
+                               theta_off=rounded(camera.theta_off))
 
 
 def floor_divide(a: Array, theta: Array) -> Array:
@@ -61,49 +85,53 @@ def low_pass(lp: Array, log_i: Array, i01: Array, dt: Array, cutoff_hz: float) -
     return lp + eps * (log_i - lp)
 
 
-def pixel_step(
-    model: SensorModel,
-    theta_on: Array,
-    theta_off: Array,
-    state: PixelState,
-    log_i: Array,
-    i01: Array,
-    leak: Array,
-    dt: Array,
-) -> tuple[PixelState, Array, Array]:
-    """Advance to the end of an interval of dt seconds, before any event is sent.
-
-    leak: contrast that leaks into ON during the interval (log units). Returns the state with
-    its memory leaked, the contrast d = lp - base at the start and at the end.
-    """
-    lp = low_pass(state.lp, log_i, i01, dt, model.cutoff_hz) if model.cutoff_hz > 0 else log_i
-    start = state.lp - state.base
-    base = state.base - leak
-    return PixelState(lp, base, state.last), start, lp - base
-
-
 def crossings(
     model: SensorModel, theta: Array, start: Array, end: Array, last: Array, dt: Array
-) -> Spikes:
-    """Events at the true crossing of the interpolated contrast.
+) -> tuple[Spikes, Array]:
+    """Events at the true crossing of the interpolated contrast, and by how many thresholds the
+    memory moves.
 
-    start, end: contrast in the direction of the event (end >= 0). With a refractory period r
-    the k-th event waits for the pixel: t_k = max(s_k, max(s_0, t_last + r) + k r), the
-    max-plus form of "no sooner than the crossing, no sooner than r after the one before".
+    start, end: contrast in the direction of the event (end >= 0).
     """
-    count = floor_divide(jnp.maximum(end, 0.0), theta)
+    crossed = floor_divide(jnp.maximum(end, 0.0), theta)
     rise = end - start
-    safe = jnp.where(rise > 0, rise, 1.0)
-    first = jnp.where(rise > 0, (theta - start) / safe, 0.0)
-    spacing = jnp.where(rise > 0, theta / safe, 0.0)
-    earliest = jnp.maximum(first, 0.0)
-    if model.refractory_s > 0:
-        positive_dt = jnp.maximum(dt, 1e-9)
-        dead = model.refractory_s / positive_dt
-        earliest = jnp.maximum(earliest, dead - last / positive_dt)
-        fits = jnp.where(earliest <= 1.0, jnp.floor((1.0 - earliest) / dead) + 1.0, 0.0)
-        count = jnp.minimum(count, fits)
-    return Spikes(count, first, spacing, earliest)
+    inverse = jnp.where(rise > 0, 1.0 / jnp.where(rise > 0, rise, 1.0), 0.0)
+    first = (theta - start) * inverse
+    spikes = Spikes(crossed, first, theta * inverse, None)
+    if model.refractory_s <= 0:
+        return spikes, crossed
+    dt = jnp.maximum(dt, 1e-9)
+    dead = model.refractory_s / dt
+    ready = dead - last / dt
+    if model.kind == "esim":
+        return thinned(spikes, ready, dead), crossed
+    spikes = delayed(spikes, ready, dead)
+    return spikes, spikes.count
+
+
+def delayed(spikes: Spikes, ready: Array, dead: Array) -> Spikes:
+    """v2e's refractory period: an event that comes too early waits.
+
+    t_k = max(s_k, max(s_0, ready) + k dead) is the max-plus form of "no sooner than the
+    crossing, no sooner than `dead` after the one before"; what does not fit into the interval
+    keeps its contrast. ready: when the pixel may fire again.
+    """
+    earliest = jnp.maximum(jnp.maximum(spikes.first, 0.0), ready)
+    fits = jnp.where(earliest <= 1.0, jnp.floor((1.0 - earliest) / dead) + 1.0, 0.0)
+    return dataclasses.replace(spikes, count=jnp.minimum(spikes.count, fits), earliest=earliest)
+
+
+def thinned(spikes: Spikes, ready: Array, dead: Array) -> Spikes:
+    """ESIM's refractory period: an event that comes too early is lost. What is left of an
+    arithmetic progression is one: from the first event after `ready`, each first one `dead`
+    later."""
+    spacing = jnp.maximum(spikes.spacing, 1e-9)
+    skipped = jnp.clip(jnp.ceil((ready - spikes.first) / spacing), 0.0, spikes.count)
+    stride = jnp.maximum(jnp.ceil(dead / spacing), 1.0)
+    left = spikes.count - skipped
+    count = jnp.where(left > 0, jnp.floor((left - 1.0) / stride) + 1.0, 0.0)
+    first = spikes.first + skipped * spikes.spacing
+    return Spikes(count, first, stride * spikes.spacing, None)
 
 
 def slot_time(k: Array, total: Array, begin: Array, end: Array) -> Array:
@@ -136,8 +164,7 @@ def slots(
     count = floor_divide(jnp.maximum(end, 0.0), theta)
     total = jnp.maximum(slots_used, 1.0)
     one = 1.0 / total
-    plain = Spikes(count, jnp.full_like(count, one), jnp.full_like(count, one),
-                   jnp.full_like(count, one))
+    plain = Spikes(count, jnp.full_like(count, one), jnp.full_like(count, one), None)
     if model.refractory_s <= 0:
         return plain, last
 
@@ -153,24 +180,54 @@ def slots(
     start = (zero, zero, zero, last)
     passed, first, final, new_last = jax.lax.fori_loop(0, total.astype(jnp.int32), visit, start)
     stride = (final - first) / jnp.maximum(passed - 1.0, 1.0)
-    skipping = Spikes(passed, (first + 1.0) * one, stride * one, (first + 1.0) * one)
+    skipping = Spikes(passed, (first + 1.0) * one, stride * one, None)
     checked = model.refractory_s > dt * one
     spikes = jax.tree.map(lambda a, b: jnp.where(checked, a, b), skipping, plain)
     return spikes, jnp.where(checked, new_last, last)
 
 
-def settle(
-    model: SensorModel, theta_on: Array, theta_off: Array, state: PixelState,
-    spikes: Spikes, rising: Array, dt: Array,
+def since_last(model: SensorModel, spikes: Spikes, last: Array, dt: Array) -> Array:
+    """Seconds from the last signal event to the end of the interval (crossing times). count
+    has no sign here."""
+    k = spikes.count - 1.0
+    at = spikes.first + k * spikes.spacing
+    if spikes.earliest is not None:
+        at = jnp.maximum(at, spikes.earliest + k * (model.refractory_s / jnp.maximum(dt, 1e-9)))
+    return jnp.where(spikes.count > 0, (1.0 - at) * dt, last + dt)
+
+
+def contrast(
+    model: SensorModel, theta_on: Array, theta_off: Array, state: PixelState, log_i: Array,
+    i01: Array, leaked: Array | None, dt: Array,
+) -> tuple[PixelState, Array, Array, Array]:
+    """Advance to the end of an interval of dt seconds, before any event is sent.
+
+    i01: normalised intensity, read by the low-pass only. leaked: contrast that leaks into ON
+    during the interval. Returns the state with its memory leaked; the threshold it moves
+    towards, negative for OFF; the contrast towards it when the interval begins and ends.
+    """
+    lp = log_i if model.cutoff_hz <= 0 else low_pass(state.lp, log_i, i01, dt, model.cutoff_hz)
+    base = state.base if leaked is None else state.base - leaked
+    start, end = state.lp - state.base, lp - base
+    rising = end > 0
+    theta = jnp.where(rising, theta_on, -theta_off)
+    return PixelState(lp, base, state.last), theta, jnp.where(rising, start, -start), jnp.abs(end)
+
+
+def send(
+    model: SensorModel, state: PixelState, theta: Array, start: Array, end: Array, dt: Array,
+    begin: Array, stop: Array, slots_used: Array,
 ) -> tuple[PixelState, Spikes]:
-    """Move the memory by the events that were sent; give the count its sign. With crossing
-    times, also remember when the last event was."""
-    base = state.base + spikes.count * jnp.where(rising, theta_on, -theta_off)
-    last = state.last
-    if model.timestamps == "crossing":
-        k = spikes.count - 1.0
-        dead = model.refractory_s / jnp.maximum(dt, 1e-9)
-        at = jnp.maximum(spikes.first + k * spikes.spacing, spikes.earliest + k * dead)
-        last = jnp.where(spikes.count > 0, (1.0 - at) * dt, state.last + dt)
-    signed = jnp.where(rising, spikes.count, -spikes.count).astype(jnp.int32)
-    return PixelState(state.lp, base, last), dataclasses.replace(spikes, count=signed)
+    """The events of the interval that `contrast` led through, and the state after them. begin,
+    stop, slots_used: see `slots`."""
+    threshold = jnp.abs(theta)
+    if model.timestamps == "v2e":
+        spikes, last = slots(model, threshold, end, state.last, dt, begin, stop, slots_used)
+        moved = spikes.count
+    else:
+        spikes, moved = crossings(model, threshold, start, end, state.last, dt)
+        last = state.last
+        if model.refractory_s > 0:
+            last = since_last(model, spikes, last, dt)
+    signed = dataclasses.replace(spikes, count=jnp.sign(theta) * spikes.count)
+    return PixelState(state.lp, state.base + moved * theta, last), signed

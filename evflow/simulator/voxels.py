@@ -1,13 +1,14 @@
 """Log frames -> voxel grid without ever making an event; jit, vmap and scan it.
 
-Within an interval a pixel's events sit on an arithmetic progression, so the sum of their
-triangular weights (Eq. 2) has a closed form (`hat_sums`). An interval touches few bins; only
-those are computed.
+The frames are scanned, `sensor.advance` says when events fall, `bins` what they weigh, and each
+interval's few touched bins are added to the grid in place. Large frames are taken in tiles of
+pixels, whose state, light and grid stay in the cache from the first frame to the last.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -17,128 +18,156 @@ import numpy as np
 
 from evflow.camera import Camera, SensorModel
 from evflow.errors import EvflowDataError
-from evflow.simulator import noise, scan
-from evflow.simulator.scan import Interval, SimState
+from evflow.simulator import bins as weigh
+from evflow.simulator import noise, sensor
+from evflow.simulator.bins import Schedule
+from evflow.simulator.pixel import PixelState, Spikes
+from evflow.simulator.sensor import Disturbance, Sensor, SimState
 from evflow.voxel import BINS
 
 Array = jax.Array
+Event = tuple[Array, Array]  # of every pixel: where in the interval, and its sign or 0
+Weights = tuple[list[Array], list[Array]]  # (ON, OFF), one (N,) per touched bin
 
-
-def hat_sums(low: Array, width: int, first: Array, spacing: Array, count: Array) -> list[Array]:
-    """Weights on bins low, low+1, ... (`width` of them) of a progression of events.
-
-    first, spacing are in bins; every event must lie in [low, low + width - 1]. Within a gap
-    between two bins the weights are linear, so the number of events in it and the sum of their
-    positions suffice: one division, whatever the count.
-    """
-    start = first - low
-    inverse = 1.0 / jnp.maximum(spacing, 1e-12)
-    weights = [jnp.zeros_like(count) for _ in range(width)]
-    done, total = jnp.zeros_like(count), jnp.zeros_like(count)
-    for gap in range(width - 1):
-        if gap == width - 2:
-            upto = count
-        else:
-            upto = jnp.clip(jnp.floor((gap + 1.0 - start) * inverse) + 1.0, 0.0, count)
-        position = upto * (start + spacing * (0.5 * (upto - 1.0)))  # sum of the first `upto`
-        number, moment = upto - done, position - total
-        weights[gap] += (gap + 1.0) * number - moment
-        weights[gap + 1] += moment - gap * number
-        done, total = upto, position
-    return weights
-
-
-def _signal_bins(
-    interval: Interval, low: Array, begin: Array, length: Array, width: int, dead: Array | None
-) -> list[Array]:
-    """Weights (H, W) per touched bin of one interval's signal events, both polarities together.
-
-    The interval spans [begin, begin + length] bins. dead: the refractory period in interval
-    lengths, None where pixels never wait.
-    """
-    spikes = interval.spikes
-    count = jnp.abs(spikes.count).astype(jnp.float32)
-    spacing = spikes.spacing * length
-    if dead is None:
-        return hat_sums(low, width, begin + spikes.first * length, spacing, count)
-    # The waiting events come first, `dead` apart, then those that cross in their own time; where
-    # crossings are no further apart than `dead`, every event waits for the one before.
-    gain = spikes.spacing - dead
-    lag = jnp.maximum(spikes.earliest - spikes.first, 0.0)
-    waiting = jnp.where(gain > 0, jnp.ceil(lag / jnp.maximum(gain, 1e-9)), count)
-    waiting = jnp.minimum(waiting, count)
-    at = spikes.first + waiting * spikes.spacing
-    late = hat_sums(low, width, begin + spikes.earliest * length,
-                    jnp.zeros_like(count) + dead * length, waiting)
-    timely = hat_sums(low, width, begin + at * length, spacing, count - waiting)
-    return [a + b for a, b in zip(late, timely, strict=True)]
-
-
-def _noise_bins(
-    model: SensorModel, interval: Interval, low: Array, begin: Array, length: Array, width: int
-) -> list[Array]:
-    """Weights (2, H, W) per touched bin of one interval's noise events (ON, OFF). The loop runs
-    only where some pixel sends two or more in one interval."""
-    counts = jnp.stack([interval.noise_on, interval.noise_off])
-
-    def place(k: Array | int) -> list[Array]:
-        s = begin + noise.placed(model, interval.noise_at, k) * length - low
-        struck = jnp.where(counts > k, 1.0, 0.0)
-        return [struck * jnp.maximum(0.0, 1.0 - jnp.abs(s - j)) for j in range(width)]
-
-    def more(k: Array, weights: list[Array]) -> list[Array]:
-        return [a + b for a, b in zip(weights, place(k), strict=True)]
-
-    return jax.lax.fori_loop(1, jnp.max(counts).astype(jnp.int32), more, place(0))
+TILE = 16384  # pixels; their maps and grid, some 3 MB, are worked on at a time
 
 
 def simulate_window(
-    model: SensorModel, noisy: bool, camera: Camera, state: SimState, log_frames: Array,
+    model: SensorModel, whole: Sensor, state: SimState, log_frames: Array,
     frame_dt_s: Array | float, bins: int,
 ) -> tuple[SimState, Array]:
     """Advance through log_frames (T, H, W), T frames after the state's own, equally spaced.
 
     Returns the state and the voxel grid (H, W, 2*bins) of the window of T intervals.
     """
-    steps = log_frames.shape[0]
-    length = (bins - 1) / steps
-    edges = np.arange(steps) * length
-    low = np.minimum(np.floor(edges + 1e-6), bins - 2).astype(np.int32)
-    width = min(bins, int(np.max(np.ceil(edges + length - 1e-6) - low)) + 1)
-    low = np.minimum(low, bins - width)
+    steps, *shape = log_frames.shape
+    count = math.prod(shape)
     dt = jnp.asarray(frame_dt_s, jnp.float32)
-    waits = model.refractory_s > 0 and model.timestamps == "crossing"
-    dead = model.refractory_s / dt if waits else None
+    intervals = state.interval + jnp.arange(steps)
+    salts = noise.salts(state.key, intervals)
+    high, low = state.time
+    clock = jnp.stack([high + dt * jnp.arange(steps + 1), jnp.full(steps + 1, low)], -1)
 
-    def body(state: SimState, inputs: tuple[Array, Array, Array]) -> tuple[SimState, Any]:
-        log_i, at, begin = inputs
-        end_s = jnp.stack([state.frame.astype(jnp.float32) * dt, jnp.zeros(())])
-        state, interval = scan.advance(model, noisy, camera, state, log_i, dt, end_s)
-        span = jnp.float32(length)
-        weights = _signal_bins(interval, at, begin, span, width, dead)
-        # An interval has one polarity per pixel: its sign marks it, and halves the traffic.
-        sign = jnp.sign(interval.spikes.count).astype(jnp.float32)
-        struck = _noise_bins(model, interval, at, begin, span, width) if noisy else []
-        return state, ([w * sign for w in weights], struck)
+    def scanned(maps: Any) -> tuple[PixelState, Array]:
+        tile, pixels, frames = maps
+        return _scan(model, tile, pixels, frames, salts, clock, dt, bins)
 
-    inputs = (log_frames, jnp.asarray(low, jnp.float32), jnp.asarray(edges, jnp.float32))
-    state, (signed, struck) = jax.lax.scan(body, state, inputs)
-    grid = [_collect(signed, struck, low, j, polarity) for polarity in (0, 1) for j in range(bins)]
-    return state, jnp.stack(grid, -1)
+    maps = (whole, state.pixels, log_frames.reshape(steps, count))
+    whole_at_once = count <= TILE or model.timestamps == "v2e"  # whose slots depend on all pixels
+    pixels, grid = scanned(maps) if whole_at_once else _tiled(scanned, maps, count)
+    end = SimState(pixels, intervals[-1] + 1, clock[-1], state.key)
+    return end, grid.reshape(*shape, 2 * bins)
 
 
-def _collect(
-    signed: list[Array], struck: list[Array], low: np.ndarray, j: int, polarity: int
-) -> Array:
-    """Bin j of one polarity (0 ON, 1 OFF): the few (interval, touched bin) pairs that fall on
-    it, added. signed: per touched bin (T, H, W); struck: (T, 2, H, W), empty without noise."""
-    total = jnp.zeros(signed[0].shape[1:], jnp.float32)
-    for t in np.flatnonzero((low <= j) & (j < low + len(signed))):
-        weight = signed[j - low[t]][t]
-        total += jax.nn.relu(weight if polarity == 0 else -weight)
-        if struck:
-            total += struck[j - low[t]][t, polarity]
-    return total
+def _tiled(
+    scanned: Callable[[Any], tuple[PixelState, Array]], maps: Any, count: int
+) -> tuple[PixelState, Array]:
+    """`scanned` tile by tile. maps: (..., count) each. A tile is a multiple of 128 pixels (loops
+    with a remainder take XLA twice as long), so the last one repeats pixels of the one before."""
+    tiles = math.ceil(count / TILE)
+    size = 128 * math.ceil(count / tiles / 128)
+
+    def tile(i: Array | int) -> tuple[Array, tuple[PixelState, Array]]:
+        at = jnp.minimum(i * size, count - size)
+        cut = partial(jax.lax.dynamic_slice_in_dim, start_index=at, slice_size=size, axis=-1)
+        return at, scanned(jax.tree.map(cut, maps))
+
+    def put(i: Array | int, done: tuple[PixelState, Array]) -> tuple[PixelState, Array]:
+        at, parts = tile(i)
+        return jax.tree.map(
+            lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, at, 0),
+            done, parts)
+
+    shapes = jax.eval_shape(lambda: tile(0)[1])
+    empty = jax.tree.map(lambda s: jnp.zeros((count, *s.shape[1:]), s.dtype), shapes)
+    return jax.lax.fori_loop(0, tiles, put, empty)
+
+
+def _scan(
+    model: SensorModel, whole: Sensor, pixels: PixelState, log_frames: Array, salts: Array,
+    clock: Array, dt: Array, bins: int,
+) -> tuple[PixelState, Array]:
+    """`simulate_window` on flat maps: log_frames (T, N) -> grid (N, 2 * bins). salts: (T, 2).
+    clock: (T + 1, 2), as in `SimState.time`."""
+    steps, count = log_frames.shape
+    plan = Schedule.of(steps, bins)
+
+    def body(
+        carry: tuple[PixelState, Array], inputs: tuple[Any, ...]
+    ) -> tuple[tuple[PixelState, Array], None]:
+        (pixels, grid), (log_i, low, offset, wide, salt, begin, end) = carry, inputs
+        i01 = sensor.i01_of(model, log_i)  # dropped by the compiler where nothing uses it
+        dist = sensor.disturb(model, whole, i01, salt, dt)
+        pixels, spikes = sensor.advance(
+            model, whole.camera, pixels, log_i, i01, dist.leaked, dist.struck, dt, (begin, end))
+        on, off = _weights(model, plan, whole.words, spikes, dist, offset, wide, dt)
+        if dist.odds is not None:
+            more = _more_noise(model, whole.words, dist, offset, plan)
+            on, off = jax.tree.map(jnp.add, (on, off), more)
+        return (pixels, weigh.add(grid, low, on, off)), None
+
+    inputs = (log_frames, plan.low, plan.offset, plan.wide, salts, clock[:-1], clock[1:])
+    grid = jnp.zeros((2 * bins, count), log_frames.dtype)
+    pixels, grid = jax.lax.scan(body, (pixels, grid), inputs)[0]
+    return pixels, grid.T
+
+
+def _event(model: SensorModel, words: Array, dist: Disturbance, k: Array, sent: Array) -> Event:
+    """The k-th noise event of an interval, of the pixels that have sent it."""
+    assert dist.odds is not None
+    at, on = noise.event(model, words, dist.drawn, k, dist.odds.share)
+    return at, jnp.where(sent, jnp.where(on, 1.0, -1.0), 0.0)
+
+
+def _weights(
+    model: SensorModel, plan: Schedule, words: Array, spikes: Spikes, dist: Disturbance,
+    offset: Array, wide: Array, dt: Array,
+) -> Weights:
+    """Weights of the signal events of an interval and of one noise event per pixel."""
+    event = None
+    if dist.struck is not None:
+        event = _event(model, words, dist, jnp.zeros((), jnp.uint32), dist.struck)
+    dead = model.refractory_s / dt if model.waits else None
+
+    def signed(width: int, spikes: Spikes, event: Event | None) -> list[list[Array]]:
+        parts = [weigh.signal_bins(width, spikes, offset, plan.length, dead)]
+        if event is not None:
+            parts.append(weigh.noise_bins(width, *event, offset, plan.length))
+        spare = [jnp.zeros_like(spikes.first)] * (plan.width - width)
+        return [part + spare for part in parts]
+
+    # The branch saves the third bin where it is not touched; it also is where XLA writes the
+    # spikes down once, instead of computing them again for every bin and polarity.
+    parts = jax.lax.cond(wide, partial(signed, plan.width), partial(signed, 2), spikes, event)
+    def of(sign: float) -> list[Array]:
+        return [sum((jnp.maximum(sign * w, 0.0) for w in column[1:]),
+                    jnp.maximum(sign * column[0], 0.0)) for column in zip(*parts, strict=True)]
+
+    return of(1.0), of(-1.0)
+
+
+def _more_noise(
+    model: SensorModel, words: Array, dist: Disturbance, offset: Array, plan: Schedule
+) -> Weights:
+    """Weights of the second and further noise events of an interval, which seldom has any."""
+    assert dist.odds is not None
+    u, mean = noise.uniform(dist.drawn), dist.odds.mean
+
+    def unfinished(carry: tuple[noise.Tail, Weights]) -> Array:
+        return jnp.any(u < carry[0][0])
+
+    def step(carry: tuple[noise.Tail, Weights]) -> tuple[noise.Tail, Weights]:
+        tail, (on, off) = carry
+        event = _event(model, words, dist, jnp.asarray(tail[2], jnp.uint32), u < tail[0])
+        weights = weigh.noise_bins(plan.width, *event, offset, plan.length)
+        on = [a + jnp.maximum(w, 0.0) for a, w in zip(on, weights, strict=True)]
+        off = [a + jnp.maximum(-w, 0.0) for a, w in zip(off, weights, strict=True)]
+        return noise.next_tail(mean, tail), (on, off)
+
+    nothing = [jnp.zeros_like(mean)] * plan.width
+    first = noise.next_tail(mean, dist.odds.tail())
+    start = (jax.tree.map(jnp.asarray, first), (nothing, list(nothing)))
+    return jax.lax.while_loop(unfinished, step, start)[1]
 
 
 def simulate_voxels(
@@ -162,7 +191,7 @@ def simulate_voxels(
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}, bins={bins}.",
                               "Need frame_dt_s > 0 and bins >= 2.")
     known = not isinstance(log_frames, jax.core.Tracer)
-    if known and not np.isfinite(np.asarray(log_frames)).all():
+    if known and not _finite(np.asarray(log_frames)):
         raise EvflowDataError("EV007", "log_frames holds NaN or infinite values.",
                               "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")
     if camera.shape[-2:] != log_frames.shape[-2:]:
@@ -175,26 +204,36 @@ def simulate_voxels(
             "Give one camera (H, W) or one for each video.")
     camera.validate()
     camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), camera)
-    noise.check_rate(noise.peak_rate(model, camera), frame_dt_s)
-    return _voxels(key, log_frames, camera, frame_dt_s=float(frame_dt_s), model=model, bins=bins,
-                   noisy=scan.is_noisy(model, camera), lead=lead)
+    nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
+    if nominal is not None:
+        noise.check_rate(noise.most_rate(model, camera, nominal), frame_dt_s)
+    return _voxels(key, log_frames, camera, nominal, frame_dt_s=float(frame_dt_s), model=model,
+                   bins=bins, lead=lead)
 
 
-@partial(jax.jit, static_argnames=("frame_dt_s", "model", "bins", "noisy", "lead"))
+def _finite(values: np.ndarray) -> bool:
+    """Whether all are; a sum tells in a third of the time, unless it overflows."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
+
+
+@partial(jax.jit, static_argnames=("frame_dt_s", "model", "bins", "lead"))
 def _voxels(
-    key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: float, model: SensorModel,
-    bins: int, noisy: bool, lead: tuple[int, ...],
+    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, *, frame_dt_s: float,
+    model: SensorModel, bins: int, lead: tuple[int, ...],
 ) -> Array:
-    def one(key: Array, frames: Array, camera: Camera) -> Array:
-        state = scan.start(key, frames[0], model)
-        return simulate_window(model, noisy, camera, state, frames[1:], frame_dt_s, bins)[1]
+    def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
+        whole, state = sensor.start(key, frames[0], camera, model, nominal)
+        return simulate_window(model, whole, state, frames[1:], frame_dt_s, bins)[1]
 
     if not lead:
-        return one(key, log_frames, camera)
+        return one(key, log_frames, camera, nominal)
     batch = math.prod(lead)
     shape = log_frames.shape[-2:]
     keys = jax.random.split(key, batch)
     cameras = jax.tree.map(lambda m: jnp.broadcast_to(m, (*lead, *shape)).reshape(-1, *shape),
                            camera)
-    grids = jax.vmap(one)(keys, log_frames.reshape(batch, *log_frames.shape[-3:]), cameras)
+    if nominal is not None:
+        nominal = jnp.broadcast_to(jnp.moveaxis(nominal, 0, -1), (*lead, 2)).reshape(batch, 2)
+    grids = jax.vmap(one)(keys, log_frames.reshape(batch, *log_frames.shape[-3:]), cameras, nominal)
     return grids.reshape(*lead, *grids.shape[1:])

@@ -1,0 +1,94 @@
+"""The border: video that comes in, checked, frame by frame and in blocks."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+
+
+def blocks(
+    frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
+    shape: tuple[int, ...], length: int,
+) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+    """Flat frames, bytes or float32 DN, and their int64 times, however the input is cut: first
+    the first frame alone, then `length` frames at a time. Raises EV001 for less than two frames,
+    EV002, EV003, EV004, EV007 and EV015 for bad ones."""
+    pairs = _single_frames(frames_iter, times_iter, shape)
+    taken = list(itertools.islice(pairs, 1))
+    if not taken:
+        raise EvflowDataError("EV001", "the video has no frames.", "Give at least two frames.")
+    count = 0
+    while taken:
+        count += len(taken)
+        yield [_flat(frame) for frame, _ in taken], np.array([t for _, t in taken], np.int64)
+        taken = list(itertools.islice(pairs, length))
+    if count < 2:
+        raise EvflowDataError("EV001", "the video has one frame.",
+                              "Events need a change: give at least two frames.")
+
+
+def _flat(frame: np.ndarray) -> np.ndarray:
+    if frame.dtype == np.uint16:
+        frame = frame.astype(np.float32) * np.float32(255.0 / 65535.0)
+    return (frame if frame.dtype == np.uint8 else frame.astype(np.float32)).ravel()
+
+
+def _single_frames(
+    frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
+    shape: tuple[int, ...],
+) -> Iterator[tuple[np.ndarray, int]]:
+    """Validated (frame, time) pairs, whatever the blocks they came in."""
+    dtype, last, index = None, None, 0
+    for block, times in itertools.zip_longest(frames_iter, times_iter):
+        if block is None or times is None:
+            raise EvflowDataError(
+                "EV002", f"the {'frames' if block is None else 'times'} end after {index} frames.",
+                "Give one time per frame, in blocks of the same lengths.")
+        block, times = np.asarray(block), np.atleast_1d(np.asarray(times))
+        block = block[None] if block.ndim == 2 else block
+        _check_block(block, times, shape, dtype, index)
+        dtype = block.dtype
+        for frame, t in zip(block, times.tolist(), strict=True):
+            if last is not None and t <= last:
+                raise EvflowDataError(
+                    "EV004", f"frame {index} is at {t} us, the one before at {last} us.",
+                    "Frame times must increase strictly.")
+            last, index = t, index + 1
+            yield frame, t
+
+
+def _check_block(
+    block: np.ndarray, times: np.ndarray, shape: tuple[int, ...], dtype: np.dtype | None,
+    index: int,
+) -> None:
+    if block.ndim != 3 or len(times) != len(block):
+        raise EvflowDataError("EV002", f"frames {block.shape} with times {times.shape}.",
+                              "Expected (T, H, W) gray frames and T times.")
+    if block.shape[1:] != shape:
+        raise EvflowDataError(
+            "EV015", f"frames are {block.shape[1:]} (H, W), the camera is {shape}.",
+            "Resize one of them.")
+    if dtype is not None and block.dtype != dtype:
+        raise EvflowDataError("EV003", f"frame {index} is {block.dtype}, earlier ones {dtype}.")
+    if not np.issubdtype(times.dtype, np.integer):
+        raise EvflowDataError("EV003", f"frame times are {times.dtype}.",
+                              "Give integer microseconds (seconds x 1e6).")
+    if block.dtype in (np.uint8, np.uint16):
+        return
+    if not np.issubdtype(block.dtype, np.floating):
+        raise EvflowDataError("EV003", f"frames are {block.dtype}.",
+                              "Expected uint8, uint16 or floating DN on 0..255.")
+    bad = ~np.isfinite(block)
+    if bad.any():
+        at = np.argwhere(bad)[0]
+        raise EvflowDataError(
+            "EV007", f"{bad.sum()} values of the frames are not finite, first in frame "
+            f"{index + int(at[0])} at y={at[1]}, x={at[2]}.")
+    if block.min(initial=0.0) < 0 or block.max(initial=0.0) > 255.5:
+        raise EvflowDataError(
+            "EV003", f"float frames reach from {block.min():.4g} to {block.max():.4g}.",
+            "Expected DN on 0..255; scale with intensity.to_dn.")

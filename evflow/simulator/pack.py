@@ -1,0 +1,142 @@
+"""What a block of frames has sent -> a sorted list of events (host, NumPy).
+
+Event times are integer microseconds in (t_prev, t_now] of their frame interval, so intervals
+never overlap. The order is total: time, then pixel, then polarity, then noise after signal.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import lru_cache
+
+import jax
+import numpy as np
+
+from evflow.camera import SensorModel
+from evflow.simulator import noise
+from evflow.simulator.active import Sent
+from evflow.types import Events
+
+Array = np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """Events in no order: interval of the block, pixel, fraction of the interval, whether ON,
+    whether noise (one flag for all)."""
+
+    step: Array
+    pixel: Array
+    fraction: Array
+    on: Array
+    noise: bool
+
+
+def columns(
+    model: SensorModel, sent: Sent, pixels: Array, words: Array, dt_us: Array
+) -> Iterator[Columns]:
+    """The events of `sent`, columns of which belong to `pixels`; intervals beyond dt_us are
+    padding. words: `Sensor.words`, whole."""
+    width = sent.fires.shape[1]
+
+    def where(flags: jax.Array) -> tuple[Array, Array, Array]:
+        """Index into (T, K) arrays, interval and pixel of what is flagged."""
+        at = np.flatnonzero(np.asarray(flags)[: len(dt_us)])
+        step = at // width
+        return at, step, pixels.take(at - step * width)
+
+    def of(values: jax.Array | None, at: Array) -> Array:
+        return np.asarray(values).ravel().take(at)
+
+    at, step, pixel = where(sent.fires)
+    count, first, spacing = (of(a, at) for a in (
+        sent.spikes.count, sent.spikes.first, sent.spikes.spacing))
+    earliest = of(sent.spikes.earliest, at) if model.waits else first
+    yield from _signal(model, count, step, pixel, dt_us, first, spacing, earliest)
+    if sent.struck is not None and sent.odds is not None:
+        at, step, pixel = where(sent.struck)
+        odds = jax.tree.map(lambda a: of(a, at), sent.odds)
+        yield _noise(model, step, pixel, words.take(pixel), of(sent.drawn, at), odds)
+
+
+def _signal(
+    model: SensorModel, count: Array, step: Array, pixel: Array, dt_us: Array, first: Array,
+    spacing: Array, earliest: Array,
+) -> Iterator[Columns]:
+    """Signal events: the first of each progression, then the others, of which there are few."""
+    on, number = count > 0, np.abs(count)
+    yield Columns(step, pixel, np.maximum(first, earliest), on, noise=False)
+    many = np.flatnonzero(number > 1)
+    row, k = _repeated(number.take(many) - 1)
+    row, k = many[row], (k + 1).astype(np.float32)
+    fraction = first.take(row) + k * spacing.take(row)
+    if model.waits:
+        dead = (model.refractory_s / (dt_us * 1e-6)).astype(np.float32)
+        fraction = np.maximum(fraction, earliest.take(row) + k * dead.take(step.take(row)))
+    yield Columns(step.take(row), pixel.take(row), fraction, on.take(row), noise=False)
+
+
+def _repeated(number: Array) -> tuple[Array, Array]:
+    """Rows 0, 1, ... each `number` times, and which time it is: 0, 1, ..."""
+    number = number.astype(np.int64)
+    row = np.repeat(np.arange(len(number)), number)
+    return row, np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
+
+
+def _noise(
+    model: SensorModel, step: Array, pixel: Array, words: Array, drawn: Array, odds: noise.Odds
+) -> Columns:
+    """Noise events, of which each pixel and interval here sends one or more."""
+    u, tail, number = noise.uniform(drawn), odds.tail(), np.zeros(len(step), np.int64)
+    while (more := u < tail[0]).any():
+        number += more
+        tail = noise.next_tail(odds.mean, tail)
+    row, k = _repeated(number)
+    at, on = noise.event(model, words[row], drawn[row], k.astype(np.uint32), odds.share[row])
+    return Columns(step[row], pixel[row], at, on, noise=True)
+
+
+def sort(
+    parts: list[Columns], edges: Array, shape: tuple[int, int]
+) -> tuple[Events, Array]:
+    """The sorted `Events` of a block whose frames are at `edges` (T + 1,) us, and (N,) bool:
+    which of them are noise.
+
+    Time, pixel, polarity and kind in one integer make a sort without an index array; equal
+    integers are equal events.
+    """
+    height, width = shape
+    bits = (4 * height * width - 1).bit_length()  # of pixel, polarity and kind
+    dtype = np.uint32 if (int(edges[-1] - edges[0]) << bits) < 2**32 else np.uint64
+    nothing = np.empty(0, dtype)
+    keys = np.concatenate([nothing, *(_keys(part, np.diff(edges), bits, dtype) for part in parts)])
+    keys.sort()
+    at = ((keys & dtype((1 << bits) - 1)) >> dtype(2)).astype(np.intp)
+    y, x = _coordinates(shape)
+    t = (keys >> dtype(bits)).astype(np.int64)
+    t += edges[0]
+    on, noise = ((keys & dtype(flag)).astype(bool) for flag in (2, 1))
+    return Events.unchecked(x.take(at), y.take(at), t, on, (width, height)), noise
+
+
+@lru_cache(maxsize=4)
+def _coordinates(shape: tuple[int, int]) -> tuple[Array, Array]:
+    """(y, x) of every pixel of a frame, uint16."""
+    y, x = np.indices(shape, np.uint16)
+    return y.ravel(), x.ravel()
+
+
+def _keys(part: Columns, dt_us: Array, bits: int, dtype: type) -> Array:
+    """Microseconds into the block, pixel, polarity and kind, packed into integers that sort so.
+    Times are rounded up to a microsecond, within (begin, end] of their interval."""
+    length = dt_us.astype(np.float32).take(part.step)
+    within = np.minimum(np.maximum(np.ceil(part.fraction * length), 1), length)
+    keys = (np.cumsum(dt_us) - dt_us).astype(dtype).take(part.step)
+    keys += within.astype(dtype)
+    keys <<= dtype(bits - 2)
+    keys += part.pixel.astype(dtype)
+    keys <<= dtype(1)
+    keys += part.on
+    keys <<= dtype(1)
+    return keys + dtype(part.noise)

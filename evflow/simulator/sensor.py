@@ -1,0 +1,141 @@
+"""All pixels of a sensor, one frame interval: what both exits, events and voxels, step.
+
+`start` makes a sensor and its state from the first frame, `advance` moves the state by one
+interval. Both are pure; jit, vmap and scan them. Pixels are one flat axis (N,).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from evflow.camera import Camera, SensorModel
+from evflow.intensity import LOG_MAPS, normalised_intensity
+from evflow.simulator import noise, pixel
+from evflow.simulator.pixel import PixelState, Spikes
+
+Array = jax.Array
+Clock = tuple[Array, Array]  # begin and end of an interval, see `SimState.time`
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """What stays the same, maps (N,). camera: with `pixel.coarse` thresholds. words: see
+    `noise.draw`. rates: None for a silent sensor. leaking: log units per second, None without
+    leak."""
+
+    camera: Camera
+    words: Array
+    rates: noise.Rates | None
+    leaking: Array | None
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SimState:
+    """pixels: PixelState of maps (N,). interval: index of the next frame interval (int32), which
+    with the key makes its `noise.salts`. time: of the last frame, seconds since frame 0 as a
+    (2,) float32 pair, high and low part (only v2e's slots read it)."""
+
+    pixels: PixelState
+    interval: Array
+    time: Array
+    key: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Disturbance:
+    """What happens to pixels in an interval whatever their memory, maps (N,). leaked: log units,
+    None without leak. drawn: `noise.draw`. odds: what it is held against, None without noise."""
+
+    leaked: Array | None
+    drawn: Array
+    odds: noise.Odds | None
+
+    @property
+    def struck(self) -> Array | None:
+        """Whether a pixel sends noise events; None without noise."""
+        return None if self.odds is None else noise.uniform(self.drawn) < self.odds.some
+
+
+def start(
+    key: Array, log_frame: Array, camera: Camera, model: SensorModel,
+    nominal: Array | None, phase: Array | float = 0.0,
+) -> tuple[Sensor, SimState]:
+    """The sensor and its state after the first log frame; maps of any one shape, kept flat.
+
+    nominal: `noise.nominal_thresholds`; None leaves noise out. phase: contrast already on the
+    pixel (log units, a map or 0 as in v2e); a recording cut from a running camera has it uniform
+    in (-theta_off, theta_on).
+    """
+    k_leak, k_words, k_intervals = jax.random.split(key, 3)
+    count = math.prod(log_frame.shape)
+    flat = pixel.coarse(jax.tree.map(lambda m: m.reshape(count), camera))
+    base = (log_frame - phase).reshape(count)
+    log_i = log_frame.reshape(count)
+    reference = jnp.mean(i01_of(model, log_i))
+    pattern = noise.leak_pattern(model, k_leak, (count,))
+    sensor = Sensor(
+        flat,
+        noise.pixel_words(k_words, count),
+        None if nominal is None else noise.rates(model, flat, reference, nominal),
+        noise.leak_rates(model, flat.theta_on, pattern) if model.leak_hz > 0 else None,
+    )
+    last = jnp.full_like(log_i, pixel.never_fired(model))
+    pixels = PixelState(log_i, base, last)
+    return sensor, SimState(
+        pixels, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32), k_intervals)
+
+
+def i01_of(model: SensorModel, log_i: Array) -> Array:
+    """Normalised intensity of log intensities."""
+    return normalised_intensity(LOG_MAPS[model.log_map][1](log_i))
+
+
+def disturb(
+    model: SensorModel, sensor: Sensor, i01: Array, salt: Array, dt: Array
+) -> Disturbance:
+    """Leak and noise of an interval of dt seconds at normalised intensity i01 (N,). salt: the
+    interval's `noise.salts`."""
+    drawn = noise.draw(sensor.words, salt)
+    leaked = odds = None
+    if sensor.leaking is not None:
+        leaked = noise.leak(model, sensor.leaking, sensor.words, drawn, dt)
+    if sensor.rates is not None:
+        odds = noise.odds(sensor.rates, i01, dt)
+    return Disturbance(leaked, drawn, odds)
+
+
+def advance(
+    model: SensorModel, camera: Camera, state: PixelState, log_i: Array, i01: Array,
+    leaked: Array | None, struck: Array | None, dt: Array, clock: Clock,
+) -> tuple[PixelState, Spikes]:
+    """One frame interval of dt seconds that ends at the log frame log_i (N,), normalised
+    intensity i01: the signal events, by per-pixel functions vmapped over (N,).
+
+    leaked, struck: see `Disturbance`. dt = 0 with the same frame changes nothing and emits
+    nothing (padding).
+    """
+    def contrast(
+        on: Array, off: Array, s: PixelState, log: Array, i: Array, leak: Array | None
+    ) -> tuple[PixelState, Array, Array, Array]:
+        return pixel.contrast(model, on, off, s, log, i, leak, dt)
+
+    state, theta, begin, end = jax.vmap(contrast)(
+        camera.theta_on, camera.theta_off, state, log_i, i01, leaked)
+    most = jnp.zeros((), end.dtype)
+    if model.timestamps == "v2e":
+        most = jnp.max(pixel.floor_divide(end, jnp.abs(theta)))
+
+    def send(s: PixelState, th: Array, b: Array, e: Array) -> tuple[PixelState, Spikes]:
+        return pixel.send(model, s, th, b, e, dt, *clock, most)
+
+    state, spikes = jax.vmap(send)(state, theta, begin, end)
+    if struck is not None and model.noise_resets_memory:
+        state = dataclasses.replace(state, base=jnp.where(struck, state.lp, state.base))
+    return state, spikes
