@@ -5,11 +5,15 @@ Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Union
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
@@ -59,13 +63,16 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True)
 class Simulate:
-    """Simulate a video, or a recording's frames, as a camera would have seen it.
+    """Simulate a video, a folder of images, or a recording's frames, as a camera would see it.
 
     Example: evflow simulate ride.mp4 --camera cam/camera.npz -o synth.h5
+
+    Example: evflow simulate frames/ --timestamps times.txt --colour rggb -o synth.h5
     """
 
     video: tyro.conf.Positional[Path]
-    """A video file, or a recording whose frames are used."""
+    """A video file; a folder of images (png, jpg, tif, bmp, pgm; 8 or 16 bits); a stack of frames
+    (.npy, .npz); or a recording, whose frames are used."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output, HDF5 in the DSEC layout (.h5)."""
     camera: Path | None = None
@@ -75,9 +82,23 @@ class Simulate:
     eta_on: float = 0.0
     eta_off: float = 0.0
     fps: float | None = None
-    """Frame rate of the video, if its own is wrong."""
-    max_motion_px: float = 1.0
-    """Interpolate frames until motion per step is below this; 0 = use the frames as they are."""
+    """Frames per second: for images without times, or where the video's own are wrong."""
+    timestamps: Path | None = None
+    """Times of the frames: one a line, alone or beside the image's name (text, csv, .npy). A
+    folder's timestamps.txt or images.txt is found unasked."""
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+    """Unit of those times; auto takes the one that gives a plausible frame rate."""
+    colour: Literal["luma", "rggb", "bggr", "grbg", "gbrg"] = "luma"
+    """What a pixel sees of colour: luma, or its channel under this Bayer mosaic. Frames with one
+    channel are taken as the mosaic itself."""
+    full_scale: float | None = None
+    """Value of white; without it 255, or 65535 in 16-bit images. 12-bit data: 4095."""
+    partial: bool = False
+    """Use what can be read of a damaged video."""
+    interpolate: bool = True
+    """Fill in frames where things move by more than --max-motion-px from frame to frame."""
+    max_motion_px: Annotated[float, tyro.conf.arg(aliases=["--max-motion"])] = 1.0
+    """Longest motion in one step, in pixels; 0 = --no-interpolate."""
     noise_resets_memory: bool = True
     """A noise event stores the present intensity, as in real pixels."""
     seed: int = 0
@@ -188,39 +209,72 @@ def _simulate(command: Simulate) -> None:
     import jax
 
     from evflow import io
-    from evflow.camera import Camera, SensorModel
+    from evflow.camera import SensorModel
+    from evflow.colour import as_seen
     from evflow.io.source import open_frames
     from evflow.progress import bar
     from evflow.simulator import simulate_stream
     from evflow.simulator.interpolate import unzip, upsample
 
-    source = open_frames(command.video, fps=command.fps)
-    width, height = source.size
-    if command.camera:
-        camera = Camera.load(command.camera)
-    else:
-        camera = Camera.constant((height, width), command.theta_on, command.theta_off,
-                                 command.eta_on, command.eta_off)
-    if camera.shape != (height, width):
-        raise EvflowDataError(
-            "EV015", f"the video is {width}x{height}, the camera "
-            f"{camera.shape[1]}x{camera.shape[0]}.", "Resize the video to the camera's size.")
-    notes: list[str] = []
-    count = 0
-    with bar("simulating") as progress, io.DsecWriter(
+    source = open_frames(
+        command.video, fps=command.fps, timestamps=command.timestamps, colour=command.colour,
+        time_unit=command.time_unit, full_scale=command.full_scale, partial=command.partial)
+    camera = _camera(command, source.size)
+    sensor = SensorModel(noise_resets_memory=command.noise_resets_memory)
+    count = frames = 0
+
+    def shown(done: int, total: int) -> None:
+        nonlocal frames
+        frames = done
+        progress(done, total)
+
+    with _stoppable(), bar("simulating") as progress, io.DsecWriter(
             command.out, source.size, overwrite=command.overwrite) as writer:
-        pairs = source.watched(progress)
-        if command.max_motion_px > 0:
-            pairs = upsample(pairs, max_motion_px=command.max_motion_px, warn=notes.append)
-        sensor = SensorModel(noise_resets_memory=command.noise_resets_memory)
+        limit = command.max_motion_px if command.interpolate else 0.0
+        pairs = as_seen(
+            source.watched(shown), command.colour, None if limit == 0 else lambda slow, pixel:
+            upsample(slow, max_motion_px=pixel * limit, warn=source.notes.append))
         for events in simulate_stream(jax.random.key(command.seed), *unzip(pairs), camera,
                                       model=sensor):
             writer.append(events)
             count += len(events)
-    for note in notes:
-        print(note, file=sys.stderr)
-    facts = {"out": str(command.out), "events": count, "frames": source.count}
-    print(json.dumps(facts) if command.json else f"{count:,} events -> {command.out}")
+    for note in source.notes:
+        print(f"note: {note}", file=sys.stderr)
+    facts = {"out": str(command.out), "events": count, "frames": frames,
+             "colour": command.colour, "notes": source.notes}
+    print(json.dumps(facts) if command.json else
+          f"{count:,} events of {frames:,} frames -> {command.out}")
+
+
+def _camera(command: Simulate, size: tuple[int, int]) -> Any:
+    """The camera asked for; EV015 where its size is not that of the video."""
+    from evflow.camera import Camera
+
+    shape = size[::-1]
+    camera = Camera.load(command.camera) if command.camera else Camera.constant(
+        shape, command.theta_on, command.theta_off, command.eta_on, command.eta_off)
+    if camera.shape != shape:
+        raise EvflowDataError(
+            "EV015", f"the video is {size[0]}x{size[1]}, the camera "
+            f"{camera.shape[1]}x{camera.shape[0]}.", "Resize the video to the camera's size.")
+    return camera
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM ends the block as Ctrl-C does, so that nothing half-written is left."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # handlers belong to the main thread
+        return
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _version(_: Version) -> None:

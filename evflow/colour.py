@@ -1,0 +1,109 @@
+"""Colour frames -> what one pixel sees: luma, or its own colour under a Bayer mosaic.
+
+Frames are (H, W, 3) in OpenCV's order B, G, R, of dtype uint8, uint16 or float32, and keep that
+dtype. A pattern names the four corners of the mosaic's cell from the top left, row by row: under
+"rggb" pixel (0, 0) sees red and pixel (1, 1) blue. A mosaic is a grey frame to everything after.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+
+Frames = Iterator[tuple[np.ndarray, int]]
+
+PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
+COLOURS = ("luma", *PATTERNS)
+
+CELLS = tuple(np.s_[row::2, column::2] for row in (0, 1) for column in (0, 1))
+PLANE_MARGIN = 32  # rows of repeated edge around a plane: more than frames to interpolate move
+
+
+def luma(bgr: np.ndarray) -> np.ndarray:
+    """Rec. 601 luma .299 R + .587 G + .114 B (H, W): OpenCV's BGR2GRAY, to the bit.
+
+    Raises EV002 (not (H, W, 3)), EV003 (dtype).
+    """
+    import cv2
+
+    return cv2.cvtColor(_checked(bgr), cv2.COLOR_BGR2GRAY)
+
+
+def mosaic(bgr: np.ndarray, pattern: str) -> np.ndarray:
+    """The Bayer mosaic (H, W) of colour frames (H, W, 3): each pixel keeps one channel.
+
+    Raises EV002 (not (H, W, 3)), EV003 (dtype), EV020 (pattern).
+    """
+    if pattern not in PATTERNS:
+        raise EvflowDataError("EV020", f"pattern={pattern!r}.", f"Choose from {PATTERNS}.")
+    bgr = _checked(bgr)
+    seen = np.empty(bgr.shape[:2], bgr.dtype)
+    for cell, letter in zip(CELLS, pattern, strict=True):
+        seen[cell] = bgr[..., "bgr".index(letter)][cell]
+    return seen
+
+
+def as_seen(
+    pairs: Frames, colour: str, interpolated: Callable[[Frames, float], Frames] | None = None
+) -> Frames:
+    """The frames (H, W) that the pixels see, of (frame, time) pairs.
+
+    pairs: frames (H, W), or (H, W, 3) where `colour` is a pattern. interpolated(pairs, pixel)
+    fills up a grey video one sensor pixel of which measures `pixel` of its own. It works on the
+    planes of `stack_planes`: between pixels of different colours it would make flicker.
+    """
+    first = next(pairs, None)
+    pairs = pairs if first is None else itertools.chain([first], pairs)
+    if colour == "luma":
+        return pairs if interpolated is None else interpolated(pairs, 1.0)
+    raw = first is not None and first[0].ndim == 2
+    if interpolated is not None:
+        planes = interpolated(((stack_planes(f), t) for f, t in pairs), 0.5 if raw else 1.0)
+        pairs = ((unstack_planes(f, 4 if raw else 3), t) for f, t in planes)
+    return pairs if raw else ((mosaic(f, colour), t) for f, t in pairs)
+
+
+def stack_planes(frame: np.ndarray) -> np.ndarray:
+    """The planes of a frame, one below the other, as one grey frame.
+
+    Of colour (H, W, 3) the three channels; of a mosaic (H, W) the four colours of its cell, each
+    (H/2, W/2). Interpolation between frames warps pixels and must not mix colours; in this form
+    each plane is interpolated as the grey video that it is. Every plane is framed above and
+    below by `PLANE_MARGIN` repeated rows, so that none moves into the next.
+    Raises EV002 (a mosaic of odd size).
+    """
+    if frame.ndim == 2:
+        if frame.shape[0] % 2 or frame.shape[1] % 2:
+            raise EvflowDataError(
+                "EV002", f"a mosaic of shape {frame.shape} has no whole number of 2x2 cells.",
+                "Crop it to even sides, or do not interpolate (--no-interpolate).")
+        planes = np.stack([frame[cell] for cell in CELLS])
+    else:
+        planes = np.moveaxis(_checked(frame), -1, 0)
+    margin = ((0, 0), (PLANE_MARGIN, PLANE_MARGIN), (0, 0))
+    return np.pad(planes, margin, mode="edge").reshape(-1, planes.shape[-1])
+
+
+def unstack_planes(stacked: np.ndarray, count: int) -> np.ndarray:
+    """The inverse of `stack_planes`: (H, W, 3) for count = 3, a mosaic (H, W) for 4."""
+    planes = stacked.reshape(count, -1, stacked.shape[1])[:, PLANE_MARGIN:-PLANE_MARGIN]
+    if count == 3:
+        return np.moveaxis(planes, 0, -1)
+    frame = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), planes.dtype)
+    for cell, plane in zip(CELLS, planes, strict=True):
+        frame[cell] = plane
+    return frame
+
+
+def _checked(bgr: np.ndarray) -> np.ndarray:
+    if bgr.ndim != 3 or bgr.shape[-1] != 3 or not bgr.size:
+        raise EvflowDataError(
+            "EV002", f"a colour frame has shape {bgr.shape}.", "Expected (H, W, 3) in B, G, R.")
+    if bgr.dtype not in (np.uint8, np.uint16, np.float32):
+        raise EvflowDataError(
+            "EV003", f"a colour frame is {bgr.dtype}.", "Expected uint8, uint16 or float32.")
+    return np.ascontiguousarray(bgr)

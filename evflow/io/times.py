@@ -1,0 +1,178 @@
+"""Files of frame times: one time per line, alone, before or after the frame's name.
+
+Read are the layouts in use: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time`
+(DVS-Voltmeter), `index time`, with blanks, tabs, commas or semicolons between, and .npy arrays.
+Lines that begin with # are comments. A unit written in a comment or header counts ("[ns]",
+"timestamp_us"); else the only one that makes the numbers a plausible video is taken and noted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from evflow.checks import check_times
+from evflow.errors import EvflowDataError
+from evflow.io.frames import existing
+from evflow.io.hints import UNITS_US, Hints
+
+MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
+EPOCH_S = (1e9, 4.1e9)  # 2001 to 2099 as seconds since 1970
+POSSIBLE_S = (2e-5, 2.0)  # between frames: 50,000 frames/s to one in two seconds
+USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s, where only one unit of 1000 can fall
+UNIT_WORDS = re.compile(r"(?:[\[(_]|in )(ns|us|µs|ms|s|sec|seconds)\b")
+
+Times = tuple[np.ndarray, list[str], str]  # int64 us (T,); names (T,) or none; a note or ""
+
+
+def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> Times:
+    """Frame times of a file, the frames' names where it has them, and what was assumed.
+
+    names: those of the images at hand, by which a column of names is told from one of times.
+    Raises EV008 (columns of unclear meaning), EV009 (damaged), EV001 (none), EV003 (the unit is
+    not clear), EV004 (not increasing), EV007 (NaN), EV016 (not there).
+    """
+    if existing(path).suffix == ".npy":
+        times, written = _load(path)
+        us, note = to_us(times, path, unit)
+        return us, [], note
+    rows, written = _rows(path)
+    times, labels = _columns(path, rows, names)
+    us, note = to_us(times, path, unit if unit != "auto" else written)
+    return us, labels, note
+
+
+def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndarray, str]:
+    """Strictly increasing times (T,) as int64 us, and a note where the unit was inferred.
+
+    Raises EV001, EV002, EV003, EV004, EV007.
+    """
+    if times.ndim != 1 or times.dtype.kind not in "iuf":
+        raise EvflowDataError(
+            "EV002", f"{where} holds times of shape {times.shape} and dtype {times.dtype}.",
+            "Expected one number per frame.")
+    if len(times) == 0:
+        raise EvflowDataError("EV001", f"{where} holds no frame time.")
+    if not np.isfinite(times).all():
+        raise EvflowDataError(
+            "EV007", f"{where} holds {(~np.isfinite(times)).sum():,} times that are not finite.")
+    back = np.flatnonzero(times[1:] <= times[:-1])
+    if len(back):
+        at = int(back[0]) + 1
+        raise EvflowDataError(
+            "EV004", f"{where}: time {at:,} is {times[at]}, the one before {times[at - 1]} "
+            f"({len(back):,} such).", "Frame times must increase: lines out of order, or repeated?")
+    note = ""
+    if unit == "auto":
+        unit, note = _plausible_unit(times, where)
+    us = Hints(time_unit=unit).microseconds(times, unit)
+    return check_times(us, f"{where}, read in {unit}", strict=True), note
+
+
+def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:
+    """The unit in which the times are those of a video, and the sentence that says so."""
+    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
+    seconds = {unit: 1e-6 * scale for unit, scale in UNITS_US.items()}
+    whole = times.dtype.kind in "iu" or bool((times % 1 == 0).all())
+    epoch = [u for u, s in seconds.items() if EPOCH_S[0] < abs(float(times[0])) * s < EPOCH_S[1]]
+    possible = [u for u, s in seconds.items() if POSSIBLE_S[0] <= step * s <= POSSIBLE_S[1]
+                and (whole or u in ("s", "ms"))]
+    usual = [u for u in possible if USUAL_S[0] <= step * seconds[u] <= USUAL_S[1]]
+    for found in (set(epoch) & set(possible), possible, usual):
+        if len(found) == 1:
+            (unit,) = found
+            return unit, (f"times of {where} were read in {unit} "
+                          f"({1 / (step * seconds[unit]):.4g} frames/s); else pass --time-unit.")
+    would = ", ".join(f"{1 / (step * seconds[u]):.4g} frames/s in {u}" for u in possible)
+    raise EvflowDataError(
+        "EV003", f"{where}: steps of {step:g} (from {times[0]}) have no clear unit"
+        + (f": {would}." if would else "."),
+        f"Pass --time-unit {', '.join(UNITS_US)}.")
+
+
+def _load(path: Path) -> tuple[np.ndarray, str]:
+    try:
+        return np.load(path, allow_pickle=False), "auto"
+    except (OSError, ValueError, EOFError) as e:
+        raise EvflowDataError("EV009", f"{path} is not a sound .npy ({e}).") from e
+
+
+def _rows(path: Path) -> tuple[list[list[str]], str]:
+    """The fields of every line with data, all of one length, and the unit written, or "auto"."""
+    try:
+        data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b"\0"
+        text = data.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as e:
+        raise EvflowDataError("EV009", f"{path} cannot be read as text ({e}).") from e
+    if "\0" in text:
+        raise EvflowDataError("EV009", f"{path} is not a text file of times.")
+    rows: list[list[str]] = []
+    words = ""
+    for number, line in enumerate(text.splitlines(), 1):
+        content, _, comment = line.partition("#")
+        fields = [f for f in re.split(r"[\s,;]+", content) if f]
+        if not fields or (not rows and not any(map(_number, fields))):
+            words += f" {comment if not fields else content}"  # a comment or the header
+            continue
+        if rows and len(fields) != len(rows[0]):
+            raise EvflowDataError(
+                "EV009", f"{path}, line {number:,} is {line[:60]!r}; lines before it have "
+                f"{len(rows[0])} columns.", "Cut off or damaged? Copy it again.")
+        rows.append(fields)
+    units = {u.replace("µ", "u")[:2].replace("se", "s") for u in UNIT_WORDS.findall(words)}
+    return rows, units.pop() if len(units) == 1 else "auto"
+
+
+def _columns(
+    path: Path, rows: list[list[str]], names: Collection[str]
+) -> tuple[np.ndarray, list[str]]:
+    """The column of times (T,), int64 or float64, and that of the names, if there is one."""
+    columns = list(zip(*rows, strict=True))
+    if len(columns) <= 1:
+        return _numbers(path, rows, 0), []
+    known = {key: name for name in names for key in (PurePosixPath(name).stem, name)}
+    label = [all(PurePosixPath(f.replace("\\", "/")).name in known for f in column)
+             for column in columns]
+    if sum(label) != 1:  # not the images at hand: a name is what is no number, or counts up
+        label = [not all(map(_number, column)) or _counts(column) for column in columns]
+    if len(columns) != 2 or sum(label) != 1:
+        raise EvflowDataError(
+            "EV008", f"{path} has lines like {' '.join(rows[0])[:60]!r}; which column is the time?",
+            "Keep one time per line, or `time name`.")
+    which = label.index(True)
+    if all(map(str.isdecimal, columns[which])) and not set(columns[which]) <= set(known):
+        return _numbers(path, rows, 1 - which), []
+    tails = [PurePosixPath(f.replace("\\", "/")).name for f in columns[which]]
+    return _numbers(path, rows, 1 - which), [known.get(tail, tail) for tail in tails]
+
+
+def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
+    """A column as int64 where all are whole (exact, also in ns since 1970), else float64."""
+    fields = [row[column] for row in rows]
+    for number, field in enumerate(fields):
+        if not _number(field):
+            raise EvflowDataError(
+                "EV009", f"{path}: {field[:40]!r} at time {number:,} is not a number.",
+                "Cut off or damaged? Copy it again.")
+    try:
+        return np.array([int(f) for f in fields], np.int64)
+    except (ValueError, OverflowError):
+        return np.array([float(f) for f in fields])
+
+
+def _number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _counts(column: tuple[str, ...]) -> bool:
+    """Whole numbers that count up by one: an index, not times (from 2 lines on)."""
+    if len(column) < 2 or not all(map(str.isdecimal, column)):
+        return False
+    return bool((np.diff(np.array([int(f) for f in column])) == 1).all())
