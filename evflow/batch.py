@@ -14,18 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import (
-    THETA_MIN,
-    Camera,
-    SensorModel,
-    Summary,
-    sample_nominal,
-    sample_pixels,
-)
+from evflow.camera import THETA_MIN, Camera, Summary, sample_nominal, sample_pixels
 from evflow.config import NuisanceConfig, TrainConfig
 from evflow.distributed import by_shard
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
 from evflow.scenes import TextureBank, render, sample_scene
+from evflow.sensors import SensorModel
 from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
 

@@ -1,7 +1,7 @@
-"""The camera: per-pixel contrast thresholds and noise rates, and the sensor they sit in.
+"""The camera: per-pixel contrast thresholds and noise rates.
 
-`Camera` is a pytree of four float32 maps (..., H, W); it passes through jit, vmap and grad.
-`SensorModel` is what is *not* per pixel: a frozen, hashable description of the pixel circuit.
+`Camera` is a pytree of four float32 maps (..., H, W); it passes through jit, vmap and grad. What
+is *not* per pixel is the `SensorModel` (sensors.py).
 `CameraPrior` is the distribution that cameras are drawn from (paper, Section IV-E, Eq. 12).
 """
 
@@ -128,56 +128,6 @@ class Camera:
         except (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
             raise EvflowDataError("EV009", f"{path} is not a readable .npz ({e}).") from e
         return Camera(*maps).validate()
-
-
-@dataclasses.dataclass(frozen=True)
-class SensorModel:
-    """What is not per pixel. The default is v2e's noise-free pixel with true crossing times.
-
-    kind: the pixel circuit; "v2e".
-    timestamps: "crossing" = the instant at which the (linearly interpolated) log intensity
-        crosses the threshold; "v2e" = v2e's slots, shared by the k-th event of every pixel.
-    log_map: "linlog" (v2e: linear below 20 DN) or "log_eps" (ESIM: log(I/255 + 1e-3)).
-    cutoff_hz: corner of the intensity-dependent first-order low-pass at 255 DN; 0 = off.
-    refractory_s: dead time after an event; the contrast is kept and fires later (v2e).
-    leak_hz, leak_jitter, leak_fpn_decades: ON leak events per second, the relative jitter of
-        each step, and the spread of the fixed pattern in decades.
-    shot_hz: v2e's shot-noise rate R, both polarities together, on top of the camera's eta.
-    eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
-        of the first frame.
-    noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
-        False adds it to the stream (the paper).
-    """
-
-    kind: Literal["v2e", "esim"] = "v2e"
-    timestamps: Literal["crossing", "v2e"] = "crossing"
-    log_map: Literal["linlog", "log_eps"] = "linlog"
-    cutoff_hz: float = 0.0
-    refractory_s: float = 0.0
-    leak_hz: float = 0.0
-    leak_jitter: float = 0.0
-    leak_fpn_decades: float = 0.0
-    shot_hz: float = 0.0
-    eta_intensity: bool = False
-    noise_resets_memory: bool = False
-
-    def __post_init__(self) -> None:
-        allowed = {"kind": ("v2e", "esim"), "timestamps": ("crossing", "v2e"),
-                   "log_map": ("linlog", "log_eps")}
-        for name, values in allowed.items():
-            if getattr(self, name) not in values:
-                raise EvflowDataError(
-                    "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
-        for name in ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades",
-                     "shot_hz"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise EvflowDataError(
-                    "EV020", f"SensorModel({name}={getattr(self, name)}).", "It must be >= 0.")
-
-    @property
-    def waits(self) -> bool:
-        """Whether an event that comes within the refractory period of another fires later."""
-        return self.refractory_s > 0 and self.timestamps == "crossing" and self.kind == "v2e"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -76,10 +76,14 @@ class Simulate:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output, HDF5 in the DSEC layout (.h5)."""
     camera: Path | None = None
-    """camera.npz from evflow estimate; without it the same thresholds everywhere."""
-    theta_on: float = 0.2
-    theta_off: float = 0.2
+    """camera.npz from evflow estimate; without it the thresholds below, or the sensor's own."""
+    sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
+    """Pixel circuit: v2e's presets and defaults, ESIM, DVS-Voltmeter, the paper's."""
+    theta_on: float | None = None
+    """The same threshold everywhere (natural log); default: the sensor's, with its mismatch."""
+    theta_off: float | None = None
     eta_on: float = 0.0
+    """Noise rate in Hz per pixel, added to the sensor's own."""
     eta_off: float = 0.0
     fps: float | None = None
     """Frames per second: for images without times, or where the video's own are wrong."""
@@ -100,7 +104,7 @@ class Simulate:
     max_motion_px: Annotated[float, tyro.conf.arg(aliases=["--max-motion"])] = 1.0
     """Longest motion in one step, in pixels; 0 = --no-interpolate."""
     noise_resets_memory: bool = True
-    """A noise event stores the present intensity, as in real pixels."""
+    """A noise event stores the present intensity, as in real pixels (v2e's sensors)."""
     seed: int = 0
     overwrite: bool = False
     json: bool = False
@@ -209,10 +213,10 @@ def _simulate(command: Simulate) -> None:
     import jax
 
     from evflow import io
-    from evflow.camera import SensorModel
     from evflow.colour import as_seen
     from evflow.io.source import open_frames
     from evflow.progress import bar
+    from evflow.sensors import known_sensor
     from evflow.simulator import simulate_stream
     from evflow.simulator.interpolate import unzip, upsample
 
@@ -220,7 +224,9 @@ def _simulate(command: Simulate) -> None:
         command.video, fps=command.fps, timestamps=command.timestamps, colour=command.colour,
         time_unit=command.time_unit, full_scale=command.full_scale, partial=command.partial)
     camera = _camera(command, source.size)
-    sensor = SensorModel(noise_resets_memory=command.noise_resets_memory)
+    sensor = known_sensor(command.sensor).model
+    if sensor.kind == "v2e":
+        sensor = dataclasses.replace(sensor, noise_resets_memory=command.noise_resets_memory)
     count = frames = 0
 
     def shown(done: int, total: int) -> None:
@@ -241,18 +247,29 @@ def _simulate(command: Simulate) -> None:
     for note in source.notes:
         print(f"note: {note}", file=sys.stderr)
     facts = {"out": str(command.out), "events": count, "frames": frames,
-             "colour": command.colour, "notes": source.notes}
+             "sensor": command.sensor, "colour": command.colour, "notes": source.notes}
     print(json.dumps(facts) if command.json else
           f"{count:,} events of {frames:,} frames -> {command.out}")
 
 
 def _camera(command: Simulate, size: tuple[int, int]) -> Any:
     """The camera asked for; EV015 where its size is not that of the video."""
-    from evflow.camera import Camera
+    import jax
+    import jax.numpy as jnp
+
+    from evflow.camera import PARAMETERS, Camera, CameraPrior
+    from evflow.sensors import known_sensor
 
     shape = size[::-1]
-    camera = Camera.load(command.camera) if command.camera else Camera.constant(
-        shape, command.theta_on, command.theta_off, command.eta_on, command.eta_off)
+    if command.camera:
+        camera = Camera.load(command.camera)
+    else:
+        known = known_sensor(command.sensor)
+        camera = Camera.sample(jax.random.key(command.seed), shape, CameraPrior(
+            (known.theta,) * 2, (known.mismatch,) * 2, noise="none"))
+        given = {name: jnp.full(shape, value) for name in PARAMETERS
+                 if (value := getattr(command, name)) is not None}
+        camera = dataclasses.replace(camera, **given).validate()
     if camera.shape != shape:
         raise EvflowDataError(
             "EV015", f"the video is {size[0]}x{size[1]}, the camera "

@@ -10,10 +10,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
-from evflow.camera import CameraPrior, SensorModel
+from evflow.camera import CameraPrior
 from evflow.errors import EvflowDataError
 from evflow.flow.config import FlowConfig
 from evflow.scenes.config import SceneConfig
+from evflow.sensors import SensorModel
 
 PARTS = ("summary", "encoder", "flow", "spread")
 

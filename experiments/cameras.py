@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow import Recording, simulate
-from evflow.camera import Camera, CameraPrior, SensorModel, Summary, sample_nominal, sample_pixels
+from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
 from evflow.config import PRESETS
 from evflow.intensity import noise_factor, normalised_intensity
 from evflow.scenes import Scene, TextureBank, render, sample_scene
 from evflow.scenes.config import SceneConfig
+from evflow.sensors import SensorModel
 
 Array = jax.Array
 

@@ -22,8 +22,9 @@ import numpy as np
 import tyro
 
 from evflow import estimate_camera, finish
-from evflow.camera import CameraPrior, SensorModel
+from evflow.camera import CameraPrior
 from evflow.recording import pool_recording
+from evflow.sensors import SensorModel
 from experiments.cameras import Hidden, Protocol
 from experiments.common import write_result
 from experiments.many import Setup, scores

@@ -25,11 +25,12 @@ import numpy as np
 import tyro
 
 from evflow import Camera, code_from_video, generate, load_weights, log_prob
-from evflow.camera import THETA_MIN, CameraPrior, SensorModel, sample_nominal, sample_pixels
+from evflow.camera import THETA_MIN, CameraPrior, sample_nominal, sample_pixels
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
 from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank, render, sample_scene
 from evflow.scenes.config import SceneConfig
+from evflow.sensors import SensorModel
 from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
 from experiments.common import write_result

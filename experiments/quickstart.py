@@ -19,11 +19,12 @@ import numpy as np
 import tyro
 
 from evflow import CameraEstimate, Events, Recording, estimate_camera, read_recording, simulate
-from evflow.camera import Camera, CameraPrior, SensorModel, Summary, sample_nominal, sample_pixels
+from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
 from evflow.progress import bar
 from evflow.report import plots
 from evflow.report.text import LABELS, describe
 from evflow.scenes import SceneConfig, make_bank, render, sample_scene
+from evflow.sensors import SensorModel
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import unzip, upsample
 from experiments.common import write_result

@@ -19,8 +19,8 @@ from networks import small_config
 
 from evflow import distributed
 from evflow.batch import sample_batch
-from evflow.camera import SensorModel
 from evflow.scenes import make_bank
+from evflow.sensors import SensorModel
 from evflow.train import init_state, make_run_step, optimiser
 
 CONFIG = dataclasses.replace(

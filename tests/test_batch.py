@@ -12,9 +12,10 @@ from networks import small_config
 
 from evflow.batch import Batch
 from evflow.batch import sample_batch as sample_batch_eagerly
-from evflow.camera import CameraPrior, SensorModel
+from evflow.camera import CameraPrior
 from evflow.config import PRESETS, NuisanceConfig
 from evflow.scenes import SceneConfig, TextureBank, make_bank
+from evflow.sensors import SensorModel
 
 sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
 

@@ -19,12 +19,12 @@ from evflow.camera import (
     THETA_MIN,
     Camera,
     CameraPrior,
-    SensorModel,
     noise_of_threshold,
     sample_nominal,
     sample_pixels,
 )
 from evflow.errors import EvflowDataError
+from evflow.sensors import SensorModel
 
 SHAPE = (4, 6)
 
@@ -165,7 +165,7 @@ def test_damaged_files_are_refused_or_harmless(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("option", "value"), [
-    ("kind", "esim"), ("timestamps", "slots"), ("log_map", "log"), ("cutoff_hz", -1.0),
+    ("kind", "dvs"), ("timestamps", "slots"), ("log_map", "log"), ("cutoff_hz", -1.0),
     ("refractory_s", -1e-3), ("leak_hz", float("nan")), ("leak_jitter", -0.1),
     ("leak_fpn_decades", float("inf")), ("shot_hz", -5.0)])
 def test_sensor_model_refuses_bad_options(option: str, value: Any) -> None:

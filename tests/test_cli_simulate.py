@@ -265,3 +265,16 @@ def test_help_shows_examples(capsys: pytest.CaptureFixture[str]) -> None:
     for option in ("--timestamps", "--colour", "--fps", "--max-motion", "--no-interpolate",
                    "--partial", "--full-scale", "--time-unit", "--overwrite"):
         assert option in text, option
+
+
+@pytest.mark.parametrize("sensor", ["noisy", "esim", "dvs240"])
+def test_sensors_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str], sensor: str) -> None:
+    """Each by its own thresholds; one threshold given replaces that one."""
+    np.save(tmp_path / "a.npy", colour_frames()[..., 1])
+    options = ["--fps", "100", "--sensor", sensor]
+    events, facts, _ = simulate(capsys, tmp_path / "a.npy", tmp_path / "a.h5", *options)
+    assert facts["sensor"] == sensor
+    assert len(events) > 200
+    fewer, _, _ = simulate(capsys, tmp_path / "a.npy", tmp_path / "b.h5", *options,
+                           "--theta-on", "0.6")
+    assert fewer.p.sum() < 0.7 * events.p.sum()

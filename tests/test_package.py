@@ -13,8 +13,9 @@ import evflow
 ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
 FLOORS = (
-    ("errors", "checks", "files"), ("types", "progress", "distributed"), ("io",), ("camera",),
-    ("intensity",), ("voxel",), ("flow", "scenes", "simulator"), ("config",), ("squash",),
+    ("errors", "checks", "files"), ("types", "progress", "distributed", "colour"), ("io",),
+    ("camera", "sensors"), ("pixels", "intensity"), ("voxel",), ("flow", "scenes", "simulator"),
+    ("config",), ("squash", "dataset"),
     ("encoder", "summary", "refine"),
     ("network", "losses", "batch"), ("model",), ("weights", "checkpoint"), ("train", "recording"),
     ("report",), ("cli",),

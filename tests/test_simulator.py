@@ -12,8 +12,9 @@ import pytest
 from recordings import equal
 from videos import SHAPE, by_pixel, drifting, milliseconds
 
-from evflow.camera import Camera, CameraPrior, SensorModel
+from evflow.camera import Camera, CameraPrior
 from evflow.intensity import LOG_MAPS, to_log
+from evflow.sensors import SensorModel
 from evflow.simulator import simulate, simulate_stream
 from evflow.simulator.active import step
 from evflow.simulator.pixel import floor_divide

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from videos import code_of
 
-from evflow.camera import Camera, SensorModel
+from evflow.camera import Camera
 from evflow.errors import EvflowDataError
+from evflow.sensors import SensorModel
 from evflow.simulator import simulate, simulate_stream, simulate_voxels
 
 SHAPE = (4, 6)

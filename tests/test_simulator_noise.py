@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from videos import by_pixel
 
-from evflow.camera import Camera, CameraPrior, SensorModel
+from evflow.camera import Camera, CameraPrior
+from evflow.sensors import SensorModel
 from evflow.simulator import simulate
 from evflow.simulator.noise import draw, event, further, pixel_words, poisson, salts, uniform
 from evflow.types import Events

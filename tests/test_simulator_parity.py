@@ -10,7 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from evflow.camera import Camera, SensorModel
+from evflow.camera import Camera
+from evflow.sensors import SensorModel
 from evflow.simulator import simulate
 from evflow.types import Events
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from videos import SHAPE, drifting
 
-from evflow.camera import Camera, CameraPrior, SensorModel
+from evflow.camera import Camera, CameraPrior
 from evflow.intensity import to_log
+from evflow.sensors import SensorModel
 from evflow.simulator import simulate, simulate_voxels
 from evflow.simulator.bins import hat_sums
 from evflow.simulator.voxels import _voxels

@@ -2,10 +2,12 @@
 
 pixel.py one interval of one pixel · noise.py Poisson noise and leak · sensor.py all pixels,
 vmapped · to events: frames.py what comes in, active.py the pixels that may fire, pack.py sorted
-lists, events.py the stream · to voxels: bins.py, voxels.py · interpolate.py slow videos to fast.
+lists, circuits.py block by block, events.py the stream · to voxels: bins.py, voxels.py · to counts:
+counts.py · voltmeter.py a Brownian pixel · interpolate.py slow videos to fast.
 """
 
+from evflow.simulator.counts import simulate_counts
 from evflow.simulator.events import simulate, simulate_stream
 from evflow.simulator.voxels import simulate_voxels
 
-__all__ = ["simulate", "simulate_stream", "simulate_voxels"]
+__all__ = ["simulate", "simulate_counts", "simulate_stream", "simulate_voxels"]

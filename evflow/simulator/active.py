@@ -14,11 +14,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from evflow.camera import SensorModel
 from evflow.intensity import normalised_intensity, to_log
+from evflow.sensors import SensorModel
 from evflow.simulator import noise, pixel, sensor
 from evflow.simulator.pixel import PixelState, Spikes
-from evflow.simulator.sensor import Sensor
+from evflow.simulator.sensor import Sensor, Struck
 
 Array = jax.Array
 
@@ -41,14 +41,12 @@ class Block:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """What K pixels send in T intervals, each (T, K). fires: whether there are signal events.
-    struck, drawn, odds: noise events, see `sensor.Disturbance`; None without."""
+    """What K pixels send in T intervals, each array (T, K). fires: whether there are signal
+    events. struck: noise events, None without."""
 
     fires: Array
     spikes: Spikes
-    struck: Array | None
-    drawn: Array | None
-    odds: noise.Odds | None
+    struck: Struck | None
 
 
 @functools.partial(jax.jit, static_argnames="model")
@@ -139,7 +137,6 @@ def step(
     log_i, i01 = to_log(frames, model.log_map), _i01(frames)
     # All that does not depend on the memory is worked out for the block at once.
     dist = jax.vmap(functools.partial(sensor.disturb, model, few))(i01, block.salts, block.dt)
-    struck = dist.struck
 
     def body(
         pixels: PixelState, inputs: tuple[Any, ...]
@@ -148,12 +145,18 @@ def step(
 
     clock = block.clock[:-1], block.clock[1:]
     pixels, spikes = jax.lax.scan(
-        body, pixels, (log_i, i01, dist.leaked, struck, block.dt, clock))
-    real = (at < whole.words.size)[None]
-    sent = Sent((spikes.count != 0) & real, spikes, None, None, None)
+        body, pixels, (log_i, i01, dist, block.dt, clock))
+    real, struck = (at < whole.words.size)[None], dist.struck
     if struck is not None:
-        sent = dataclasses.replace(sent, struck=struck & real, drawn=dist.drawn, odds=dist.odds)
+        struck = dataclasses.replace(struck, some=struck.some & real)
     kept = ("base", "last") if model.refractory_s > 0 else ("base",)
     put = {name: getattr(after, name).at[at].set(getattr(pixels, name), mode="drop")
            for name in kept}
-    return dataclasses.replace(after, **put), sent
+    return dataclasses.replace(after, **put), Sent((spikes.count != 0) & real, spikes, struck)
+
+
+@functools.partial(jax.jit, static_argnames="model")
+def strike(model: SensorModel, whole: Sensor, block: Block) -> Struck | None:
+    """The noise of a block, (T, N), of sensors whose signal comes from elsewhere."""
+    one = functools.partial(sensor.disturb, model, whole)
+    return jax.vmap(one)(_i01(block.frames), block.salts, block.dt).struck

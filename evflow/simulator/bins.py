@@ -101,6 +101,11 @@ def noise_bins(width: int, at: Array, sign: Array, offset: Array, length: float)
     return [sign * jnp.maximum(0.0, 1.0 - jnp.abs(position - j)) for j in range(width)]
 
 
+def by_polarity(weights: list[Array]) -> tuple[list[Array], list[Array]]:
+    """(ON, OFF) of weights that are negative for OFF."""
+    return [jnp.maximum(w, 0.0) for w in weights], [jnp.maximum(-w, 0.0) for w in weights]
+
+
 def add(grid: Array, low: Array, on: list[Array], off: list[Array]) -> Array:
     """Add weights (N,) to bins low, low + 1, ... of grid (2 * bins, N): [ON bins, OFF bins]."""
     bins = grid.shape[0] // 2

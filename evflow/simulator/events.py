@@ -8,33 +8,25 @@ works on a block, the host packs the one before.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from typing import Literal, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import Camera, SensorModel
+from evflow.camera import Camera
 from evflow.checks import COLUMNS
 from evflow.errors import EvflowDataError
-from evflow.intensity import to_log
-from evflow.simulator import active, noise, pack, sensor
-from evflow.simulator.active import Block, Sent
+from evflow.sensors import SensorModel
+from evflow.simulator import pack
+from evflow.simulator.circuits import BLOCK, Fetch, circuit
 from evflow.simulator.frames import blocks
-from evflow.simulator.pixel import PixelState
-from evflow.simulator.sensor import Sensor, SimState
 from evflow.types import Events
 
 Array = jax.Array
 Labelled = tuple[Events, np.ndarray]
-
-BLOCK = 8  # frames; more of them have more active pixels, fewer pass more often over all pixels
-SALTED = 64 * BLOCK  # intervals whose salts are drawn at a time
-ACTIVE = 8192  # active pixels that are stepped at a time; their arrays stay in the cache
 
 
 @overload
@@ -103,82 +95,22 @@ def _packed(
 ) -> Iterator[Labelled]:
     """One block is with the device while the one before is packed."""
     camera = _checked_camera(camera)
-    nominal, most_hz = None, 0.0
-    if noise.is_noisy(model, camera):
-        nominal = noise.nominal_thresholds(model, camera)
-        most_hz = noise.most_rate(model, camera, nominal)
+    shape = (camera.shape[0], camera.shape[1])
     (first,), last = next(video)
-    whole, state = _start(key, first.reshape(camera.shape), camera, nominal, model=model)
-    pixels, origin = state.pixels, int(last[0])
-    words, shape = np.asarray(whole.words), (camera.shape[0], camera.shape[1])
+    pixels = circuit(key, first.reshape(shape), int(last[0]), camera, model)
 
-    def packed(sent: list[tuple[np.ndarray, Sent]], edges: np.ndarray) -> Labelled:
-        parts = [part for group, out in sent
-                 for part in pack.columns(model, out, group, words, np.diff(edges))]
-        return pack.sort(parts, edges, shape)
+    def packed(fetch: Fetch, edges: np.ndarray) -> Labelled:
+        return pack.sort(fetch(), edges, shape)
 
     # NumPy and XLA let go of the interpreter in long loops: two cores are busy.
     with ThreadPoolExecutor(1) as behind:
         waiting: list[Future[Labelled]] = []
-        for (frames, times), salts in zip(video, _salts(state.key), strict=False):
+        for frames, times in video:
             edges = np.concatenate([last, times])
-            noise.check_rate(most_hz, float(np.diff(edges).max()) * 1e-6)
-            pixels, sent = _advance(model, whole, pixels, _block(salts, frames, edges, origin))
+            fetch = pixels.advance(frames, edges)
             yield from (one.result() for one in waiting)
-            waiting, last = [behind.submit(packed, sent, edges)], times[-1:]
+            waiting, last = [behind.submit(packed, fetch, edges)], times[-1:]
         yield from (one.result() for one in waiting)
-
-
-@partial(jax.jit, static_argnames="model")
-def _start(
-    key: Array, frame: Array, camera: Camera, nominal: Array | None, *, model: SensorModel
-) -> tuple[Sensor, SimState]:
-    return sensor.start(key, to_log(frame, model.log_map), camera, model, nominal)
-
-
-def _advance(
-    model: SensorModel, whole: Sensor, pixels: PixelState, block: Block
-) -> tuple[PixelState, list[tuple[np.ndarray, Sent]]]:
-    """Dispatch a block; only which pixels are active is waited for."""
-    after, may_send = active.look(model, whole, pixels, block)
-    count = whole.words.size
-    if model.timestamps == "v2e":  # its slots depend on all pixels
-        at, size = np.arange(count, dtype=np.int32), count
-    else:
-        at, size = np.flatnonzero(may_send).astype(np.int32), ACTIVE
-    sent = []
-    for first in range(0, len(at), size):
-        some = at[first : first + size]
-        padded = np.full(size, count, np.int32)
-        padded[: len(some)] = some
-        after, out = active.step(model, whole, pixels, after, block, padded)
-        sent.append((some, out))
-    return after, sent
-
-
-def _block(
-    salts: np.ndarray, frames: list[np.ndarray], edges: np.ndarray, origin: int
-) -> Block:
-    """The block, padded to BLOCK frames."""
-    missing = BLOCK - len(frames)
-    frames = frames + [frames[-1]] * missing
-    edges = np.append(edges, np.full(missing, edges[-1]))
-    seconds = (edges - origin) * 1e-6
-    high = seconds.astype(np.float32)
-    clock = np.stack([high, seconds - high], -1).astype(np.float32)
-    dt = (np.diff(edges) * 1e-6).astype(np.float32)
-    return Block(*map(jnp.asarray, (np.stack(frames), dt, clock, salts)))
-
-
-def _salts(key: Array) -> Iterator[np.ndarray]:
-    """`noise.salts` of block after block."""
-    for first in itertools.count(0, SALTED):
-        yield from np.asarray(_some_salts(key, first)).reshape(-1, BLOCK, 2)
-
-
-@jax.jit
-def _some_salts(key: Array, first: int) -> Array:
-    return noise.salts(key, first + jnp.arange(SALTED))
 
 
 def _checked_camera(camera: Camera) -> Camera:

@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import Camera, SensorModel
+from evflow.camera import Camera
 from evflow.errors import EvflowDataError
 from evflow.intensity import noise_factor
+from evflow.sensors import SensorModel
 
 Array = jax.Array
 Values = Any  # jax.Array or np.ndarray

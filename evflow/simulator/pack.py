@@ -13,9 +13,10 @@ from functools import lru_cache
 import jax
 import numpy as np
 
-from evflow.camera import SensorModel
+from evflow.sensors import SensorModel
 from evflow.simulator import noise
 from evflow.simulator.active import Sent
+from evflow.simulator.sensor import Struck
 from evflow.types import Events
 
 Array = np.ndarray
@@ -33,31 +34,37 @@ class Columns:
     noise: bool
 
 
-def columns(
-    model: SensorModel, sent: Sent, pixels: Array, words: Array, dt_us: Array
+def signal_columns(
+    model: SensorModel, sent: Sent, pixels: Array, dt_us: Array
 ) -> Iterator[Columns]:
-    """The events of `sent`, columns of which belong to `pixels`; intervals beyond dt_us are
-    padding. words: `Sensor.words`, whole."""
-    width = sent.fires.shape[1]
-
-    def where(flags: jax.Array) -> tuple[Array, Array, Array]:
-        """Index into (T, K) arrays, interval and pixel of what is flagged."""
-        at = np.flatnonzero(np.asarray(flags)[: len(dt_us)])
-        step = at // width
-        return at, step, pixels.take(at - step * width)
-
-    def of(values: jax.Array | None, at: Array) -> Array:
-        return np.asarray(values).ravel().take(at)
-
-    at, step, pixel = where(sent.fires)
-    count, first, spacing = (of(a, at) for a in (
+    """The signal events of `sent`, whose columns belong to `pixels`."""
+    at, step, pixel = _where(sent.fires, pixels, len(dt_us))
+    count, first, spacing = (_of(a, at) for a in (
         sent.spikes.count, sent.spikes.first, sent.spikes.spacing))
-    earliest = of(sent.spikes.earliest, at) if model.waits else first
+    earliest = first if sent.spikes.earliest is None else _of(sent.spikes.earliest, at)
     yield from _signal(model, count, step, pixel, dt_us, first, spacing, earliest)
-    if sent.struck is not None and sent.odds is not None:
-        at, step, pixel = where(sent.struck)
-        odds = jax.tree.map(lambda a: of(a, at), sent.odds)
-        yield _noise(model, step, pixel, words.take(pixel), of(sent.drawn, at), odds)
+
+
+def noise_columns(
+    model: SensorModel, struck: Struck | None, pixels: Array, words: Array, dt_us: Array
+) -> Iterator[Columns]:
+    """The noise events. words: `Sensor.words`, whole."""
+    if struck is not None:
+        at, step, pixel = _where(struck.some, pixels, len(dt_us))
+        odds = jax.tree.map(lambda a: _of(a, at), struck.odds)
+        yield _noise(model, step, pixel, words.take(pixel), _of(struck.drawn, at), odds)
+
+
+def _where(flags: jax.Array, pixels: Array, steps: int) -> tuple[Array, Array, Array]:
+    """Index into arrays (T, K), interval and pixel of what is flagged; intervals from `steps` on
+    are padding."""
+    at = np.flatnonzero(np.asarray(flags)[:steps])
+    step = at // flags.shape[1]
+    return at, step, pixels.take(at - step * flags.shape[1])
+
+
+def _of(values: jax.Array, at: Array) -> Array:
+    return np.asarray(values).ravel().take(at)
 
 
 def _signal(

@@ -14,7 +14,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from evflow.camera import Camera, SensorModel
+from evflow.camera import Camera
+from evflow.sensors import SensorModel
 
 Array = jax.Array
 
@@ -51,11 +52,12 @@ def never_fired(model: SensorModel) -> float:
     return 1e6 if model.timestamps == "crossing" else -model.refractory_s
 
 
-def coarse(camera: Camera) -> Camera:
-    """Thresholds rounded to 16 significant bits (a change below 8e-6 of their value).
+def exact(camera: Camera) -> Camera:
+    """Thresholds rounded to 16 significant bits, a change below 8e-6 of their value.
 
-    k theta is then exact in float32 for k <= 256: whether a compiler fuses multiply and add
-    cannot decide the exact ties that 8-bit video is full of, and all programs count alike.
+    Sums of log intensity and thresholds are then exact in float32, and a contrast of k theta
+    crosses k times. 8-bit video is full of such ties, wherever a pixel returns to a value it had.
+    ESIM adds thresholds to its reference until it passes; v2e rounds, and loses one in 600.
     """
     def rounded(theta: Array) -> Array:
         if theta.dtype != jnp.float32:

@@ -12,8 +12,9 @@ import math
 import jax
 import jax.numpy as jnp
 
-from evflow.camera import Camera, SensorModel
+from evflow.camera import Camera
 from evflow.intensity import LOG_MAPS, normalised_intensity
+from evflow.sensors import SensorModel
 from evflow.simulator import noise, pixel
 from evflow.simulator.pixel import PixelState, Spikes
 
@@ -24,9 +25,8 @@ Clock = tuple[Array, Array]  # begin and end of an interval, see `SimState.time`
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """What stays the same, maps (N,). camera: with `pixel.coarse` thresholds. words: see
-    `noise.draw`. rates: None for a silent sensor. leaking: log units per second, None without
-    leak."""
+    """What stays the same, maps (N,). words: see `noise.draw`. rates: None for a silent sensor.
+    leaking: log units per second, None without leak."""
 
     camera: Camera
     words: Array
@@ -49,18 +49,23 @@ class SimState:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Struck:
+    """Noise of an interval, maps (N,). some: whether a pixel sends any event; drawn (`noise.draw`)
+    and odds say how many, when, and of which polarity."""
+
+    some: Array
+    drawn: Array
+    odds: noise.Odds
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class Disturbance:
-    """What happens to pixels in an interval whatever their memory, maps (N,). leaked: log units,
-    None without leak. drawn: `noise.draw`. odds: what it is held against, None without noise."""
+    """What happens to pixels in an interval whatever their memory. leaked: log units (N,), None
+    without leak. struck: None without noise."""
 
     leaked: Array | None
-    drawn: Array
-    odds: noise.Odds | None
-
-    @property
-    def struck(self) -> Array | None:
-        """Whether a pixel sends noise events; None without noise."""
-        return None if self.odds is None else noise.uniform(self.drawn) < self.odds.some
+    struck: Struck | None
 
 
 def start(
@@ -75,7 +80,8 @@ def start(
     """
     k_leak, k_words, k_intervals = jax.random.split(key, 3)
     count = math.prod(log_frame.shape)
-    flat = pixel.coarse(jax.tree.map(lambda m: m.reshape(count), camera))
+    flat = jax.tree.map(lambda m: m.reshape(count), camera)
+    flat = pixel.exact(flat) if model.kind == "esim" else flat
     base = (log_frame - phase).reshape(count)
     log_i = log_frame.reshape(count)
     reference = jnp.mean(i01_of(model, log_i))
@@ -102,24 +108,23 @@ def disturb(
 ) -> Disturbance:
     """Leak and noise of an interval of dt seconds at normalised intensity i01 (N,). salt: the
     interval's `noise.salts`."""
-    drawn = noise.draw(sensor.words, salt)
-    leaked = odds = None
+    drawn, leaked, struck = noise.draw(sensor.words, salt), None, None
     if sensor.leaking is not None:
         leaked = noise.leak(model, sensor.leaking, sensor.words, drawn, dt)
     if sensor.rates is not None:
         odds = noise.odds(sensor.rates, i01, dt)
-    return Disturbance(leaked, drawn, odds)
+        struck = Struck(noise.uniform(drawn) < odds.some, drawn, odds)
+    return Disturbance(leaked, struck)
 
 
 def advance(
     model: SensorModel, camera: Camera, state: PixelState, log_i: Array, i01: Array,
-    leaked: Array | None, struck: Array | None, dt: Array, clock: Clock,
+    disturbance: Disturbance, dt: Array, clock: Clock,
 ) -> tuple[PixelState, Spikes]:
     """One frame interval of dt seconds that ends at the log frame log_i (N,), normalised
     intensity i01: the signal events, by per-pixel functions vmapped over (N,).
 
-    leaked, struck: see `Disturbance`. dt = 0 with the same frame changes nothing and emits
-    nothing (padding).
+    dt = 0 with the same frame changes nothing and emits nothing (padding).
     """
     def contrast(
         on: Array, off: Array, s: PixelState, log: Array, i: Array, leak: Array | None
@@ -127,7 +132,7 @@ def advance(
         return pixel.contrast(model, on, off, s, log, i, leak, dt)
 
     state, theta, begin, end = jax.vmap(contrast)(
-        camera.theta_on, camera.theta_off, state, log_i, i01, leaked)
+        camera.theta_on, camera.theta_off, state, log_i, i01, disturbance.leaked)
     most = jnp.zeros((), end.dtype)
     if model.timestamps == "v2e":
         most = jnp.max(pixel.floor_divide(end, jnp.abs(theta)))
@@ -136,6 +141,7 @@ def advance(
         return pixel.send(model, s, th, b, e, dt, *clock, most)
 
     state, spikes = jax.vmap(send)(state, theta, begin, end)
-    if struck is not None and model.noise_resets_memory:
-        state = dataclasses.replace(state, base=jnp.where(struck, state.lp, state.base))
+    if disturbance.struck is not None and model.noise_resets_memory:
+        base = jnp.where(disturbance.struck.some, state.lp, state.base)
+        state = dataclasses.replace(state, base=base)
     return state, spikes

@@ -16,17 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import Camera, SensorModel
+from evflow.camera import Camera
 from evflow.errors import EvflowDataError
+from evflow.intensity import LOG_MAPS, normalised_intensity
+from evflow.sensors import SensorModel
 from evflow.simulator import bins as weigh
-from evflow.simulator import noise, sensor
+from evflow.simulator import noise, sensor, voltmeter
 from evflow.simulator.bins import Schedule
 from evflow.simulator.pixel import PixelState, Spikes
-from evflow.simulator.sensor import Disturbance, Sensor, SimState
+from evflow.simulator.sensor import Sensor, SimState, Struck
 from evflow.voxel import BINS
 
 Array = jax.Array
-Event = tuple[Array, Array]  # of every pixel: where in the interval, and its sign or 0
 Weights = tuple[list[Array], list[Array]]  # (ON, OFF), one (N,) per touched bin
 
 TILE = 16384  # pixels; their maps and grid, some 3 MB, are worked on at a time
@@ -99,10 +100,10 @@ def _scan(
         i01 = sensor.i01_of(model, log_i)  # dropped by the compiler where nothing uses it
         dist = sensor.disturb(model, whole, i01, salt, dt)
         pixels, spikes = sensor.advance(
-            model, whole.camera, pixels, log_i, i01, dist.leaked, dist.struck, dt, (begin, end))
-        on, off = _weights(model, plan, whole.words, spikes, dist, offset, wide, dt)
-        if dist.odds is not None:
-            more = _more_noise(model, whole.words, dist, offset, plan)
+            model, whole.camera, pixels, log_i, i01, dist, dt, (begin, end))
+        on, off = _weights(model, plan, spikes, offset, wide, dt)
+        if dist.struck is not None:
+            more = _noise(model, whole.words, dist.struck, offset, plan)
             on, off = jax.tree.map(jnp.add, (on, off), more)
         return (pixels, weigh.add(grid, low, on, off)), None
 
@@ -112,62 +113,74 @@ def _scan(
     return pixels, grid.T
 
 
-def _event(model: SensorModel, words: Array, dist: Disturbance, k: Array, sent: Array) -> Event:
-    """The k-th noise event of an interval, of the pixels that have sent it."""
-    assert dist.odds is not None
-    at, on = noise.event(model, words, dist.drawn, k, dist.odds.share)
-    return at, jnp.where(sent, jnp.where(on, 1.0, -1.0), 0.0)
+def _scan_brownian(
+    key: Array, model: SensorModel, whole: Sensor, log_frames: Array, salts: Array, dt: Array,
+    bins: int,
+) -> Array:
+    """DVS-Voltmeter's grid (N, 2 * bins) of flat log frames (T + 1, N), with the camera's noise.
+    key: of the signal."""
+    frames = LOG_MAPS[model.log_map][1](log_frames)
+    plan = Schedule.of(len(frames) - 1, bins)
+
+    def body(
+        carry: tuple[voltmeter.State, Array], inputs: tuple[Any, ...]
+    ) -> tuple[tuple[voltmeter.State, Array], None]:
+        (voltage, grid), (frame, index, low, offset, salt) = carry, inputs
+        touched = jnp.zeros((2, plan.width, frame.size), grid.dtype)
+        voltage, (on, off) = voltmeter.weights(
+            key, index, model.voltmeter, whole.camera, voltage, frame, dt * 1e6, touched, offset,
+            plan.length)
+        weights: Weights = list(on), list(off)
+        struck = sensor.disturb(model, whole, normalised_intensity(frame), salt, dt).struck
+        if struck is not None:
+            more = _noise(model, whole.words, struck, offset, plan)
+            weights = jax.tree.map(jnp.add, weights, more)
+        return (voltage, weigh.add(grid, low, *weights)), None
+
+    steps = jnp.arange(len(frames) - 1)
+    start = voltmeter.start(frames[0]), jnp.zeros((2 * bins, frames.shape[1]), frames.dtype)
+    return jax.lax.scan(body, start, (frames[1:], steps, plan.low, plan.offset, salts))[0][1].T
 
 
 def _weights(
-    model: SensorModel, plan: Schedule, words: Array, spikes: Spikes, dist: Disturbance,
-    offset: Array, wide: Array, dt: Array,
+    model: SensorModel, plan: Schedule, spikes: Spikes, offset: Array, wide: Array, dt: Array
 ) -> Weights:
-    """Weights of the signal events of an interval and of one noise event per pixel."""
-    event = None
-    if dist.struck is not None:
-        event = _event(model, words, dist, jnp.zeros((), jnp.uint32), dist.struck)
+    """Weights of the signal events of an interval."""
     dead = model.refractory_s / dt if model.waits else None
 
-    def signed(width: int, spikes: Spikes, event: Event | None) -> list[list[Array]]:
-        parts = [weigh.signal_bins(width, spikes, offset, plan.length, dead)]
-        if event is not None:
-            parts.append(weigh.noise_bins(width, *event, offset, plan.length))
+    def signed(width: int, spikes: Spikes) -> list[Array]:
         spare = [jnp.zeros_like(spikes.first)] * (plan.width - width)
-        return [part + spare for part in parts]
+        return weigh.signal_bins(width, spikes, offset, plan.length, dead) + spare
 
     # The branch saves the third bin where it is not touched; it also is where XLA writes the
     # spikes down once, instead of computing them again for every bin and polarity.
-    parts = jax.lax.cond(wide, partial(signed, plan.width), partial(signed, 2), spikes, event)
-    def of(sign: float) -> list[Array]:
-        return [sum((jnp.maximum(sign * w, 0.0) for w in column[1:]),
-                    jnp.maximum(sign * column[0], 0.0)) for column in zip(*parts, strict=True)]
-
-    return of(1.0), of(-1.0)
+    return weigh.by_polarity(
+        jax.lax.cond(wide, partial(signed, plan.width), partial(signed, 2), spikes))
 
 
-def _more_noise(
-    model: SensorModel, words: Array, dist: Disturbance, offset: Array, plan: Schedule
+def _noise(
+    model: SensorModel, words: Array, struck: Struck, offset: Array, plan: Schedule
 ) -> Weights:
-    """Weights of the second and further noise events of an interval, which seldom has any."""
-    assert dist.odds is not None
-    u, mean = noise.uniform(dist.drawn), dist.odds.mean
+    """Weights of the noise events of an interval: the first of every pixel, and the others as long
+    as there are any, which is seldom."""
+    u, mean = noise.uniform(struck.drawn), struck.odds.mean
+
+    def event(k: Array, sent: Array) -> Weights:
+        at, on = noise.event(model, words, struck.drawn, k, struck.odds.share)
+        sign = jnp.where(sent, jnp.where(on, 1.0, -1.0), 0.0)
+        return weigh.by_polarity(weigh.noise_bins(plan.width, at, sign, offset, plan.length))
 
     def unfinished(carry: tuple[noise.Tail, Weights]) -> Array:
         return jnp.any(u < carry[0][0])
 
     def step(carry: tuple[noise.Tail, Weights]) -> tuple[noise.Tail, Weights]:
-        tail, (on, off) = carry
-        event = _event(model, words, dist, jnp.asarray(tail[2], jnp.uint32), u < tail[0])
-        weights = weigh.noise_bins(plan.width, *event, offset, plan.length)
-        on = [a + jnp.maximum(w, 0.0) for a, w in zip(on, weights, strict=True)]
-        off = [a + jnp.maximum(-w, 0.0) for a, w in zip(off, weights, strict=True)]
-        return noise.next_tail(mean, tail), (on, off)
+        tail, weights = carry
+        more = event(jnp.asarray(tail[2], jnp.uint32), u < tail[0])
+        return noise.next_tail(mean, tail), jax.tree.map(jnp.add, weights, more)
 
-    nothing = [jnp.zeros_like(mean)] * plan.width
-    first = noise.next_tail(mean, dist.odds.tail())
-    start = (jax.tree.map(jnp.asarray, first), (nothing, list(nothing)))
-    return jax.lax.while_loop(unfinished, step, start)[1]
+    first = event(jnp.zeros((), jnp.uint32), struck.some)
+    tail = jax.tree.map(jnp.asarray, noise.next_tail(mean, struck.odds.tail()))
+    return jax.lax.while_loop(unfinished, step, (tail, first))[1]
 
 
 def simulate_voxels(
@@ -223,8 +236,16 @@ def _voxels(
     model: SensorModel, bins: int, lead: tuple[int, ...],
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
+        if model.kind != "voltmeter":
+            whole, state = sensor.start(key, frames[0], camera, model, nominal)
+            return simulate_window(model, whole, state, frames[1:], frame_dt_s, bins)[1]
+        key, signal = jax.random.split(key)
         whole, state = sensor.start(key, frames[0], camera, model, nominal)
-        return simulate_window(model, whole, state, frames[1:], frame_dt_s, bins)[1]
+        steps, *shape = frames.shape
+        salts = noise.salts(state.key, jnp.arange(steps - 1))
+        dt = jnp.asarray(frame_dt_s, jnp.float32)
+        grid = _scan_brownian(signal, model, whole, frames.reshape(steps, -1), salts, dt, bins)
+        return grid.reshape(*shape, 2 * bins)
 
     if not lead:
         return one(key, log_frames, camera, nominal)

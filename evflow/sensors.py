@@ -1,0 +1,152 @@
+"""Sensor models: what of an event camera is not per pixel, and known sensors by name.
+
+`SensorModel` is a frozen, hashable description of the pixel circuit; jit takes it as a static
+argument. `SENSORS` holds published settings, each with the thresholds that go with them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+
+LogMap = Literal["auto", "linlog", "log_eps"]
+KINDS = ("v2e", "esim", "voltmeter", "paper")
+# Options that a kind of circuit has no part for.
+WITHOUT = {
+    "v2e": (),
+    "esim": ("cutoff_hz", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz"),
+    "voltmeter": ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades",
+                  "shot_hz", "noise_resets_memory"),
+    "paper": ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz",
+              "noise_resets_memory"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Voltmeter:
+    """Constants of DVS-Voltmeter (Lin et al., ECCV 2022, Eq. 10 and 11), for DN on 0..255 and
+    times in us.
+
+    mu = k1 dL/dt / (L + k2) + k4 + k5 L per us, sigma = k3 sqrt(L) / (L + k2) + k6 per sqrt(us),
+    in units of the published threshold. A contrast theta is the level k1 theta, so that
+    theta = 1 / k1 (.190 for DVS346, .226 for DVS240) is the published pixel.
+    """
+
+    k1: float
+    k2: float
+    k3: float
+    k4: float
+    k5: float
+    k6: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():  # the leak, k4 + k5 L, may have either sign
+            low = {"k1": 1e-30, "k2": 1e-30, "k4": -np.inf, "k5": -np.inf}.get(name, 0.0)
+            if not (np.isfinite(value) and value >= low):
+                raise EvflowDataError("EV020", f"Voltmeter({name}={value}).",
+                                      f"It must be finite, and at least {low:g}.")
+
+
+DVS346 = Voltmeter(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
+DVS240 = Voltmeter(4.4241, 23.0, 2e-4, 1e-7, 5e-8, 1e-5)
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorModel:
+    """What is not per pixel. The default is v2e's noise-free pixel with true crossing times.
+
+    kind: the pixel circuit. "v2e": all of the below; "esim": log-eps intensity, and events that
+        come within the refractory period are lost; "voltmeter": Brownian motion with drift, its
+        constants in `voltmeter`; "paper": thresholds and noise rates alone (Section IV-E).
+        Whatever the kind, the camera's eta is added.
+    timestamps: "crossing" = the instant at which the (linearly interpolated) log intensity
+        crosses the threshold; "v2e" = v2e's slots, shared by the k-th event of every pixel.
+    log_map: "linlog" (v2e: linear below 20 DN) or "log_eps" (ESIM: log(I/255 + 1e-3));
+        "auto" becomes the kind's own.
+    cutoff_hz: corner of the intensity-dependent first-order low-pass at 255 DN; 0 = off.
+    refractory_s: dead time after an event; the contrast is kept and fires later (v2e).
+    leak_hz, leak_jitter, leak_fpn_decades: ON leak events per second, the relative jitter of
+        each step, and the spread of the fixed pattern in decades.
+    shot_hz: v2e's shot-noise rate R, both polarities together, on top of the camera's eta.
+    eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
+        of the first frame.
+    noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
+        False adds it to the stream (the paper).
+    """
+
+    kind: Literal["v2e", "esim", "voltmeter", "paper"] = "v2e"
+    timestamps: Literal["crossing", "v2e"] = "crossing"
+    log_map: LogMap = "auto"
+    cutoff_hz: float = 0.0
+    refractory_s: float = 0.0
+    leak_hz: float = 0.0
+    leak_jitter: float = 0.0
+    leak_fpn_decades: float = 0.0
+    shot_hz: float = 0.0
+    eta_intensity: bool = False
+    noise_resets_memory: bool = False
+    voltmeter: Voltmeter = DVS346
+
+    def __post_init__(self) -> None:
+        if self.log_map == "auto":
+            object.__setattr__(self, "log_map", "log_eps" if self.kind == "esim" else "linlog")
+        allowed = {"kind": KINDS, "log_map": ("linlog", "log_eps"), "timestamps": (
+            ("crossing", "v2e") if self.kind in ("v2e", "paper") else ("crossing",))}
+        for name, values in allowed.items():
+            if getattr(self, name) not in values:
+                raise EvflowDataError(
+                    "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
+        for name in ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades",
+                     "shot_hz"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise EvflowDataError(
+                    "EV020", f"SensorModel({name}={getattr(self, name)}).", "It must be >= 0.")
+        for name in WITHOUT[self.kind]:
+            if getattr(self, name):
+                raise EvflowDataError(
+                    "EV020", f"SensorModel(kind={self.kind!r}, {name}={getattr(self, name)}).",
+                    "A pixel of this kind has none; leave it out, or take kind='v2e'.")
+
+    @property
+    def waits(self) -> bool:
+        """Whether an event that comes within the refractory period of another fires later."""
+        return self.refractory_s > 0 and self.timestamps == "crossing" and self.kind == "v2e"
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownSensor:
+    """A model, and the thresholds (natural log) that go with it: median of both polarities and
+    standard deviation from pixel to pixel."""
+
+    model: SensorModel
+    theta: float
+    mismatch: float
+    source: str
+
+
+_NOISY = SensorModel(cutoff_hz=30.0, leak_hz=0.1, leak_jitter=0.1, leak_fpn_decades=0.1,
+                     shot_hz=5.0, noise_resets_memory=True)
+SENSORS: dict[str, KnownSensor] = {
+    "clean": KnownSensor(SensorModel(), 0.2, 0.02, "v2e --dvs_params clean"),
+    "noisy": KnownSensor(_NOISY, 0.2, 0.05, "v2e --dvs_params noisy"),
+    "v2e": KnownSensor(
+        dataclasses.replace(_NOISY, cutoff_hz=300.0, leak_hz=0.01, shot_hz=0.001,
+                            refractory_s=5e-4), 0.2, 0.03, "v2e's command-line defaults"),
+    "esim": KnownSensor(SensorModel(kind="esim"), 0.2, 0.0, "ESIM, noise-free"),
+    "dvs346": KnownSensor(SensorModel(kind="voltmeter", voltmeter=DVS346), 1 / DVS346.k1, 0.0,
+                          "DVS-Voltmeter, calibrated on a DAVIS346"),
+    "dvs240": KnownSensor(SensorModel(kind="voltmeter", voltmeter=DVS240), 1 / DVS240.k1, 0.0,
+                          "DVS-Voltmeter, calibrated on a DAVIS240"),
+    "paper": KnownSensor(SensorModel(kind="paper"), 0.3, 0.15, "TPAMI 2024, Section IV-E"),
+}
+
+
+def known_sensor(name: str) -> KnownSensor:
+    """The sensor of this name; raises EV020."""
+    if name not in SENSORS:
+        raise EvflowDataError("EV020", f"no sensor {name!r}.", f"Choose {tuple(SENSORS)}.")
+    return SENSORS[name]

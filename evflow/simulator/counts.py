@@ -1,0 +1,155 @@
+"""Event counts per pixel and polarity: exact ones, and a smooth mode that has gradients.
+
+Counts are steps in theta. The smooth mode replaces each step by a ramp of some width around it:
+as wide as a threshold, the count is what one expects of a pixel whose memory may lie anywhere; as
+narrow as nothing, it is the count. Its gradients in theta, eta and light are those of the ramp.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from evflow.camera import Camera
+from evflow.errors import EvflowDataError
+from evflow.sensors import SensorModel
+from evflow.simulator import noise, pixel, sensor
+from evflow.simulator.pixel import PixelState
+from evflow.simulator.sensor import Sensor, SimState
+
+Array = jax.Array
+
+
+def simulate_counts(
+    key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: Array | float,
+    model: SensorModel | None = None, smooth: float = 0.0,
+) -> Array:
+    """Events per pixel (H, W, 2) = [ON, OFF] of a video, float32; jit, vmap, differentiate it.
+
+    log_frames: (T, H, W) natural-log intensity in the map of `model.log_map`, frame_dt_s apart.
+    camera: maps (H, W). smooth: width of the ramps in thresholds, 0 (exact counts, no gradient)
+    to 1; above 0 the noise is its expectation, and the key only draws the leak's pattern. Raises
+    EV002, EV015, EV020 (options; a model that has no smooth counts).
+    """
+    model = model or SensorModel()
+    if log_frames.ndim != 3 or len(log_frames) < 2:
+        raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
+                              "Expected (T, H, W) with at least two frames; vmap for more.")
+    if camera.shape != log_frames.shape[1:]:
+        raise EvflowDataError(
+            "EV015", f"the camera is {camera.shape}, the frames {log_frames.shape[1:]}.")
+    if not 0 <= smooth <= 1:
+        raise EvflowDataError("EV020", f"smooth={smooth}.", "Choose 0 (exact) to 1.")
+    if model.kind == "voltmeter" or (smooth and (model.refractory_s or model.leak_jitter)):
+        raise EvflowDataError(
+            "EV020", f"{model} has no {'smooth ' if smooth else ''}counts.",
+            "Leave out refractory_s and leak_jitter, or add up simulate_voxels over bins.")
+    camera = camera.validate()
+    nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
+    return _counts(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32),
+                   model=model, smooth=float(smooth))
+
+
+@partial(jax.jit, static_argnames=("model", "smooth"))
+def _counts(
+    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array, *,
+    model: SensorModel, smooth: float,
+) -> Array:
+    steps, *shape = log_frames.shape
+    whole, state = sensor.start(key, log_frames[0], camera, model, nominal)
+    frames = log_frames[1:].reshape(steps - 1, math.prod(shape))
+    if smooth:  # of the thresholds themselves: rounded ones have no gradient
+        whole = dataclasses.replace(whole, camera=jax.tree.map(jnp.ravel, camera))
+    scan = partial(_scan_smooth, smooth) if smooth else _scan
+    return jnp.stack(scan(model, whole, state, frames, dt), -1).reshape(*shape, 2)
+
+
+def _scan(
+    model: SensorModel, whole: Sensor, state: SimState, frames: Array, dt: Array
+) -> tuple[Array, Array]:
+    """(ON, OFF) counts (N,) over flat log frames (T, N)."""
+    steps = jnp.arange(len(frames))
+    high = dt * jnp.arange(len(frames) + 1)
+    clock = jnp.stack([high, jnp.zeros_like(high)], -1)
+
+    def body(
+        carry: tuple[PixelState, Array, Array], inputs: tuple[Any, ...]
+    ) -> tuple[tuple[PixelState, Array, Array], None]:
+        (pixels, on, off), (log_i, salt, begin, end) = carry, inputs
+        i01 = sensor.i01_of(model, log_i)
+        dist = sensor.disturb(model, whole, i01, salt, dt)
+        pixels, spikes = sensor.advance(
+            model, whole.camera, pixels, log_i, i01, dist, dt, (begin, end))
+        on, off = on + jnp.maximum(spikes.count, 0.0), off + jnp.maximum(-spikes.count, 0.0)
+        if dist.struck is not None:
+            more = _struck(model, whole.words, dist.struck)
+            on, off = on + more[0], off + more[1]
+        return (pixels, on, off), None
+
+    zero = jnp.zeros_like(frames[0])
+    inputs = (frames, noise.salts(state.key, steps), clock[:-1], clock[1:])
+    (_, on, off), _ = jax.lax.scan(body, (state.pixels, zero, zero), inputs)
+    return on, off
+
+
+def _struck(model: SensorModel, words: Array, struck: sensor.Struck) -> tuple[Array, Array]:
+    """(ON, OFF) noise events of an interval, the ones of `simulate`."""
+    u, mean = noise.uniform(struck.drawn), struck.odds.mean
+
+    def step(carry: tuple[noise.Tail, Array, Array]) -> tuple[noise.Tail, Array, Array]:
+        tail, on, off = carry
+        k = jnp.asarray(tail[2], jnp.uint32)
+        rising = noise.event(model, words, struck.drawn, k, struck.odds.share)[1]
+        sent = u < tail[0]
+        return noise.next_tail(mean, tail), on + (sent & rising), off + (sent & ~rising)
+
+    zero = jnp.zeros_like(u)
+    start = (jax.tree.map(jnp.asarray, struck.odds.tail()), zero, zero)
+    return jax.lax.while_loop(lambda c: jnp.any(u < c[0][0]), step, start)[1:]
+
+
+def soft_floor(x: Array, width: float) -> Array:
+    """floor(x) whose steps are smooth ramps (3 s^2 - 2 s^3) of a width <= 1 around the integers:
+    the mean over x is that of floor, the derivative is continuous."""
+    shifted = x + 0.5 * width
+    whole = jnp.floor(shifted)
+    s = jnp.clip((shifted - whole) / width, 0.0, 1.0)
+    return whole - 1.0 + s * s * (3.0 - 2.0 * s)
+
+
+def _scan_smooth(
+    smooth: float, model: SensorModel, whole: Sensor, state: SimState, frames: Array, dt: Array
+) -> tuple[Array, Array]:
+    """(ON, OFF) smooth counts (N,); the memory moves by as much as they say."""
+    camera = whole.camera
+
+    def body(
+        carry: tuple[PixelState, Array, Array], log_i: Array
+    ) -> tuple[tuple[PixelState, Array, Array], None]:
+        pixels, on, off = carry
+        i01 = sensor.i01_of(model, log_i)
+        lp, base = log_i, pixels.base
+        if model.cutoff_hz > 0:
+            lp = pixel.low_pass(pixels.lp, log_i, i01, dt, model.cutoff_hz)
+        if whole.leaking is not None:
+            base = base - whole.leaking * dt
+        contrast = lp - base
+        up, down = (jnp.maximum(soft_floor(sign * contrast / theta, smooth), 0.0)
+                    for sign, theta in ((1.0, camera.theta_on), (-1.0, camera.theta_off)))
+        base = base + up * camera.theta_on - down * camera.theta_off
+        if whole.rates is not None:
+            rates = whole.rates.at(i01)
+            if model.noise_resets_memory:
+                some = noise.some(dt * (rates[0] + rates[1]))
+                base = base + some * (lp - base)
+            up, down = up + dt * rates[0], down + dt * rates[1]
+        return (dataclasses.replace(pixels, lp=lp, base=base), on + up, off + down), None
+
+    zero = jnp.zeros_like(frames[0])
+    (_, on, off), _ = jax.lax.scan(body, (state.pixels, zero, zero), frames)
+    return on, off
