@@ -1,0 +1,161 @@
+"""One sequence of a data set, as a pure function of (config, seed, number).
+
+Textures, scene, camera, noise: everything is drawn from fold_in(key(seed), number), so that a
+sequence is the same whoever makes it, and in whatever order. Frames are rendered and simulated
+block by block: of them, only those that are kept stay in memory.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
+from evflow.dataset.config import DatasetConfig
+from evflow.dataset.motion import optical_flow
+from evflow.dataset.sequence import EventSequence
+from evflow.intensity import noise_factor, normalised_intensity, to_log
+from evflow.scenes import Scene, TextureBank, load_photos, make_bank, render, sample_scene
+from evflow.simulator import simulate_stream
+from evflow.types import Events
+
+Array = jax.Array
+
+BLOCK_PIXELS = 32 * 346 * 260  # frames x pixels rendered at a time: 12 MB
+BLOCK_FRAMES = 64
+TEST_PHOTO = 4  # every fourth photograph is for the test sequences alone
+
+
+def make_sequence(config: DatasetConfig, seed: int, number: int) -> EventSequence:
+    """Sequence `number` of the set, counted through training, then test.
+
+    Bytes are equal on machines of one kind with equal versions of the packages; elsewhere the
+    last bits of a logarithm may differ.
+    """
+    k_bank, k_scene, k_camera, k_events, k_noise = jax.random.split(
+        jax.random.fold_in(jax.random.key(seed), number), 5)
+    bank = _bank(k_bank, config, test=number >= config.train)
+    scene = _sample_scene(k_scene, bank, config.scene, config.shape)
+    film = Film(scene, config)
+    nominal, camera = _draw_camera(k_camera, film.light[0], config.prior, config.shape)
+    events = _events(k_events, film, camera, config)
+    # The simulator takes the noise rates at the first frame's mean intensity; what is told are
+    # those at the sequence's.
+    gain = 1.0
+    if config.model.eta_intensity:
+        gain = float(np.mean(film.light[config.lead :])) / film.light[0]
+    video = np.stack(film.kept)
+    log = np.asarray(to_log(video, config.model.log_map or "linlog"))
+    noise = config.frame_noise_dn * np.asarray(jax.random.normal(k_noise, video.shape))
+    flow, visible = _flows(scene, _instants(config)[config.lead :: config.every], config.shape)
+    return EventSequence(
+        events=events,
+        frames=np.clip(np.rint(video + noise), 0, 255).astype(np.uint8),
+        frame_times=_times_us(config)[config.lead :: config.every],
+        flow=np.asarray(flow), flow_visible=np.asarray(visible), changes=np.diff(log, axis=0),
+        camera=_at_mean(camera, gain),
+        nominal={name: float(v) for name, v in _at_mean(nominal, gain).items()})
+
+
+class Film:
+    """The rendered frames of a scene, played once; it keeps those of the sequence, and the
+    intensity factor of Eq. 12 of every frame played (from the start, of the first block)."""
+
+    def __init__(self, scene: Scene, config: DatasetConfig) -> None:
+        self.kept: list[np.ndarray] = []
+        self.light: list[float] = []
+        self._scene, self._config = scene, config
+        blocks = self._render()
+        self._blocks = itertools.chain([next(blocks)], blocks)
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        """Blocks (T, H, W) of DN."""
+        return self._blocks
+
+    def _render(self) -> Iterator[np.ndarray]:
+        config, instants = self._config, _instants(self._config)
+        length = block_length(config)
+        for first in range(0, len(instants), length):
+            part = instants[first : first + length]
+            padded = np.pad(part, (0, length - len(part)), mode="edge")  # one compiled program
+            block = np.asarray(render(self._scene, padded, config.shape))[: len(part)]
+            self.light += noise_factor(normalised_intensity(
+                block.mean((1, 2), dtype=np.float64))).tolist()
+            index = np.arange(first, first + len(part)) - config.lead
+            self.kept += list(block[(index >= 0) & (index % config.every == 0)])
+            yield block
+
+
+def block_length(config: DatasetConfig) -> int:
+    """Frames per block."""
+    return min(max(1, BLOCK_PIXELS // (config.width * config.height)), BLOCK_FRAMES)
+
+
+def _times_us(config: DatasetConfig) -> np.ndarray:
+    """Times of the rendered frames, int64 us: 0 is the first of the sequence."""
+    count = config.lead + config.every * config.intervals + 1
+    return (np.arange(count, dtype=np.int64) - config.lead) * (1_000_000 // config.render_hz)
+
+
+def _instants(config: DatasetConfig) -> np.ndarray:
+    """The same in seconds of the scene, whose reference instant is the middle of the sequence."""
+    times = _times_us(config)
+    return ((times - times[-1] // 2) * 1e-6).astype(np.float32)
+
+
+def _events(key: Array, film: Film, camera: Camera, config: DatasetConfig) -> Events:
+    """Those from the first kept frame to just before the last."""
+    times, length = _times_us(config), block_length(config)
+    blocks = (times[first : first + length] for first in range(0, len(times), length))
+    parts = simulate_stream(key, film, blocks, camera, model=config.model)
+    return Events.concatenate([part.slice(0, int(times[-1])) for part in parts])
+
+
+def _at_mean(values: Camera | Summary, gain: float) -> dict[str, np.ndarray]:
+    """The fields by name, noise rates times `gain`."""
+    fields = {f.name: np.asarray(getattr(values, f.name)) for f in dataclasses.fields(values)}
+    return {k: v * np.float32(gain) if k.startswith("eta") else v for k, v in fields.items()}
+
+
+_sample_scene = jax.jit(sample_scene, static_argnames=("config", "shape"))
+
+
+@functools.partial(jax.jit, static_argnames=("prior", "shape"))
+def _draw_camera(
+    key: Array, light: ArrayLike, prior: CameraPrior, shape: tuple[int, int]
+) -> tuple[Summary, Camera]:
+    """light: the intensity factor of Eq. 12 that noise rates follow."""
+    k_nominal, k_pixels = jax.random.split(key)
+    nominal = sample_nominal(k_nominal, (), prior, jnp.asarray(light, jnp.float32))
+    return nominal, sample_pixels(k_pixels, nominal, shape, prior.eta_spread)
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _flows(scene: Scene, instants: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Flow (T-1, 2, H, W) and visibility (T-1, H, W) between consecutive instants (T,)."""
+    return jax.lax.map(lambda pair: optical_flow(scene, *pair, shape),
+                       (instants[:-1], instants[1:]))
+
+
+def _bank(key: Array, config: DatasetConfig, *, test: bool) -> TextureBank:
+    """The textures of one sequence."""
+    k_photos, k_draw = jax.random.split(key)
+    chosen: list[np.ndarray] = []
+    if config.photos:
+        known = [p for i, p in enumerate(_photos()) if (i % TEST_PHOTO == 0) == test]
+        picks = jax.random.randint(k_photos, (config.photos,), 0, len(known))
+        chosen = [known[i] for i in picks.tolist()]
+    return make_bank(
+        k_draw, config.textures, chosen, config.texture_px, config.cutout_px, crops=1)
+
+
+@functools.cache
+def _photos() -> tuple[np.ndarray, ...]:
+    return tuple(load_photos().values())

@@ -1,0 +1,243 @@
+"""What a data set holds, and whether it still does: manifests, hashes, verification.
+
+Every shard keeps a manifest of its own, manifests/00002-of-00004.json, and writes no other's, so
+that no lock is needed. A sequence is recorded there before it is renamed into place: what is in
+place is recorded. manifest.json is their union, written anew at the end of every run. Two records
+of one sequence may differ (made on different machines); the one that fits the files counts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from evflow.dataset.sequence import EventSequence, sequence_names
+from evflow.dataset.store import SUFFIXES, Format
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+
+Record = dict[str, Any]
+Identity = dict[str, Any]
+Progress = Callable[[int, int], None]
+
+PARTS, MERGED = "manifests", "manifest.json"
+
+
+def identity(config: Mapping[str, Any], seed: int, format: Format) -> Identity:
+    """What makes two data sets the same one, as it is read back from JSON."""
+    return json.loads(json.dumps({"config": config, "seed": seed, "format": format}))
+
+
+def place(folder: Path, name: str, format: str) -> Path:
+    """Where the sequence `name` lies: an .h5 file or a folder."""
+    return folder / f"{name}{SUFFIXES[format]}"  # type: ignore[index]
+
+
+def record(draft: Path, name: str, sequence: EventSequence) -> Record:
+    """The record of a sequence written to `draft`, which will lie at its place."""
+    files = sorted(draft.iterdir()) if draft.is_dir() else [draft]
+    inside = {p: f"{name}/{p.name}" if draft.is_dir() else f"{name}{p.suffix}" for p in files}
+    on = int(sequence.events.p.sum())
+    return {
+        "files": {inside[p]: {"bytes": p.stat().st_size, "sha256": sha256(p)} for p in files},
+        "events_on": on, "events_off": len(sequence.events) - on,
+        "duration_s": float(sequence.frame_times[-1]) * 1e-6, "frames": len(sequence.frames),
+        "nominal": sequence.nominal}
+
+
+def sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Part:
+    """The manifest that one shard writes, and no other process."""
+
+    def __init__(
+        self, folder: Path, shard: tuple[int, int], which: Identity, made_by: Mapping[str, Any]
+    ) -> None:
+        self.name = f"{shard[0]:05d}-of-{shard[1]:05d}"
+        self._path = folder / PARTS / f"{self.name}.json"
+        known = _read(self._path) if self._path.exists() else {"made_by": [], "sequences": {}}
+        makers = known["made_by"]
+        self._content = {"dataset": which, "sequences": known["sequences"],
+                         "made_by": makers if made_by in makers else [*makers, made_by]}
+        self.save()
+
+    def add(self, name: str, entry: Record) -> None:
+        self._content["sequences"][name] = entry
+        self.save()
+
+    def withdraw(self) -> None:
+        """Take it away again, where nothing is recorded yet."""
+        if not self._content["sequences"]:
+            self._path.unlink()
+
+    def save(self) -> None:
+        with atomic_write(self._path, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(self._content, sort_keys=True) + "\n")
+
+
+@dataclasses.dataclass(frozen=True)
+class Manifests:
+    """All manifests of a folder: the sets they are of (one, unless something went wrong), the
+    records claimed of each sequence, who made them, and the files that cannot be read."""
+
+    folder: Path
+    identities: list[Identity]
+    claims: dict[str, list[Record]]
+    made_by: list[Any]
+    damaged: dict[Path, str]
+
+    @staticmethod
+    def read(folder: Path) -> Manifests:
+        found = Manifests(folder, [], {}, [], {})
+        for path in [*sorted((folder / PARTS).glob("*.json")), folder / MERGED]:
+            try:
+                content = _read(path)
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except EvflowDataError as e:
+                found.damaged[path] = str(e)
+                continue
+            _join(found.identities, [content["dataset"]])
+            _join(found.made_by, content["made_by"])
+            for name, entry in content["sequences"].items():
+                _join(found.claims.setdefault(name, []), [entry])
+        return found
+
+    def check(self, which: Identity) -> None:
+        """EV013 where the folder holds a set of another configuration, seed or format."""
+        for there in self.identities:
+            old, new = _flat(there), _flat(which)
+            differ = [f"{k}: {old.get(k)} there, {new.get(k)} here"
+                      for k in sorted(old.keys() | new.keys()) if old.get(k) != new.get(k)]
+            if differ:
+                raise EvflowDataError(
+                    "EV013", f"{self.folder} holds another data set "
+                    f"({'; '.join(differ[:5])}{' ...' if differ[5:] else ''}).",
+                    "Go on with the same options, or choose another --out.")
+
+    def merge(self, part: str) -> None:
+        """Write manifest.json, the union; `part` names this process among those running."""
+        names = sorted(self.claims)
+        entries = {name: self.truest(name) for name in names}
+        total = {"sequences": len(names), **{k: sum(e[k] for e in entries.values())
+                 for k in ("events_on", "events_off", "duration_s")}}
+        total["bytes"] = sum(f["bytes"] for e in entries.values() for f in e["files"].values())
+        content = {"dataset": self.identities[0], "total": total, "made_by": self.made_by,
+                   "sequences": entries}
+        # Drafts of its own: two hosts may share a process id.
+        draft = self.folder / PARTS / f".{part}.{MERGED}"
+        with atomic_write(draft, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+        os.replace(draft, self.folder / MERGED)
+
+    def truest(self, name: str) -> Record:
+        """The record that fits the files, where there are several."""
+        claims = self.claims[name]
+        sound = (c for c in claims if len(claims) > 1 and not _fault(self.folder, c, deep=True))
+        return next(sound, claims[-1])
+
+    def fault(self, name: str, format: str, *, deep: bool = True) -> str | None:
+        """What is wrong with a sequence, or None; sizes are compared, and hashes if `deep`."""
+        where = place(self.folder, name, format)
+        if not where.exists():
+            return f"{where.name} is missing"
+        if name not in self.claims:
+            return f"{where.name} is in no manifest"
+        faults = [_fault(self.folder, claim, deep=deep) for claim in self.claims[name]]
+        return None if None in faults else faults[-1]
+
+
+def merge(folder: Path, part: str) -> Manifests:
+    """Write manifest.json so that it holds all that any process has recorded by then.
+
+    Another shard may end meanwhile: whoever writes last looks once more, so that no record of
+    a shard that wrote earlier is left out.
+    """
+    found = Manifests.read(folder)
+    while True:
+        found.merge(part)
+        again = Manifests.read(folder)
+        if again.claims == found.claims:
+            return again
+        found = again
+
+
+def verify(
+    folder: str | os.PathLike, shard: tuple[int, int] = (0, 1), progress: Progress | None = None
+) -> dict[str, str]:
+    """Read every file of a data set again; {sequence or manifest: what is wrong with it}.
+
+    shard (i, N): only every N-th sequence, from the i-th. progress(done, total).
+    Raises EV016 where there is no data set, EV009 where none of its manifests can be read.
+    """
+    found = Manifests.read(Path(folder))
+    faults = {str(p.relative_to(folder)): why for p, why in found.damaged.items()}
+    if not found.identities:
+        raise EvflowDataError(
+            *(("EV009", f"{folder}: {'; '.join(faults.values())}", "Make it again: --only-missing.")
+              if faults else ("EV016", f"no data set in {folder} (no {MERGED}).")))
+    found.check(found.identities[0])
+    which = found.identities[0]
+    names = sequence_names(which["config"]["train"], which["config"]["test"])[shard[0]::shard[1]]
+    for name, fault in faults_of(found, names, which["format"], progress):
+        if fault:
+            faults[name] = fault
+    return faults
+
+
+def faults_of(
+    found: Manifests, names: Iterable[str], format: str, progress: Progress | None = None,
+    *, deep: bool = True,
+) -> Iterator[tuple[str, str | None]]:
+    """(name, what is wrong or None) of each sequence."""
+    names = list(names)
+    for done, name in enumerate(names, 1):
+        yield name, found.fault(name, format, deep=deep)
+        if progress:
+            progress(done, len(names))
+
+
+def _fault(folder: Path, entry: Record, *, deep: bool) -> str | None:
+    for name, known in entry["files"].items():
+        path = folder / name
+        if not path.is_file():
+            return f"{name} is missing"
+        if (size := path.stat().st_size) != known["bytes"]:
+            return f"{name} has {size:,} bytes, not {known['bytes']:,}"
+        if deep and sha256(path) != known["sha256"]:
+            return f"{name} is damaged (its SHA-256 differs)"
+    return None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """One manifest; EV009 where it is cut off or is none."""
+    try:
+        content = json.loads(path.read_text())
+        shapes = {"dataset": dict, "sequences": dict, "made_by": list}
+        if not all(isinstance(content[k], kind) for k, kind in shapes.items()):
+            raise TypeError("not a manifest")
+    except (ValueError, TypeError, KeyError) as e:
+        raise EvflowDataError(
+            "EV009", f"{path} is cut off or no manifest ({type(e).__name__}: {e}).",
+            "--only-missing removes it and makes what no other manifest records.") from e
+    return content
+
+
+def _join(known: list[Any], new: Iterable[Any]) -> None:
+    known += [item for item in new if item not in known]
+
+
+def _flat(tree: Any, name: str = "") -> dict[str, Any]:
+    """{"a": {"b": 1}} -> {"a.b": 1}."""
+    if not isinstance(tree, dict):
+        return {name: tree}
+    return {k: v for key, part in tree.items()
+            for k, v in _flat(part, f"{name}.{key}" if name else key).items()}

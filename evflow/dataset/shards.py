@@ -1,0 +1,210 @@
+"""Making a data set: shards, workers, and going on after anything that stopped it.
+
+A sequence is drafted in a hidden folder, recorded in the shard's manifest, then renamed into place:
+a killed process leaves nothing that looks finished. Processes share nothing but the folder, and
+each sequence depends on (config, seed, its number) alone, so any number of shards and workers,
+on any scheduler, makes the same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import multiprocessing
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from evflow.dataset import manifest
+from evflow.dataset.config import DatasetConfig
+from evflow.dataset.generate import make_sequence
+from evflow.dataset.manifest import Manifests, Part, Progress, Record
+from evflow.dataset.store import Format, write_sequence
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+
+DRAFTS = ".drafts-"
+
+
+def build(
+    folder: str | os.PathLike, config: DatasetConfig, seed: int = 0, *,
+    shard: tuple[int, int] = (0, 1), workers: int = 1, format: Format = "dsec",
+    only_missing: bool = False, made_by: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> list[str]:
+    """Make what is not there of shard (i, N): every N-th sequence, from the i-th.
+
+    workers: processes on this machine. only_missing: read the shard's files again, and make also
+    those that are damaged or in no manifest (else they are an error). made_by: what the manifest
+    says of this machine. progress(done, total). Returns the names of what was made; the same call
+    goes on after any interruption. No two processes may make one shard at a time.
+
+    Raises EV009 (a damaged file or manifest), EV013 (another set is there), EV019 (the disk is
+    full, the folder cannot be written, a worker died), EV020 (shard or workers out of range).
+    """
+    if not 0 <= shard[0] < shard[1] or workers < 1:
+        raise EvflowDataError("EV020", f"shard={shard[0]}/{shard[1]}, workers={workers}.",
+                              "Shards are 0/N to N-1/N; workers are 1 or more.")
+    folder, which = Path(folder), manifest.identity(config.as_dict(), seed, format)
+    found, part = _begin(folder, shard, which, made_by or {}, only_missing)
+    wanted = _wanted(found, config.names[shard[0]::shard[1]], format, only_missing, progress)
+    numbers = {name: number for number, name in enumerate(config.names)}
+    with _drafting(folder, part) as drafts:
+        jobs = [Job(name, numbers[name], config, seed, format, drafts) for name in wanted]
+        with contextlib.closing(_drafts(jobs, workers)) as made:
+            for done, (name, draft, entry) in enumerate(made, 1):
+                part.add(name, entry)
+                _commit(draft, manifest.place(folder, name, format))
+                if progress:
+                    progress(done, len(jobs))
+    found = manifest.merge(folder, part.name)
+    if not any(f for _, f in manifest.faults_of(found, config.names, format, deep=False)):
+        _remove_drafts(folder, "*")  # of killed processes
+    return wanted
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """A sequence to be made."""
+
+    name: str
+    number: int
+    config: DatasetConfig
+    seed: int
+    format: Format
+    drafts: Path
+
+
+def _begin(
+    folder: Path, shard: tuple[int, int], which: manifest.Identity, made_by: Mapping[str, Any],
+    repair: bool,
+) -> tuple[Manifests, Part]:
+    """What is there, and this shard's own manifest beside it."""
+    _checked(folder, which, repair=repair)
+    part = Part(folder, shard, which, made_by)
+    try:  # again: of two sets that begin at once, one sees the other
+        return _checked(folder, which), part
+    except EvflowDataError:
+        part.withdraw()
+        raise
+
+
+@contextlib.contextmanager
+def _drafting(folder: Path, part: Part) -> Iterator[Path]:
+    """A hidden folder of this shard alone, empty, and removed in the end."""
+    _remove_drafts(folder, part.name)
+    try:
+        yield folder / f"{DRAFTS}{part.name}"
+    finally:
+        _remove_drafts(folder, part.name)
+
+
+def _remove_drafts(folder: Path, part: str) -> None:
+    for drafts in folder.glob(f"{DRAFTS}{part}"):
+        shutil.rmtree(drafts, ignore_errors=True)
+
+
+def _checked(folder: Path, which: manifest.Identity, *, repair: bool = False) -> Manifests:
+    """The folder's manifests, which must be of this data set; damaged ones are removed for
+    repair, else EV009."""
+    found = Manifests.read(folder)
+    found.check(which)
+    for path, why in found.damaged.items():
+        if not repair:
+            raise EvflowDataError("EV009", why)
+        path.unlink()
+    return found
+
+
+def _wanted(
+    found: Manifests, names: tuple[str, ...], format: Format, repair: bool,
+    progress: Progress | None,
+) -> list[str]:
+    """The sequences to make; EV009, EV013 for one in the way that is not to be repaired."""
+    wanted = []
+    checked = manifest.faults_of(found, names, format, progress if repair else None, deep=repair)
+    for name, fault in checked:
+        where = manifest.place(found.folder, name, format)
+        if fault and not repair and where.exists():
+            code = "EV009" if name in found.claims else "EV013"
+            raise EvflowDataError(code, f"{where}: {fault}.", "--only-missing makes it again.")
+        if fault:
+            wanted.append(name)
+    return wanted
+
+
+def _commit(draft: Path, final: Path) -> None:
+    """Rename a draft into place; what lies there is damaged."""
+    with atomic_write(final, overwrite=True) as temporary:
+        if final.is_dir():
+            shutil.rmtree(final)
+        os.replace(draft, temporary)
+
+
+Made = tuple[str, Path, Record]
+
+
+def _draft(job: Job) -> Made:
+    sequence = make_sequence(job.config, job.seed, job.number)
+    draft = manifest.place(job.drafts, job.name, job.format)
+    write_sequence(draft, sequence, job.format)
+    return job.name, draft, manifest.record(draft, job.name, sequence)
+
+
+def _drafts(jobs: list[Job], workers: int) -> Generator[Made]:
+    """Every draft, in order."""
+    if workers == 1 or len(jobs) < 2:
+        yield from map(_draft, jobs)
+        return
+    others = set(multiprocessing.active_children())
+    # A fresh interpreter: JAX's threads do not survive a fork.
+    pool = ProcessPoolExecutor(
+        min(workers, len(jobs)), multiprocessing.get_context("spawn"), initializer=_follow_parent)
+    try:
+        for made in pool.map(_try_draft, jobs):
+            if isinstance(made, _Refusal):
+                raise EvflowDataError(made.code, made.seen, made.fix)
+            yield made
+    except BrokenProcessPool as e:
+        raise EvflowDataError(
+            "EV019", "a worker process died (out of memory?).",
+            "The same command goes on; fewer --workers need less memory.") from e
+    finally:
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()  # what they still do is not wanted
+        pool.shutdown(cancel_futures=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Refusal:
+    """An `EvflowDataError` on its way between processes."""
+
+    code: str
+    seen: str
+    fix: str
+
+
+def _try_draft(job: Job) -> Made | _Refusal:
+    try:
+        return _draft(job)
+    except EvflowDataError as e:
+        return _Refusal(e.code, e.seen, e.fix)
+
+
+def _follow_parent() -> None:
+    """A worker leaves Ctrl-C to its parent, and ends where that is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_after, args=(parent.join,), daemon=True).start()
+
+
+def _end_after(wait: Callable[[], None]) -> None:
+    wait()
+    os._exit(1)

@@ -1,0 +1,133 @@
+"""Make a data set: events, frames, optical flow, intensity changes and camera maps.
+
+    python -m experiments.make_dataset --out sets/full                    # 300 + 30 sequences
+    python -m experiments.make_dataset --out sets/full --workers 8
+    python -m experiments.make_dataset --out sets/full --shard 17/64      # any scheduler's array
+    python -m experiments.make_dataset --out sets/full --verify           # exit code 1: damage
+    python -m experiments.make_dataset --out sets/full --only-missing     # make that again
+
+A sequence is a function of the configuration, the seed and its number: any number of shards and
+workers makes the same files. Ctrl-C and SIGTERM leave nothing half-written; the same command goes
+on. evflow.dataset.read_sequence and iter_sequences read the set as NumPy arrays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal
+
+import tyro
+
+from evflow.dataset.config import PRESETS, DatasetConfig
+from evflow.dataset.manifest import MERGED, verify
+from evflow.dataset.shards import build
+from evflow.errors import EvflowDataError
+from evflow.progress import bar
+from experiments.common import provenance
+
+STOPPED = 130  # the shell's exit code of Ctrl-C
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Make a data set of simulated cameras, or verify one."""
+
+    out: Path
+    """Folder of the set."""
+    preset: Literal["full", "debug"] = "full"
+    shard: str = "0/1"
+    """i/N: every N-th sequence, from the i-th; i = 0 .. N-1."""
+    workers: int = 1
+    """Processes on this machine."""
+    format: Literal["dsec", "npy"] = "dsec"
+    """One HDF5 file a sequence, in the layout of DSEC, or a folder of .npy files."""
+    seed: int = 0
+    verify: bool = False
+    """Make nothing: read every file again and compare it with its hash."""
+    only_missing: bool = False
+    """Compare hashes first; make what is missing or damaged."""
+    train: int | None = None
+    """Sequences to train on (default: the preset's, as all that follow)."""
+    test: int | None = None
+    width: int | None = None
+    height: int | None = None
+    seconds: float | None = None
+    """Duration of every sequence."""
+    frame_hz: int | None = None
+    """Frames per second that are kept; a divisor of 1000."""
+
+
+def main(options: Options) -> int:
+    """The exit code: 0, or 1 where a set that was verified is not whole."""
+    shard = parse_shard(options.shard)
+    if options.verify:
+        with bar("verified") as progress:
+            faults = verify(options.out, shard, progress)
+        for name, why in faults.items():
+            print(f"{name}: {why}")
+        print(f"{options.out}: {len(faults)} faults; --only-missing makes them good." if faults
+              else f"{options.out}: whole.")
+        return 1 if faults else 0
+    with bar("sequences") as progress, sigterm_as_ctrl_c():
+        made = build(
+            options.out, configuration(options), options.seed, shard=shard,
+            workers=options.workers, format=options.format, only_missing=options.only_missing,
+            made_by=maker(), progress=progress)
+    total = json.loads((options.out / MERGED).read_text())["total"]
+    print(f"{len(made)} sequences made; {options.out} holds {total['sequences']}: "
+          f"{total['events_on'] + total['events_off']:,} events, {total['bytes'] / 1e6:,.0f} MB.")
+    return 0
+
+
+def configuration(options: Options) -> DatasetConfig:
+    """The preset with the options' changes."""
+    names = ("train", "test", "width", "height", "seconds", "frame_hz")
+    changes = {k: getattr(options, k) for k in names if getattr(options, k) is not None}
+    return dataclasses.replace(PRESETS[options.preset], **changes)
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """ "17/64" -> (17, 64)."""
+    index, slash, count = text.partition("/")
+    if not (slash and index.isdecimal() and count.isdecimal() and int(index) < int(count)):
+        raise EvflowDataError("EV020", f"--shard {text}.", "Give i/N, from 0/N to N-1/N.")
+    return int(index), int(count)
+
+
+def maker() -> dict[str, Any]:
+    """Versions and machine, those of the packages that draw and write included."""
+    known = provenance()
+    names = ("scikit-image", "opencv-python-headless", "h5py")
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        known["versions"] |= {name: importlib.metadata.version(name) for name in names}
+    return known
+
+
+@contextlib.contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """A scheduler's SIGTERM takes the way of Ctrl-C, through every `finally`."""
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+if __name__ == "__main__":
+    try:
+        raise SystemExit(main(tyro.cli(Options, description=__doc__)))
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on.")
+        raise SystemExit(STOPPED) from None
