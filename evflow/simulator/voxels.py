@@ -30,7 +30,7 @@ from evflow.voxel import BINS
 Array = jax.Array
 Weights = tuple[list[Array], list[Array]]  # (ON, OFF), one (N,) per touched bin
 
-TILE = 16384  # pixels; their maps and grid, some 3 MB, are worked on at a time
+TILE = 8192  # pixels; their maps and grid, some 1.5 MB, are worked on at a time
 
 
 def simulate_window(
@@ -92,22 +92,21 @@ def _scan(
     clock: (T + 1, 2), as in `SimState.time`."""
     steps, count = log_frames.shape
     plan = Schedule.of(steps, bins)
-
     def body(
         carry: tuple[PixelState, Array], inputs: tuple[Any, ...]
     ) -> tuple[tuple[PixelState, Array], None]:
-        (pixels, grid), (log_i, low, offset, wide, salt, begin, end) = carry, inputs
+        (pixels, grid), (log_i, low, offset, wide, salt, clock) = carry, inputs
         i01 = sensor.i01_of(model, log_i)  # dropped by the compiler where nothing uses it
         dist = sensor.disturb(model, whole, i01, salt, dt)
         pixels, spikes = sensor.advance(
-            model, whole.camera, pixels, log_i, i01, dist, dt, (begin, end))
-        on, off = _weights(model, plan, spikes, offset, wide, dt)
+            model, whole.camera, pixels, log_i, i01, dist, dt, clock)
+        weights = _weights(model, plan, spikes, offset, wide, dt)
         if dist.struck is not None:
-            more = _noise(model, whole.words, dist.struck, offset, plan)
-            on, off = jax.tree.map(jnp.add, (on, off), more)
-        return (pixels, weigh.add(grid, low, on, off)), None
+            more = _noise_weights(model, plan, whole.words, dist.struck, offset)
+            weights = jax.tree.map(jnp.add, weights, more)
+        return (pixels, weigh.add(grid, low, *weights)), None
 
-    inputs = (log_frames, plan.low, plan.offset, plan.wide, salts, clock[:-1], clock[1:])
+    inputs = (log_frames, plan.low, plan.offset, plan.wide, salts, (clock[:-1], clock[1:]))
     grid = jnp.zeros((2 * bins, count), log_frames.dtype)
     pixels, grid = jax.lax.scan(body, (pixels, grid), inputs)[0]
     return pixels, grid.T
@@ -125,7 +124,7 @@ def _scan_brownian(
     def body(
         carry: tuple[voltmeter.State, Array], inputs: tuple[Any, ...]
     ) -> tuple[tuple[voltmeter.State, Array], None]:
-        (voltage, grid), (frame, index, low, offset, salt) = carry, inputs
+        (voltage, grid), (frame, index, salt, low, offset) = carry, inputs
         touched = jnp.zeros((2, plan.width, frame.size), grid.dtype)
         voltage, (on, off) = voltmeter.weights(
             key, index, model.voltmeter, whole.camera, voltage, frame, dt * 1e6, touched, offset,
@@ -133,13 +132,14 @@ def _scan_brownian(
         weights: Weights = list(on), list(off)
         struck = sensor.disturb(model, whole, normalised_intensity(frame), salt, dt).struck
         if struck is not None:
-            more = _noise(model, whole.words, struck, offset, plan)
+            more = _noise_weights(model, plan, whole.words, struck, offset)
             weights = jax.tree.map(jnp.add, weights, more)
         return (voltage, weigh.add(grid, low, *weights)), None
 
     steps = jnp.arange(len(frames) - 1)
     start = voltmeter.start(frames[0]), jnp.zeros((2 * bins, frames.shape[1]), frames.dtype)
-    return jax.lax.scan(body, start, (frames[1:], steps, plan.low, plan.offset, salts))[0][1].T
+    inputs = (frames[1:], steps, salts, plan.low, plan.offset)
+    return jax.lax.scan(body, start, inputs)[0][1].T
 
 
 def _weights(
@@ -158,29 +158,34 @@ def _weights(
         jax.lax.cond(wide, partial(signed, plan.width), partial(signed, 2), spikes))
 
 
-def _noise(
-    model: SensorModel, words: Array, struck: Struck, offset: Array, plan: Schedule
+def _noise_weights(
+    model: SensorModel, plan: Schedule, words: Array, struck: Struck, offset: Array
 ) -> Weights:
-    """Weights of the noise events of an interval: the first of every pixel, and the others as long
-    as there are any, which is seldom."""
+    """Weights of the noise events of one interval, each pixel's first and the few others."""
     u, mean = noise.uniform(struck.drawn), struck.odds.mean
 
-    def event(k: Array, sent: Array) -> Weights:
+    def placed(k: Array, sent: Array) -> Array:
+        """Where each pixel's k-th event falls, negative for OFF, 0 where none is sent."""
         at, on = noise.event(model, words, struck.drawn, k, struck.odds.share)
-        sign = jnp.where(sent, jnp.where(on, 1.0, -1.0), 0.0)
-        return weigh.by_polarity(weigh.noise_bins(plan.width, at, sign, offset, plan.length))
+        return jnp.where(sent, jnp.where(on, at, -at), 0.0)
+
+    def weights(at: Array) -> Weights:
+        return weigh.by_polarity(weigh.noise_bins(
+            plan.width, jnp.abs(at), jnp.sign(at), offset, plan.length))
 
     def unfinished(carry: tuple[noise.Tail, Weights]) -> Array:
         return jnp.any(u < carry[0][0])
 
     def step(carry: tuple[noise.Tail, Weights]) -> tuple[noise.Tail, Weights]:
-        tail, weights = carry
-        more = event(jnp.asarray(tail[2], jnp.uint32), u < tail[0])
-        return noise.next_tail(mean, tail), jax.tree.map(jnp.add, weights, more)
+        tail, total = carry
+        more = weights(placed(jnp.asarray(tail[2], jnp.uint32), u < tail[0]))
+        return noise.next_tail(mean, tail), jax.tree.map(jnp.add, total, more)
 
-    first = event(jnp.zeros((), jnp.uint32), struck.some)
+    # Behind a branch XLA writes the places down once, not again for every bin and polarity.
+    first = jax.lax.cond(jnp.any(struck.some), lambda: placed(jnp.zeros((), jnp.uint32),
+                         struck.some), lambda: jnp.zeros_like(u))
     tail = jax.tree.map(jnp.asarray, noise.next_tail(mean, struck.odds.tail()))
-    return jax.lax.while_loop(unfinished, step, (tail, first))[1]
+    return jax.lax.while_loop(unfinished, step, (tail, weights(first)))[1]
 
 
 def simulate_voxels(
