@@ -112,7 +112,7 @@ def score(
         block = cut_block(k_block, batch, config)
         known = unsquash_summary(batch.nominal)
         noise = config.summary_noise * jax.random.normal(k_noise, known.shape)
-        y6 = network.over_pixels(known + noise, block.dlogI.shape[1:])
+        y6 = network.over_pixels(known + noise, block.dlogI.shape)
         changes, _ = network.encode_changes(
             model, net, block.voxels, block.dlogI, block.context, y6)
         u = network.condition(model, changes, block.context, y6)

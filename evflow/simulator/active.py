@@ -30,12 +30,12 @@ SLACK = 1e-4  # of a threshold: what sums in another order may differ by
 class Block:
     """T frames and the intervals that end at them. frames: (T, N) DN, uint8 or float32. dt: (T,)
     seconds. clock: (T + 1, 2) times of the frame before and of these, see `SimState.time`.
-    salts: (T, 2) of `noise.salts`."""
+    salts: (T, 2) of `noise.salts`. The last three may be NumPy arrays."""
 
     frames: Array
-    dt: Array
-    clock: Array
-    salts: Array
+    dt: Any
+    clock: Any
+    salts: Any
 
 
 @jax.tree_util.register_dataclass

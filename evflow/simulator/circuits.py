@@ -79,7 +79,8 @@ class _Blocks:
         high = seconds.astype(np.float32)
         clock = np.stack([high, seconds - high], -1).astype(np.float32)
         dt = (np.diff(edges) * 1e-6).astype(np.float32)
-        return Block(*map(jnp.asarray, (np.stack(frames), dt, clock, self._next_salts())))
+        # Only the frames are always read; jit passes over what a model has no use for.
+        return Block(jnp.asarray(np.stack(frames)), dt, clock, self._next_salts())
 
     def _next_salts(self) -> np.ndarray:
         if not len(self.salts):
