@@ -95,6 +95,19 @@ def test_keys_matter_only_where_something_is_random() -> None:
     equal(first, second)
 
 
+def test_events_of_very_long_intervals_stay_in_them() -> None:
+    """Half a minute is more microseconds than float32 can count."""
+    edges = np.cumsum([0, 33_554_435, 40_000_001, 1])
+    frames = drifting(4, speed=3.0)
+    for model in (SensorModel(), SensorModel(timestamps="v2e")):
+        events = simulate(KEY, frames, edges, QUIET, model=model)
+        assert len(events) > 200
+        parts = [simulate(KEY, frames[:n], edges[:n], QUIET, model=model) for n in (2, 3)]
+        assert [part.t[-1] <= edge for part, edge in zip(parts, edges[1:], strict=False)]
+        equal(events.slice(0, int(edges[1]) + 1), parts[0])
+        equal(events.slice(0, int(edges[2]) + 1), parts[1])
+
+
 def test_video_length_does_not_recompile() -> None:
     simulate(KEY, drifting(5), milliseconds(5), QUIET)
     before = step._cache_size()

@@ -25,6 +25,7 @@ Array = jax.Array
 Values = Any  # jax.Array or np.ndarray
 
 MAX_MEAN = 70.0  # noise events per pixel and interval; beyond ~85 exp(-mean) underflows
+LEAK_THETA = 10.0  # natural log; all of an image sensor's range is 5.5
 GOLDEN = np.uint32(0x9E3779B9)  # 2^32 / golden ratio: distinct numbers far apart
 JITTER = 1 << 30  # what the leak's draws are numbered from; those of events count from 0
 
@@ -224,8 +225,9 @@ def check_rate(rate_hz: float, dt_s: float) -> None:
 
 
 def leak_rates(model: SensorModel, theta_on: Array, pattern: Array) -> Array:
-    """Contrast that leaks into ON per second: rate x fixed pattern x theta_on (v2e)."""
-    return model.leak_hz * pattern * theta_on
+    """Contrast that leaks into ON per second: rate x fixed pattern x theta_on (v2e). Thresholds
+    beyond what light can reach are those of dead pixels, which leak does not wake either."""
+    return model.leak_hz * pattern * jnp.minimum(theta_on, LEAK_THETA)
 
 
 def leak(model: SensorModel, leaking: Array, words: Array, drawn: Array, dt: Array) -> Array:

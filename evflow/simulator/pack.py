@@ -137,7 +137,8 @@ def _coordinates(shape: tuple[int, int]) -> tuple[Array, Array]:
 def _keys(part: Columns, dt_us: Array, bits: int, dtype: type) -> Array:
     """Microseconds into the block, pixel, polarity and kind, packed into integers that sort so.
     Times are rounded up to a microsecond, within (begin, end] of their interval."""
-    length = dt_us.astype(np.float32).take(part.step)
+    exact = np.float32 if dt_us.max(initial=0) < 1 << 24 else np.float64
+    length = dt_us.astype(exact).take(part.step)
     within = np.minimum(np.maximum(np.ceil(part.fraction * length), 1), length)
     keys = (np.cumsum(dt_us) - dt_us).astype(dtype).take(part.step)
     keys += within.astype(dtype)
