@@ -31,6 +31,13 @@ def test_dvs128_by_name_and_by_size(tmp_path: Path) -> None:
     equal(read_events(path, size=(128, 128)), events)
 
 
+def test_size_does_not_change_the_layout_of_a_named_chip(tmp_path: Path) -> None:
+    path = tmp_path / "a.aedat"
+    path.write_bytes(b"#!AER-DAT2.0\r\n# AEChip: DAVIS240C\r\n"
+                     + struct.pack(">2I", 5 << 22 | 6 << 12 | 0x800, 9))
+    assert listed(read_events(path, size=(128, 128))) == [(121, 122, 9, 1)]
+
+
 def test_words_beside_the_events(tmp_path: Path) -> None:
     path = tmp_path / "a.aedat"
     words = [(1 << 31, 5), (1 << 31 | 1 << 10, 6), (0xC00 | 1 << 31, 7), (0x400, 8),

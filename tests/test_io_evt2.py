@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from recordings import equal, refused
-from test_io_stream import clustered, evt2
+from test_io_stream import clustered, evt2, evt3
 
 from evflow.io import read_recording
 from evflow.io.prophesee import parse
@@ -81,3 +83,16 @@ def test_other_encodings_and_sizes(tmp_path: Path) -> None:
     equal(read_recording(path, size=(240, 180)).events, clustered(50))
     path.write_bytes(b"% evt 2.0\n% geometry 99999x1\n")
     assert refused(path).code == "EV020"
+
+
+@pytest.mark.parametrize(("encode", "word"), [(evt2, 4), (evt3, 2)])
+def test_big_endian_words(
+    tmp_path: Path, encode: Callable[[Events, bytes], bytes], word: int
+) -> None:
+    name = encode.__name__.upper().encode()
+    events = clustered(100)
+    data = np.frombuffer(encode(events, b""), f"<u{word}")
+    path = tmp_path / "a.raw"
+    path.write_bytes(b"% format " + name + b";height=180;width=240;endianness=big\n% end\n"
+                     + data.astype(f">u{word}").tobytes())
+    equal(read_recording(path).events, events)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +142,17 @@ def test_agrees_with_the_package_evt3(tmp_path: Path) -> None:
     path.write_bytes(evt3(clustered(3000)))
     got, other = read_events(path), package.decode_file(str(path))
     equal(got, Events(other.x, other.y, other.timestamp.astype(np.int64), other.polarity, SIZE))
+
+
+def test_memory_of_full_vectors_is_bounded(tmp_path: Path) -> None:
+    """A chunk of nothing but full masks is 1.5 million events: 100 MB of temporaries, not more."""
+    path = tmp_path / "a.raw"
+    words = np.full(400_000, 0x4FFF, "<u2")
+    words[::100] = 0x3000
+    path.write_bytes(HEADER + struct.pack("<2H", 0x8000, 7) + words.tobytes())
+    tracemalloc.start()
+    n = len(read_events(path))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert n == 396_000 * 12
+    assert peak < 13 * n + 8 * n + 100e6

@@ -13,7 +13,24 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from evflow.errors import EvflowDataError
-from evflow.io import aedat4, dsec, ijrr, npz
+from evflow.io import (
+    aedat2,
+    aedat4,
+    dat,
+    dsec,
+    e2vid,
+    event_utils,
+    evimo2,
+    evreal,
+    evt2,
+    evt3,
+    ijrr,
+    mvsec,
+    npz,
+    rosbag,
+    v2e,
+    v2e_text,
+)
 from evflow.io.hints import Hints
 from evflow.types import Events, Recording
 
@@ -41,7 +58,9 @@ class Writer(Protocol):
     ) -> None: ...
 
 
-FORMATS: tuple[Format, ...] = (aedat4, dsec, npz, ijrr)
+FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
+    aedat4, aedat2, evt2, evt3, dat, v2e, mvsec, event_utils, dsec, npz, evimo2, evreal, e2vid,
+    v2e_text, ijrr, rosbag)
 WRITERS: dict[str, Writer] = {"dsec": dsec, "npz": npz}
 
 

@@ -30,9 +30,9 @@ SLACK = 1e-4  # of a threshold: what sums in another order may differ by
 class Block:
     """T frames and the intervals that end at them. frames: (T, N) DN, uint8 or float32. dt: (T,)
     seconds. clock: (T + 1, 2) times of the frame before and of these, see `SimState.time`.
-    salts: (T, 2) of `noise.salts`. The last three may be NumPy arrays."""
+    salts: (T, 2) of `noise.salts`. On the host all are NumPy arrays."""
 
-    frames: Array
+    frames: Any
     dt: Any
     clock: Any
     salts: Any

@@ -1,15 +1,17 @@
 """The host's view of a sensor: frames go in block by block, events come out.
 
 `Thresholds` (v2e, ESIM, the paper) and `Brownian` (DVS-Voltmeter) keep the pixels' state from
-block to block. `advance` sends a block to the device and returns what will fetch its events, which
-another thread may call while the next block is under way.
+block to block. `run` sends blocks to the device and yields what will fetch their events; by then
+the next block is under way: packing the events of the one before keeps a second core busy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +23,8 @@ from evflow.sensors import SensorModel
 from evflow.simulator import active, noise, pack, sensor, voltmeter
 from evflow.simulator.active import Block, Sent
 from evflow.simulator.pack import Columns
-from evflow.simulator.sensor import Sensor, SimState
+from evflow.simulator.pixel import PixelState
+from evflow.simulator.sensor import Sensor, SimState, Struck
 
 Array = jax.Array
 Fetch = Callable[[], list[Columns]]
@@ -32,8 +35,9 @@ ACTIVE = 8192  # active pixels that are stepped at a time; their arrays stay in 
 
 
 class Circuit(Protocol):
-    def advance(self, frames: list[np.ndarray], edges: np.ndarray) -> Fetch:
-        """The next up to BLOCK flat frames. edges: their times and that of the frame before."""
+    def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
+        """For each block, what fetches its events. video: up to BLOCK flat frames, and the
+        (T + 1,) times of these and of the frame before."""
 
 
 def circuit(key: Array, frame: np.ndarray, start_us: int, camera: Camera, model: SensorModel
@@ -55,6 +59,14 @@ def _salts(key: Array, first: int) -> Array:
     return noise.salts(key, first + jnp.arange(SALTED))
 
 
+def _aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
+    """An empty array that a CPU device takes over without a copy: at a multiple of 64 bytes."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    return memory[first : first + size].view(dtype).reshape(shape)
+
+
 class _Blocks:
     """What both kinds share: noise rates, and blocks padded to BLOCK frames."""
 
@@ -65,26 +77,38 @@ class _Blocks:
         if noise.is_noisy(model, camera):
             nominal = noise.nominal_thresholds(model, camera)
             self.most_hz = noise.most_rate(model, camera, nominal)
-        self.whole, self.state = _start(key, frame, camera, nominal, model=model)
-        self.words = np.asarray(self.whole.words)
+        self.whole, state = _start(key, frame, camera, nominal, model=model)
+        self.pixels, self.key, self.words = state.pixels, state.key, np.asarray(self.whole.words)
         self.interval, self.salts = 0, np.empty((0, 2), np.uint32)
+        self.no_clock = np.zeros((BLOCK + 1, 2), np.float32)
+        # Fresh memory is dear. Two blocks are under way while a third is filled.
+        shape = (BLOCK, frame.size)
+        self.buffers = itertools.cycle([_aligned(shape, frame.dtype) for _ in range(4)])
 
     def block(self, frames: list[np.ndarray], edges: np.ndarray) -> Block:
         """Raises EV014 where the noise is more than an interval can hold."""
-        noise.check_rate(self.most_hz, float(np.diff(edges).max()) * 1e-6)
-        missing = BLOCK - len(frames)
-        frames = frames + [frames[-1]] * missing
-        edges = np.append(edges, np.full(missing, edges[-1]))
-        seconds = (edges - self.start_us) * 1e-6
-        high = seconds.astype(np.float32)
-        clock = np.stack([high, seconds - high], -1).astype(np.float32)
-        dt = (np.diff(edges) * 1e-6).astype(np.float32)
+        dt_us = np.diff(edges)
+        noise.check_rate(self.most_hz, float(dt_us.max()) * 1e-6)
+        if missing := BLOCK - len(frames):
+            frames = frames + [frames[-1]] * missing
+            dt_us = np.append(dt_us, np.zeros(missing, np.int64))
+        buffer = next(self.buffers)
+        np.stack(frames, out=buffer)
         # Only the frames are always read; jit passes over what a model has no use for.
-        return Block(jnp.asarray(np.stack(frames)), dt, clock, self._next_salts())
+        return Block(buffer, (dt_us * 1e-6).astype(np.float32),
+                     self._clock(edges[0], dt_us), self._next_salts())
+
+    def _clock(self, begin_us: int, dt_us: np.ndarray) -> np.ndarray:
+        """(BLOCK + 1, 2) times for v2e's slots, see `SimState.time`."""
+        if self.model.timestamps != "v2e":
+            return self.no_clock
+        seconds = (begin_us - self.start_us + np.append(0, np.cumsum(dt_us))) * 1e-6
+        high = seconds.astype(np.float32)
+        return np.stack([high, seconds - high], -1).astype(np.float32)
 
     def _next_salts(self) -> np.ndarray:
         if not len(self.salts):
-            self.salts = np.asarray(_salts(self.state.key, self.interval))
+            self.salts = np.asarray(_salts(self.key, self.interval))
             self.interval += SALTED
         first, self.salts = np.split(self.salts, [BLOCK])
         return first
@@ -93,10 +117,22 @@ class _Blocks:
 class Thresholds(_Blocks):
     """Pixels that compare log intensity with thresholds; only those that may fire are stepped."""
 
-    def advance(self, frames: list[np.ndarray], edges: np.ndarray) -> Fetch:
-        block, sent, count = self.block(frames, edges), [], self.words.size
-        pixels = self.state.pixels
-        after, may_send = active.look(self.model, self.whole, pixels, block)
+    def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
+        looked: tuple[Any, ...] = ()
+        for frames, edges in video:
+            block = self.block(frames, edges)
+            fetch = self._step(*looked) if looked else None
+            # In line behind the step before, which it continues; nothing is waited for here.
+            after, may_send = active.look(self.model, self.whole, self.pixels, block)
+            looked = block, np.diff(edges), after, may_send
+            if fetch:
+                yield fetch
+        yield self._step(*looked)
+
+    def _step(
+        self, block: Block, dt_us: np.ndarray, after: PixelState, may_send: Array
+    ) -> Fetch:
+        sent, count = [], self.words.size
         if self.model.timestamps == "v2e":  # its slots depend on all pixels
             at, size = np.arange(count, dtype=np.int32), count
         else:
@@ -105,10 +141,10 @@ class Thresholds(_Blocks):
             some = at[first : first + size]
             padded = np.full(size, count, np.int32)
             padded[: len(some)] = some
-            after, out = active.step(self.model, self.whole, pixels, after, block, padded)
+            after, out = active.step(self.model, self.whole, self.pixels, after, block, padded)
             sent.append((some, out))
-        self.state = SimState(after, self.state.interval, self.state.time, self.state.key)
-        return partial(self._columns, sent, np.diff(edges))
+        self.pixels = after
+        return partial(self._columns, sent, dt_us)
 
     def _columns(self, sent: list[tuple[np.ndarray, Sent]], dt_us: np.ndarray) -> list[Columns]:
         def of(pixels: np.ndarray, out: Sent) -> Iterator[Columns]:
@@ -124,20 +160,28 @@ class Brownian(_Blocks):
     def __init__(
         self, key: Array, frame: np.ndarray, start_us: int, camera: Camera, model: SensorModel
     ) -> None:
-        key, self.key = jax.random.split(key)
+        key, self.signal = jax.random.split(key)
         super().__init__(key, frame, start_us, camera, model)
         self.camera, self.count = jax.tree.map(jnp.ravel, camera), 0
         self.voltage = voltmeter.start(frame.ravel())
 
-    def advance(self, frames: list[np.ndarray], edges: np.ndarray) -> Fetch:
-        block, dt_us, parts = self.block(frames, edges), np.diff(edges), []
-        struck = active.strike(self.model, self.whole, block)
-        for step, frame in enumerate(frames):
-            self.voltage, pixel, fraction, on = voltmeter.fired(
-                self.key, self.count, self.model.voltmeter, self.camera, self.voltage, frame,
-                float(dt_us[step]))
-            parts.append(Columns(np.full(len(pixel), step), pixel, fraction, on, noise=False))
-            self.count += 1
+    def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
+        for frames, edges in video:
+            dt_us = np.diff(edges)
+            struck = active.strike(self.model, self.whole, self.block(frames, edges))
+            signal = [self._interval(*each) for each in zip(
+                range(len(frames)), frames, dt_us.tolist(), strict=True)]
+            yield partial(self._columns, signal, struck, dt_us)
+
+    def _interval(self, step: int, frame: np.ndarray, dt_us: float) -> Columns:
+        self.voltage, pixel, fraction, on = voltmeter.fired(
+            self.signal, self.count, self.model.voltmeter, self.camera, self.voltage, frame, dt_us)
+        self.count += 1
+        return Columns(np.full(len(pixel), step), pixel, fraction, on, noise=False)
+
+    def _columns(
+        self, signal: list[Columns], struck: Struck | None, dt_us: np.ndarray
+    ) -> list[Columns]:
         everywhere = np.arange(self.words.size)
-        return lambda: parts + list(
-            pack.noise_columns(self.model, struck, everywhere, self.words, dt_us))
+        noise = pack.noise_columns(self.model, struck, everywhere, self.words, dt_us)
+        return [*signal, *noise]

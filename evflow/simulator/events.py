@@ -2,14 +2,13 @@
 
 Frames go to the device in blocks that begin at multiples of BLOCK (the last one padded with
 empty intervals), so the same compiled programs see every frame and the bytes do not depend on
-how the frames arrive. Frame interval i draws its noise from (key, i) alone. While the device
-works on a block, the host packs the one before.
+how the frames arrive. Frame interval i draws its noise from (key, i) alone.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Literal, overload
 
 import jax
@@ -21,7 +20,7 @@ from evflow.checks import COLUMNS
 from evflow.errors import EvflowDataError
 from evflow.sensors import SensorModel
 from evflow.simulator import pack
-from evflow.simulator.circuits import BLOCK, Fetch, circuit
+from evflow.simulator.circuits import BLOCK, circuit
 from evflow.simulator.frames import blocks
 from evflow.types import Events
 
@@ -81,7 +80,7 @@ def simulate_stream(
 
     frames_iter yields single frames (H, W) or blocks (T, H, W), times_iter the matching
     scalars or (T,) arrays in us. Yields `Events` of eight frames at a time, each later than the
-    one before, after reading eight frames more; together they are the same bytes as `simulate`
+    one before, after reading sixteen frames more; together they are the same bytes as `simulate`
     for any cut of the input. labels: as in `simulate`.
     """
     packed = _packed(key, blocks(frames_iter, times_iter, camera.shape, BLOCK), camera,
@@ -93,24 +92,28 @@ def _packed(
     key: Array, video: Iterator[tuple[list[np.ndarray], np.ndarray]], camera: Camera,
     model: SensorModel,
 ) -> Iterator[Labelled]:
-    """One block is with the device while the one before is packed."""
+    """While the device works on a block, one that is done is packed."""
     camera = _checked_camera(camera)
     shape = (camera.shape[0], camera.shape[1])
     (first,), last = next(video)
     pixels = circuit(key, first.reshape(shape), int(last[0]), camera, model)
+    ours, theirs = itertools.tee(_with_edges(video, last))  # never more than two blocks apart
+    fetch = None
+    for fetched in pixels.run(theirs):
+        if fetch:
+            yield pack.sort(fetch(), next(ours)[1], shape)
+        fetch = fetched
+    if fetch:
+        yield pack.sort(fetch(), next(ours)[1], shape)
 
-    def packed(fetch: Fetch, edges: np.ndarray) -> Labelled:
-        return pack.sort(fetch(), edges, shape)
 
-    # NumPy and XLA let go of the interpreter in long loops: two cores are busy.
-    with ThreadPoolExecutor(1) as behind:
-        waiting: list[Future[Labelled]] = []
-        for frames, times in video:
-            edges = np.concatenate([last, times])
-            fetch = pixels.advance(frames, edges)
-            yield from (one.result() for one in waiting)
-            waiting, last = [behind.submit(packed, fetch, edges)], times[-1:]
-        yield from (one.result() for one in waiting)
+def _with_edges(
+    video: Iterator[tuple[list[np.ndarray], np.ndarray]], last: np.ndarray
+) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+    """(frames, times) with the time of the frame before put in front."""
+    for frames, times in video:
+        yield frames, np.concatenate([last, times])
+        last = times[-1:]
 
 
 def _checked_camera(camera: Camera) -> Camera:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from functools import lru_cache
 
 import jax
 import numpy as np
@@ -38,11 +37,21 @@ def signal_columns(
     model: SensorModel, sent: Sent, pixels: Array, dt_us: Array
 ) -> Iterator[Columns]:
     """The signal events of `sent`, whose columns belong to `pixels`."""
-    at, step, pixel = _where(sent.fires, pixels, len(dt_us))
-    count, first, spacing = (_of(a, at) for a in (
-        sent.spikes.count, sent.spikes.first, sent.spikes.spacing))
-    earliest = first if sent.spikes.earliest is None else _of(sent.spikes.earliest, at)
-    yield from _signal(model, count, step, pixel, dt_us, first, spacing, earliest)
+    spikes, (at, step, pixel) = sent.spikes, _where(sent.fires, pixels, len(dt_us))
+    count, first = _of(spikes.count, at), _of(spikes.first, at)
+    earliest = None if spikes.earliest is None else _of(spikes.earliest, at)
+    on = count > 0
+    yield Columns(step, pixel, first if earliest is None else np.maximum(first, earliest), on,
+                  noise=False)
+    # The further events of each progression; there are few.
+    many = np.flatnonzero(np.abs(count) > 1)
+    row, k = _repeated(np.abs(count.take(many)) - 1)
+    row, k = many[row], (k + 1).astype(np.float32)
+    step, fraction = step.take(row), first.take(row) + k * _of(spikes.spacing, at.take(row))
+    if earliest is not None:
+        dead = (model.refractory_s / (dt_us * 1e-6)).astype(np.float32)
+        fraction = np.maximum(fraction, earliest.take(row) + k * dead.take(step))
+    yield Columns(step, pixel.take(row), fraction, on.take(row), noise=False)
 
 
 def noise_columns(
@@ -65,23 +74,6 @@ def _where(flags: jax.Array, pixels: Array, steps: int) -> tuple[Array, Array, A
 
 def _of(values: jax.Array, at: Array) -> Array:
     return np.asarray(values).ravel().take(at)
-
-
-def _signal(
-    model: SensorModel, count: Array, step: Array, pixel: Array, dt_us: Array, first: Array,
-    spacing: Array, earliest: Array,
-) -> Iterator[Columns]:
-    """Signal events: the first of each progression, then the others, of which there are few."""
-    on, number = count > 0, np.abs(count)
-    yield Columns(step, pixel, np.maximum(first, earliest), on, noise=False)
-    many = np.flatnonzero(number > 1)
-    row, k = _repeated(number.take(many) - 1)
-    row, k = many[row], (k + 1).astype(np.float32)
-    fraction = first.take(row) + k * spacing.take(row)
-    if model.waits:
-        dead = (model.refractory_s / (dt_us * 1e-6)).astype(np.float32)
-        fraction = np.maximum(fraction, earliest.take(row) + k * dead.take(step.take(row)))
-    yield Columns(step.take(row), pixel.take(row), fraction, on.take(row), noise=False)
 
 
 def _repeated(number: Array) -> tuple[Array, Array]:
@@ -119,28 +111,28 @@ def sort(
     nothing = np.empty(0, dtype)
     keys = np.concatenate([nothing, *(_keys(part, np.diff(edges), bits, dtype) for part in parts)])
     keys.sort()
-    at = ((keys & dtype((1 << bits) - 1)) >> dtype(2)).astype(np.intp)
-    y, x = _coordinates(shape)
+    pixel = (keys & dtype((1 << bits) - 1)) >> dtype(2)
+    y = pixel // dtype(width)
+    x = pixel - y * dtype(width)
     t = (keys >> dtype(bits)).astype(np.int64)
     t += edges[0]
     on, noise = ((keys & dtype(flag)).astype(bool) for flag in (2, 1))
-    return Events.unchecked(x.take(at), y.take(at), t, on, (width, height)), noise
-
-
-@lru_cache(maxsize=4)
-def _coordinates(shape: tuple[int, int]) -> tuple[Array, Array]:
-    """(y, x) of every pixel of a frame, uint16."""
-    y, x = np.indices(shape, np.uint16)
-    return y.ravel(), x.ravel()
+    columns = x.astype(np.uint16), y.astype(np.uint16), t, on
+    return Events.unchecked(*columns, (width, height)), noise
 
 
 def _keys(part: Columns, dt_us: Array, bits: int, dtype: type) -> Array:
     """Microseconds into the block, pixel, polarity and kind, packed into integers that sort so.
     Times are rounded up to a microsecond, within (begin, end] of their interval."""
     exact = np.float32 if dt_us.max(initial=0) < 1 << 24 else np.float64
-    length = dt_us.astype(exact).take(part.step)
-    within = np.minimum(np.maximum(np.ceil(part.fraction * length), 1), length)
-    keys = (np.cumsum(dt_us) - dt_us).astype(dtype).take(part.step)
+    even = (dt_us == dt_us[0]).all()
+    length = exact(dt_us[0]) if even else dt_us.astype(exact).take(part.step)
+    within = part.fraction * length
+    np.ceil(within, out=within)
+    np.maximum(within, 1, out=within)
+    np.minimum(within, length, out=within)
+    keys = (part.step * dt_us[0] if even else (np.cumsum(dt_us) - dt_us).take(part.step)
+            ).astype(dtype)
     keys += within.astype(dtype)
     keys <<= dtype(bits - 2)
     keys += part.pixel.astype(dtype)

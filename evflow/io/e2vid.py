@@ -1,0 +1,78 @@
+"""Text of E2VID (rpg_e2vid): the first line `width height`, then a line `t[s] x y p` per event; as
+a .txt file, or alone in a zip.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from evflow.errors import EvflowDataError
+from evflow.io import text
+from evflow.io.hints import Hints
+from evflow.io.stream import collect
+from evflow.types import Recording
+
+NAME = "e2vid"
+EXTENSIONS: tuple[str, ...] = (".zip", ".txt")
+
+FIRST = re.compile(rb"[ \t]*(\d{1,5})[ \t]+(\d{1,5})[ \t]*\r?\n")
+EVENT = re.compile(rb"$|[\d.eE+-]+[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?(\n|$)")
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    if _is_text(head):
+        return True
+    if not head.startswith(b"PK\x03\x04"):
+        return False
+    try:
+        with _opened(path) as f:
+            return _is_text(f.readline(100) + f.readline(100))
+    except EvflowDataError as e:
+        return e.code == "EV009"  # `read` says what is damaged
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises EV008 (several files in the zip), EV009 (damaged) and what `stream.gather` raises."""
+    with _opened(path) as f:
+        line = f.readline(100)
+        first = FIRST.match(line)
+        if first is None:
+            raise EvflowDataError(
+                "EV009", f"{path} begins with {line[:40]!r}; expected `width height`.",
+                "Copy or write it again.")
+        return collect(path, text.events(f, (4,), len(line)), hints,
+                       (int(first[1]), int(first[2])), native="s")
+
+
+def _is_text(head: bytes) -> bool:
+    first = FIRST.match(head)
+    return first is not None and EVENT.match(head, first.end()) is not None
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """The text, of the file or of the one .txt in the zip."""
+    with open(path, "rb") as f:
+        if f.read(2) != b"PK":
+            f.seek(0)
+            yield f
+            return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [n for n in archive.namelist()
+                     if n.lower().endswith(".txt") and not n.startswith("__MACOSX")]
+            if len(names) != 1:
+                raise EvflowDataError(
+                    "EV008", f"{path} holds {len(names)} texts: {sorted(names)[:5]}.",
+                    "Pass a zip with one text of events.")
+            with archive.open(names[0]) as inner:
+                yield inner
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError,
+            ValueError, OSError) as e:
+        raise EvflowDataError("EV009", f"{path} is damaged ({e}).", "Copy it again.") from e

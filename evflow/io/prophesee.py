@@ -1,0 +1,76 @@
+"""The text header of Prophesee's files: lines `% key value`, then binary data.
+
+The header ends after `% end`, or before the first line that is not text beginning with `% `.
+What it tells of the sensor: width and height, or a name whose size is known.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+from evflow.checks import Size
+
+MAX_HEADER = 1 << 16  # bytes; real ones have 200 to 600
+TEXT = re.compile(rb"%[ \t][\x20-\x7e\t]*\r?\n|%\r?\n")
+
+SENSORS: tuple[tuple[str, Size], ...] = (  # found in plugin_name, sensor_name or generation
+    (r"genx320", (320, 320)),
+    (r"gen3|^3\.[01]$", (640, 480)),
+    (r"gen4|imx636|^4\.[0-2]$", (1280, 720)),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Header:
+    """fields: the last value of each key, in lower case. start: the byte where data begins."""
+
+    fields: dict[str, str]
+    start: int
+
+    @property
+    def encoding(self) -> str:
+        """"EVT2", "EVT3", "EVT2.1" ... as `% format` or `% evt` has it; "" where neither is."""
+        named = self.fields.get("format", "").split(";")[0].strip().upper()
+        version = self.fields.get("evt", "").strip()
+        return (named or (f"EVT{version}" if version else "")).removesuffix(".0")
+
+    @property
+    def order(self) -> str:
+        """Byte order of the words, ">" where `% format` says endianness=big."""
+        return ">" if "endianness=big" in self.fields.get("format", "").lower() else "<"
+
+    def size(self) -> tuple[Size | None, tuple[str, ...]]:
+        """(width, height) or None, and a note where it follows from the sensor's name."""
+        told = dict(re.findall(r"(width|height)=(\d+)", self.fields.get("format", "").lower()))
+        told = {key: self.fields[key] for key in ("width", "height") if key in self.fields} | told
+        pair = re.fullmatch(r"(\d+)x(\d+)", self.fields.get("geometry", ""))
+        if pair:
+            return (int(pair[1]), int(pair[2])), ()
+        if len(told) == 2 and all(value.isdecimal() for value in told.values()):
+            return (int(told["width"]), int(told["height"])), ()
+        for key in ("sensor_name", "plugin_name", "generation", "sensor_generation"):
+            name = self.fields.get(key, "").strip().lower()
+            for pattern, size in SENSORS:
+                if re.search(pattern, name):
+                    return size, (f"the sensor is taken as {size[0]}x{size[1]} after {key} {name}",)
+        return None, ()
+
+
+def parse(head: bytes) -> Header:
+    """The header at the beginning of these bytes; no fields where there is none."""
+    fields: dict[str, str] = {}
+    start = 0
+    while line := TEXT.match(head, start):
+        start = line.end()
+        key, _, value = line[0][1:].decode("ascii").strip().partition(" ")
+        if key.lower() == "end" and not value:
+            break
+        fields[key.lower()] = value.strip()
+    return Header(fields, start)
+
+
+def read_header(path: Path) -> Header:
+    with open(path, "rb") as f:
+        return parse(f.read(MAX_HEADER))
