@@ -41,3 +41,7 @@ class EvflowDataError(Exception):
     def __init__(self, code: str, seen: str, fix: str = "") -> None:
         self.code, self.seen, self.fix = code, seen, fix
         super().__init__(f"{code} {CODES[code]}: {seen}{' ' + fix if fix else ''}")
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        """Pickled by its parts, so that it passes from process to process."""
+        return type(self), (self.code, self.seen, self.fix)

@@ -261,8 +261,10 @@ def test_resume_is_exact_on_as_many_devices_and_close_on_others(processes: Proce
     for name, leaf in expected.items():
         np.testing.assert_array_equal(weights["44"][name], leaf, err_msg=name)
         for moved in ("41", "14"):
+            # Gradients differ by the order of sums, 1e-6 of a leaf's largest. Adam divides each
+            # by its own size: where that is a hundredth of the largest, a step differs by 1e-4.
             scale = max(float(np.abs(leaf).max()), 1e-30)
-            np.testing.assert_allclose(weights[moved][name], leaf, rtol=0, atol=1e-5 * scale)
+            np.testing.assert_allclose(weights[moved][name], leaf, rtol=0, atol=1e-4 * scale)
 
 
 def flat(out: Path) -> Arrays:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import pickle
 from pathlib import Path
 
 import pytest
@@ -47,3 +48,9 @@ def test_imports_run_downward(path: Path) -> None:
         for name in names:
             if name != "evflow.__version__":
                 assert floor(name) <= here, f"{module} imports {name}, which is above it"
+
+
+def test_errors_pass_from_process_to_process() -> None:
+    error = pickle.loads(pickle.dumps(evflow.EvflowDataError("EV004", "seen.", "Fix it.")))
+    assert (error.code, error.seen, error.fix) == ("EV004", "seen.", "Fix it.")
+    assert str(error) == "EV004 timestamps not sorted: seen. Fix it."

@@ -167,10 +167,7 @@ def _drafts(jobs: list[Job], workers: int) -> Generator[Made]:
     pool = ProcessPoolExecutor(
         min(workers, len(jobs)), multiprocessing.get_context("spawn"), initializer=_follow_parent)
     try:
-        for made in pool.map(_try_draft, jobs):
-            if isinstance(made, _Refusal):
-                raise EvflowDataError(made.code, made.seen, made.fix)
-            yield made
+        yield from pool.map(_draft, jobs)
     except BrokenProcessPool as e:
         raise EvflowDataError(
             "EV019", "a worker process died (out of memory?).",
@@ -179,22 +176,6 @@ def _drafts(jobs: list[Job], workers: int) -> Generator[Made]:
         for worker in set(multiprocessing.active_children()) - others:
             worker.terminate()  # what they still do is not wanted
         pool.shutdown(cancel_futures=True)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Refusal:
-    """An `EvflowDataError` on its way between processes."""
-
-    code: str
-    seen: str
-    fix: str
-
-
-def _try_draft(job: Job) -> Made | _Refusal:
-    try:
-        return _draft(job)
-    except EvflowDataError as e:
-        return _Refusal(e.code, e.seen, e.fix)
 
 
 def _follow_parent() -> None:

@@ -92,7 +92,8 @@ class Hints:
                     "Are they seconds? Pass time_unit='s' (--time-unit s).")
             if not np.isfinite(t).all():
                 raise EvflowDataError("EV007", f"{(~np.isfinite(t)).sum():,} times are not finite.")
-            us = np.rint(t.astype(np.float64) * UNITS_US[unit])
+            with np.errstate(over="ignore"):  # an overflow is too late, as below
+                us = np.rint(t.astype(np.float64) * UNITS_US[unit])
             if np.abs(us).max() >= 2.0**63:
                 raise _too_late(t, unit)
             return us.astype(np.int64)
