@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from videos import SHAPE, by_pixel, drifting, milliseconds
 from evflow.camera import Camera, CameraPrior
 from evflow.intensity import LOG_MAPS, to_log
 from evflow.sensors import SensorModel
-from evflow.simulator import simulate, simulate_stream
+from evflow.simulator import active, simulate, simulate_stream
 from evflow.simulator.active import step
 from evflow.simulator.pixel import floor_divide
 from evflow.types import Events
@@ -93,6 +94,31 @@ def test_keys_matter_only_where_something_is_random() -> None:
     first, second = (simulate(jax.random.key(k), drifting(40), milliseconds(40), QUIET)
                      for k in (0, 1))
     equal(first, second)
+
+
+@pytest.mark.parametrize("model", [
+    SensorModel(), SensorModel(leak_hz=20.0), EVERYTHING,
+    SensorModel(kind="esim", refractory_s=1e-3), SensorModel(leak_hz=50.0, leak_jitter=2.0),
+    SensorModel(shot_hz=50.0, eta_intensity=True)])
+def test_pixels_that_are_passed_over_have_nothing_to_send(
+    model: SensorModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same bytes where every pixel is stepped; and most of a quiet scene is passed over."""
+    frames, times = drifting(40), milliseconds(40)
+    active_ones = simulate(KEY, frames, times, NOISY, model=model)
+    look, shares = active.look, []
+
+    def look_at_all(*args: Any) -> Any:
+        after, found = look(*args)
+        shares.append(float(found.mean()))
+        return after, jnp.ones_like(found)
+
+    monkeypatch.setattr(active, "look", look_at_all)
+    equal(active_ones, simulate(KEY, frames, times, NOISY, model=model))
+    still = np.broadcast_to(frames[:1], frames.shape)
+    shares.clear()
+    assert len(simulate(KEY, still, times, QUIET, model=SensorModel())) == 0
+    assert max(shares) == 0
 
 
 def test_events_of_very_long_intervals_stay_in_them() -> None:

@@ -82,7 +82,8 @@ def _look_at_extremes(
                    for pick in (jnp.maximum, jnp.minimum))
     base = pixels.base
     if sensor.leaking is not None:
-        base = base - sensor.leaking * jnp.sum(block.dt)
+        for dt in block.dt:  # one by one, as `step` does: a sum rounds differently
+            base = base - sensor.leaking * dt
     active = _beyond(sensor, most - base, pixels.base - least)
     after = PixelState(to_log(frames[-1], model.log_map), base, pixels.last)
     return after, active
