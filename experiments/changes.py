@@ -58,7 +58,7 @@ def errors(params: Any, batch: Batch) -> dict[str, Array]:
     parts = changes.shape[-1]
     found = {
         "encoder": jnp.cumsum(up - down, -1),
-        "frames alone": dlogI[..., None] * (jnp.arange(parts) + 1.0) / parts,
+        "frames alone": jnp.stack([dlogI * (i + 1) / parts for i in range(parts)], -1),
         "events alone": jnp.cumsum(on * theta_on - off * theta_off, -1),
         "no change": jnp.zeros_like(true)}
     active = (jnp.abs(changes).sum(-1).mean((1, 2)) > ACTIVE).astype(true.dtype)

@@ -121,8 +121,8 @@ def compare(made: Array, one: Array, two: Array, where: Array) -> Row:
     empty = where & (one.sum(-1) + two.sum(-1) == 0)
     used = float(one_n[:, where].sum()) >= ENOUGH
     pair = [correlation(made_n, one_n), correlation(one_n, two_n), 1.0] if used else [0.0] * 3
-    return {"made": np.asarray((made_n * where).sum((1, 2))),
-            "simulated": np.asarray(0.5 * ((one_n + two_n) * where).sum((1, 2))),
+    return {"made": np.asarray((made_n * where[None]).sum((1, 2))),
+            "simulated": np.asarray(0.5 * ((one_n + two_n) * where[None]).sum((1, 2))),
             "empty": np.array([(jnp.abs(made) * empty[..., None]).sum(),
                                empty.sum() * made.shape[-1]]),
             "correlations": np.array(pair)}

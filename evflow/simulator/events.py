@@ -7,7 +7,7 @@ how the frames arrive. Frame interval i draws its noise from (key, i) alone.
 
 from __future__ import annotations
 
-import itertools
+from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Literal, overload
 
@@ -97,23 +97,22 @@ def _packed(
     shape = (camera.shape[0], camera.shape[1])
     (first,), last = next(video)
     pixels = circuit(key, first.reshape(shape), int(last[0]), camera, model)
-    ours, theirs = itertools.tee(_with_edges(video, last))  # never more than two blocks apart
+    edges: deque[np.ndarray] = deque()  # of the blocks under way
+
+    def watched() -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+        before = last
+        for frames, times in video:
+            edges.append(np.concatenate([before, times]))
+            yield frames, edges[-1]
+            before = times[-1:]
+
     fetch = None
-    for fetched in pixels.run(theirs):
+    for fetched in pixels.run(watched()):
         if fetch:
-            yield pack.sort(fetch(), next(ours)[1], shape)
+            yield pack.sort(fetch(), edges.popleft(), shape)
         fetch = fetched
     if fetch:
-        yield pack.sort(fetch(), next(ours)[1], shape)
-
-
-def _with_edges(
-    video: Iterator[tuple[list[np.ndarray], np.ndarray]], last: np.ndarray
-) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-    """(frames, times) with the time of the frame before put in front."""
-    for frames, times in video:
-        yield frames, np.concatenate([last, times])
-        last = times[-1:]
+        yield pack.sort(fetch(), edges.popleft(), shape)
 
 
 def _checked_camera(camera: Camera) -> Camera:

@@ -7,7 +7,7 @@ videos are first filled up with motion-compensated frames (host code, frame pair
 
 from __future__ import annotations
 
-import itertools
+import collections
 import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -107,7 +107,17 @@ def _warp(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
 def unzip(
     pairs: Iterable[tuple[np.ndarray, int]]
 ) -> tuple[Iterator[np.ndarray], Iterator[int]]:
-    """Lazy (frames, times) of a stream of pairs, for `simulate_stream`, which reads both in
-    step: never more than one frame waits."""
-    first, second = itertools.tee(pairs)
-    return (frame for frame, _ in first), (t for _, t in second)
+    """Lazy (frames, times) of a stream of pairs, for `simulate_stream`, which reads a frame and
+    then its time: nothing waits longer than that (itertools.tee would hold 57 pairs)."""
+    source, times = iter(pairs), collections.deque[int]()
+
+    def frames() -> Iterator[np.ndarray]:
+        for frame, t in source:
+            times.append(t)
+            yield frame
+
+    def waiting() -> Iterator[int]:
+        while times:
+            yield times.popleft()
+
+    return frames(), waiting()
