@@ -5,13 +5,9 @@ Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import signal
 import sys
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -215,7 +211,7 @@ def _simulate(command: Simulate) -> None:
     from evflow import io
     from evflow.colour import as_seen
     from evflow.io.source import open_frames
-    from evflow.progress import bar
+    from evflow.progress import bar, stoppable
     from evflow.sensors import known_sensor
     from evflow.simulator import simulate_stream
     from evflow.simulator.interpolate import unzip, upsample
@@ -234,7 +230,7 @@ def _simulate(command: Simulate) -> None:
         frames = done
         progress(done, total)
 
-    with _stoppable(), bar("simulating") as progress, io.DsecWriter(
+    with stoppable(), bar("simulating") as progress, io.DsecWriter(
             command.out, source.size, overwrite=command.overwrite) as writer:
         limit = command.max_motion_px if command.interpolate else 0.0
         pairs = as_seen(
@@ -275,23 +271,6 @@ def _camera(command: Simulate, size: tuple[int, int]) -> Any:
             "EV015", f"the video is {size[0]}x{size[1]}, the camera "
             f"{camera.shape[1]}x{camera.shape[0]}.", "Resize the video to the camera's size.")
     return camera
-
-
-@contextlib.contextmanager
-def _stoppable() -> Iterator[None]:
-    """SIGTERM ends the block as Ctrl-C does, so that nothing half-written is left."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # handlers belong to the main thread
-        return
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _version(_: Version) -> None:

@@ -17,10 +17,7 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import json
-import signal
-from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
 from typing import Any, Literal
 
 import tyro
@@ -29,7 +26,7 @@ from evflow.dataset.config import PRESETS, DatasetConfig
 from evflow.dataset.manifest import MERGED, verify
 from evflow.dataset.shards import build
 from evflow.errors import EvflowDataError
-from evflow.progress import bar
+from evflow.progress import bar, stoppable
 from experiments.common import provenance
 
 STOPPED = 130  # the shell's exit code of Ctrl-C
@@ -75,7 +72,7 @@ def main(options: Options) -> int:
         print(f"{options.out}: {len(faults)} faults; --only-missing makes them good." if faults
               else f"{options.out}: whole.")
         return 1 if faults else 0
-    with bar("sequences") as progress, sigterm_as_ctrl_c():
+    with bar("sequences") as progress, stoppable():
         made = build(
             options.out, configuration(options), options.seed, shard=shard,
             workers=options.workers, format=options.format, only_missing=options.only_missing,
@@ -108,19 +105,6 @@ def maker() -> dict[str, Any]:
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         known["versions"] |= {name: importlib.metadata.version(name) for name in names}
     return known
-
-
-@contextlib.contextmanager
-def sigterm_as_ctrl_c() -> Iterator[None]:
-    """A scheduler's SIGTERM takes the way of Ctrl-C, through every `finally`."""
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 if __name__ == "__main__":

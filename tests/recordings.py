@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -82,3 +83,16 @@ def survives(path: Path) -> bool:
         return False
     assert isinstance(recording, Recording)
     return True
+
+
+def damage(target: Path, count: int, survives: Callable[[], bool]) -> None:
+    """`count` damaged copies in place of the file: each is read or refused, some are refused; and
+    the file itself is read again."""
+    sound = target.read_bytes()
+    read = 0
+    for data in mutations(sound, count):
+        target.write_bytes(data)
+        read += survives()
+    assert read < count
+    target.write_bytes(sound)
+    assert survives()

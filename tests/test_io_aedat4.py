@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recordings import T0, equal, make, mutations, refused, survives
+from recordings import T0, damage, equal, make, refused, survives
 
 from evflow.io import read_events, read_recording, write_events
 from evflow.types import Events
@@ -159,12 +159,6 @@ def test_damaged_aedat4_only_raises_data_errors(
     data_file: Callable[[str], Path], tmp_path: Path
 ) -> None:
     pytest.importorskip("aedat")
-    source = data_file("data/formats/dvxplorer320.aedat4").read_bytes()
     path = tmp_path / "a.aedat4"
-    read = 0
-    for data in mutations(source, 120):
-        path.write_bytes(data)
-        read += survives(path)
-    assert read < 120
-    path.write_bytes(source)
-    assert survives(path)
+    path.write_bytes(data_file("data/formats/dvxplorer320.aedat4").read_bytes())
+    damage(path, 120, lambda: survives(path))

@@ -16,7 +16,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io import prophesee
 from evflow.io.hints import Hints
-from evflow.io.stream import Chunk, Clock, Damage, collect, cut_at, words
+from evflow.io.stream import Chunk, Clock, collect, typed, words
 from evflow.types import Recording
 
 NAME = "evt2"
@@ -52,13 +52,7 @@ class Decoder:
         self.timeless = self.triggers = 0
 
     def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
-        for byte, table in source:
-            kind = (table >> 28).astype(np.uint8)
-            sound, wrong = cut_at(UNDEFINED[kind], table)
-            yield self.decode(sound, kind[: len(sound)], byte)
-            if wrong >= 0:
-                raise Damage(byte + 4 * wrong, f"word {table[wrong]:#010x} is of type "
-                             f"{kind[wrong]:#x}, which EVT2 does not have")
+        return typed(source, UNDEFINED, "EVT2", self.decode)
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
         marks = np.flatnonzero(kind == TIME)

@@ -17,7 +17,7 @@ import numpy as np
 from evflow.io import prophesee
 from evflow.io.evt2 import leftovers
 from evflow.io.hints import Hints
-from evflow.io.stream import Chunk, Clock, Damage, collect, cut_at, words
+from evflow.io.stream import Chunk, Clock, collect, typed, words
 from evflow.types import Recording
 
 NAME = "evt3"
@@ -61,13 +61,7 @@ class Decoder:
         self.stateless = self.triggers = 0
 
     def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
-        for byte, table in source:
-            kind = (table >> 12).astype(np.uint8)
-            sound, wrong = cut_at(UNDEFINED[kind], table)
-            yield self.decode(sound, kind[: len(sound)], byte)
-            if wrong >= 0:
-                raise Damage(byte + 2 * wrong, f"word {table[wrong]:#06x} is of type "
-                             f"{kind[wrong]:#x}, which EVT3 does not have", self.unit)
+        return typed(source, UNDEFINED, "EVT3", self.decode, self.unit)
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
         self.triggers += int(np.count_nonzero(kind == TRIGGER))

@@ -16,7 +16,7 @@ import numpy as np
 
 from evflow.colour import COLOURS, luma
 from evflow.errors import EvflowDataError
-from evflow.io.hints import UNITS_US
+from evflow.io.hints import UNITS_US, check_choices, known
 from evflow.types import luma as rec709
 
 Frames = Iterator[tuple[np.ndarray, int]]
@@ -51,10 +51,7 @@ class FrameHints:
     partial: bool = False
 
     def __post_init__(self) -> None:
-        for name, allowed in (("time_unit", ("auto", *UNITS_US)), ("colour", COLOURS)):
-            if getattr(self, name) not in allowed:
-                raise EvflowDataError(
-                    "EV020", f"{name}={getattr(self, name)!r}.", f"Choose from {allowed}.")
+        check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS)
         for name in ("fps", "full_scale"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
@@ -69,12 +66,7 @@ class FrameHints:
     @staticmethod
     def parse(given: dict[str, Any]) -> FrameHints:
         """Hints of keyword arguments; an unknown one raises EV020."""
-        names = [field.name for field in dataclasses.fields(FrameHints)]
-        unknown = sorted(set(given) - set(names))
-        if unknown:
-            raise EvflowDataError(
-                "EV020", f"unknown option {', '.join(unknown)}.", f"Videos know {names}.")
-        return FrameHints(**given)
+        return FrameHints(**known(given, FrameHints, "Videos"))
 
     def at_rate(self, index: int) -> int:
         """The time of frame `index` in us at `fps`."""

@@ -19,6 +19,24 @@ UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 POLARITIES = ("auto", "01", "pm1", "invert")
 
 
+def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
+    """EV020 where an attribute of `options` is none of its choices."""
+    for name, allowed in choices.items():
+        if getattr(options, name) not in allowed:
+            raise EvflowDataError(
+                "EV020", f"{name}={getattr(options, name)!r}.", f"Choose from {allowed}.")
+
+
+def known(given: dict[str, Any], fields_of: type, who: str) -> dict[str, Any]:
+    """`given`; EV020 where it names what is no field of the dataclass. who: takes its fields."""
+    names = [field.name for field in dataclasses.fields(fields_of)]
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise EvflowDataError(
+            "EV020", f"unknown option {', '.join(unknown)}.", f"{who} know {names}.")
+    return given
+
+
 @dataclasses.dataclass(frozen=True)
 class Hints:
     """What the user knows about a file.
@@ -38,10 +56,7 @@ class Hints:
     size: Size | None = None
 
     def __post_init__(self) -> None:
-        for name, allowed in (("time_unit", ("auto", *UNITS_US)), ("polarity", POLARITIES)):
-            if getattr(self, name) not in allowed:
-                raise EvflowDataError(
-                    "EV020", f"{name}={getattr(self, name)!r}.", f"Choose from {allowed}.")
+        check_choices(self, time_unit=("auto", *UNITS_US), polarity=POLARITIES)
         for name in ("start_s", "stop_s"):
             value = getattr(self, name)
             number = isinstance(value, int | float | np.number)
@@ -57,12 +72,7 @@ class Hints:
     @staticmethod
     def parse(given: dict[str, Any]) -> Hints:
         """Hints of keyword arguments; an unknown one raises EV020."""
-        names = [field.name for field in dataclasses.fields(Hints)]
-        unknown = sorted(set(given) - set(names))
-        if unknown:
-            raise EvflowDataError(
-                "EV020", f"unknown option {', '.join(unknown)}.", f"Readers know {names}.")
-        return Hints(**given)
+        return Hints(**known(given, Hints, "Readers"))
 
     def sensor(self, *known: Size | None, reach: tuple[int, int] | None = None) -> Size:
         """The first of `self.size` and `known` that is not None, or EV015.

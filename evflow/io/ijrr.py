@@ -22,6 +22,7 @@ from evflow.checks import check_times
 from evflow.errors import EvflowDataError
 from evflow.io.frames import stack_frames
 from evflow.io.hints import Hints
+from evflow.io.images import decode
 from evflow.types import Events, Recording
 
 NAME = "ijrr"
@@ -198,8 +199,6 @@ def _read_index(index: Root, hints: Hints) -> tuple[np.ndarray, list[str]]:
 
 def _image(root: Root, name: str) -> np.ndarray:
     """One image file at its full bit depth, grey or RGB; EV008, EV009, EV016."""
-    import cv2
-
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts:
         raise EvflowDataError("EV008", f"images.txt names {name}, which leaves the recording.")
@@ -208,11 +207,5 @@ def _image(root: Root, name: str) -> np.ndarray:
         raise EvflowDataError(
             "EV016", f"images.txt names {name}, which is not in {root}.",
             "Restore the image, or remove its line.")
-    data = np.frombuffer(file.read_bytes(), np.uint8)
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise EvflowDataError("EV009", f"{file} is not a sound image.", "Copy it again.")
+    image = decode(file)
     return image if image.ndim == 2 else image[..., 2::-1]  # OpenCV's order is B, G, R(, A)

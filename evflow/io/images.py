@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -75,7 +76,7 @@ def natural(name: str) -> tuple[list[str | int], str]:
     return [int(p) if i % 2 else p for i, p in enumerate(parts)], name
 
 
-def decode(file: Path) -> np.ndarray:
+def decode(file: Path | zipfile.Path) -> np.ndarray:
     """One image at its full bit depth: (H, W) or (H, W, 3 or 4) in B, G, R(, A).
 
     Raises EV009 (damaged, cut off), EV016 (not there).

@@ -94,6 +94,22 @@ def cut_at(wrong: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
     return table[:first], first
 
 
+def typed(
+    source: Iterable[tuple[int, np.ndarray]], undefined: np.ndarray, name: str,
+    decode: Callable[[np.ndarray, np.ndarray, int], Chunk], unit: str = "byte",
+) -> Iterator[Chunk]:
+    """decode(words, their types, byte) of (byte, words) whose top four bits are a type; Damage
+    at a type of which `undefined` (16,) says that the format `name` has none."""
+    for byte, table in source:
+        size = table.dtype.itemsize
+        kind = (table >> (8 * size - 4)).astype(np.uint8)
+        sound, wrong = cut_at(undefined[kind], table)
+        yield decode(sound, kind[: len(sound)], byte)
+        if wrong >= 0:
+            raise Damage(byte + size * wrong, f"word {table[wrong]:#0{2 * size + 2}x} is of type "
+                         f"{kind[wrong]:#x}, which {name} does not have", unit)
+
+
 def collect(
     path: Path,
     chunks: Iterable[Chunk],

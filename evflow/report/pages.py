@@ -15,12 +15,11 @@ import numpy as np
 from evflow.report.plots import OFF_COLOUR, ON_COLOUR, event_image, new_figure, save_figure
 from evflow.types import Events
 
-RED, BLUE = OFF_COLOUR, ON_COLOUR  # the paper's ON and OFF
-SIDES = (("on", RED), ("off", BLUE))
+SIDES = (("on", ON_COLOUR), ("off", OFF_COLOUR))
 
 
 def _image(axis: Any, events: Events, span_us: tuple[int, int], title: str) -> None:
-    axis.imshow(event_image(events, *span_us, colours=(RED, BLUE)), interpolation="nearest")
+    axis.imshow(event_image(events, *span_us), interpolation="nearest")
     axis.set_title(title, fontsize=10)
     axis.set_xticks([])
     axis.set_yticks([])
@@ -156,10 +155,10 @@ def _source_curve(axis: Any, source: dict[str, Any]) -> None:
     x, measured, law = (np.asarray(source[k]) for k in ("x", "measured", "law"))
     if source.get("steps") or source.get("discrete"):
         axis.bar(x, measured, width=x[1] - x[0], color="0.75", label="simulated")
-        axis.plot(x, law, "o" if source.get("discrete") else "-", color=RED, ms=4, lw=1.3,
+        axis.plot(x, law, "o" if source.get("discrete") else "-", color=ON_COLOUR, ms=4, lw=1.3,
                   label="law")
     else:
-        axis.plot(x, law, color=RED, lw=1.3, label="law")
+        axis.plot(x, law, color=ON_COLOUR, lw=1.3, label="law")
         axis.plot(x, measured, "o", color="0.35", ms=4, label="simulated")
     axis.set_ylim(bottom=0)
     if source.get("log") is True:

@@ -19,8 +19,7 @@ from evflow.recording import CameraEstimate
 from evflow.types import Events
 
 TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON [Hz]", "eta_off": "η OFF [Hz]"}
-Colour = tuple[float, float, float]
-ON_COLOUR, OFF_COLOUR = (0.13, 0.35, 0.75), (0.80, 0.20, 0.18)
+ON_COLOUR, OFF_COLOUR = (0.80, 0.20, 0.18), (0.13, 0.35, 0.75)  # red and blue, as in the paper
 
 
 def require() -> None:
@@ -48,14 +47,12 @@ def save_figure(figure: Any, path: str | os.PathLike) -> None:
         Path(temporary).write_bytes(buffer.getvalue())
 
 
-def event_image(
-    events: Events, t0_us: int, t1_us: int, colours: tuple[Colour, Colour] = (ON_COLOUR, OFF_COLOUR)
-) -> np.ndarray:
+def event_image(events: Events, t0_us: int, t1_us: int) -> np.ndarray:
     """(H, W, 3) in 0..1: white ground, ON and OFF in their colours, saturating at three events."""
     on, off = events.slice(t0_us, t1_us).count_map().astype(np.float32)
     net = np.clip((on - off) / 3.0, -1.0, 1.0)[..., None]
     both = np.clip((on + off) / 3.0, 0.0, 1.0)[..., None]
-    colour = np.where(net >= 0, *colours)
+    colour = np.where(net >= 0, ON_COLOUR, OFF_COLOUR)
     strength = np.maximum(np.abs(net), 0.35 * both)
     return 1.0 - strength * (1.0 - colour)
 
