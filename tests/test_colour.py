@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from videos import code_of
 
-from evflow.cli import Simulate
 from evflow.colour import COLOURS, PATTERNS, as_seen, luma, mosaic, stack_planes, unstack_planes
+from evflow.commands.simulate import Simulate
 from evflow.simulator.interpolate import upsample
 
 

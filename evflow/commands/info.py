@@ -1,0 +1,58 @@
+"""`evflow info`: what is in a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from evflow.commands.options import Reading
+
+if TYPE_CHECKING:
+    from evflow.types import Recording
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Info(Reading):
+    """What is in a recording.
+
+    Example: evflow info flight.aedat4
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder of any known format."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> None:
+        recording = self.read(self.recording)
+        facts = _facts(recording)
+        if self.json:
+            print(json.dumps(facts, indent=2))
+            return
+        print(recording)
+        for name, value in facts.items():
+            print(f"  {name:16} {value}")
+
+
+def _facts(recording: Recording) -> dict[str, Any]:
+    from evflow import io
+
+    events, times = recording.events, recording.frame_times
+    facts = {
+        "events": len(events), "size": list(events.size), "duration_s": events.duration_us / 1e6,
+        "first_us": int(events.t[0]) if len(events) else None,
+        "last_us": int(events.t[-1]) if len(events) else None,
+        "on_fraction": float(events.p.mean()) if len(events) else None,
+        "frames": len(times),
+        "first_frame_us": int(times[0]) if len(times) else None,
+        "last_frame_us": int(times[-1]) if len(times) else None,
+        "frame_dtype": str(recording.frames.dtype), "notes": list(recording.notes),
+    }
+    if len(times) > 1 and len(events):
+        plan = io.plan_windows(recording)
+        facts["windows"], facts["skipped"] = len(plan.pairs), list(plan.skipped)
+    return facts
