@@ -15,7 +15,8 @@ ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
 FLOORS = (
     ("errors", "checks", "files"), ("types", "progress", "distributed", "colour"), ("io",),
-    ("camera", "sensors", "metrics"), ("pixels", "intensity"), ("voxel",), ("flow", "scenes", "simulator"),
+    ("camera", "sensors", "metrics"), ("pixels", "intensity"), ("voxel",),
+    ("flow", "scenes", "simulator"),
     ("config",), ("squash", "dataset"),
     ("encoder", "summary", "refine"),
     ("network", "losses", "batch"), ("model",), ("weights", "checkpoint"), ("train", "recording"),
