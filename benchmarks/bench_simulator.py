@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.harness import Case, Setting, Workload
 from evflow.camera import Camera
-from evflow.intensity import to_log, uint8_table
+from evflow.intensity import uint8_table
 from evflow.scenes.photos import load_photos
 from evflow.sensors import SensorModel
 from evflow.simulator import simulate, simulate_voxels
@@ -75,7 +75,7 @@ def voxels_evflow(setting: Setting, noisy: bool) -> Workload:
     frames = video(setting, (10 if setting.quick else WINDOW_FRAMES) + 1)
     camera, model = Camera.constant(frames.shape[1:], THETA, THETA), _sensor(noisy)
     return Workload(
-        lambda: simulate_voxels(jax.random.key(0), to_log(frames), camera,
+        lambda: simulate_voxels(jax.random.key(0), frames, camera,
                                 frame_dt_s=DT_US * 1e-6, model=model, bins=BINS),
         partial(_voxel_work, frames))
 

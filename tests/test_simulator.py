@@ -90,6 +90,16 @@ def test_streams_are_lazy() -> None:
     assert next(stream).t[0] > 8_000
 
 
+@pytest.mark.parametrize("model", [SensorModel(), SensorModel(refractory_s=1e-3)])
+def test_frames_may_be_hours_apart(model: SensorModel) -> None:
+    """The same crossings as in milliseconds, at times to the hour's fraction."""
+    frames = drifting(12)
+    fast = simulate(KEY, frames, 1_000_000 * np.arange(12), QUIET, model=model)
+    slow = simulate(KEY, frames, 3600 * 1_000_000 * np.arange(12), QUIET, model=model)
+    np.testing.assert_array_equal(slow.count_map(), fast.count_map())
+    assert np.abs(np.sort(slow.t) / 3600 - fast.t).max() < 2.0
+
+
 def test_keys_matter_only_where_something_is_random() -> None:
     first, second = (simulate(jax.random.key(k), drifting(40), milliseconds(40), QUIET)
                      for k in (0, 1))

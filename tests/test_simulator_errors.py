@@ -128,3 +128,8 @@ def test_nan_log_frames_are_refused() -> None:
     frames[1, 2, 3] = np.nan
     with pytest.raises(EvflowDataError, match="EV007"):
         simulate_voxels(jax.random.key(0), frames, Camera.constant((4, 5)), frame_dt_s=1e-3)
+
+
+def test_brightness_in_place_of_logarithms_is_refused() -> None:
+    with pytest.raises(EvflowDataError, match=r"EV003.*mean of 100"):
+        simulate_voxels(KEY, np.full((3, *SHAPE), 100.0, np.float32), CAMERA, frame_dt_s=1e-3)

@@ -85,6 +85,19 @@ def test_noise_with_several_events_an_interval() -> None:
     agree(ours, direct, events, 32_000)
 
 
+@pytest.mark.parametrize("model", [
+    SensorModel(), ALL_ON, SensorModel(kind="esim", log_map="log_eps"),
+    SensorModel(kind="voltmeter")], ids=lambda m: m.kind)
+def test_bytes_give_the_same_grid_as_their_logarithms(model: SensorModel) -> None:
+    frames = FRAMES.astype(np.uint8)
+    ours, theirs = (np.asarray(simulate_voxels(KEY, f, NOISY, frame_dt_s=1e-3, model=model))
+                    for f in (frames, to_log(frames, model.log_map)))
+    assert ours.sum() > 1000
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    batch = simulate_voxels(KEY, np.stack([frames] * 2), NOISY, frame_dt_s=1e-3, model=model)
+    assert batch.shape == (2, *ours.shape)
+
+
 LOG = to_log(FRAMES[:9])
 call = partial(simulate_voxels, frame_dt_s=1e-3, bins=4)
 

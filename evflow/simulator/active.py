@@ -22,6 +22,7 @@ from evflow.simulator.sensor import Sensor, Struck
 
 Array = jax.Array
 
+TICKS = 1 << 30  # microseconds in a block that leave room for two flags in 32 bits
 SLACK = 1e-4  # of a threshold: what sums in another order may differ by
 
 
@@ -29,11 +30,12 @@ SLACK = 1e-4  # of a threshold: what sums in another order may differ by
 @dataclasses.dataclass(frozen=True)
 class Block:
     """T frames and the intervals that end at them. frames: (T, N) DN, uint8 or float32. dt: (T,)
-    seconds. clock: (T + 1, 2) times of the frame before and of these, see `SimState.time`.
-    salts: (T, 2) of `noise.salts`. On the host all are NumPy arrays."""
+    seconds. dt_us: (T,) uint32. clock: (T + 1, 2) times of the frame before and of these, see
+    `SimState.time`. salts: (T, 2) of `noise.salts`."""
 
     frames: Any
     dt: Any
+    dt_us: Any
     clock: Any
     salts: Any
 
@@ -42,9 +44,12 @@ class Block:
 @dataclasses.dataclass(frozen=True)
 class Sent:
     """What K pixels send in T intervals, each array (T, K). fires: whether there are signal
-    events. struck: noise events, None without."""
+    events. ticks: uint32, of the first of them the microseconds from the begin of the block,
+    times 4, + 2 where ON, + 1 where it is not the only one (nonsense in blocks of `TICKS` us and
+    more). struck: noise events, None without."""
 
     fires: Array
+    ticks: Array
     spikes: Spikes
     struck: Struck | None
 
@@ -153,7 +158,19 @@ def step(
     kept = ("base", "last") if model.refractory_s > 0 else ("base",)
     put = {name: getattr(after, name).at[at].set(getattr(pixels, name), mode="drop")
            for name in kept}
-    return dataclasses.replace(after, **put), Sent((spikes.count != 0) & real, spikes, struck)
+    sent = Sent((spikes.count != 0) & real, _ticks(spikes, block.dt_us), spikes, struck)
+    return dataclasses.replace(after, **put), sent
+
+
+def _ticks(spikes: Spikes, dt_us: Array) -> Array:
+    """`Sent.ticks`. Times are rounded up to a microsecond, within (begin, end] of their
+    interval."""
+    at = spikes.first if spikes.earliest is None else jnp.maximum(spikes.first, spikes.earliest)
+    length = dt_us.astype(at.dtype)[:, None]
+    within = jnp.clip(jnp.ceil(at * length), 1, length).astype(jnp.uint32)
+    when = (jnp.cumsum(dt_us) - dt_us)[:, None] + within
+    on, more = (flag.astype(jnp.uint32) for flag in (spikes.count > 0, abs(spikes.count) > 1))
+    return (when << 2) | (on << 1) | more
 
 
 @functools.partial(jax.jit, static_argnames="model")

@@ -28,10 +28,13 @@ from evflow.simulator.sensor import Sensor, SimState, Struck
 
 Array = jax.Array
 Fetch = Callable[[], list[Columns]]
+Spiked = tuple[np.ndarray, np.ndarray, np.ndarray]  # pixel, fraction of the interval, whether ON
 
 BLOCK = 8  # frames; more of them have more active pixels, fewer pass more often over all pixels
 SALTED = 64 * BLOCK  # intervals whose salts are drawn at a time
-ACTIVE = 8192  # active pixels that are stepped at a time; their arrays stay in the cache
+# Active pixels that are stepped at a time, padded to one of these: the arrays of the most stay in
+# the cache, and the least is worth a call.
+ACTIVE = (2048, 4096, 8192)
 
 
 class Circuit(Protocol):
@@ -95,7 +98,7 @@ class _Blocks:
         buffer = next(self.buffers)
         np.stack(frames, out=buffer)
         # Only the frames are always read; jit passes over what a model has no use for.
-        return Block(buffer, (dt_us * 1e-6).astype(np.float32),
+        return Block(buffer, (dt_us * 1e-6).astype(np.float32), dt_us.astype(np.uint32),
                      self._clock(edges[0], dt_us), self._next_salts())
 
     def _clock(self, begin_us: int, dt_us: np.ndarray) -> np.ndarray:
@@ -133,13 +136,14 @@ class Thresholds(_Blocks):
         self, block: Block, dt_us: np.ndarray, after: PixelState, may_send: Array
     ) -> Fetch:
         sent, count = [], self.words.size
+        sizes: tuple[int, ...] = ACTIVE
         if self.model.timestamps == "v2e":  # its slots depend on all pixels
-            at, size = np.arange(count, dtype=np.int32), count
+            at, sizes = np.arange(count, dtype=np.int32), (count,)
         else:
-            at, size = np.flatnonzero(may_send).astype(np.int32), ACTIVE
-        for first in range(0, len(at), size):
-            some = at[first : first + size]
-            padded = np.full(size, count, np.int32)
+            at = np.flatnonzero(may_send).astype(np.int32)
+        for first in range(0, len(at), sizes[-1]):
+            some = at[first : first + sizes[-1]]
+            padded = np.full(next(n for n in sizes if n >= len(some)), count, np.int32)
             padded[: len(some)] = some
             after, out = active.step(self.model, self.whole, self.pixels, after, block, padded)
             sent.append((some, out))
@@ -147,11 +151,9 @@ class Thresholds(_Blocks):
         return partial(self._columns, sent, dt_us)
 
     def _columns(self, sent: list[tuple[np.ndarray, Sent]], dt_us: np.ndarray) -> list[Columns]:
-        def of(pixels: np.ndarray, out: Sent) -> Iterator[Columns]:
-            yield from pack.signal_columns(self.model, out, pixels, dt_us)
-            yield from pack.noise_columns(self.model, out.struck, pixels, self.words, dt_us)
-
-        return [part for pixels, out in sent for part in of(pixels, out)]
+        noise = (part for pixels, out in sent for part in pack.noise_columns(
+            self.model, out.struck, pixels, self.words, dt_us))
+        return [*pack.signal_columns(self.model, sent, dt_us), *noise]
 
 
 class Brownian(_Blocks):
@@ -169,19 +171,20 @@ class Brownian(_Blocks):
         for frames, edges in video:
             dt_us = np.diff(edges)
             struck = active.strike(self.model, self.whole, self.block(frames, edges))
-            signal = [self._interval(*each) for each in zip(
-                range(len(frames)), frames, dt_us.tolist(), strict=True)]
+            signal = [self._interval(*each) for each in zip(frames, dt_us.tolist(), strict=True)]
             yield partial(self._columns, signal, struck, dt_us)
 
-    def _interval(self, step: int, frame: np.ndarray, dt_us: float) -> Columns:
+    def _interval(self, frame: np.ndarray, dt_us: float) -> Spiked:
         self.voltage, pixel, fraction, on = voltmeter.fired(
             self.signal, self.count, self.model.voltmeter, self.camera, self.voltage, frame, dt_us)
         self.count += 1
-        return Columns(np.full(len(pixel), step), pixel, fraction, on, noise=False)
+        return pixel, fraction, on
 
     def _columns(
-        self, signal: list[Columns], struck: Struck | None, dt_us: np.ndarray
+        self, signal: list[Spiked], struck: Struck | None, dt_us: np.ndarray
     ) -> list[Columns]:
+        step = np.repeat(np.arange(len(signal)), [len(pixel) for pixel, _, _ in signal])
+        pixel, fraction, on = (np.concatenate(c) for c in zip(*signal, strict=True))
         everywhere = np.arange(self.words.size)
-        noise = pack.noise_columns(self.model, struck, everywhere, self.words, dt_us)
-        return [*signal, *noise]
+        return [pack.from_fractions(step, pixel, fraction, on, dt_us, noise=False),
+                *pack.noise_columns(self.model, struck, everywhere, self.words, dt_us)]

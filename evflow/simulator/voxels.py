@@ -18,7 +18,7 @@ import numpy as np
 
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
-from evflow.intensity import LOG_MAPS, normalised_intensity
+from evflow.intensity import LOG_MAPS, normalised_intensity, to_log
 from evflow.sensors import SensorModel
 from evflow.simulator import bins as weigh
 from evflow.simulator import noise, sensor, voltmeter
@@ -30,6 +30,7 @@ from evflow.voxel import BINS
 Array = jax.Array
 Weights = tuple[list[Array], list[Array]]  # (ON, OFF), one (N,) per touched bin
 
+MOST_LOG = 6.0  # more than the logarithm of 255 DN
 TILE = 8192  # pixels; their maps and grid, some 1.5 MB, are worked on at a time
 
 
@@ -37,7 +38,8 @@ def simulate_window(
     model: SensorModel, whole: Sensor, state: SimState, log_frames: Array,
     frame_dt_s: Array | float, bins: int,
 ) -> tuple[SimState, Array]:
-    """Advance through log_frames (T, H, W), T frames after the state's own, equally spaced.
+    """Advance through log_frames (T, H, W), T frames after the state's own, equally spaced: log
+    intensity, or bytes.
 
     Returns the state and the voxel grid (H, W, 2*bins) of the window of T intervals.
     """
@@ -95,7 +97,8 @@ def _scan(
     def body(
         carry: tuple[PixelState, Array], inputs: tuple[Any, ...]
     ) -> tuple[tuple[PixelState, Array], None]:
-        (pixels, grid), (log_i, low, offset, wide, salt, clock) = carry, inputs
+        (pixels, grid), (frame, low, offset, wide, salt, clock) = carry, inputs
+        log_i = _log(model, frame)
         i01 = sensor.i01_of(model, log_i)  # dropped by the compiler where nothing uses it
         dist = sensor.disturb(model, whole, i01, salt, dt)
         pixels, spikes = sensor.advance(
@@ -107,9 +110,14 @@ def _scan(
         return (pixels, weigh.add(grid, low, *weights)), None
 
     inputs = (log_frames, plan.low, plan.offset, plan.wide, salts, (clock[:-1], clock[1:]))
-    grid = jnp.zeros((2 * bins, count), log_frames.dtype)
+    grid = jnp.zeros((2 * bins, count), pixels.lp.dtype)
     pixels, grid = jax.lax.scan(body, (pixels, grid), inputs)[0]
     return pixels, grid.T
+
+
+def _log(model: SensorModel, frames: Array) -> Array:
+    """Log intensity of frames, which they hold unless they are bytes."""
+    return to_log(frames, model.log_map) if frames.dtype == jnp.uint8 else frames
 
 
 def _scan_brownian(
@@ -194,24 +202,26 @@ def simulate_voxels(
 ) -> Array:
     """Voxel grid of a video seen by a camera, on the device (Eq. 2).
 
-    log_frames: float32 (..., T, H, W) natural-log intensity in the map of `model.log_map`,
-    frame_dt_s seconds apart; the window is their span. camera: maps (H, W), or (..., H, W)
+    log_frames: float32 (..., T, H, W) natural-log intensity in the map of `model.log_map`, or
+    uint8 DN, which pass through that map on the way (and take a quarter of the memory);
+    frame_dt_s seconds apart, the window is their span. camera: maps (H, W), or (..., H, W)
     with the same leading axes. Returns float32 (..., H, W, 2*bins). One key serves all
     leading axes, split among them. Without leading axes the grid equals `simulate` followed
     by `voxelize` (same key, noise included) up to the microsecond rounding of event times.
     """
     model = model or SensorModel()
-    log_frames = jnp.asarray(log_frames, jnp.float32)
+    log_frames = jnp.asarray(log_frames)
+    if log_frames.dtype != jnp.uint8:
+        log_frames = log_frames.astype(jnp.float32)
     if log_frames.ndim < 3 or log_frames.shape[-3] < 2:
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
                               "Expected (..., T, H, W) with at least two frames.")
     if not 0 < frame_dt_s < math.inf or bins < 2:
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}, bins={bins}.",
                               "Need frame_dt_s > 0 and bins >= 2.")
-    known = not isinstance(log_frames, jax.core.Tracer)
-    if known and not _finite(np.asarray(log_frames)):
-        raise EvflowDataError("EV007", "log_frames holds NaN or infinite values.",
-                              "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")
+    known = not isinstance(log_frames, jax.core.Tracer) and log_frames.dtype != jnp.uint8
+    if known:
+        _check_light(np.asarray(log_frames))
     if camera.shape[-2:] != log_frames.shape[-2:]:
         raise EvflowDataError(
             "EV015", f"the camera is {camera.shape[-2:]}, the frames {log_frames.shape[-2:]}.")
@@ -229,10 +239,18 @@ def simulate_voxels(
                    bins=bins, lead=lead)
 
 
-def _finite(values: np.ndarray) -> bool:
-    """Whether all are; a sum tells in a third of the time, unless it overflows."""
+def _check_light(log_frames: np.ndarray) -> None:
+    """EV007 where not all is finite (a sum tells in a third of the time, unless it overflows),
+    EV003 where it cannot be a logarithm of DN."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
+        mean = log_frames.sum() / max(log_frames.size, 1)
+        if not (np.isfinite(mean) or np.isfinite(log_frames).all()):
+            raise EvflowDataError("EV007", "log_frames holds NaN or infinite values.",
+                                  "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")
+    if mean > MOST_LOG:
+        raise EvflowDataError(
+            "EV003", f"log_frames has a mean of {mean:.3g}, but white (255 DN) has 5.54.",
+            "Is it DN? Pass uint8, or take intensity.to_log first.")
 
 
 @partial(jax.jit, static_argnames=("frame_dt_s", "model", "bins", "lead"))
@@ -242,9 +260,11 @@ def _voxels(
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
         if model.kind != "voltmeter":
-            whole, state = sensor.start(key, frames[0], camera, model, nominal)
+            first = _log(model, frames[0])
+            whole, state = sensor.start(key, first, camera, model, nominal)
             return simulate_window(model, whole, state, frames[1:], frame_dt_s, bins)[1]
         key, signal = jax.random.split(key)
+        frames = _log(model, frames)
         whole, state = sensor.start(key, frames[0], camera, model, nominal)
         steps, *shape = frames.shape
         salts = noise.salts(state.key, jnp.arange(steps - 1))
