@@ -27,13 +27,21 @@ from evflow.files import atomic_write
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-from benchmarks import bench_estimate, bench_simulator, bench_train, bench_voxels, limits
+from benchmarks import (
+    bench_estimate,
+    bench_io,
+    bench_simulator,
+    bench_train,
+    bench_voxels,
+    limits,
+)
 from benchmarks.harness import Case, Record, Setting, compare, facts, isolated, measure
 
 SUBJECTS: dict[str, tuple[Case, ...]] = {
     "limits": limits.CASES,
     "simulator": bench_simulator.CASES,
     "voxels": bench_voxels.CASES,
+    "io": bench_io.CASES,
     "estimate": bench_estimate.CASES,
     "train": bench_train.CASES,
 }
@@ -44,7 +52,7 @@ class Options:
     """Time evflow on this machine, beside its limits and beside peers."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
-    """Subjects: simulator, voxels, estimate, train (default: all)."""
+    """Subjects: simulator, voxels, io, estimate, train (default: all)."""
     quick: bool = False
     """Tiny inputs, one repeat, one process: shows that it runs, times mean nothing."""
     out: Path | None = None

@@ -108,12 +108,14 @@ def split_rows(f: Any, setting: Setting) -> Any:
 
 
 def pixels_evflow(setting: Setting) -> Workload:
-    (params, note), (voxels, dlogI), known = network(setting), window(setting), known_summary()
-    return Workload(lambda: estimate_y(params, voxels, dlogI, window_s=WINDOW_S, summary=known),
+    (params, note), (voxels, dlogI) = network(setting), window(setting)
+    known = partial(estimate_y, window_s=WINDOW_S, summary=known_summary())
+    call = split_rows(known, setting) if setting.devices > 1 else known
+    return Workload(lambda: call(params, voxels, dlogI),
                     _work(params, dlogI.size, *PIXEL_PARTS), note)
 
 
-def pixels_torch(setting: Setting, rows: int | None) -> Workload:
+def pixels_torch(setting: Setting, rows: int | None, compiled: bool = False) -> Workload:
     import torch
 
     from benchmarks import peer_torch
@@ -125,9 +127,12 @@ def pixels_torch(setting: Setting, rows: int | None) -> Workload:
         voxels.reshape(n, -1), dlogI.reshape(n), np.zeros((n, 3), np.float32), y)]
     net = peer_torch.weights(next(iter(params.values())))
 
+    estimate = partial(peer_torch.estimate, config=config)
+    estimate = torch.compile(estimate, dynamic=False) if compiled else estimate
+
     def call() -> Any:
-        with torch.inference_mode():
-            return peer_torch.estimate_chunked(net, inputs, config, rows or n)
+        with torch.no_grad():
+            return peer_torch.in_chunks(estimate, net, inputs, rows or n)
 
     return Workload(call, _work(params, n, *PIXEL_PARTS), note)
 
@@ -172,11 +177,13 @@ def flow_torch(setting: Setting) -> Workload:
 
 CASES = (
     Case("estimate", "whole", "evflow", whole, splits=True),
-    Case("estimate", "pixels, given the summary", "evflow", pixels_evflow),
+    Case("estimate", "pixels, given the summary", "evflow", pixels_evflow, splits=True),
     Case("estimate", "pixels, given the summary", "torch, eager",
          partial(pixels_torch, rows=None), needs="torch"),
     Case("estimate", "pixels, given the summary", f"torch, {TORCH_ROWS} rows at a time",
          partial(pixels_torch, rows=TORCH_ROWS), needs="torch"),
+    Case("estimate", "pixels, given the summary", f"torch.compile, {TORCH_ROWS} rows at a time",
+         partial(pixels_torch, rows=TORCH_ROWS, compiled=True), needs="torch"),
     Case("estimate", "flow forward", "evflow, folded", partial(flow_evflow, folded=True),
          splits=True),
     Case("estimate", "flow forward", "evflow, folded, chunks of 1024",

@@ -7,6 +7,7 @@ usually written. `weights(params)` turns evflow's dict into tensors, so outputs 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from evflow.squash import CENTRE, SCALE
 
 Tensor = torch.Tensor
 Weights = dict[str, Any]
+THETA_SCALE, THETA_CENTRE = (torch.tensor(np.asarray(a[:2])) for a in (SCALE, CENTRE))
 
 
 def weights(params: Any) -> Weights:
@@ -78,7 +80,7 @@ def estimate(
 ) -> tuple[Tensor, Tensor]:
     """Encoder, flow and spread of the default architecture: voxels (N, 32), dlogI (N,), context
     (N, 3), summary y (N, 6) -> y (N, 4) and its standard deviation (N, 4)."""
-    theta = torch.exp(y[:, :2] * torch.tensor(SCALE[:2]) + torch.tensor(CENTRE[:2]))
+    theta = torch.exp(y[:, :2] * THETA_SCALE + THETA_CENTRE)
     seen = _pixel_features(voxels, dlogI, context)
     on, off = voxels.chunk(2, 1)
     on, off = on * theta[:, :1], off * theta[:, 1:]
@@ -95,12 +97,12 @@ def estimate(
     return residual + y[:, :4], spread
 
 
-def estimate_chunked(
-    net: Weights, inputs: list[Tensor], config: ModelConfig, rows: int
+def in_chunks(
+    estimate: Callable[..., tuple[Tensor, Tensor]], net: Weights, inputs: list[Tensor], rows: int
 ) -> tuple[Tensor, Tensor]:
     """`estimate` of [voxels, dlogI, context, y] a few rows at a time, so that activations stay
     in cache."""
-    parts = [estimate(net, voxels, dlogI, context, y, config) for voxels, dlogI, context, y
+    parts = [estimate(net, voxels, dlogI, context, y) for voxels, dlogI, context, y
              in zip(*(a.split(rows) for a in inputs), strict=True)]
     y, std = zip(*parts, strict=True)
     return torch.cat(y), torch.cat(std)

@@ -20,6 +20,10 @@ _HOME = {
     "SENSORS": "sensors",
     "SensorModel": "sensors",
     "Summary": "camera",
+    "Finding": "inspection",
+    "Report": "inspection",
+    "check": "inspection",
+    "linearised": "io.adjust",
     "read_events": "io",
     "read_recording": "io",
     "iter_windows": "io",
@@ -49,7 +53,9 @@ _HOME = {
     "unsquash": "model",
     "load_weights": "weights",
     "save_weights": "weights",
-    "CameraEstimate": "recording",
+    "compare": "metrics.streams",
+    "write_report": "report.camera",
+    "CameraEstimate": "camera_estimate",
     "estimate_camera": "recording",
 }
 

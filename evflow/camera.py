@@ -10,8 +10,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,8 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.errors import EvflowDataError
+from evflow.errors import EvflowDataError, naming
 from evflow.files import atomic_write
+from evflow.io.archives import load_npz
 
 Array = jax.Array
 
@@ -112,22 +111,23 @@ class Camera:
         if not path.is_file():
             raise EvflowDataError(
                 "EV016", f"no camera file at {path}.", "Make one: evflow estimate.")
-        try:
-            with open(path, "rb") as file:  # np.load leaves damaged archives open
-                data = np.load(file, allow_pickle=False)
-                if not isinstance(data, np.lib.npyio.NpzFile):
-                    raise EvflowDataError("EV008", f"{path} is one array, not an .npz of maps.",
-                                          "Expected a camera.npz written by Camera.save.")
-                missing = [n for n in PARAMETERS if n not in data]
-                if missing:
-                    raise EvflowDataError(
-                        "EV008", f"{path} holds {sorted(data)} but not {missing}.",
-                        "Expected a camera.npz written by evflow estimate or Camera.save.",
-                    )
-                maps = [jnp.asarray(data[n], jnp.float32) for n in PARAMETERS]
-        except (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
-            raise EvflowDataError("EV009", f"{path} is not a readable .npz ({e}).") from e
-        return Camera(*maps).validate()
+        with open(path, "rb") as file:
+            if file.read(6) == np.lib.format.MAGIC_PREFIX:
+                raise EvflowDataError("EV008", f"{path} is one array, not an .npz of maps.",
+                                      "Expected a camera.npz written by Camera.save.")
+        data = load_npz(path)
+        missing = [n for n in PARAMETERS if n not in data]
+        if missing:
+            raise EvflowDataError(
+                "EV008", f"{path} holds {sorted(data)} but not {missing}.",
+                "Expected a camera.npz written by evflow estimate or Camera.save.",
+            )
+        with naming(path):
+            for name in PARAMETERS:
+                if data[name].dtype.kind not in "fiu":
+                    raise EvflowDataError("EV009", f"{name} has dtype {data[name].dtype}.",
+                                          "Expected float32.")
+            return Camera(*(jnp.asarray(data[n], jnp.float32) for n in PARAMETERS)).validate()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,18 +10,30 @@ from typing import Annotated, Union
 
 import tyro
 
+from evflow.commands.check import Check
+from evflow.commands.compare import Compare
+from evflow.commands.convert import Convert
 from evflow.commands.estimate import Estimate
+from evflow.commands.export import Export
 from evflow.commands.info import Info
+from evflow.commands.render import Render
 from evflow.commands.simulate import Simulate
 from evflow.commands.version import Version
+from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
 
 RESOURCES = ("EV019",)
 
 Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these annotations
     Annotated[Info, tyro.conf.subcommand("info")],
+    Annotated[Check, tyro.conf.subcommand("check")],
     Annotated[Estimate, tyro.conf.subcommand("estimate")],
+    Annotated[Compare, tyro.conf.subcommand("compare")],
+    Annotated[Render, tyro.conf.subcommand("render")],
     Annotated[Simulate, tyro.conf.subcommand("simulate")],
+    Annotated[Convert, tyro.conf.subcommand("convert")],
+    Annotated[Voxel, tyro.conf.subcommand("voxel")],
+    Annotated[Export, tyro.conf.subcommand("export")],
     Annotated[Version, tyro.conf.subcommand("version")],
 ]
 

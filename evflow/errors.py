@@ -7,6 +7,9 @@ programming error, an `EvflowDataError` is something about the user's file or ar
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 CODES: dict[str, str] = {
     "EV001": "empty input",
     "EV002": "wrong shape",
@@ -28,6 +31,19 @@ CODES: dict[str, str] = {
     "EV018": "weights do not fit this version of the network",
     "EV019": "the disk is full or the output cannot be written",
     "EV020": "option out of range",
+    "EV021": "polarity inverted",
+    "EV022": "polarity lost",
+    "EV023": "wrong time unit",
+    "EV024": "frames and events not aligned",
+    "EV025": "a gap in the events",
+    "EV026": "the clock jumps",
+    "EV027": "saturated or black frames",
+    "EV028": "repeated frames",
+    "EV029": "frames mirrored",
+    "EV030": "frames dropped",
+    "EV031": "bit depth of the frames",
+    "EV032": "colour frames",
+    "EV033": "pixels far busier than their neighbours",
 }
 
 
@@ -45,3 +61,14 @@ class EvflowDataError(Exception):
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         """Pickled by its parts, so that it passes from process to process."""
         return type(self), (self.code, self.seen, self.fix)
+
+
+@contextlib.contextmanager
+def naming(path: object) -> Iterator[None]:
+    """Every message from the block names the file: `path` is put before those that do not."""
+    try:
+        yield
+    except EvflowDataError as e:
+        if str(path) in str(e):
+            raise
+        raise EvflowDataError(e.code, f"{path}: {e.seen}", e.fix) from e

@@ -12,18 +12,22 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from evflow import io, model, network
 from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.camera_estimate import CameraEstimate
 from evflow.config import PRESETS
 from evflow.errors import EvflowDataError
+from evflow.inspection.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.intensity import delta_log_intensity, lin_log
+from evflow.io.glitches import exposed
+from evflow.noise_only import estimate_noise
 from evflow.refine import (
     Chunk,
     dead_pixels,
@@ -42,50 +46,7 @@ from evflow.weights import load_weights
 Array = jax.Array
 Progress = Callable[[int, int], None]
 
-VALID_EVENTS = 3  # fewer events in the used windows say next to nothing about a pixel
 FEW_EVENTS = 200  # signal events per polarity below which a threshold is called undetermined
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class CameraEstimate:
-    """What was measured.
-
-    camera, std: maps (H, W) and their standard deviations; summary, summary_std: the camera's
-    medians and mismatch (scalars); valid: (H, W) bool, pixels with at least 3 events in the
-    windows used that are not hot; n_events: (H, W) uint32 events there; hot, dead: (H, W) bool,
-    pixels that fire by themselves, and pixels that never do amid others that do; windows: how
-    many were used; warnings: what to know before trusting it, a sentence each.
-    """
-
-    camera: Camera
-    std: Camera
-    summary: Summary
-    summary_std: Summary
-    valid: np.ndarray
-    n_events: np.ndarray
-    hot: np.ndarray
-    dead: np.ndarray
-    windows: int
-    warnings: tuple[str, ...]
-
-    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
-        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events."""
-        extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
-        return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
-                                n_events=self.n_events, hot=self.hot, dead=self.dead)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Summary, std and warnings as JSON-ready values."""
-        def floats(s: Summary) -> dict[str, float]:
-            return {k: float(v) for k, v in dataclasses.asdict(s).items()}
-
-        def places(mask: np.ndarray) -> list[list[int]]:
-            return [[int(x), int(y)] for y, x in np.argwhere(mask)]
-
-        return {"summary": floats(self.summary), "summary_std": floats(self.summary_std),
-                "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
-                "hot_pixels": places(self.hot), "dead_pixels": places(self.dead),
-                "windows": self.windows, "warnings": list(self.warnings)}
 
 
 def estimate_camera(
@@ -93,19 +54,24 @@ def estimate_camera(
     refine: Literal["auto", "off"] = "auto", min_window_us: int = 40_000,
     progress: Progress | None = None,
 ) -> CameraEstimate:
-    """Estimate a camera from a recording with frames.
+    """Estimate a camera from a recording with frames; of a static scene without frames its noise
+    alone (evflow/noise_only.py), thresholds undetermined.
 
     Windows run from frame to frame until at least min_window_us long. refine: "auto" simulates
     stretches of the recording with the estimate and corrects it, which takes the error of
     theta on held-out cameras from .022 to .011; "off" leaves it to the network alone.
-    progress(done, total) is called after every window.
-    Raises EV011, EV012, EV017 where the recording cannot tell, EV020 on a bad option.
+    progress(done, total) is called after every window. What usually goes wrong with a recording
+    is not looked for here: `check(recording).raise_if_failed()` before.
+    Raises EV011 (no frames, and the scene moves), EV012, EV017 where the recording cannot tell,
+    EV020 on a bad option.
     """
     if refine not in ("auto", "off"):
         raise EvflowDataError("EV020", f"refine={refine!r}.", 'Choose "auto" or "off".')
     recording = recording_or_path
     if not isinstance(recording, Recording):
         recording = io.read_recording(recording)
+    if not recording.has_frames:
+        return estimate_noise(recording)
     params = load_weights() if params is None else params
     plan = io.plan_windows(recording, min_window_us)
     total, done = 2 * len(plan.pairs), 0
@@ -118,27 +84,24 @@ def estimate_camera(
             if progress:
                 progress(done, total)
 
-    stats, n_events = _pool(params, windows())
+    stats, n_events, n_shown = _pool(params, windows())
     summary, summary_std = model.finish(params, stats)
     chunks = refinement_chunks(recording, plan.pairs) if refine == "auto" else []
     hot = np.zeros(n_events.shape, bool)
     if chunks:
         hot = hot_pixels(chunks, float(summary.eta_on + summary.eta_off))
-        chunks = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
-        fusion = next(iter(params.values())).get("fusion")
-        refined = refine_summary(chunks, summary, summary_std, fusion)
-        summary, summary_std = refined.summary, refined.std
+        summary, summary_std = _refined(params, chunks, hot, summary, summary_std)
     camera, std = _fuse(params, windows(), summary, summary_std)
     if chunks:
         camera, std = _with_regression(camera, std, chunks, summary, summary_std)
     dead = dead_pixels(n_events)
     return CameraEstimate(
-        camera, std, summary, summary_std, (n_events >= VALID_EVENTS) & ~hot, n_events, hot, dead,
+        camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         len(plan.pairs),
         (*_condensed(plan.skipped), *_warnings(stats, n_events, summary, hot, dead)))
 
 
-def window_inputs(window: Window) -> tuple[np.ndarray, Array, dict[str, Array | float]]:
+def window_inputs(window: Window) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
     """voxels (H, W, 32), dlogI (H, W) and conditions of one window of a recording."""
     voxels = voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
     intensity = 0.5 * (lin_log(window.frame0) + lin_log(window.frame1))
@@ -150,21 +113,47 @@ def pool_recording(
     params: model.Params, recording: Recording, min_window_us: int = 40_000
 ) -> tuple[model.Stats, np.ndarray]:
     """Summed Stats of all windows, and the events (H, W) in them."""
-    return _pool(params, io.iter_windows(recording, min_window_us))
+    return _pool(params, io.iter_windows(recording, min_window_us))[:2]
 
 
-def _pool(params: model.Params, windows: Iterator[Window]) -> tuple[model.Stats, np.ndarray]:
+def _pool(
+    params: model.Params, windows: Iterator[Window]
+) -> tuple[model.Stats, np.ndarray, np.ndarray]:
+    """Summed Stats of what the frames show, all events (H, W), and those that the frames show."""
     total: model.Stats | None = None
-    n_events: np.ndarray | None = None
+    n_events = n_shown = np.zeros(())
     for window in windows:
-        voxels, dlogI, given = window_inputs(window)
-        stats = model.summarize(params, voxels, dlogI, **given)
+        shown = exposed(window.frame0, window.frame1)
+        stats = _shown_stats(params, window, shown)
         counts = window.events.count_map().sum(0).astype(np.uint32)
         total = stats if total is None else total + stats
-        n_events = counts if n_events is None else n_events + counts
-    assert total is not None
-    assert n_events is not None  # iter_windows raises EV017 rather than yield nothing
-    return total, n_events
+        n_events, n_shown = n_events + counts, n_shown + counts * shown
+    assert total is not None  # iter_windows raises EV017 rather than yield nothing
+    if n_events.any() and not n_shown.any():
+        raise EvflowDataError(
+            "EV017", "no event happens where the frames are neither saturated nor black.",
+            "Expose the frames so that they show what moves.")
+    return total, n_events.astype(np.uint32), n_shown
+
+
+def _shown_stats(params: model.Params, window: Window, shown: np.ndarray) -> model.Stats:
+    """Stats of the pixels that are shown (H, W). The others are replaced by random ones of them
+    and the sums scaled down to their number: arrays of one shape are compiled once."""
+    voxels, dlogI, given = window_inputs(window)
+    share = float(shown.mean())
+    if 0 < share < 1:
+        rng = np.random.default_rng(window.index)
+        source = np.arange(shown.size)
+        source[~shown.ravel()] = rng.choice(np.flatnonzero(shown), int((~shown).sum()))
+
+        def filled(values: ArrayLike) -> np.ndarray:
+            pixels = np.asarray(values).reshape(shown.size, -1)
+            return pixels[source].reshape(np.shape(values))
+
+        voxels, dlogI = filled(voxels), filled(dlogI)
+        given["intensity"] = filled(given["intensity"])
+    stats = model.summarize(params, voxels, dlogI, **given)
+    return stats if share == 1 else jax.tree.map(lambda leaf: leaf * share, stats)
 
 
 def _fuse(
@@ -179,7 +168,8 @@ def _fuse(
     for window in windows:
         voxels, dlogI, given = window_inputs(window)
         y, s = model.estimate_y(params, voxels, dlogI, summary=summary, **given)
-        gained = jnp.maximum(s**-2.0 - prior_precision, 0.0)
+        shown = jnp.asarray(exposed(window.frame0, window.frame1))[..., None]
+        gained = jnp.where(shown, jnp.maximum(s**-2.0 - prior_precision, 0.0), 0.0)
         # A posterior mean is shrunk towards the prior; (gained) (x - prior) = s^-2 (y - prior)
         # is the window's own evidence x before shrinkage.
         weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
@@ -200,6 +190,15 @@ def refinement_chunks(
         return []
     usable = [i for first, last in pairs for i in range(first, last)]
     return [make_chunk(recording, run) for run in plan_chunks(recording, usable)]
+
+
+def _refined(
+    params: model.Params, chunks: list[Chunk], hot: np.ndarray, summary: Summary, std: Summary
+) -> tuple[Summary, Summary]:
+    """The summary and its std after refinement, without hot (H, W) pixels."""
+    used = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
+    refined = refine_summary(used, summary, std, next(iter(params.values())).get("fusion"))
+    return refined.summary, refined.std
 
 
 def _with_regression(
@@ -249,7 +248,7 @@ def _warnings(
                          "network was trained on: an extrapolation. Frames with a gamma or an "
                          "offset stretch the scale.")
     active = float((n_events >= VALID_EVENTS).mean())
-    if active < 0.05:
+    if active < ACTIVE_SHARE:
         found.append(f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
                      "elsewhere the maps show the camera's summary. Record more motion.")
     return found

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from importlib import resources
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import jax
@@ -43,6 +43,7 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
     params: Params = {}
     try:
         with safe_open(path, framework="numpy") as file:
+            _check_tensors(path, file)
             for name in file.keys():  # noqa: SIM118 - safe_open is no mapping
                 *parents, leaf = name.split("/")
                 node = params
@@ -52,6 +53,19 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
     except SafetensorError as e:
         raise EvflowDataError("EV009", f"{path} is not a readable safetensors file ({e}).") from e
     return params
+
+
+def _check_tensors(path: Path, file: Any) -> None:
+    """EV018 unless all are float32 and none has the name of a group of others."""
+    names = list(file.keys())
+    groups = {str(parent) for name in names for parent in PurePosixPath(name).parents}
+    for name in names:
+        kind = file.get_slice(name).get_dtype()
+        if kind != "F32" or str(PurePosixPath(name)) in groups:
+            raise EvflowDataError(
+                "EV018", f"{path}: {name} is of {kind}"
+                + (" and also a group of others." if kind == "F32" else "."),
+                "Expected float32 arrays, as save_weights writes them.")
 
 
 def save_weights(
@@ -69,5 +83,9 @@ def save_weights(
 
 def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
     """The card that was saved with the weights: command, seed, steps, data, figures."""
-    with safe_open(weights_path(name_or_path), framework="numpy") as file:
-        return json.loads((file.metadata() or {}).get("card", "{}"))
+    path = weights_path(name_or_path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return json.loads((file.metadata() or {}).get("card", "{}"))
+    except (SafetensorError, ValueError, RecursionError) as e:
+        raise EvflowDataError("EV009", f"{path} has no readable model card ({e}).") from e

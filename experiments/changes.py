@@ -1,18 +1,22 @@
-"""The conditional intensity-change encoder on simulated scenes (paper, Table XI).
+"""Intensity change: our encoder beside the filters (paper, Table XI and Fig. 15).
 
     python -m experiments.changes --preset full
+    python -m experiments.changes --recording ijrr/boxes_6dof --span-s 5 20   # IJRR, whole
 
-Frames give the change of a whole window; the encoder says how it came about. Scored is the mean
-absolute error of the change up to each of the window's 16 parts, in log units and in the paper's
-log_255 (1 = the whole range of 8 bits), for windows in which something happens; beside it what
-the frames alone say (a straight line between them) and the events alone at the camera's
-thresholds. The paper's .10 (AKF) and .06 (its encoder) are of real recordings, between adjacent
-frames, in units that it does not state.
+First, on windows of simulated scenes as in training, the mean absolute error of the change up to
+each of a window's 16 parts, by the encoder, by what the frames alone say (a straight line) and by
+the events alone at the camera's thresholds. Then whole recordings, real and simulated, where the
+asynchronous Kalman filter, the complementary filter and plain integration join in; what each
+protocol gives away is in change_systems.py. Errors are in natural-log units and in the paper's
+log_255 (1 = the whole range of 8 bits), signed and of the magnitude. The paper's .10 (AKF) and
+.06 (its encoder) are between adjacent frames of IJRR, in units that it does not state.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,21 +25,32 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from evflow import encode, load_weights
+from evflow import Recording, encode, load_weights, read_recording
 from evflow.batch import Batch, sample_batch
+from evflow.camera import CameraPrior
 from evflow.config import preset
+from evflow.intensity import lin_log
 from evflow.progress import bar
-from evflow.scenes import make_bank
+from evflow.report import plots
+from evflow.scenes import SceneConfig, make_bank
+from experiments import change_systems as systems
+from experiments.cameras import Protocol, hidden_recording
 from experiments.common import write_result
+from experiments.images import mean_ci
 
 Array = jax.Array
 LOG_255 = float(np.log(255.0))
 ACTIVE = 0.02  # log units: least mean absolute change of a window that counts
+HELD = ("ijrr_slider_depth", "newton_cradle_davis346.aedat4")
+FRAME_MS = 32  # of simulated recordings: 16 parts of 2 frames of the 1 kHz video
+MEASURES = ("log", "log_255", "magnitude", "fired")
+TITLES = {"next": "up to the next frame", "middle": "up to the held-out middle of three frames"}
+SHOWN = ("AKF", "AKF, latest frame", "complementary", "integration", "encoder")
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Score the intensity changes that the encoder predicts."""
+    """Score intensity changes."""
 
     weights: str = "default"
     preset: Literal["debug", "full"] = "debug"
@@ -43,6 +58,12 @@ class Options:
     seed: int = 7_000_003
     batches: int | None = None
     """Batches of 16 sequences (default: the preset's)."""
+    recording: tuple[Path, ...] = ()
+    """Recordings with frames (default: those under $EVFLOW_DATA)."""
+    span_s: tuple[float, float] | None = None
+    """Seconds of the recordings to use, from their first frame."""
+    seeds: int | None = None
+    """Simulated recordings (default: the preset's)."""
 
 
 def errors(params: Any, batch: Batch) -> dict[str, Array]:
@@ -66,8 +87,8 @@ def errors(params: Any, batch: Batch) -> dict[str, Array]:
         k: (jnp.abs(v - true).mean((1, 2, 3)) * active).sum() for k, v in found.items()}}
 
 
-def main(options: Options) -> dict[str, Any]:
-    params = load_weights(options.weights)
+def windows(options: Options, params: Any) -> dict[str, Any]:
+    """Errors over the windows of simulated scenes."""
     config = dataclasses.replace(preset("default"), windows=1)
     count = options.batches or {"debug": 2, "full": 40}[options.preset]
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))
@@ -79,15 +100,114 @@ def main(options: Options) -> dict[str, Any]:
             made = jax.device_get(step(jax.random.fold_in(k_data, i)))
             total = {k: total.get(k, 0.0) + float(v) for k, v in made.items()}
             progress(i + 1, count)
-    windows = total.pop("windows")
-    result = {k: {"log": v / windows, "log_255": v / windows / LOG_255} for k, v in total.items()}
-    lines = ["| change from | MAE, log units | MAE, log_255 |", "|---|---|---|"]
-    lines += [f"| {k} | {v['log']:.4f} | {v['log_255']:.4f} |" for k, v in result.items()]
-    text = "\n".join(lines) + f"\n\n{windows:.0f} windows. Paper: AKF .10, its encoder .06 (IJRR)."
+    found = total.pop("windows")
+    return {**{k: {"log": v / found, "log_255": v / found / LOG_255} for k, v in total.items()},
+            "windows": found}
+
+
+def recordings(options: Options) -> Iterator[tuple[str, Recording, np.ndarray | None]]:
+    """(name, recording, true log video between its frames): the real ones, then simulated ones of
+    as many cameras. debug: the first real one."""
+    full = options.preset == "full"
+    held = Path(os.environ.get("EVFLOW_DATA", "")) / "data/recordings"
+    there = [held / name for name in HELD if (held / name).exists()]
+    for path in options.recording or there[:None if full else 1]:
+        yield path.stem, systems.cut(read_recording(path), options.span_s), None
+    if options.recording:
+        return
+    k_bank, k_data = jax.random.split(jax.random.key(options.seed + 1))
+    bank = make_bank(k_bank, 96, photos=False)
+    protocol = Protocol(
+        prior=CameraPrior(theta=(0.1, 0.4), mismatch=(0.03, 0.03)), frame_ms=FRAME_MS,
+        scene=SceneConfig(speed_px_s=(40.0, 300.0), static_fraction=0.0, contrast=(0.5, 1.0)),
+        shape=(96, 128) if full else (48, 64))
+    for seed in range(options.seeds or (20 if full else 2)):
+        hidden = hidden_recording(jax.random.fold_in(k_data, seed), bank, protocol)
+        fine = hidden.kept[:-1, None] + np.arange(systems.PARTS + 1) * FRAME_MS // systems.PARTS
+        video = np.asarray(lin_log(hidden.video[fine.ravel()]))
+        yield "simulated", hidden.recording, video.reshape(*fine.shape, *video.shape[1:])
+
+
+def scored(scene: systems.Scene, params: Any) -> dict[str, dict[str, np.ndarray]]:
+    """Mean MEASURES (4,) of each protocol and system over a recording's intervals."""
+    rows: dict[str, dict[str, list[list[float]]]] = {}
+    for name, task in (("next", systems.next_frame), ("middle", systems.middle_frame)):
+        for true, made in task(scene, params):
+            fired = made["integration"][-1] != 0
+            for system, change in made.items():
+                row = rows.setdefault(name, {}).setdefault(system, [])
+                row.append(systems.errors(true[-1:], change[-1:], fired))
+                if len(true) > 1:
+                    rows.setdefault("path", {}).setdefault(system, []).append(
+                        systems.errors(true, change, fired))
+    return {task: {s: np.nanmean(found, 0) for s, found in row.items()}
+            for task, row in rows.items()}
+
+
+def picture(out: Path, scenes: list[tuple[str, systems.Scene]], params: Any) -> None:
+    """Fig. 15: a frame, the change to the held-out next one, and what every system says of it,
+    the median active interval of each recording."""
+    figure = plots.new_figure(2.6 * (len(SHOWN) + 2), 2.2 * len(scenes))
+    axes = figure.subplots(len(scenes), len(SHOWN) + 2, squeeze=False)
+    for row, (name, scene) in zip(axes, scenes, strict=True):
+        every = list(systems.middle_frame(scene, params))
+        sizes = [float(np.abs(true).mean()) for true, _ in every]
+        true, made = every[int(np.argsort(sizes)[len(sizes) // 2])]
+        row[0].imshow(scene.recording.frame_dn(scene.good[0]), cmap="gray", vmin=0, vmax=255)
+        row[0].set_title(name, fontsize=9)
+        for axis, (title, change) in zip(
+            row[1:], {"true change": true, **{s: made[s] for s in SHOWN}}.items(), strict=True
+        ):
+            error = np.abs(change[-1] - true[-1]).mean()
+            axis.imshow(change[-1], cmap="RdBu_r", vmin=-0.6, vmax=0.6, interpolation="nearest")
+            axis.set_title(title if change is true else f"{title}: {error:.3f}", fontsize=9)
+        for axis in row:
+            axis.set_axis_off()
+    plots.save_figure(figure, out)
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown: the windows, then each recording by each protocol."""
+    lines = ["**windows of simulated scenes, the whole path**\n",
+             "| change from | MAE, log units | MAE, log_255 |", "|---|---|---|"]
+    lines += [f"| {k} | {v['log']:.4f} | {v['log_255']:.4f} |"
+              for k, v in result.items() if k not in ("windows", "recordings")]
+    lines.append(f"\n{result['windows']:.0f} windows. Paper: AKF .10, its encoder .06 (IJRR), "
+                 ".18 and .13 (EVIMO2v2).")
+    for name, tasks in result["recordings"].items():
+        for task, rows in tasks.items():
+            what = TITLES.get(task, "up to 16 instants before the next frame")
+            lines += [f"\n**{name}, {what}**\n", "| change from | MAE, log units | MAE, log_255 | "
+                      "of magnitudes, log_255 | where integration says any, log units |",
+                      "|" + "---|" * 5]
+            for system, row in rows.items():
+                cells = [f"{row[m][0]:.4f}" + (f" ± {row[m][1]:.4f}" if row[m][1] else "")
+                         for m in MEASURES]
+                lines.append(f"| {system} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main(options: Options) -> dict[str, Any]:
+    plots.require()
+    params = load_weights(options.weights)
+    result = windows(options, params)
+    found: dict[str, list[dict[str, dict[str, np.ndarray]]]] = {}
+    shown: dict[str, systems.Scene] = {}
+    with bar("recordings") as progress:
+        for number, (name, recording, video) in enumerate(recordings(options), 1):
+            scene = systems.make_scene(params, recording, video)
+            found.setdefault(name, []).append(scored(scene, params))
+            shown.setdefault(name, scene)
+            progress(number, number)
+    result["recordings"] = {name: {task: {system: {
+        m: mean_ci(np.array([s[task][system][i] for s in scores]))
+        for i, m in enumerate(MEASURES)} for system in scores[0][task]} for task in scores[0]}
+        for name, scores in found.items()}
+    text = table(result)
     print(text)
-    write_result(options.out / "changes.json", {**result, "windows": windows},
-                 dataclasses.asdict(options))
+    write_result(options.out / "changes.json", result, dataclasses.asdict(options))
     (options.out / "changes.md").write_text(text + "\n")
+    picture(options.out / "changes.png", list(shown.items()), params)
     return result
 
 

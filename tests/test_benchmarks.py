@@ -31,10 +31,10 @@ QUICK = Setting(quick=True)
 RUN_FACTS = {"time", "platform", "python", "cpu", "cpus", "memory_gb", "load_before", "versions",
              "quick"}
 UNITS = {"simulator": {"frames", "events", "GB"}, "voxels": {"events", "GB"},
-         "estimate": {"frames", "GFLOP"}, "train": set()}
+         "io": {"events", "GB"}, "estimate": {"frames", "GFLOP"}, "train": set()}
 
 
-@pytest.mark.parametrize("subject", ["simulator", "voxels", "estimate",
+@pytest.mark.parametrize("subject", ["simulator", "voxels", "io", "estimate",
                                      pytest.param("train", marks=pytest.mark.slow)])
 def test_subject_yields_complete_records(subject: str, tmp_path: Path) -> None:
     out = tmp_path / "new" / "results.jsonl"
@@ -171,8 +171,9 @@ def test_torch_peer_is_the_same_network() -> None:
     n = dlogI.size
     y6 = torch.tensor(np.tile(np.asarray(unsquash_summary(summary)), (n, 1)))
     rows = torch.tensor(np.asarray(voxels)).reshape(n, -1)
-    theirs = peer_torch.estimate_chunked(
-        net, [rows, torch.tensor(np.asarray(dlogI)).reshape(n), torch.zeros(n, 3), y6], config, 100)
+    theirs = peer_torch.in_chunks(
+        functools.partial(peer_torch.estimate, config=config), net,
+        [rows, torch.tensor(np.asarray(dlogI)).reshape(n), torch.zeros(n, 3), y6], 100)
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(a.reshape(n, 4), b, rtol=2e-4, atol=2e-4)
     u = jax.random.normal(jax.random.key(1), (n, config.flow.condition))

@@ -21,7 +21,7 @@ from evflow.types import Events
 @pytest.mark.parametrize("pieces", [1, 7, 300])
 def test_dsec_layout_and_chunked_writing(tmp_path: Path, pieces: int,
                                          monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evflow.io.dsec.FLUSH", 500)
+    monkeypatch.setattr("evflow.io.writer.FLUSH", 500)
     events = make(3000, span=40_000).events
     cuts = np.linspace(T0, T0 + 40_000, pieces + 1).astype(int)
     with DsecWriter(tmp_path / "a.h5", SIZE) as out:

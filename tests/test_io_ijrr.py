@@ -31,7 +31,7 @@ def test_ijrr_text_in_microseconds_is_read_when_told(tmp_path: Path) -> None:
 def test_ijrr_blocks_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_ijrr(tmp_path, make())
     whole = read_recording(tmp_path)
-    monkeypatch.setattr("evflow.io.ijrr.BLOCK", 101)  # lines are 20 bytes: cut at every place
+    monkeypatch.setattr("evflow.io.text.BLOCK", 101)  # lines are 20 bytes: cut at every place
     equal(read_recording(tmp_path).events, whole.events)
     part = read_events(tmp_path, start_s=0.1, stop_s=0.2)
     first = int(whole.events.t[0])
@@ -40,19 +40,19 @@ def test_ijrr_blocks_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize(("text", "code", "seen"), [
     ("", "EV001", "no event"),
-    ("0.1 1 2 1\n0.2 1 2\n", "EV009", "line 2 is b'0.2 1 2'"),
-    ("0.1 1 2 1\n0.2 1 2 1\n0.3", "EV009", "line 3"),
-    ("0.1 1 2 1 7\n", "EV009", "line 1"),
-    ("0.1 a 2 1\n", "EV009", "line 1"),
+    ("0.1 1 2 1\n0.2 1 2\n", "EV009", "byte 10 of 18: the line b'0.2 1 2'"),
+    ("0.1 1 2 1\n0.2 1 2 1\n0.3", "EV009", "byte 20 of 23"),
+    ("0.1 1 2 1 7\n", "EV009", "byte 0"),
+    ("0.1 a 2 1\n", "EV009", "byte 0"),
     ("0.1 1 2 1\n" + "x" * 5_000_000, "EV009", "damaged"),
     ("0.1 1.5 2 1\n", "EV003", "undistorted"),
-    ("0.1 99999999999 2 1\n", "EV003", "x is"),
+    ("0.1 99999999999 2 1\n", "EV005", "x=99999999999"),
     ("0.1 1 2 0.5\n", "EV006", "p is 0.5"),
-    ("0.1 nan 2 1\n", "EV007", "x is nan"),
-    ("nan 1 2 1\n", "EV007", "not finite"),
-    ("1e300 1 2 1\n", "EV003", "more than int64"),
-    ("0.2 1 2 1\n0.1 1 2 1\n", "EV004", "go back"),
-    ("0.1 70 2 1\n", "EV005", "x 70..70"),
+    ("0.1 nan 2 1\n", "EV009", "b'0.1 nan 2 1'"),
+    ("nan 1 2 1\n", "EV009", "b'nan 1 2 1'"),
+    ("1e300 1 2 1\n", "EV003", "t is 1e+300"),
+    ("0.2 1 2 1\n0.1 1 2 1\n", "EV004", "goes back"),
+    ("0.1 70 2 1\n", "EV005", "x=70"),
     ("".join(f"{i} 1 2 1\n" for i in range(20)), "EV003", "time_unit='us'"),
 ])
 def test_ijrr_with_bad_text(tmp_path: Path, text: str, code: str, seen: str) -> None:
@@ -66,7 +66,8 @@ def test_ijrr_with_bad_text(tmp_path: Path, text: str, code: str, seen: str) -> 
     ("0.1 images/frame_00000000.png\n0.2 images/small.png\n", "EV015"),
     ("0.1 images/none.png\n", "EV016"), ("0.1 ../../secret.png\n", "EV008"),
     ("0.1 /etc/passwd\n", "EV008"), ("0.1\n", "EV009"), ("x images/a.png\n", "EV009"),
-    ("0.1 events.txt\n", "EV009"), ("0.1 images/a.png\n0.1 images/a.png\n", "EV004")])
+    ("0.1 events.txt\n", "EV009"), ("0.1 images/a.png\n0.1 images/b.png\n", "EV004"),
+    ("0.1 images/a.png\n0.2 images/a.png\n", "EV009")])
 def test_ijrr_with_bad_images(tmp_path: Path, index: str, code: str) -> None:
     write_ijrr(tmp_path, make(20, count=1))
     assert cv2.imwrite(str(tmp_path / "images/small.png"), np.zeros((2, 2), np.uint8))

@@ -14,13 +14,16 @@ import evflow
 ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
 FLOORS = (
-    ("errors", "checks", "files"), ("types", "progress", "distributed", "colour"), ("io",),
-    ("camera", "sensors", "metrics"), ("pixels", "intensity"), ("voxel",),
+    ("errors", "checks", "files", "pickles", "folders"),
+    ("types", "progress", "distributed", "colour"), ("io",),
+    ("camera", "camera_estimate", "sensors", "metrics"), ("pixels", "intensity"),
+    ("voxel", "inspection", "exports"),
     ("flow", "scenes", "simulator"),
     ("config",), ("squash", "dataset"),
     ("encoder", "summary", "refine"),
-    ("network", "losses", "batch"), ("model",), ("weights", "checkpoint"), ("train", "recording"),
-    ("baselines",), ("report",), ("commands",), ("cli",),
+    ("network", "losses", "batch", "noise_only"), ("model",), ("weights", "checkpoint"),
+    ("train", "recording"),
+    ("baselines", "downstream"), ("report",), ("commands",), ("cli",),
 )
 
 

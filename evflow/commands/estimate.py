@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from evflow.commands.options import Reading, write_json
 from evflow.errors import EvflowDataError
+
+if TYPE_CHECKING:
+    from evflow.recording import CameraEstimate
+    from evflow.types import Recording
+
+SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate warns of these itself
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -22,20 +29,26 @@ class Estimate(Reading):
     """
 
     recording: tyro.conf.Positional[Path]
-    """A recording with frames."""
+    """A recording with frames; of a static scene without frames the noise alone is measured."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Folder for camera.npz, camera.json and the pictures."""
+    """Folder for camera.npz, camera.json, the pictures and report.html."""
     weights: str = "default"
     """Name of released weights, or a .safetensors path."""
     window_ms: float = 40.0
     """Shortest window; windows run from frame to frame."""
     plots: bool = True
     """Write maps and histograms as PNG (needs matplotlib)."""
+    report: bool = True
+    """Write report.html: the recording re-simulated, a held-out half, in ten panels (needs
+    matplotlib; takes about as long as the estimate)."""
+    checks: bool = True
+    """Stop where `evflow check` finds errors."""
     overwrite: bool = False
     json: bool = False
     """Print the summary as JSON."""
 
     def run(self) -> None:
+        from evflow.inspection import check
         from evflow.progress import bar
         from evflow.recording import estimate_camera
         from evflow.report import plots
@@ -45,19 +58,39 @@ class Estimate(Reading):
         if (self.out / "camera.npz").exists() and not self.overwrite:
             raise EvflowDataError(
                 "EV013", f"{self.out / 'camera.npz'} exists.", "Pass --overwrite.")
-        if self.plots:
+        if self.plots or self.report:
             plots.require()
         recording = self.read(self.recording)
+        report = check(recording)
+        if self.checks:
+            report.raise_if_failed()
+        doubts = [str(f) for f in (*report.errors, *report.warnings) if f.code not in SAID_BELOW]
+        for doubt in doubts:
+            print(f"warning: {doubt}", file=sys.stderr)
         params = load_weights(self.weights)
         with bar("estimating") as progress:
             found = estimate_camera(
                 recording, params, min_window_us=round(self.window_ms * 1000), progress=progress)
+        found = dataclasses.replace(found, warnings=(*doubts, *found.warnings))
         found.save(self.out / "camera.npz", overwrite=self.overwrite)
-        facts = {**found.as_dict(), "recording": str(self.recording), "weights": self.weights,
+        facts = {**found.as_dict(), "recording": str(self.recording),
+                 "notes": list(recording.notes), "weights": self.weights,
                  "weights_steps": model_card(self.weights).get("steps")}
         write_json(self.out / "camera.json", facts)
         if self.plots:
             plots.camera_maps(found, self.out / "maps.png")
             plots.camera_histograms(found, self.out / "histograms.png")
+        if self.report:
+            self._report(found, recording)
         print(json.dumps(facts, indent=2) if self.json else describe(found))
         print(f"written to {self.out}/", file=sys.stderr)
+
+    def _report(self, found: CameraEstimate, recording: Recording) -> None:
+        from evflow.progress import bar
+        from evflow.report.camera import write_report
+
+        with bar("reporting") as progress:
+            write_report(
+                self.out / "report.html", found, recording, weights=self.weights,
+                source=self.recording, command=shlex.join(["evflow", *sys.argv[1:]]),
+                min_window_us=round(self.window_ms * 1000), overwrite=True, progress=progress)

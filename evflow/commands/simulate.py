@@ -6,11 +6,17 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
+from evflow.commands.writing import Format, named
 from evflow.errors import EvflowDataError
+
+if TYPE_CHECKING:
+    from evflow.io.frames import Frames
+    from evflow.io.writer import EventWriter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +32,12 @@ class Simulate:
     """A video file; a folder of images (png, jpg, tif, bmp, pgm; 8 or 16 bits); a stack of frames
     (.npy, .npz); or a recording, whose frames are used."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Output, HDF5 in the DSEC layout (.h5)."""
+    """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
+    aedat4, none (a folder) evreal."""
+    format: Format = "auto"
+    """Format of the output, where it is not what the extension stands for."""
+    frames_too: bool = False
+    """Write the video's frames beside the events: grey, at their own times."""
     camera: Path | None = None
     """camera.npz from evflow estimate; without it the thresholds below, or the sensor's own."""
     sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
@@ -86,11 +97,14 @@ class Simulate:
             frames = done
             progress(done, total)
 
-        with stoppable(), bar("simulating") as progress, io.DsecWriter(
-                self.out, source.size, overwrite=self.overwrite) as writer:
+        with stoppable(), bar("simulating") as progress, io.open_writer(
+                self.out, source.size, named(self.format), overwrite=self.overwrite) as writer:
             limit = self.max_motion_px if self.interpolate else 0.0
+            video = source.watched(shown)
+            if self.frames_too:
+                video = _recorded(video, self.colour, writer)
             pairs = as_seen(
-                source.watched(shown), self.colour, None if limit == 0 else lambda slow, pixel:
+                video, self.colour, None if limit == 0 else lambda slow, pixel:
                 upsample(slow, max_motion_px=pixel * limit, warn=source.notes.append))
             for events in simulate_stream(jax.random.key(self.seed), *unzip(pairs), camera,
                                           model=sensor):
@@ -98,10 +112,20 @@ class Simulate:
                 count += len(events)
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)
-        facts = {"out": str(self.out), "events": count, "frames": frames,
+        facts = {"out": str(self.out), "format": writer.NAME, "events": count, "frames": frames,
                  "sensor": self.sensor, "colour": self.colour, "notes": source.notes}
         print(json.dumps(facts) if self.json else
               f"{count:,} events of {frames:,} frames -> {self.out}")
+
+
+def _recorded(video: Frames, colour: str, writer: EventWriter) -> Frames:
+    """The frames on their way, each written as the pixels see it."""
+    from evflow.colour import as_seen
+
+    for frame, time in video:
+        seen, _ = next(as_seen(iter([(frame, time)]), colour))
+        writer.append_frames(seen[None], np.array([time]))
+        yield frame, time
 
 
 def _camera(command: Simulate, size: tuple[int, int]) -> Any:

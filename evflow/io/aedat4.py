@@ -1,8 +1,9 @@
 """AEDAT 4 (iniVation DV): events, and frames at mid-exposure, through the `aedat` package.
 
-The decoder aborts the whole process on a header that is not UTF-8 XML and panics on damaged
-packets; so the header is checked here first, and whatever the decoder raises becomes EV009 with
-the byte where it stopped. Damage behind `stop_s` does not matter.
+The decoder aborts the whole process on a header that is not UTF-8 XML, or nested too deeply, and
+on a packet that claims more than there is memory; it panics on damaged ones. So the header, and
+the size of each packet before it is decoded, are checked here first, and whatever the decoder
+raises becomes EV009 with the byte where it stopped. Damage behind `stop_s` does not matter.
 """
 
 from __future__ import annotations
@@ -12,20 +13,24 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.compressed import most_bytes
 from evflow.io.frames import stack_frames
 from evflow.io.hints import Hints
+from evflow.io.limits import FREE, RATIO
+from evflow.io.stream import Damage
 from evflow.types import Events, Recording
 
 NAME = "aedat4"
 EXTENSIONS: tuple[str, ...] = (".aedat4",)
 
 MAGIC = b"#!AER-DAT4.0\r\n"
-INFO_NODE = 2  # the XML is the third field of the header's flatbuffer table
+TABLE_POSITION, INFO_NODE = 1, 2  # fields of the header's flatbuffer table: i64, XML
+MAX_DEPTH = 64  # of the XML; DV writes 5
 LATE_US = 1_000_000  # frames lie behind the events of their time by less than this
 
 
@@ -39,7 +44,7 @@ def read(path: Path, hints: Hints) -> Recording:
     Raises EV008 (no event stream, or several), EV009 (damaged), EV010 (no `aedat`), and what
     `Events` and `Recording` raise.
     """
-    packets_start = _check_header(path)
+    packets_start, table = _check_header(path)
     streams = _decoder(path).id_to_stream()
     found = {kind: [i for i, s in streams.items() if s["type"] == kind]
              for kind in ("events", "frame")}
@@ -48,21 +53,27 @@ def read(path: Path, hints: Hints) -> Recording:
         raise EvflowDataError(
             "EV008", f"{path} holds the streams {{{kinds}}}.",
             "One event stream and at most one frame stream are read: export one camera alone.")
-    events, frames = _decode(path, packets_start, hints)
+    events, frames = _decode(path, packets_start, table, hints)
     info = streams[found["events"][0]]
     x, y, t, p = (np.concatenate([packet[n] for packet in events]) if events else np.zeros(0, int)
                   for n in ("x", "y", "t", "p"))
     t, size = hints.microseconds(t, "us"), hints.sensor((info["width"], info["height"]))
-    return hints.crop(_recording(path, Events(x, y, t, hints.on(p), size), frames, hints))
+    return hints.crop(_recording(path, hints.events(x, y, t, hints.on(p), size), frames, hints))
 
 
-def _decode(path: Path, packets_start: int, hints: Hints) -> tuple[list[Any], list[Any]]:
+def _decode(
+    path: Path, packets_start: int, table: int, hints: Hints
+) -> tuple[list[Any], list[Any]]:
     """The event packets (structured arrays) and the frames (dicts), up to `stop_s` or the end."""
     events: list[Any] = []
     frames: list[Any] = []
-    stop, last, count = np.iinfo(np.int64).max, 0, 0
+    stop, last, byte = np.iinfo(np.int64).max, 0, packets_start
     try:
-        for count, packet in enumerate(_decoder(path), 1):  # noqa: B007 (read on failure)
+        decoder = iter(_decoder(path))
+        for byte in _packets(path, packets_start, table):  # noqa: B007 (read on failure)
+            packet = next(decoder, None)
+            if packet is None:
+                break
             if len(packet.get("events", ())):
                 events.append(packet["events"])
                 last = hints.instant(events[-1]["t"][-1], "us")
@@ -76,66 +87,108 @@ def _decode(path: Path, packets_start: int, hints: Hints) -> tuple[list[Any], li
         raise
     except BaseException as e:  # a Rust panic derives from BaseException
         if last < stop:
-            raise _damaged(path, packets_start, count, events, len(frames), e) from e
+            byte = e.byte if isinstance(e, Damage) else byte
+            error = _damaged(path, byte, events, len(frames), e)
+            error.__cause__ = e
+            hints.forgive(error, len(events) > 0)
     return events, frames
 
 
 def _damaged(
-    path: Path, packets_start: int, count: int, events: list[Any], n_frames: int, e: BaseException
+    path: Path, byte: int, events: list[Any], n_frames: int, e: BaseException
 ) -> EvflowDataError:
-    """EV009 with the byte at which packet number `count` begins and what was read before it."""
-    position = next(
-        (offset for i, offset in enumerate(_offsets(path, packets_start)) if i == count), None)
-    place = f"at byte {position:,} of " if position is not None else "at the end of "
+    """EV009 with the byte at which the damaged packet begins and what was read before it."""
     n = sum(len(packet) for packet in events)
     us = int(events[-1]["t"][-1]) - int(events[0]["t"][0]) if events else 0
     until = us // 1000 / 1000  # rounded down: read with this stop_s, the file is sound
     return EvflowDataError(
-        "EV009", f"{path} is cut off or damaged {place}{os.path.getsize(path):,} bytes "
-        f"({e}); {n:,} events up to {until:.3f} s and {n_frames} frames before that are sound.",
-        f"Copy it again, or read the sound part: stop_s={until:.3f} (--stop)." if until else
-        "Copy it again.")
+        "EV009", f"{path} is cut off or damaged at byte {byte:,} of {os.path.getsize(path):,} "
+        f"bytes ({e}); {n:,} events up to {until:.3f} s and {n_frames} frames before that are "
+        "sound.",
+        f"Copy it again, or read the sound part: stop_s={until:.3f} (--stop), or --partial."
+        if until else "Copy it again.")
 
 
-def _offsets(path: Path, start: int) -> Iterator[int]:
-    """Where packets begin: each is {i32 stream, i32 size, size bytes}."""
+def _packets(path: Path, start: int, table: int) -> Iterator[int]:
+    """Where packets begin, each {i32 stream, i32 size, size bytes}, up to the table; then, for
+    ever, where they end. Damage at one that claims more than is left, or expands beyond measure:
+    the decoder would take that much memory."""
     total = os.path.getsize(path)
     with open(path, "rb") as f:
-        while start + 8 <= total:
-            yield start
+        while start + 8 <= total and start != table:
             f.seek(start + 4)
             size = int.from_bytes(f.read(4), "little", signed=True)
-            if size < 0:
-                return
+            if not 0 <= size <= total - start - 8:
+                raise Damage(start, f"a packet of {size:,} bytes where {total - start - 8:,} are "
+                             "left")
+            if (most := most_bytes(f.read(size))) > FREE + RATIO * size:
+                raise Damage(start, f"a packet of {size:,} bytes that expand to {most:,}")
+            yield start
             start += 8 + size
+    while True:
+        yield start
 
 
-def _check_header(path: Path) -> int:
-    """Return where the packets start; EV009 unless the header is a sound one."""
+def _check_header(path: Path) -> tuple[int, int]:
+    """Where the packets start, and where their table is (-1: nowhere); EV009 unless the header is
+    a sound one."""
     with open(path, "rb") as f:
         magic, size = f.read(len(MAGIC)), int.from_bytes(f.read(4), "little")
         header = f.read(min(size, os.path.getsize(path)))
     try:
         if magic != MAGIC or len(header) < size:
             raise ValueError("cut off" if MAGIC.startswith(magic[:13]) else "wrong version line")
-        ElementTree.fromstring(_info_node(header).decode("utf-8"))
-    except (ValueError, struct.error, ElementTree.ParseError) as e:
+        _check_xml(_info_node(header))
+        place = _field(header, TABLE_POSITION)
+        table = struct.unpack_from("<q", header, place)[0] if place else -1
+    except (ValueError, struct.error, expat.ExpatError) as e:
         raise EvflowDataError(
             "EV009", f"{path} has a damaged AEDAT4 header ({e}).", "Copy it again.") from e
-    return len(MAGIC) + 4 + size
+    return len(MAGIC) + 4 + size, table
+
+
+def _field(header: bytes, number: int) -> int:
+    """The byte of a field of the header's flatbuffer, root table -> vtable -> field; 0: absent."""
+    (table,) = struct.unpack_from("<I", header, 0)
+    vtable = table - struct.unpack_from("<i", header, table)[0]
+    if vtable < 0:
+        raise ValueError("its table lies before it")
+    if struct.unpack_from("<H", header, vtable)[0] < 6 + 2 * number:
+        return 0
+    (field,) = struct.unpack_from("<H", header, vtable + 4 + 2 * number)
+    return table + field if field else 0
 
 
 def _info_node(header: bytes) -> bytes:
-    """The XML string of the header's flatbuffer: root table -> vtable -> field -> string."""
-    (table,) = struct.unpack_from("<I", header, 0)
-    vtable = table - struct.unpack_from("<i", header, table)[0]
-    (field,) = struct.unpack_from("<H", header, vtable + 4 + 2 * INFO_NODE)
-    pointer = table + field
+    """The XML string of the header's flatbuffer."""
+    pointer = _field(header, INFO_NODE)
+    if not pointer:
+        raise ValueError("it has no description")
     string = pointer + struct.unpack_from("<I", header, pointer)[0]
     (length,) = struct.unpack_from("<I", header, string)
     if not 0 < length <= len(header) - string - 4:
         raise ValueError("its description is cut off")
     return header[string + 4 : string + 4 + length]
+
+
+def _check_xml(text: bytes) -> None:
+    """ValueError and ExpatError unless it is UTF-8 XML, of tags in tags to a bounded depth."""
+    depth = 0
+
+    def step(by: int) -> None:
+        nonlocal depth
+        depth += by
+        if depth > MAX_DEPTH:
+            raise ValueError(f"its description is nested more than {MAX_DEPTH} deep")
+
+    def refuse(*_: object) -> None:
+        raise ValueError("its description defines entities")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = lambda *_: step(1)
+    parser.EndElementHandler = lambda _: step(-1)
+    parser.StartDoctypeDeclHandler = refuse
+    parser.Parse(text.decode("utf-8"), True)
 
 
 def _decoder(path: Path) -> Any:

@@ -1,18 +1,20 @@
 """Reading and writing recordings: the registry of formats.
 
-A format is a module with a NAME, its EXTENSIONS, `sniff` and `read`, and `write` where it can;
-adding one is a new file and one entry in `FORMATS`. A file is recognised by its content, and by
-its extension only where several formats claim it. Whatever is wrong with a file comes out as an
-`EvflowDataError`.
+A format is a module with a NAME, its EXTENSIONS, `sniff` and `read`, and an `EventWriter` where it
+can be written; adding one is a new file and an entry in `FORMATS` and in `WRITERS`. A file is
+recognised by its content, and by its extension only where several formats claim it. Whatever is
+wrong with a file comes out as an `EvflowDataError`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any, Protocol
 
-from evflow.errors import EvflowDataError
+from evflow.checks import Size
+from evflow.errors import EvflowDataError, naming
 from evflow.io import (
     aedat2,
     aedat4,
@@ -32,6 +34,8 @@ from evflow.io import (
     v2e_text,
 )
 from evflow.io.hints import Hints
+from evflow.io.write_aedat4 import Aedat4Writer
+from evflow.io.writer import EventWriter, copy
 from evflow.types import Events, Recording
 
 HEAD = 4096  # bytes of a file that `sniff` sees
@@ -50,18 +54,15 @@ class Format(Protocol):
         """The recording, every hint obeyed; a file without frames gives an empty stack."""
 
 
-class Writer(Protocol):
-    """What a format module offers that can also write."""
-
-    def write(
-        self, path: str | os.PathLike, recording: Recording, *, overwrite: bool = False
-    ) -> None: ...
-
-
 FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
     aedat4, aedat2, evt2, evt3, dat, v2e, mvsec, event_utils, dsec, npz, evimo2, evreal, e2vid,
     v2e_text, ijrr, rosbag)
-WRITERS: dict[str, Writer] = {"dsec": dsec, "npz": npz}
+WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
+    dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
+    npz.NpzWriter, Aedat4Writer)}
+WRITTEN = {  # the format that an output's extension stands for, unless told otherwise
+    ".h5": "dsec", ".hdf5": "dsec", ".zip": "e2vid", ".txt": "e2vid", ".npz": "npz",
+    ".aedat4": "aedat4", "": "evreal"}
 
 
 def find_format(path: str | os.PathLike) -> Format:
@@ -69,8 +70,9 @@ def find_format(path: str | os.PathLike) -> Format:
     path = Path(path)
     try:
         head = b"" if path.is_dir() else _head(path)
-    except OSError as e:
-        raise EvflowDataError("EV016", f"{path} cannot be opened ({e.strerror}).") from e
+    except (OSError, ValueError) as e:  # ValueError: a NUL in the name
+        why = e.strerror if isinstance(e, OSError) and e.strerror else e
+        raise EvflowDataError("EV016", f"{path!s:.200} cannot be opened ({why}).") from e
     claims = [f for f in FORMATS if f.sniff(path, head)]
     claims.sort(key=lambda f: path.suffix.lower() not in f.EXTENSIONS)
     if claims:
@@ -87,7 +89,7 @@ def find_format(path: str | os.PathLike) -> Format:
 def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
     """Read events and frames of any known format; without frames the stack is (0, H, W).
 
-    hints: start_s, stop_s, time_unit, polarity, size (see `Hints`).
+    hints: start_s, stop_s, time_unit, polarity, size, partial, drop_outside (see `Hints`).
     Raises EV008 (unknown format), EV009 (damaged), EV010 (a package is missing), EV016 (not
     there), EV020 (unknown hint), and what `Events` and `Recording` raise.
     """
@@ -95,13 +97,17 @@ def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
     path = Path(path)
     found = find_format(path)
     try:
-        return found.read(path, told)
+        with naming(path):
+            recording = found.read(path, told)
     except MemoryError as e:
         raise EvflowDataError(
             "EV009", f"{path} asks for more memory than there is.",
             "If it is sound, read a part: start_s, stop_s (--start, --stop).") from e
     except OSError as e:
         raise EvflowDataError("EV009", f"{path} cannot be read ({e}).", "Copy it again.") from e
+    if not told.remarks:
+        return recording
+    return dataclasses.replace(recording, notes=(*recording.notes, *told.remarks))
 
 
 def read_events(path: str | os.PathLike, **hints: Any) -> Events:
@@ -116,17 +122,49 @@ def write_events(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write events, and the frames of a `Recording`, as "dsec" or "npz"; all or nothing.
+    """Write events, and the frames of a `Recording`, in one of `WRITERS`; all or nothing.
 
-    Raises EV010 (a package is missing), EV013 (exists), EV019 (cannot be written), EV020
-    (unknown format).
+    Raises EV003 (what the format cannot hold), EV010 (a package is missing), EV013 (exists),
+    EV019 (cannot be written), EV020 (unknown format, or one without frames for a recording with).
     """
-    if format not in WRITERS:
-        raise EvflowDataError("EV020", f"format={format!r}.", f"Choose from {sorted(WRITERS)}.")
     recording = events if isinstance(events, Recording) else Recording.of_events(events)
-    WRITERS[format].write(path, recording, overwrite=overwrite)
+    write_recording(path, recording, format, overwrite=overwrite)
+
+
+def write_recording(
+    path: str | os.PathLike,
+    recording: Recording,
+    format: str | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write events and frames; format None: what the extension stands for. Errors as above."""
+    with open_writer(path, recording.events.size, format, overwrite=overwrite) as out:
+        copy(recording, out)
+
+
+def open_writer(
+    path: str | os.PathLike, size: Size, format: str | None = None, *, overwrite: bool = False
+) -> EventWriter:
+    """A writer for events and frames in parts, to be used in a `with`; errors as above."""
+    return writer_of(path, format)(path, size, overwrite=overwrite)
+
+
+def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventWriter]:
+    """The writer of a format, None: of an output's extension; EV020 where there is none."""
+    if format is not None and format not in WRITERS:
+        raise EvflowDataError("EV020", f"format={format!r}.", f"Choose from {sorted(WRITERS)}.")
+    suffix = Path(path).suffix.lower()
+    if format is None and suffix not in WRITTEN:
+        kinds = ", ".join(f"{s or 'a folder'} ({name})" for s, name in WRITTEN.items())
+        raise EvflowDataError(
+            "EV020", f"the extension {suffix} of {path} stands for no format that can be written.",
+            f"Take one of {kinds}, or pass format (--format): {', '.join(WRITERS)}.")
+    return WRITERS[WRITTEN[suffix] if format is None else format]
 
 
 def _head(path: Path) -> bytes:
+    if path.exists() and not path.is_file():  # to open a pipe would wait for its writer
+        raise OSError("it is no regular file")
     with open(path, "rb") as f:
         return f.read(HEAD)

@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import bisect
 import contextlib
-import os
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
-from evflow.checks import Size, check_size, check_times
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
-from evflow.io.hdf5 import DAMAGE, MAGIC, Disk, load_h5py, need_filters, plausible
+from evflow.io import tables
+from evflow.io.hdf5 import DAMAGE, MAGIC, Hdf5Writer, load_h5py, plausible
 from evflow.io.hints import Hints
 from evflow.types import Events, Recording
 
@@ -28,8 +25,7 @@ NAME = "dsec"
 EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
 
 DSEC_SIZE = (640, 480)
-CHUNK = 1 << 16  # events per HDF5 chunk: 256 KiB of t
-FLUSH = 1 << 20  # events gathered before they are compressed
+FLUSH = 1 << 20  # events rewritten at a time where t widens
 INDEX_MS = 1 << 20  # milliseconds indexed at a time: 8 MiB, however long the camera was silent
 MAX_MS = 10**8  # 28 hours; beyond that two clocks were joined and ms_to_idx would not fit
 
@@ -57,127 +53,59 @@ def read(path: Path, hints: Hints) -> Recording:
             size = DSEC_SIZE
             if "width" in f.attrs:
                 size = int(f.attrs["width"]), int(f.attrs["height"])
-            offset = hints.instant(f["t_offset"][()], "us") if "t_offset" in f else 0
+            offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
             part, span = _range(columns["t"], offset, hints)
             x, y, t, p = (columns[name][part] for name in ("x", "y", "t", "p"))
             t = _shift(hints.microseconds(t, "us"), offset)
-            events = Events(x, y, t, hints.on(p), hints.sensor(size))
+            events = hints.events(x, y, t, hints.on(p), hints.sensor(size))
             if "frames" not in f:
                 return Recording.of_events(events)
-            times = hints.microseconds(plausible(path, f["frame_times"])[:], "us")
+            frames = tables.dataset(path, f, "frames", (None, None, None))
+            times = hints.microseconds(
+                tables.dataset(path, f, "frame_times", (len(frames),))[:], "us")
             keep = slice(*np.searchsorted(times, span))
-            return Recording(events, plausible(path, f["frames"])[keep], times[keep])
+            return Recording(events, frames[keep], times[keep])
     except DAMAGE as e:
         raise EvflowDataError(
             "EV009", f"{path} is cut off or damaged ({type(e).__name__}: {e}).",
             "Copy it again; h5ls and h5dump show what is left.") from e
 
 
-def write(path: str | os.PathLike, recording: Recording, *, overwrite: bool = False) -> None:
-    """Raises EV010 (no h5py), EV013 (exists), EV019 (cannot be written)."""
-    with DsecWriter(path, recording.events.size, overwrite=overwrite) as out:
-        out.append(recording.events)
-        if recording.has_frames:
-            out.append_frames(recording.frames, recording.frame_times)
+class DsecWriter(Hdf5Writer):
+    """Write events (and frames) chunk by chunk; t is u32 and widens to i64 past 71 minutes."""
 
+    NAME = NAME
+    offset_us: int | None = None
+    n_events = 0  # in the file
 
-class DsecWriter:
-    """Write events (and frames) chunk by chunk; the file appears when the block ends well.
+    def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
+        super()._open(temporary, stack)
+        self._file.attrs["width"], self._file.attrs["height"] = self.size
+        for name, dtype in (("x", "u2"), ("y", "u2"), ("p", "u1"), ("t", "u4")):
+            self._create(f"events/{name}", (), dtype, self.CHUNK)
+        self._create("ms_to_idx", (), "u8", self.CHUNK)
 
-    >>> with DsecWriter("out.h5", (346, 260)) as out:
-    ...     for events in simulate_stream(...):
-    ...         out.append(events)
+    def _finish(self) -> None:
+        self._file.create_dataset("t_offset", data=np.int64(self.offset_us or 0))
 
-    Nothing is left behind by an exception. t is u32 and widens to i64 past 71 minutes.
-    """
-
-    def __init__(self, path: str | os.PathLike, size: Size, *, overwrite: bool = False) -> None:
-        self.path, self.size, self.overwrite = Path(path), check_size(size), overwrite
-        self.offset_us: int | None = None
-        self.n_events = 0  # in the file
-        self._waiting: list[Events] = []
-        self._last_us = self._last_frame_us = np.zeros(0, np.int64)
-        self._stack = contextlib.ExitStack()
-        self._file: Any = None
-        self._disk: Disk
-
-    def __enter__(self) -> DsecWriter:
-        h5py = load_h5py()
-        with contextlib.ExitStack() as stack:
-            temporary = stack.enter_context(atomic_write(self.path, overwrite=self.overwrite))
-            self._disk = stack.enter_context(Disk(temporary, "w+"))
-            stack.callback(self._disk.check)
-            # HDF5 1.10 checksums its metadata: of 1,500 damaged files none passed for sound,
-            # where 24 did in the older layout.
-            self._file = stack.enter_context(h5py.File(self._disk, "w", libver=("v110", "v110")))
-            self._file.attrs["width"], self._file.attrs["height"] = self.size
-            for name, dtype in (("x", "u2"), ("y", "u2"), ("p", "u1"), ("t", "u4")):
-                self._create(f"events/{name}", (), dtype, CHUNK)
-            self._create("ms_to_idx", (), "u8", CHUNK)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, e: BaseException | None, tb: TracebackType | None
-    ) -> None:
-        if e is not None:
-            self._stack.__exit__(kind, e, tb)
-            return
-        with self._stack:
-            self._flush()
-            self._file.create_dataset("t_offset", data=np.int64(self.offset_us or 0))
-
-    def append(self, events: Events) -> None:
-        """Add events that follow those appended before; EV004 (order), EV015 (size)."""
-        if events.size != self.size:
-            raise EvflowDataError(
-                "EV015", f"events of size {events.size} for a file of size {self.size}.")
-        if len(events) == 0:
-            return
+    def _check(self, events: Events) -> None:
+        """EV004 where the events span more than ms_to_idx should."""
         if self.offset_us is None:
             self.offset_us = int(events.t[0])
-        check_times(np.append(self._last_us, events.t[:1]), "t", strict=False)
         span = int(events.t[-1]) - self.offset_us
         if span > MAX_MS * 1000:
             raise EvflowDataError(
                 "EV004", f"events span {span / 3.6e9:,.0f} hours.",
                 "Were recordings of different clocks joined?")
-        self._last_us = events.t[-1:]
-        self._waiting.append(events)
-        if sum(map(len, self._waiting)) >= FLUSH:
-            self._flush()
 
-    def append_frames(self, frames: np.ndarray, frame_times: np.ndarray) -> None:
-        """Add frames (T, H, W) at frame_times (T,) int64 us; what `Recording` raises."""
-        none = np.zeros(0, int)
-        part = Recording(Events(none, none, none, none, self.size), frames, frame_times)
-        check_times(np.append(self._last_frame_us, part.frame_times), "frame_times", strict=True)
+    def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
         if "frames" not in self._file:
-            self._create("frames", part.frames.shape[1:], part.frames.dtype, 1)
-            self._create("frame_times", (), "i8", CHUNK)
-        if self._file["frames"].dtype != part.frames.dtype:
-            raise EvflowDataError(
-                "EV003", f"frames of {part.frames.dtype} after {self._file['frames'].dtype}.",
-                "All frames of a recording have one dtype.")
-        self._last_frame_us = part.frame_times[-1:]
-        self._extend("frames", part.frames)
-        self._extend("frame_times", part.frame_times)
+            self._create("frames", frames.shape[1:], frames.dtype, 1)
+            self._create("frame_times", (), "i8", self.CHUNK)
+        self._extend("frames", frames)
+        self._extend("frame_times", times)
 
-    def _create(self, name: str, item: tuple[int, ...], dtype: Any, chunk: int) -> None:
-        self._file.create_dataset(
-            name, (0, *item), dtype, maxshape=(None, *item), chunks=(chunk, *item),
-            compression="gzip", compression_opts=1, shuffle=True)
-
-    def _extend(self, name: str, values: np.ndarray) -> None:
-        data = self._file[name]
-        data.resize(len(data) + len(values), axis=0)
-        data[len(data) - len(values) :] = values
-        self._disk.check()
-
-    def _flush(self) -> None:
-        if not self._waiting:
-            return
-        events, self._waiting = Events.concatenate(self._waiting), []
+    def _write(self, events: Events) -> None:
         t = events.t - self.offset_us
         self._widen(int(t[-1]))
         for name, values in (("x", events.x), ("y", events.y), ("p", events.p), ("t", t)):
@@ -198,7 +126,7 @@ class DsecWriter:
         if last_us < 2**32 or group["t"].dtype == np.int64:
             return
         group.move("t", "t_u32")
-        self._create("events/t", (), "i8", CHUNK)
+        self._create("events/t", (), "i8", self.CHUNK)
         for first in range(0, self.n_events, FLUSH):
             self._extend("events/t", group["t_u32"][first : first + FLUSH].astype(np.int64))
         del group["t_u32"]
@@ -212,14 +140,16 @@ def _columns(path: Path, f: Any) -> dict[str, Any]:
         raise EvflowDataError(
             "EV008", f"{path}: /events holds {sorted(group)} but not {missing}.",
             "Expected the DSEC layout: /events/{x, y, t, p}.")
-    columns = {name: group[name] for name in ("x", "y", "t", "p")}
-    shapes = {name: data.shape for name, data in columns.items()}
-    if len(set(shapes.values())) > 1 or len(shapes["t"]) != 1:
-        raise EvflowDataError(
-            "EV009", f"{path}: /events has columns of shapes {shapes}.", "Write the file again.")
-    for data in columns.values():
-        need_filters(path, plausible(path, data))
+    columns = {name: tables.dataset(path, group, name, (None,)) for name in ("x", "y", "t", "p")}
+    tables.same_length(path, columns)
     return columns
+
+
+def _scalar(path: Path, f: Any, name: str) -> Any:
+    """The one value of a data set of shape () or (1,); EV009."""
+    if getattr(f[name], "size", None) != 1:
+        raise EvflowDataError("EV009", f"{path}: {name} is no single number.", "Write it again.")
+    return plausible(path, f[name])[()]
 
 
 def _range(t: Any, offset: int, hints: Hints) -> tuple[slice, np.ndarray]:

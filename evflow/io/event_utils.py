@@ -8,6 +8,7 @@ without images the order in which all events fit.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io import tables
+from evflow.io.hdf5 import Hdf5Writer
 from evflow.io.hints import Hints
 from evflow.io.stream import gather
-from evflow.types import Recording
+from evflow.io.writer import FLUSH, SECONDS_US
+from evflow.types import Events, Recording
 
 NAME = "event_utils"
 EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
@@ -88,3 +91,48 @@ def _size(
             f"sensor_resolution {height}, {width} was taken as (width, height): events reach "
             f"x={reach[0]}, y={reach[1]}",)
     return (width, height), ()
+
+
+class EventUtilsWriter(Hdf5Writer):
+    """xs, ys int16 as their loaders want them; ts float64 s; ps bool. Every image has `timestamp`
+    and `event_idx`, the last event before it."""
+
+    NAME = NAME
+    MAX_SIDE = 2**15
+    TIMES_US = (-SECONDS_US, SECONDS_US)
+
+    def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
+        super()._open(temporary, stack)
+        self._on, self._first_s, self._image_s = 0, 0.0, np.zeros(0)
+        for name, dtype in zip(COLUMNS, ("i2", "i2", "f8", "?"), strict=True):
+            self._create(f"events/{name}", (), dtype, self.CHUNK)
+
+    def _write(self, events: Events) -> None:
+        seconds = events.t / 1e6
+        if not len(self._file["events/ts"]):
+            self._first_s = float(seconds[0])
+        for name, values in zip(COLUMNS, (events.x, events.y, seconds, events.p), strict=True):
+            self._extend(f"events/{name}", values)
+        self._on += int(events.p.sum())
+
+    def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
+        for frame, second in zip(frames, times / 1e6, strict=True):
+            image = self._file.create_dataset(
+                f"images/image{len(self._image_s):09d}", data=frame, chunks=frame.shape,
+                compression="gzip", compression_opts=1, shuffle=True)
+            image.attrs.update(size=frame.shape, timestamp=second, type="greyscale")
+            self._image_s = np.append(self._image_s, second)
+            self._disk.check()
+
+    def _finish(self) -> None:
+        ts, count = self._file["events/ts"], len(self._image_s)
+        before = np.zeros(count, np.int64)
+        for first in range(0, len(ts) if count else 0, FLUSH):
+            before += np.searchsorted(ts[first : first + FLUSH], self._image_s)
+        for index, events in enumerate(before):
+            self._file[f"images/image{index:09d}"].attrs["event_idx"] = max(events - 1, 0)
+        last_s = float(ts[-1]) if len(ts) else 0.0
+        self._file.attrs.update(
+            sensor_resolution=self.size[::-1], num_events=len(ts), num_pos=self._on,
+            num_neg=len(ts) - self._on, t0=self._first_s, tk=last_s,
+            duration=last_s - self._first_s, num_imgs=count, num_flow=0)

@@ -17,6 +17,7 @@ GLITCH_SHARE = 0.3  # of the pixels, all brighter or all darker: fast textures a
 OTHER_SHARE = 0.02
 EXPOSURE = 0.08  # log units: change that most pixels share
 ALIKE, ALIKE_SHARE = 0.05, 0.6  # log units, share of pixels
+SATURATED_DN, BLACK_DN = 252.0, 0.5  # a frame at either end hides what its pixel saw
 LIT_SHARE = 0.3  # of the pixels have events where the light itself changed
 
 
@@ -34,6 +35,11 @@ def faulty_frames(recording: Recording) -> tuple[dict[int, str], dict[int, str]]
             steps[i - 1] = (f"all of the frame changes by {np.expm1(shift):+.0%} and no events "
                             "say so (auto-exposure?)")
     return glitches, steps
+
+
+def exposed(*frames: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels that are neither saturated nor black in any of the frames (H, W), DN."""
+    return np.all([(frame > BLACK_DN) & (frame < SATURATED_DN) for frame in frames], axis=0)
 
 
 def _glitch(before: np.ndarray, frame: np.ndarray, after: np.ndarray) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from evflow.checks import Size, check_polarity, check_size
 from evflow.errors import EvflowDataError
-from evflow.types import Recording
+from evflow.types import Events, Recording
 
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 POLARITIES = ("auto", "01", "pm1", "invert")
@@ -29,7 +29,7 @@ def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
 
 def known(given: dict[str, Any], fields_of: type, who: str) -> dict[str, Any]:
     """`given`; EV020 where it names what is no field of the dataclass. who: takes its fields."""
-    names = [field.name for field in dataclasses.fields(fields_of)]
+    names = [field.name for field in dataclasses.fields(fields_of) if field.init]
     unknown = sorted(set(given) - set(names))
     if unknown:
         raise EvflowDataError(
@@ -47,6 +47,10 @@ class Hints:
     polarity: "auto" = {0, 1} or {-1, 1}, whichever it is; "01" and "pm1" insist; "invert"
         swaps ON and OFF.
     size: (width, height), overrides what the file says.
+    partial: of a damaged or cut-off file take what lies before the damage, where events are read
+        one after another (not HDF5, npz).
+    drop_outside: leave out events outside the sensor instead of refusing them.
+    remarks: what obeying these cost, a sentence each; grows while a file is read.
     """
 
     start_s: float | None = None
@@ -54,6 +58,9 @@ class Hints:
     time_unit: str = "auto"
     polarity: str = "auto"
     size: Size | None = None
+    partial: bool = False
+    drop_outside: bool = False
+    remarks: list[str] = dataclasses.field(default_factory=list, init=False, compare=False)
 
     def __post_init__(self) -> None:
         check_choices(self, time_unit=("auto", *UNITS_US), polarity=POLARITIES)
@@ -130,6 +137,23 @@ class Hints:
         on = check_polarity(p)
         return ~on if self.polarity == "invert" else on
 
+    def events(
+        self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, size: Size
+    ) -> Events:
+        """`Events` of columns (N,), those outside `size` left out where that was asked for."""
+        if self.drop_outside and len(x):
+            inside = within(x, y, size)
+            if not inside.all():
+                self.remarks.append(dropped(int((~inside).sum()), len(x), size))
+                x, y, t, p = (column[inside] for column in (x, y, t, p))
+        return Events(x, y, t, p, size)
+
+    def forgive(self, error: EvflowDataError, sound: bool) -> None:
+        """Raise the error, unless what is sound before the damage was asked for and is some."""
+        if not (self.partial and sound and error.code in ("EV004", "EV009")):
+            raise error
+        self.remarks.append(f"only the part before the damage was read (--partial): {error.seen}")
+
     def span_us(self, first_us: int) -> tuple[int, int]:
         """The absolute half-open range [start, stop) in us for a file that begins at first_us."""
         limits = np.iinfo(np.int64)
@@ -160,6 +184,17 @@ class Hints:
         return EvflowDataError(
             "EV001", f"no events between {self.start_s or 0:g} s and {stop}.",
             f"The recording covers 0.000 to {duration_us / 1e6:.3f} s.")
+
+
+def within(x: np.ndarray, y: np.ndarray, size: Size) -> np.ndarray:
+    """(N,) bool: which coordinates lie on a sensor of (width, height)."""
+    return (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
+
+
+def dropped(count: int, total: int, size: Size) -> str:
+    """The remark on events that were left out."""
+    return (f"{count:,} of {total:,} events lay outside {size[0]}x{size[1]} and were left out "
+            "(--drop-outside)")
 
 
 def _too_late(t: np.ndarray, unit: str) -> EvflowDataError:

@@ -7,30 +7,26 @@ data set does not say where in the exposure it lies. calib.txt, imu.txt and pose
 
 from __future__ import annotations
 
-import io
 import re
-import warnings
 import zipfile
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
-from evflow.checks import check_times
+from evflow.checks import Size, check_times
 from evflow.errors import EvflowDataError
-from evflow.io.frames import stack_frames
+from evflow.io import tables, text
+from evflow.io.archives import DAMAGE, unzipped
 from evflow.io.hints import Hints
 from evflow.io.images import decode
-from evflow.types import Events, Recording
+from evflow.io.stream import Chunk, gather
+from evflow.types import Recording
 
 NAME = "ijrr"
 EXTENSIONS: tuple[str, ...] = (".zip", ".txt", "")
 
 EVENTS, IMAGES = "events.txt", "images.txt"
-BLOCK = 1 << 22  # bytes of text parsed at a time, 150,000 lines
-MAX_LINE = 1000  # a longer one is not text
 
 Root = Path | zipfile.Path
 
@@ -42,7 +38,7 @@ def sniff(path: Path, head: bytes) -> bool:
         try:
             with zipfile.ZipFile(path) as archive:
                 return any(_is_events(name) for name in archive.namelist())
-        except (zipfile.BadZipFile, OSError, ValueError):
+        except DAMAGE:
             return path.suffix.lower() == ".zip"  # cut off: the extension decides
     lines = [line for line in head.split(b"\n") if line and not line.startswith(b"#")]
     return bool(lines) and re.fullmatch(
@@ -54,25 +50,24 @@ def read(path: Path, hints: Hints) -> Recording:
     looked for beside it).
 
     Raises EV008 (not that layout), EV009 (damaged text, image or zip), EV016 (an image is
-    missing), and what `Events` and `Recording` raise.
+    missing), and what `stream.gather` and `Recording` raise.
     """
     try:
         if path.is_dir():
-            return _read(path, EVENTS, hints)
+            return _read(path / EVENTS, path, EVENTS, hints)
         with open(path, "rb") as f:
             zipped = f.read(2) == b"PK"
         if not zipped:
-            return _read(path.parent, path.name, hints)
-        with zipfile.ZipFile(path) as archive:
+            return _read(path, path.parent, path.name, hints)
+        with unzipped(path) as archive:
             found = [PurePosixPath(name) for name in archive.namelist() if _is_events(name)]
             if len(found) != 1:
                 raise EvflowDataError(
                     "EV008", f"{path} holds {len(found)} recordings: {sorted(map(str, found))}.",
                     "Unpack it and pass one folder.")
             parent = "" if found[0].parent == PurePosixPath(".") else f"{found[0].parent}/"
-            return _read(zipfile.Path(archive, parent), EVENTS, hints)
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError,
-            ValueError) as e:
+            return _read(path, zipfile.Path(archive, parent), EVENTS, hints)
+    except ValueError as e:
         raise EvflowDataError("EV009", f"{path} is damaged ({e}).", "Copy it again.") from e
 
 
@@ -80,103 +75,37 @@ def _is_events(name: str) -> bool:
     return PurePosixPath(name).name == EVENTS and not name.startswith("__MACOSX")
 
 
-def _read(root: Root, name: str, hints: Hints) -> Recording:
-    text = root / name
-    table = _read_events(text, hints)
-    if hints.time_unit == "auto" and len(table) >= 10 and (table[:, 0] % 1 == 0).all():
-        raise EvflowDataError(
-            "EV003", f"{text}: all times are whole numbers ({table[0, 0]:.0f}, ...), not seconds.",
-            "Microseconds? Pass time_unit='us' (--time-unit us).")
-    t = hints.microseconds(table[:, 0], "s")
-    x, y, p = (_whole(text, table[:, i], n) for i, n in ((1, "x"), (2, "y"), (3, "p")))
+def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
+    """path: what messages name."""
     times, names = (_read_index(root / IMAGES, hints) if name == EVENTS
                     else (np.zeros(0, np.int64), []))
-    if not len(t) and not names and hints.size is None:
-        raise EvflowDataError("EV001", f"{text} holds no event.")
     size = _image(root, names[0]).shape[1::-1] if names else None
-    reach = (int(x.max()), int(y.max())) if len(x) else None
-    events = Events(x, y, t, hints.on(p), hints.sensor(size, reach=reach))
-    if len(t) and not hints.whole:  # decode only the images that `crop` will keep
-        keep = slice(*np.searchsorted(times, hints.span_us(int(t[0]))))
-        times, names = times[keep], names[keep]
+    with (root / name).open("rb") as f:
+        chunks = _in_seconds(path, text.events(f, (4,)), hints, size)
+        events, span = gather(path, chunks, hints, size, "s")
     if not names:
-        return hints.crop(Recording.of_events(events))
-    frames, notes = stack_frames([_image(root, n) for n in names], text)
-    notes = ("frame times are those of images.txt", *notes)
-    return hints.crop(Recording(events, frames, times, notes))
+        return Recording.of_events(events)
+    return tables.with_frames(
+        path, events, span, times, lambda keep: [_image(root, n) for n in names[keep]],
+        ("frame times are those of images.txt",))
 
 
-def _read_events(text: Root, hints: Hints) -> np.ndarray:
-    """The table t, x, y, p as float64 (N, 4), read until `stop_s`."""
-    tables, line, stop = [np.zeros((0, 4))], 1, np.inf
-    with text.open("rb") as f:
-        for block in _blocks(f):
-            rows = _parse(text, block, line)
-            line += block.count(b"\n")
-            if len(rows) and len(tables) == 1 and hints.stop_s is not None:
-                stop = hints.span_us(hints.instant(rows[0, 0], "s"))[1]
-            tables.append(rows)
-            if len(rows) and stop < np.inf and hints.instant(rows[-1, 0], "s") >= stop:
-                break
-    return np.concatenate(tables)
-
-
-def _blocks(f: Any) -> Iterator[bytes]:
-    """The file in pieces of whole lines."""
-    rest = b""
-    while chunk := f.read(BLOCK):
-        rest += chunk
-        end = rest.rfind(b"\n") + 1
-        if end:
-            yield rest[:end]
-            rest = rest[end:]
-        elif len(rest) > MAX_LINE:
-            raise ValueError(f"a line of more than {MAX_LINE} bytes is not text")
-    if rest:
-        yield rest
-
-
-def _parse(text: Root, block: bytes, line: int) -> np.ndarray:
-    """A block that begins at `line` as float64 (rows, 4); EV009 names the first bad line."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a block of comments holds no data
-            rows = np.loadtxt(io.StringIO(block.decode("ascii")), ndmin=2)
-        if rows.size == 0 or rows.shape[1] == 4:
-            return rows.reshape(-1, 4)
-    except ValueError:
-        pass
-    for number, content in enumerate(block.split(b"\n"), line):
-        fields = content.partition(b"#")[0].split()
-        if fields and not (len(fields) == 4 and all(map(_is_number, fields))):
+def _in_seconds(
+    path: Path, chunks: Iterable[Chunk], hints: Hints, size: Size | None
+) -> Iterator[Chunk]:
+    """The chunks; EV001 where there is neither event nor size, EV003 where the times of the first
+    are whole numbers, which seconds are not."""
+    seen = False
+    for chunk in chunks:
+        whole = not seen and len(chunk.t) >= 10 and bool((chunk.t % 1 == 0).all())
+        if whole and hints.time_unit == "auto":
             raise EvflowDataError(
-                "EV009", f"{text}, line {number:,} is {content[:60]!r}; expected t[s] x y p.",
-                "Cut off or damaged? Copy it again, or delete the last line if it is that one.")
-    raise EvflowDataError("EV009", f"{text} is not plain text near line {line:,}.")
-
-
-def _is_number(field: bytes) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
-
-
-def _whole(text: Root, column: np.ndarray, name: str) -> np.ndarray:
-    """A column of whole numbers as int64; EV003 (coordinates), EV006 (polarity), EV007 (NaN)."""
-    bad = ~np.isfinite(column)
-    if bad.any():
-        raise EvflowDataError(
-            "EV007", f"{text}: {name} is {column[bad][0]} at event {int(np.argmax(bad)):,}.")
-    bad = (column % 1 != 0) | (np.abs(column) > 2**31)
-    if bad.any():
-        raise EvflowDataError(
-            "EV006" if name == "p" else "EV003",
-            f"{text}: {name} is {column[bad][0]} at event {int(np.argmax(bad)):,}.",
-            "Expected 0 or 1." if name == "p" else
-            "Coordinates are raw integer pixels: were they undistorted? Use the raw ones.")
-    return column.astype(np.int64)
+                "EV003", f"{path}: all times are whole numbers ({chunk.t[0]:.0f}, ...), not "
+                "seconds.", "Microseconds? Pass time_unit='us' (--time-unit us).")
+        seen = seen or len(chunk.t) > 0
+        yield chunk
+    if not (seen or size or hints.size):
+        raise EvflowDataError("EV001", f"{path} holds no event.")
 
 
 def _read_index(index: Root, hints: Hints) -> tuple[np.ndarray, list[str]]:
@@ -188,13 +117,16 @@ def _read_index(index: Root, hints: Hints) -> tuple[np.ndarray, list[str]]:
         fields = content.partition(b"#")[0].split()
         if not fields:
             continue
-        if len(fields) != 2 or not _is_number(fields[0]):
+        if len(fields) != 2 or not text.is_number(fields[0]):
             raise EvflowDataError(
                 "EV009", f"{index}, line {number:,} is {content[:60]!r}; expected t[s] path.")
         seconds.append(float(fields[0]))
         names.append(fields[1].decode("utf-8"))
-    times = hints.microseconds(np.array(seconds), "s")
-    return check_times(times, str(index), strict=True), names
+    times = check_times(hints.microseconds(np.array(seconds), "s"), str(index), strict=True)
+    if len(set(names)) < len(names):  # each would be decoded: little text, much memory
+        raise EvflowDataError("EV009", f"{index} has {len(names):,} lines for {len(set(names)):,} "
+                              "images.", "Give each time its own image.")
+    return times, names
 
 
 def _image(root: Root, name: str) -> np.ndarray:

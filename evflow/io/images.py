@@ -12,6 +12,8 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.io.frames import FrameHints, Image
+from evflow.io.limits import check_expansion
+from evflow.io.pictures import claimed_bytes
 from evflow.io.times import read_times
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
@@ -84,15 +86,21 @@ def decode(file: Path | zipfile.Path) -> np.ndarray:
     import cv2
 
     try:
+        if not file.is_file():  # a pipe has no end
+            raise OSError(0, "it is no regular file")
         data = file.read_bytes()
     except OSError as e:
         raise EvflowDataError("EV016", f"{file} cannot be read ({e.strerror}).") from e
+    claimed = claimed_bytes(data)
+    if claimed is not None:
+        check_expansion(claimed, len(data), file)
     # OpenCV fills what is missing of a cut-off JPEG or PNG with grey and says nothing.
     jpeg, png = data.startswith(b"\xff\xd8"), data.startswith(b"\x89PNG")
     whole = not ((jpeg and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
                  or (png and b"IEND" not in data))
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        image = (None if claimed is None else
+                 cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
     except cv2.error:
         image = None
     if image is None or not whole:

@@ -6,22 +6,23 @@ Members are checked against the bytes that the archive really holds before memor
 
 from __future__ import annotations
 
-import math
-import os
+import contextlib
+import tempfile
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.io.archives import DAMAGE, load_npz
+from evflow.io.arrays import GrowingArray
 from evflow.io.hints import Hints
+from evflow.io.writer import EventWriter
 from evflow.types import Events, Recording
 
 NAME = "npz"
 EXTENSIONS: tuple[str, ...] = (".npz",)
-
-MAX_RATIO = 1040  # DEFLATE cannot expand by more than 1032
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -30,13 +31,13 @@ def sniff(path: Path, head: bytes) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError, ValueError):
+    except DAMAGE:
         return path.suffix.lower() in EXTENSIONS  # cut off: the extension decides
 
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises EV008 (a column is missing), EV009 (damaged), and what `Events` raises."""
-    arrays = _load(path)
+    arrays = load_npz(path)
     missing = [name for name in ("t", "x", "y", "p") if name not in arrays]
     if missing:
         raise EvflowDataError(
@@ -46,7 +47,8 @@ def read(path: Path, hints: Hints) -> Recording:
     x, y = arrays["x"], arrays["y"]
     reach = (int(x.max()), int(y.max())) if x.dtype.kind in "iu" and x.size and y.size else None
     size = hints.sensor(None if stored is None else tuple(stored.ravel().tolist()), reach=reach)
-    events = Events(x, y, hints.microseconds(arrays["t"], "us"), hints.on(arrays["p"]), size)
+    events = hints.events(
+        x, y, hints.microseconds(arrays["t"], "us"), hints.on(arrays["p"]), size)
     if "frames" not in arrays:
         return hints.crop(Recording.of_events(events))
     if "frame_times" not in arrays:
@@ -55,40 +57,40 @@ def read(path: Path, hints: Hints) -> Recording:
     return hints.crop(Recording(events, arrays["frames"], times))
 
 
-def write(path: str | os.PathLike, recording: Recording, *, overwrite: bool = False) -> None:
-    """Raises EV013 (exists), EV019 (cannot be written)."""
-    events = recording.events
-    arrays = {name: getattr(events, name) for name in ("t", "x", "y", "p")}
-    arrays["size"] = np.array(events.size, np.int32)
-    if recording.has_frames:
-        arrays |= {"frames": recording.frames, "frame_times": recording.frame_times}
-    with atomic_write(path, overwrite=overwrite) as temporary, open(temporary, "wb") as f:
-        np.savez_compressed(f, allow_pickle=False, **arrays)
+class NpzWriter(EventWriter):
+    """The columns grow as .npy files in a folder beside the output, which goes with them; at the
+    end they are compressed one after the other, and no array is ever in memory."""
 
+    NAME = NAME
 
-def _load(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of the archive by key; EV009 where any of them is damaged."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {info.filename.removesuffix(".npy"): _member(archive, info)
-                    for info in archive.infolist()}
-    except Exception as e:  # zip, zlib, NumPy's header parser, tokenize: a dozen kinds
-        raise EvflowDataError(
-            "EV009", f"{path} is not a sound .npz ({e or type(e).__name__}).",
-            "Copy or export it again; arrays of objects (pickles) are refused.") from e
+    def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
+        self._archive = stack.enter_context(zipfile.ZipFile(
+            temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1))
+        self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory(
+            prefix=f".{self.path.name}.", dir=self.path.parent)))
+        kinds = {"t": "i8", "x": "u2", "y": "u2", "p": "?"}
+        self._columns = {name: self._column(name, kind, stack) for name, kind in kinds.items()}
 
+    def _column(
+        self, name: str, dtype: Any, stack: contextlib.ExitStack, item: tuple[int, ...] = ()
+    ) -> GrowingArray:
+        return stack.enter_context(GrowingArray(self._folder / f"{name}.npy", dtype, item))
 
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    if not info.filename.endswith(".npy"):  # skipping it could lose the frames unseen
-        raise ValueError(f"{info.filename} is not an array")
-    if info.file_size > MAX_RATIO * info.compress_size + 1024:
-        raise ValueError(f"{info.filename} claims {info.file_size:,} bytes")
-    with archive.open(info) as f:
-        major = np.lib.format.read_magic(f)[0]
-        header = (np.lib.format.read_array_header_1_0 if major == 1
-                  else np.lib.format.read_array_header_2_0)
-        shape, _, dtype = header(f)
-    if math.prod(shape) * dtype.itemsize > info.file_size:
-        raise ValueError(f"{info.filename} is cut off: {dtype} {shape}")
-    with archive.open(info) as f:
-        return np.lib.format.read_array(f, allow_pickle=False)
+    def _write(self, events: Events) -> None:
+        for name in ("t", "x", "y", "p"):
+            self._columns[name].append(getattr(events, name))
+
+    def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
+        if "frames" not in self._columns:
+            for name, dtype, item in (("frames", frames.dtype, frames.shape[1:]),
+                                      ("frame_times", "i8", ())):
+                self._columns[name] = self._column(name, dtype, self._stack, item)
+        self._columns["frames"].append(frames)
+        self._columns["frame_times"].append(times)
+
+    def _finish(self) -> None:
+        for name, column in self._columns.items():
+            column.close()
+            self._archive.write(self._folder / f"{name}.npy", f"{name}.npy")
+        with self._archive.open("size.npy", "w") as f:
+            np.lib.format.write_array(f, np.array(self.size, np.int32))

@@ -15,6 +15,8 @@ from evflow.checks import Size
 MAX_HEADER = 1 << 16  # bytes; real ones have 200 to 600
 TEXT = re.compile(rb"%[ \t][\x20-\x7e\t]*\r?\n|%\r?\n")
 
+SIDE = re.compile(r"\d{1,5}")  # pixels
+
 SENSORS: tuple[tuple[str, Size], ...] = (  # found in plugin_name, sensor_name or generation
     (r"genx320", (320, 320)),
     (r"gen3|^3\.[01]$", (640, 480)),
@@ -43,12 +45,13 @@ class Header:
 
     def size(self) -> tuple[Size | None, tuple[str, ...]]:
         """(width, height) or None, and a note where it follows from the sensor's name."""
-        told = dict(re.findall(r"(width|height)=(\d+)", self.fields.get("format", "").lower()))
+        layout = self.fields.get("format", "").lower()
+        told = dict(re.findall(r"(width|height)=(\d{1,5})\b", layout))
         told = {key: self.fields[key] for key in ("width", "height") if key in self.fields} | told
-        pair = re.fullmatch(r"(\d+)x(\d+)", self.fields.get("geometry", ""))
+        pair = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.fields.get("geometry", ""))
         if pair:
             return (int(pair[1]), int(pair[2])), ()
-        if len(told) == 2 and all(value.isdecimal() for value in told.values()):
+        if len(told) == 2 and all(map(SIDE.fullmatch, told.values())):
             return (int(told["width"]), int(told["height"])), ()
         for key in ("sensor_name", "plugin_name", "generation", "sensor_generation"):
             name = self.fields.get(key, "").strip().lower()

@@ -10,9 +10,10 @@ others are named in a note.
 
 from __future__ import annotations
 
+import bz2
 import io
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,15 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io import evt3, stream, tables
 from evflow.io.hints import Hints
+from evflow.io.limits import RATIO, check_expansion
 from evflow.io.messages import EVENT_TYPES, IMAGE, Message, Packet
 from evflow.io.stream import Chunk, Clock, Damage, gather
 from evflow.types import Recording
 
 NAME = "rosbag"
 EXTENSIONS: tuple[str, ...] = (".bag",)
+
+CHUNK = 1 << 26  # bytes that a chunk may have; rosbag's own have 768 kB
 
 EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 CAER = np.dtype([("data", "<u4"), ("t", "<u4")])
@@ -135,6 +139,9 @@ class _Bag:
     def __enter__(self) -> _Bag:
         try:
             self.reader.open()
+            for place, chunk in self.reader.chunks.items():  # bombs are unpacked no further
+                unpack = _bounded(chunk.decompressor)
+                self.reader.chunks[place] = chunk._replace(decompressor=unpack)
         except Exception as e:
             raise self._damaged(e) from e
         return self
@@ -165,7 +172,7 @@ class _Bag:
     def messages(self, topic: str) -> Iterator[Message]:
         wanted = [c for c in self.reader.connections if c.topic == topic]
         source = self.reader.messages(connections=wanted)
-        index = 0
+        index = read = 0
         while True:
             try:
                 _, _, raw = next(source)
@@ -175,6 +182,8 @@ class _Bag:
                 raise
             except Exception as e:  # ReaderError, and what bz2, lz4 and struct raise
                 raise self._damaged(e) from e
+            read += len(raw)
+            check_expansion(read, os.path.getsize(self.path), f"the index of {self.path}")
             yield Message(bytes(raw), index)
             index += 1
 
@@ -218,6 +227,25 @@ class _Bag:
         return tables.with_frames(
             self.path, events, span, np.array(times, np.int64), lambda keep: images[keep],
             (*notes, f"frame times are the header times of {topic}"))
+
+
+def _bounded(unpack: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """The same for a chunk that expands within `limits`; ValueError for others."""
+    from lz4.frame import LZ4FrameDecompressor, decompress
+
+    makers: dict[Any, Any] = {bz2.decompress: bz2.BZ2Decompressor, decompress: LZ4FrameDecompressor}
+    if unpack not in makers:  # not compressed
+        return unpack
+
+    def bounded(data: bytes) -> bytes:
+        decoder = makers[unpack]()
+        out: bytes = decoder.decompress(data, max_length=CHUNK + RATIO * len(data))
+        if not decoder.eof:
+            raise ValueError(f"a chunk of {len(data):,} bytes that is cut off, or expands to more "
+                             f"than {len(out):,}")
+        return out
+
+    return bounded
 
 
 class _Bounded:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from evflow.errors import EvflowDataError
+from evflow.errors import EvflowDataError, naming
 from evflow.io.base import find_format, read_recording
 from evflow.io.frames import FrameHints, Frames, FrameSource, Image, converted, existing
 from evflow.io.images import open_folder
@@ -23,6 +23,11 @@ def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
     frames), EV020 (unknown hint; no times), and what the readers raise.
     """
     told, path = FrameHints.parse(hints), existing(path)
+    with naming(path):
+        return _open(path, told)
+
+
+def _open(path: Path, told: FrameHints) -> FrameSource:
     if is_stack(path):
         stack = open_stack(path, told)
         return _source(stack.size, len(stack.times_us), lambda: stack.images(told.partial), told,

@@ -11,17 +11,18 @@ import math
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.archives import DAMAGE, load_member, npy_header, unzipped
 from evflow.io.frames import FrameHints, Image
+from evflow.io.limits import check_expansion
 from evflow.io.times import read_times, to_us
 
 FRAMES = ("frames", "images", "imgs", "video", "arr_0")
 TIMES = ("frame_times", "timestamps", "times", "t")
-DAMAGE = (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError, SyntaxError)
 
 
 def is_stack(path: Path) -> bool:
@@ -30,9 +31,11 @@ def is_stack(path: Path) -> bool:
         return True
     if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
         return False
-    with zipfile.ZipFile(path) as archive:
-        names = {name.removesuffix(".npy") for name in archive.namelist()}
-    return not {"t", "x", "y", "p"} <= names
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return not {"t.npy", "x.npy", "y.npy", "p.npy"} <= set(archive.namelist())
+    except DAMAGE:
+        return True  # `open_stack` says why
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +76,7 @@ class Stack:
         done = 0
         try:
             with zipfile.ZipFile(self.path) as archive, archive.open(self.member) as f:
-                _header(f)
+                npy_header(f)
                 while done < self.shape[0]:
                     data = f.read(count * self.dtype.itemsize)
                     yield np.frombuffer(data, self.dtype, count).reshape(self.shape[1:])
@@ -91,10 +94,10 @@ def open_stack(path: Path, hints: FrameHints) -> Stack:
             stack, times = _open_npz(path)
         else:
             stack, times = _open_npy(path, hints.partial), None
-    except DAMAGE as e:
+    except (OSError, EOFError, ValueError) as e:
         raise EvflowDataError(
-            "EV009", f"{path} is not a sound NumPy file ({e or type(e).__name__}).",
-            "Copy or save it again; arrays of objects (pickles) are refused.") from e
+            "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
+            "Copy or save it again.") from e
     _check(stack)
     us, note = _times(stack, hints, times)
     return dataclasses.replace(stack, times_us=us, notes=(note,) if note else ())
@@ -111,7 +114,7 @@ def cut_off(path: object, read: int, promised: int, why: str) -> EvflowDataError
 
 def _open_npy(path: Path, partial: bool) -> Stack:
     with open(path, "rb") as f:
-        shape, fortran, dtype = _header(f)
+        shape, fortran, dtype = npy_header(f)
         offset = f.tell()
     frame = max(1, math.prod(shape[1:]) * dtype.itemsize)
     whole = min((path.stat().st_size - offset) // frame, shape[0] if shape else 0)
@@ -122,36 +125,25 @@ def _open_npy(path: Path, partial: bool) -> Stack:
 
 
 def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
-    with zipfile.ZipFile(path) as archive:
-        names = [name.removesuffix(".npy") for name in archive.namelist()]
+    with unzipped(path, streamed=[f"{name}.npy" for name in FRAMES]) as archive:
+        names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
         member = next((name for name in FRAMES if name in names), None)
         if member is None:
             raise EvflowDataError(
                 "EV008", f"{path} holds {sorted(names)} but no frames.",
                 f"Expected {', '.join(FRAMES)}; or t, x, y, p for a recording.")
         with archive.open(member + ".npy") as f:
-            shape, fortran, dtype = _header(f)
+            shape, fortran, dtype = npy_header(f)
         clock = next((name for name in TIMES if name in names), None)
         times = None
         if clock is not None:
-            with archive.open(clock + ".npy") as f:
-                times = np.lib.format.read_array(f, allow_pickle=False)
+            times = load_member(archive, archive.getinfo(clock + ".npy"))
     if fortran and len(shape) > 1:
         raise EvflowDataError(
             "EV009", f"{path} holds {member} in Fortran order, whose frames are not together.",
             "Save np.ascontiguousarray(frames).")
     stack = Stack(path, member + ".npy", shape, dtype, False, 0, np.zeros(0, np.int64), ())
     return stack, times
-
-
-def _header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    major = np.lib.format.read_magic(f)[0]
-    read: Any = (np.lib.format.read_array_header_1_0 if major == 1
-                 else np.lib.format.read_array_header_2_0)
-    shape, fortran, dtype = read(f)
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects")
-    return shape, fortran, dtype
 
 
 def _check(stack: Stack) -> None:
@@ -162,6 +154,9 @@ def _check(stack: Stack) -> None:
             "EV002", f"{stack.path} has shape {shape}.",
             "Channels come last: np.moveaxis(frames, 1, -1)." if first else
             "Expected frames (T, H, W), or (T, H, W, 3) in R, G, B.")
+    if stack.member:
+        check_expansion(math.prod(shape[1:]) * stack.dtype.itemsize, stack.path.stat().st_size,
+                        f"one frame of {stack.path}")
     if min(shape) == 0:
         raise EvflowDataError("EV001", f"{stack.path} holds frames of shape {shape}.")
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from evflow.checks import COLUMNS, RESET_US, Size
 from evflow.errors import EvflowDataError
-from evflow.io.hints import Hints
+from evflow.io.hints import Hints, dropped, within
 from evflow.types import Events, Recording
 
 CHUNK = 1 << 18  # bytes decoded at a time: the temporaries of 64k words stay in a core's cache
@@ -138,10 +138,11 @@ def gather(
             if len(chunk.t) and gathered.add(chunk):
                 break
     except Damage as e:
-        raise EvflowDataError(
+        error = EvflowDataError(
             "EV009", f"{path} is cut off or damaged at {_place(path, e.unit, e.byte)}: {e.seen}"
-            f"{gathered.so_far()}",
-            "Copy it again" + gathered.sound_part()) from e
+            f"{gathered.so_far()}", "Copy it again" + gathered.sound_part())
+        error.__cause__ = e
+        hints.forgive(error, gathered.kept > 0)
     return gathered.events(size), (gathered.start, gathered.stop)
 
 
@@ -151,7 +152,7 @@ class _Gathered:
     def __init__(self, path: Path, hints: Hints, size: Size | None, native: str) -> None:
         self.path, self.hints, self.size, self.native = path, hints, size, native
         self.columns: dict[str, list[np.ndarray]] = {name: [] for name in COLUMNS}
-        self.seen = self.kept = self.first = self.last = 0
+        self.seen = self.kept = self.first = self.last = self.outside = 0
         self.reach = (0, 0)
         self.start, self.stop = hints.span_us(0)
 
@@ -169,17 +170,35 @@ class _Gathered:
                 raise self._odd(chunk, "p", int(np.argmax((p < -1) | (p > 1))))
             p = p.astype(np.int8)
         chunk = chunk._replace(x=x, y=y, p=p)
+        if self.hints.drop_outside and self.size:
+            chunk, t = self._inside(chunk, t, self.size)
+            if not len(t):
+                return False
         wrong = self._first_wrong(chunk, t)
         self._keep(chunk, t[:wrong])
         if wrong < len(t) and self.last < self.stop:
-            raise self._wrong(chunk, t, wrong)
+            self.hints.forgive(self._wrong(chunk, t, wrong), self.kept > 0)
+            return True
         return self.last >= self.stop and self.kept > 0
+
+    def _inside(self, chunk: Chunk, t: np.ndarray, size: Size) -> tuple[Chunk, np.ndarray]:
+        """The events on the sensor alone."""
+        inside = within(chunk.x, chunk.y, size)
+        if inside.all():
+            return chunk, t
+        self.outside += int((~inside).sum())
+        kept = np.flatnonzero(inside)
+        return Chunk(chunk.x[kept], chunk.y[kept], chunk.t[kept], chunk.p[kept],
+                     lambda i: chunk.where(int(kept[i])), chunk.unit), t[kept]
 
     def _whole(self, chunk: Chunk, name: str) -> np.ndarray:
         """A column without fractions as integers or bool."""
         column: np.ndarray = getattr(chunk, name)
-        if column.dtype.kind != "f":
+        if column.dtype.kind in "biu":
             return column
+        if column.dtype.kind != "f":
+            raise EvflowDataError(
+                "EV003", f"{self.path}: {name} has dtype {column.dtype}.", "Expected numbers.")
         with np.errstate(invalid="ignore"):
             whole = column.astype(np.int64)  # of NaN and infinity some integer, not equal to them
         same = whole == column
@@ -252,11 +271,14 @@ class _Gathered:
 
     def sound_part(self) -> str:
         until = (self.last - self.first) // 1000 / 1000  # rounded down: up to it all is sound
-        return f", or read the sound part: stop_s={until:.3f} (--stop)." if until else "."
+        return (f", or read the sound part: stop_s={until:.3f} (--stop), or --partial."
+                if until else ".")
 
     def events(self, size: Size | None) -> Events:
         if self.seen and not self.kept:
             raise self.hints.empty(self.last - self.first)
+        if self.outside and self.size:
+            self.hints.remarks.append(dropped(self.outside, self.seen + self.outside, self.size))
         size = self.hints.sensor(size, reach=self.reach if self.seen else None)
         joined = {}
         for name, kind in KINDS.items():

@@ -57,7 +57,7 @@ def _parse(byte: int, block: bytes, widths: tuple[int, ...]) -> tuple[np.ndarray
         pass
     for content in block.split(b"\n"):
         fields = content.partition(b"#")[0].split()
-        if fields and widths and len(fields) in widths and all(map(_is_number, fields)):
+        if fields and widths and len(fields) in widths and all(map(is_number, fields)):
             widths = (len(fields),)
         elif fields:
             raise Damage(byte, f"the line {content[:60]!r} is not `t x y p` "
@@ -66,7 +66,8 @@ def _parse(byte: int, block: bytes, widths: tuple[int, ...]) -> tuple[np.ndarray
     raise Damage(byte, "what stands before is not plain text")
 
 
-def _is_number(field: bytes) -> bool:
+def is_number(field: bytes) -> bool:
+    """Is it a finite number?"""
     try:
         return bool(np.isfinite(float(field)))
     except ValueError:

@@ -1,7 +1,8 @@
 """Files of frame times: one time per line, alone, before or after the frame's name.
 
 Read are the layouts in use: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time`
-(DVS-Voltmeter), `index time`, with blanks, tabs, commas or semicolons between, and .npy arrays.
+(DVS-Voltmeter), `index time`, begin and end of the exposure (DSEC), of which the middle is taken;
+with blanks, tabs, commas or semicolons between; and .npy arrays.
 Lines that begin with # are comments. A unit written in a comment or header counts ("[ns]",
 "timestamp_us"); else the only one that makes the numbers a plausible video is taken and noted.
 """
@@ -16,6 +17,7 @@ import numpy as np
 
 from evflow.checks import check_times
 from evflow.errors import EvflowDataError
+from evflow.io.arrays import mapped
 from evflow.io.frames import existing
 from evflow.io.hints import UNITS_US, Hints
 
@@ -36,8 +38,7 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> T
     not clear), EV004 (not increasing), EV007 (NaN), EV016 (not there).
     """
     if existing(path).suffix == ".npy":
-        times, written = _load(path)
-        us, note = to_us(times, path, unit)
+        us, note = to_us(np.array(mapped(path, (None,))), path, unit)
         return us, [], note
     rows, written = _rows(path)
     times, labels = _columns(path, rows, names)
@@ -93,13 +94,6 @@ def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:
         f"Pass --time-unit {', '.join(UNITS_US)}.")
 
 
-def _load(path: Path) -> tuple[np.ndarray, str]:
-    try:
-        return np.load(path, allow_pickle=False), "auto"
-    except (OSError, ValueError, EOFError) as e:
-        raise EvflowDataError("EV009", f"{path} is not a sound .npy ({e}).") from e
-
-
 def _rows(path: Path) -> tuple[list[list[str]], str]:
     """The fields of every line with data, all of one length, and the unit written, or "auto"."""
     try:
@@ -138,15 +132,27 @@ def _columns(
              for column in columns]
     if sum(label) != 1:  # not the images at hand: a name is what is no number, or counts up
         label = [not all(map(_number, column)) or _counts(column) for column in columns]
-    if len(columns) != 2 or sum(label) != 1:
+    clock = [i for i, named in enumerate(label) if not named]
+    times = (_numbers(path, rows, clock[0]) if len(clock) == 1 else
+             _middle(path, rows, clock) if len(clock) == 2 else None)
+    if times is None or sum(label) > 1:
         raise EvflowDataError(
             "EV008", f"{path} has lines like {' '.join(rows[0])[:60]!r}; which column is the time?",
-            "Keep one time per line, or `time name`.")
-    which = label.index(True)
-    if all(map(str.isdecimal, columns[which])) and not set(columns[which]) <= set(known):
-        return _numbers(path, rows, 1 - which), []
-    tails = [PurePosixPath(f.replace("\\", "/")).name for f in columns[which]]
-    return _numbers(path, rows, 1 - which), [known.get(tail, tail) for tail in tails]
+            "Keep one time per line, `time name`, or begin and end of the exposure.")
+    named = columns[label.index(True)] if any(label) else ()
+    if all(map(str.isdecimal, named)) and not set(named) <= set(known):
+        return times, []
+    tails = [PurePosixPath(f.replace("\\", "/")).name for f in named]
+    return times, [known.get(tail, tail) for tail in tails]
+
+
+def _middle(path: Path, rows: list[list[str]], clock: list[int]) -> np.ndarray | None:
+    """Mid-exposure (T,) of columns of begin and end; None where they are something else."""
+    begin, end = (_numbers(path, rows, column) for column in clock)
+    if (end < begin).any() or (end[:-1] > begin[1:]).any():
+        return None
+    return begin + (end - begin) // 2 if begin.dtype == end.dtype == np.int64 else (
+        begin + 0.5 * (end - begin))
 
 
 def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
@@ -173,6 +179,6 @@ def _number(field: str) -> bool:
 
 def _counts(column: tuple[str, ...]) -> bool:
     """Whole numbers that count up by one: an index, not times (from 2 lines on)."""
-    if len(column) < 2 or not all(map(str.isdecimal, column)):
+    if len(column) < 2 or not all(f.isdecimal() and len(f) < 19 for f in column):
         return False
     return bool((np.diff(np.array([int(f) for f in column])) == 1).all())

@@ -11,7 +11,7 @@ import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -151,6 +151,8 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
             raise EvflowDataError("EV009", f"no frame of {path} can be decoded.", "Copy it again.")
         if not hints.partial and claimed > 1:
             _check_end(path, capture, claimed)
+        if not hints.partial:
+            _check_bytes(path)
     times, notes = None, []
     if hints.timestamps is not None:
         times, _, note = read_times(Path(hints.timestamps), hints.time_unit)
@@ -177,6 +179,38 @@ def _check_end(path: Path, capture: Any, claimed: int) -> None:
     lost = min(claimed - count, by_time) if last > 0 else claimed - count
     if lost > _slack(claimed):
         raise cut_off(path, count, claimed, REST)
+
+
+def _check_bytes(path: Path) -> None:
+    """EV009 where an AVI or an mp4 claims more bytes than the file has: OpenCV would fill the rest
+    of its last frame with grey."""
+    total = path.stat().st_size
+    with open(path, "rb") as f:
+        head = f.read(12)
+        if head.startswith(b"RIFF") and head[8:] == b"AVI ":
+            end = 8 + int.from_bytes(head[4:8], "little")
+        elif head[4:8] == b"ftyp":
+            end = _boxes_end(f, total)
+        else:
+            return
+    if end > total:
+        raise EvflowDataError(
+            "EV009", f"{path} ends {end - total:,} bytes early, at byte {total:,}.",
+            "Cut off: copy it again, or pass --partial (partial=True).")
+
+
+def _boxes_end(f: IO[bytes], total: int) -> int:
+    """Where the last box of an mp4 ends: {u32 size, name}, size 1: u64 size, 0: to the end."""
+    at = 0
+    while at + 8 <= total:
+        f.seek(at)
+        box = f.read(16)
+        size = int.from_bytes(box[:4], "big")
+        size = int.from_bytes(box[8:], "big") if size == 1 else size or total - at
+        if size < 8:
+            break
+        at += size
+    return at
 
 
 def _slack(claimed: int) -> float:

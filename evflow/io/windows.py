@@ -39,7 +39,7 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     """
     if operator.index(min_us) < 1:
         raise EvflowDataError("EV020", f"min_us={min_us}.", "A window takes 1 us or more.")
-    _check_overlap(recording)
+    check_overlap(recording)
     times = recording.frame_times
     start, stop = _covered(recording)
     late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
@@ -104,7 +104,8 @@ def _covered(recording: Recording) -> tuple[int, int]:
     return int(t[0]) - max(EDGE_US, first), int(t[-1]) + max(EDGE_US, last)
 
 
-def _check_overlap(recording: Recording) -> None:
+def check_overlap(recording: Recording) -> None:
+    """EV001 (no events), EV011 (fewer than two frames), EV012 (no common time)."""
     t, times = recording.events.t, recording.frame_times
     if len(t) == 0:
         raise EvflowDataError("EV001", "the recording has no events.")
@@ -116,4 +117,5 @@ def _check_overlap(recording: Recording) -> None:
     if times[-1] <= start or times[0] >= stop:
         raise EvflowDataError(
             "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but frames {times[0]:,}.."
-            f"{times[-1]:,} us.", "Are both on one clock and in one unit? See time_unit.")
+            f"{times[-1]:,} us.",
+            "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms.")

@@ -13,12 +13,12 @@ moves the estimate until the two agree. Each pixel is compared only after its fi
 its memory is known: nothing depends on what happened before the recording began.
 """
 
-from evflow.refine.faults import dead_pixels, hot_pixels
+from evflow.refine.faults import dead_pixels, fires_alone, hot_pixels
 from evflow.refine.fit import Refined, fused, refine_summary
 from evflow.refine.path import Chunk, make_chunk, plan_chunks
 from evflow.refine.pixels import pixel_posterior
 
 __all__ = [
-    "Chunk", "Refined", "dead_pixels", "fused", "hot_pixels", "make_chunk", "pixel_posterior",
-    "plan_chunks", "refine_summary",
+    "Chunk", "Refined", "dead_pixels", "fires_alone", "fused", "hot_pixels", "make_chunk",
+    "pixel_posterior", "plan_chunks", "refine_summary",
 ]

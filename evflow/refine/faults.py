@@ -16,8 +16,13 @@ def hot_pixels(chunks: list[Chunk], rate_hz: float) -> np.ndarray:
     """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
     happens in front of them; less than one in a million by chance."""
     events, seconds = np.sum([c.quiet for c in chunks], 0)
-    expected = HOT_FACTOR * rate_hz * seconds
-    return events > expected + 5.0 * np.sqrt(expected) + HOT_EVENTS
+    return fires_alone(events, rate_hz * seconds)
+
+
+def fires_alone(events: np.ndarray, expected: np.ndarray | float) -> np.ndarray:
+    """Where events exceed what a pixel's noise is expected to send, and by chance."""
+    most = HOT_FACTOR * np.asarray(expected)
+    return events > most + 5.0 * np.sqrt(most) + HOT_EVENTS
 
 
 def dead_pixels(n_events: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import itertools
 import numpy as np
 
 from evflow.intensity import lin_log
+from evflow.io.glitches import SATURATED_DN, exposed
 from evflow.refine.pixels import pixel_equations
 from evflow.refine.trace import Trace, trace_of_events
 from evflow.simulator.interpolate import Interpolator
@@ -31,7 +32,8 @@ class Chunk:
     bright: (H, W) bool, pixels whose frames are neither near black nor saturated; dt_s: (K,)
     interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
     equations: (7, H, W) of each pixel's regression, see pixels.py; quiet: (2, H, W) events in
-    intervals in which the pixel's path stays within QUIET, and their seconds.
+    intervals in which the pixel's path stays within QUIET, and their seconds. Intervals with a
+    saturated or black frame are in neither.
     """
 
     path: np.ndarray
@@ -44,7 +46,7 @@ class Chunk:
 
 
 QUIET = 0.05  # log units: less than the smallest threshold of any use
-DARK_DN, SATURATED_DN = 15.0, 252.0  # below, half a DN of noise is .03 in log; above, it clips
+DARK_DN = 15.0  # below, half a DN of noise is .03 in log
 
 
 def plan_chunks(recording: Recording, intervals: list[int]) -> list[list[int]]:
@@ -79,15 +81,18 @@ def make_chunk(recording: Recording, run: list[int], steps: int = STEPS) -> Chun
         motion.append(moved)
     stack, fine = np.stack(frames), np.asarray(lin_log(np.stack(path)))
     bright = (stack.min(0) >= DARK_DN) & (stack.max(0) <= SATURATED_DN)
+    shown = np.stack([exposed(*pair) for pair in itertools.pairwise(frames)])
     dt_s = np.diff(times).astype(np.float32) * 1e-6
     trace = trace_of_events(recording.events, times, steps)
     return Chunk(
         fine, bright, dt_s, np.array(motion, np.float32), trace,
-        pixel_equations(recording.events, times, fine, steps), _quiet(fine, trace, dt_s, steps))
+        pixel_equations(recording.events, times, fine, steps, shown),
+        _quiet(fine, trace, dt_s, shown))
 
 
-def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, steps: int) -> np.ndarray:
+def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    steps = (len(path) - 1) // len(dt_s)
     inner = path[1:].reshape(len(dt_s), steps, *path.shape[1:])
-    still = inner.max(1) - inner.min(1) < QUIET
+    still = (inner.max(1) - inner.min(1) < QUIET) & shown
     events = (np.asarray(trace.counts).sum(1) * still).sum(0)
     return np.stack([events, (dt_s[:, None, None] * still).sum(0)])

@@ -18,13 +18,16 @@ RANGE_ERROR = 0.2  # of the path's range in an interval: its error half-way betw
 PRIOR_COUNT = 3.0  # events' worth of belief in PATH_ERROR, against the residuals seen
 SHARED_ERROR = 4.0  # errors of neighbouring events go together: variance is this much larger
 PASSES = 3
+HIDDEN = 1e-9  # weight of an event whose brightness no frame shows: nothing, yet no 0 / 0
 
 
 def pixel_equations(
-    events: Events, times_us: np.ndarray, path: np.ndarray, steps: int
+    events: Events, times_us: np.ndarray, path: np.ndarray, steps: int,
+    shown: np.ndarray | None = None,
 ) -> np.ndarray:
     """Normal equations (7, H, W): sums of weighted aa, ab, bb, ay, by, yy about their means, and
-    the number of events; path (K*steps + 1, H, W) between the frames at times_us (K+1,)."""
+    the number of events; path (K*steps + 1, H, W) between the frames at times_us (K+1,). Events
+    of intervals that are not shown (K, H, W) count on, but are not regressed."""
     width, height = events.size
     used = events.slice(int(times_us[0]) + 1, int(times_us[-1]) + 1)
     n_pixels, k = height * width, len(times_us) - 1
@@ -43,6 +46,8 @@ def pixel_equations(
     inner = path[1:].reshape(k, steps, -1)
     span = (inner.max(1) - inner.min(1))[interval, pixel]
     weight = 1.0 / (1.0 + (RANGE_ERROR / PATH_ERROR * span) ** 2 * 4 * fraction * (1 - fraction))
+    if shown is not None:
+        weight *= np.where(shown.reshape(k, -1)[interval, pixel], 1.0, HIDDEN)
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     group = np.cumsum(np.diff(pixel, prepend=-1) != 0) - 1
 
@@ -55,7 +60,8 @@ def pixel_equations(
     a, b = np.cumsum(on), np.cumsum(1.0 - on)
     a, b, y = (centred(v) for v in (a - a[first][group], b[first][group] - b, y))
     sums = [total(weight * u * v) for u, v in ((a, a), (a, b), (b, b), (a, y), (b, y), (y, y))]
-    out[:, pixel[first]] = [*sums, total(np.ones_like(y))]
+    used_events = np.ones_like(y) if shown is None else shown.reshape(k, -1)[interval, pixel]
+    out[:, pixel[first]] = [*sums, total(used_events)]
     return out.reshape(7, height, width)
 
 

@@ -17,7 +17,8 @@ def describe(found: CameraEstimate) -> str:
     std = dataclasses.asdict(found.summary_std)
     lines = [f"{LABELS[name]:22} {float(value):7.3f} ± {float(std[name]):.3f}"
              for name, value in dataclasses.asdict(found.summary).items()]
-    lines.append(f"from {int(found.n_events.sum()):,} events in {found.windows} windows; "
-                 f"{found.valid.mean():.0%} of the pixels have events of their own")
+    events = f"from {int(found.n_events.sum()):,} events"
+    lines.append(f"{events} in {found.windows} windows; {found.valid.mean():.0%} of the pixels "
+                 "have events of their own" if found.windows else f"{events}, without frames")
     lines += [f"note: {warning}" for warning in found.warnings]
     return "\n".join(lines)

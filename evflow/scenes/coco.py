@@ -19,6 +19,8 @@ from evflow.errors import EvflowDataError
 from evflow.io.frames import existing
 from evflow.scenes.rle import decode_rle
 
+MAX_PIXELS = 1 << 28  # of an image: its mask takes a byte each
+
 
 @dataclasses.dataclass(frozen=True)
 class CocoObject:
@@ -113,6 +115,8 @@ def _objects(path: Path, data: dict[str, Any]) -> tuple[CocoObject, ...]:
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
                 raise EvflowDataError(
                     "EV020", f"{where} is {name}, which leaves the folder of the images.")
+            if min(size) < 1 or size[0] * size[1] > MAX_PIXELS:
+                raise ValueError(f"{size[0]}x{size[1]} pixels")
             image[entry["id"]] = name, size
         where = f"{path}, categories"
         names = {c["id"]: str(c["name"]) for c in data.get("categories", [])}
@@ -128,7 +132,7 @@ def _objects(path: Path, data: dict[str, Any]) -> tuple[CocoObject, ...]:
             found.append(CocoObject(
                 name, size, shape, float(entry.get("area", np.nan)),
                 names.get(entry.get("category_id"), ""), bool(entry.get("iscrowd", 0)), where))
-    except (KeyError, TypeError, ValueError, AttributeError) as e:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as e:
         raise EvflowDataError(
             "EV008", f"{where} lacks or misstates a field ({type(e).__name__}: {e}).",
             "Images need id, file_name, width, height; annotations image_id, segmentation.") from e

@@ -26,8 +26,9 @@ def decode_rle(counts: str | bytes | Sequence[int], shape: tuple[int, int],
     runs = (unpack_counts(counts, where) if isinstance(counts, str | bytes)
             else _listed(counts, where))
     height, width = shape
-    if (runs < 0).any():
-        raise EvflowDataError("EV009", f"{where} has a run of {runs.min()} pixels.", _FIX)
+    if (runs < 0).any() or (runs > height * width).any():  # the latter's sum could wrap around
+        odd = runs[(runs < 0) | (runs > height * width)][0]
+        raise EvflowDataError("EV009", f"{where} has a run of {odd} pixels.", _FIX)
     if runs.sum() != height * width:
         raise EvflowDataError(
             "EV009", f"{where} covers {runs.sum():,} pixels, its image {width}x{height} has "
@@ -59,7 +60,10 @@ def unpack_counts(text: str | bytes, where: str = "an RLE") -> np.ndarray:
 
 
 def _listed(counts: Sequence[int], where: str) -> np.ndarray:
-    runs = np.asarray(counts)
+    try:
+        runs = np.asarray(counts)
+    except ValueError:  # lists in a list
+        runs = np.zeros((), object)
     if runs.ndim != 1 or (runs.size and runs.dtype.kind not in "iu"):
         raise EvflowDataError(
             "EV003", f"{where} has runs of shape {runs.shape} and dtype {runs.dtype}.",

@@ -1,0 +1,38 @@
+"""The compared systems: other ways to tell a camera's thresholds and noise, one file each.
+
+    SYSTEMS["ecc median"].fit(recording) -> Fitted
+
+ecc.py least squares on frame differences · jaer.py gains that learn · s2r.py event rates ·
+match.py simulation of the same scene (resimulate.py) · noise_forms.py noise rates in closed form ·
+calibration.py and steps.py the paper's own ground truth (Section III-B). Written from the
+equations of the papers they name; where a published rule and the strongest fair reading differ,
+both are here.
+"""
+
+from evflow.baselines.base import Fitted, Solution, System
+from evflow.baselines.calibration import calibrate_static, calibrate_step
+from evflow.baselines.ecc import Ecc, EccEvents
+from evflow.baselines.jaer import Jaer
+from evflow.baselines.match import Match
+from evflow.baselines.noise_forms import v2e_noise, voltmeter_noise
+from evflow.baselines.s2r import S2r
+
+# By name, in the order of the table; an experiment is a loop over them.
+SYSTEMS: dict[str, System] = {
+    "ecc": Ecc(),
+    "ecc offset 40": Ecc(offset_dn=40.0),
+    "ecc median": Ecc("median"),
+    "ecc global": Ecc("global", span=1),
+    "ecc events": EccEvents(),
+    "s2r": S2r(),
+    "s2r same": S2r("same"),
+    "s2r same, per polarity": S2r("same", per_polarity=True),
+    "jaer": Jaer(),
+    "jaer normalised": Jaer(passes=100, normalised=True),
+    "match": Match(),
+}
+
+__all__ = [
+    "SYSTEMS", "Ecc", "EccEvents", "Fitted", "Jaer", "Match", "S2r", "Solution", "System",
+    "calibrate_static", "calibrate_step", "v2e_noise", "voltmeter_noise",
+]

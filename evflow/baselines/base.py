@@ -1,0 +1,135 @@
+"""What the compared systems share: the protocol, its result, and the data they all start from.
+
+A `System` is a frozen dataclass of its options; `fit` takes a recording and never fails for lack
+of data: what cannot be measured is marked invalid and holds a stated value, never NaN. Thresholds
+are in natural-log units of the lin-log map, as everywhere.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import THETA_MIN, Camera
+from evflow.errors import EvflowDataError
+from evflow.intensity import lin_log
+from evflow.io import plan_windows
+from evflow.refine.trace import trace_of_events
+from evflow.types import Recording
+
+UNKNOWN = 0.3  # log units: where nothing is known, the middle of the common range .1-.5
+THETA_MAX = 2.0  # log units: a factor of seven; beyond it a fit has run away
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a system says of a camera.
+
+    camera: maps (H, W), finite and positive everywhere; eta is 0 where a system measures none.
+    valid: (2, H, W) bool, ON and OFF: where the map was measured. theta: (2,) median thresholds
+    over the valid pixels, ON and OFF (of the whole map where there are none). seconds: it took.
+    notes: a sentence each.
+    """
+
+    camera: Camera
+    valid: np.ndarray
+    theta: np.ndarray
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def found(self) -> np.ndarray:
+        """(2,) bool: whether anything was measured, ON and OFF."""
+        return np.asarray(self.valid.any((1, 2)))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Solution:
+    """A system's own answer: theta (2, H, W), not yet checked; valid (2, H, W); eta (2,) in Hz."""
+
+    theta: np.ndarray
+    valid: np.ndarray
+    eta: tuple[float, float] = (0.0, 0.0)
+    notes: tuple[str, ...] = ()
+
+
+class System(abc.ABC):
+    """A way to tell a camera's thresholds from a recording; its options are its fields."""
+
+    @abc.abstractmethod
+    def solve(self, recording: Recording) -> Solution:
+        """The system's own answer; raises EvflowDataError where the recording cannot tell."""
+
+    def fit(self, recording: Recording) -> Fitted:
+        """Thresholds of a recording. A recording that cannot tell, a fit that diverges or leaves
+        [.01, 2] give a defined map that is not valid there."""
+        start = time.perf_counter()
+        width, height = recording.events.size
+        try:
+            solution = self.solve(recording)
+        except EvflowDataError as error:
+            solution = nothing((height, width), str(error))
+        theta = np.asarray(solution.theta, np.float32)
+        sound = np.isfinite(theta) & (theta >= THETA_MIN) & (theta <= THETA_MAX)
+        valid = solution.valid & sound
+        theta = np.clip(np.where(np.isfinite(theta), theta, UNKNOWN), THETA_MIN, THETA_MAX)
+        medians = [np.median(t[v] if v.any() else t) for t, v in zip(theta, valid, strict=True)]
+        eta = (jnp.full((height, width), e, jnp.float32) for e in solution.eta)
+        camera = Camera(*map(jnp.asarray, theta), *eta).validate()
+        return Fitted(camera, valid, np.array(medians), time.perf_counter() - start,
+                      solution.notes)
+
+
+def nothing(shape: tuple[int, int], note: str, theta: float = UNKNOWN) -> Solution:
+    """No answer: `theta` everywhere, valid nowhere."""
+    return Solution(np.full((2, *shape), theta, np.float32), np.zeros((2, *shape), bool),
+                    notes=(note,))
+
+
+def constant(
+    shape: tuple[int, int], theta: np.ndarray, found: np.ndarray, *notes: str,
+    eta: tuple[float, float] = (0.0, 0.0),
+) -> Solution:
+    """One threshold per polarity, theta (2,), for all pixels; found (2,): whether measured."""
+    maps = np.broadcast_to(np.asarray(theta, np.float32)[:, None, None], (2, *shape))
+    valid = np.broadcast_to(np.asarray(found, bool)[:, None, None], (2, *shape))
+    return Solution(maps, valid, eta, notes)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Interval:
+    """Between two neighbouring frames: counts (2, H, W) float32 of ON and OFF events, the log
+    frames (H, W) at its ends, and whether it begins where the one before ended."""
+
+    counts: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    continues: bool
+
+
+def usable(recording: Recording) -> list[int]:
+    """The intervals i (frame i to i + 1) that events cover and no fault spoils; raises EV001,
+    EV011, EV012 and EV017 where there are none."""
+    plan = plan_windows(recording, 1)
+    found = [i for first, last in plan.pairs for i in range(first, last)]
+    if not found:
+        raise EvflowDataError("EV017", f"no frame interval can be used ({plan.skipped[:2]}).")
+    return found
+
+
+def intervals(
+    recording: Recording, log: Callable[[np.ndarray], object] = lin_log
+) -> Iterator[Interval]:
+    """The usable intervals in time order, one in memory at a time; log maps DN to log units."""
+    last, after = -2, np.zeros(0)
+    for i in usable(recording):
+        continues = last == i - 1
+        before = after if continues else np.asarray(log(recording.frame_dn(i)))
+        after, last = np.asarray(log(recording.frame_dn(i + 1))), i
+        trace = trace_of_events(recording.events, recording.frame_times[i:i + 2], 1)
+        yield Interval(np.asarray(trace.counts)[0], before, after, continues)

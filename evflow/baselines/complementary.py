@@ -1,0 +1,62 @@
+"""The complementary filter: events high-passed, frames low-passed, added up.
+
+Scheerlinck, Barnes, Mahony, "Continuous-time Intensity Estimation Using Event Cameras" (ACCV
+2018): dx/dt = sum of p theta delta(t - t_i) - alpha (x - L_frame), the latest frame held. Between
+events x decays to the frame; the filter is linear, so a whole segment is one weighted sum, exactly:
+x(t1) = L + (x(t0) - L) e^(-alpha (t1 - t0)) + sum of p theta e^(-alpha (t1 - t_i)).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from evflow.baselines.reconstruction import Reconstructor, checked, log_of, segments, steps_of
+from evflow.camera import Camera
+from evflow.types import Events
+
+
+@dataclasses.dataclass(frozen=True)
+class Complementary(Reconstructor):
+    """Complementary filter.
+
+    cutoff_rad_s: alpha, above which events lead (published 2 pi). trust, margin: alpha falls to
+    `trust` of itself where the frame is darkest or brightest, from `margin` of its range of log
+    intensity on (published .1 and .05): clipped pixels say little. Before the first frame, or
+    without frames, the brightness of `start_dn` takes its place.
+    """
+
+    cutoff_rad_s: float = 2.0 * np.pi
+    trust: float = 0.1
+    margin: float = 0.05
+
+    def log_images(
+        self, events: Events, frames: np.ndarray, frame_times: np.ndarray, camera: Camera,
+        times: np.ndarray,
+    ) -> np.ndarray:
+        frames, frame_times, theta, times = checked(events, frames, frame_times, camera, times)
+        width, height = events.size
+        state = np.full(height * width, float(log_of(self.start_dn, self.offset_dn)))
+        shown, alpha = state, np.full(state.size, self.cutoff_rad_s)
+        images = np.zeros((len(times), height, width), np.float32)
+        for part in segments(events, frame_times, times):
+            if part.frame >= 0:
+                shown = np.asarray(log_of(frames[part.frame], self.offset_dn), np.float64).ravel()
+                alpha = self._alpha(shown)
+                state = shown if part.frame == 0 else state
+            pixel, step = steps_of(events, part.events, theta)
+            age_s = 1e-6 * (part.end_us - events.t[part.events])
+            kept = np.exp(-alpha * 1e-6 * (part.end_us - part.begin_us))
+            fresh = np.bincount(pixel, step * np.exp(-alpha[pixel] * age_s), state.size)
+            state = shown + (state - shown) * kept + fresh
+            images[part.images] = state.reshape(height, width)
+        return images
+
+    def _alpha(self, shown: np.ndarray) -> np.ndarray:
+        """alpha of each pixel: full inside the frame's range, less towards its ends."""
+        low, high = float(shown.min()), float(shown.max())
+        edge = self.margin * (high - low)
+        inside = np.minimum(shown - low, high - shown)
+        share = np.clip(inside / edge, 0.0, 1.0) if edge > 0 else np.ones_like(shown)
+        return self.cutoff_rad_s * (self.trust + (1.0 - self.trust) * share)

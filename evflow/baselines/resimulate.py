@@ -1,0 +1,119 @@
+"""A recording's own scene, simulated with any thresholds: what MATCH and S2R compare with.
+
+The path between the frames is motion-compensated, or given where the frames are a fast video. A
+camera is one row (theta_ON, theta_OFF, eta_ON, eta_OFF, sigma_ON, sigma_OFF); all rows see the
+same random numbers, so that their differences are the cameras'.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.baselines.base import usable
+from evflow.camera import THETA_MIN, Camera
+from evflow.errors import EvflowDataError
+from evflow.intensity import lin_log
+from evflow.recording import refinement_chunks
+from evflow.refine import Chunk, make_chunk
+from evflow.refine.noise import combined_rate, quiet_events
+from evflow.refine.path import STEPS
+from evflow.refine.pixels import pixel_equations
+from evflow.refine.trace import Trace, trace_of_camera
+from evflow.types import Recording
+
+Array = jax.Array
+
+Path = Literal["flow", "given"]
+BLOCK_US = 25_000  # of a given video: a typical frame interval, in which edges cross pixels
+TYPICAL_ETA, ETA_SPREAD = 0.1, 2.0  # Hz and relative std: held only where nothing is at rest
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """Stretches of a recording and the number of fine steps per frame interval; seen: (4, 2)
+    statistics of the recorded events, see `statistics`; eta: (2,) noise rates in Hz of what is at
+    rest."""
+
+    chunks: list[Chunk]
+    steps: int
+    seen: np.ndarray
+    eta: np.ndarray
+
+    def simulate(self, key: Array, rows: np.ndarray, fresh: float) -> np.ndarray:
+        """Statistics (V, 4, 2) of the cameras rows (V, 6); fresh: 1 where the memory starts at
+        the first frame's brightness, 0 where it may lie anywhere between the thresholds."""
+        start = jnp.asarray(fresh, jnp.float32)
+        made = [[_simulated(jax.random.fold_in(key, i), c.path, c.dt_s, c.bright, row,
+                            start if i == 0 else jnp.zeros_like(start), self.steps)
+                 for i, c in enumerate(self.chunks)] for row in jnp.asarray(rows, jnp.float32)]
+        return np.asarray(made, np.float64).sum(1)
+
+
+def scene_of(recording: Recording, path: Path, quiet: bool = True) -> Scene:
+    """The scene of a recording. quiet: measure the noise of what is at rest. Raises EV001, EV011,
+    EV012, EV017 as `plan_windows` does, and EV017 where the frames are too small for flow."""
+    found = usable(recording)
+    if path == "flow":
+        steps, chunks = STEPS, refinement_chunks(recording, tuple((i, i + 1) for i in found))
+    else:
+        between = np.median(np.diff(recording.frame_times))
+        steps = int(np.clip(round(BLOCK_US / between), 1, len(recording.frames) - 1))
+        chunks = [_given(recording, run, steps) for run in _runs(found) if len(run) >= steps]
+    if not chunks:
+        raise EvflowDataError("EV017", "the frames are too small for optical flow.",
+                              'Give the video between them: path="given".')
+    seen = np.sum([statistics(c.recorded, c.bright) for c in chunks], 0, np.float64)
+    eta = np.zeros(2)
+    if quiet:
+        events = np.sum([quiet_events(c, steps) for c in chunks], 0)
+        eta = combined_rate(events, np.full(2, TYPICAL_ETA), np.full(2, ETA_SPREAD))
+    return Scene(chunks, steps, np.asarray(seen), eta)
+
+
+def _given(recording: Recording, run: list[int], steps: int) -> Chunk:
+    """A run of intervals of a fast video as one chunk, whose frames are every `steps`-th one and
+    whose path is the video."""
+    index = np.arange(run[0], run[0] + len(run) // steps * steps + 1)
+    events, times = recording.events, recording.frame_times[index[::steps]]
+    coarse = Recording(events, recording.frames[index[::steps]], times)
+    chunk = make_chunk(coarse, list(range(len(times) - 1)), steps)
+    path = np.asarray(lin_log(np.stack([recording.frame_dn(int(i)) for i in index])))
+    equations = pixel_equations(events, times, path, steps)
+    return dataclasses.replace(chunk, path=path, equations=equations)
+
+
+def _runs(found: list[int]) -> list[list[int]]:
+    """Consecutive intervals together."""
+    breaks = np.flatnonzero(np.diff(found) > 1) + 1
+    return [part.tolist() for part in np.split(np.array(found), breaks)]
+
+
+@jax.jit
+def statistics(trace: Trace, bright: Array) -> Array:
+    """(4, 2): sums over pixels of the counts, of their square roots and of the pixels that fire
+    at all, ON and OFF; then the number of pixels there are, twice."""
+    counts = jnp.asarray(trace.counts).sum(0) * bright[None]
+    pixels = jnp.full(2, bright.sum(), counts.dtype)
+    return jnp.stack([counts.sum((1, 2)), jnp.sqrt(counts).sum((1, 2)),
+                      (counts > 0).sum((1, 2)).astype(counts.dtype), pixels])
+
+
+@partial(jax.jit, static_argnames="steps")
+def _simulated(
+    key: Array, path: Array, dt_s: Array, bright: Array, row: Array, fresh: Array, steps: int
+) -> Array:
+    """Statistics (4, 2) of one camera on one chunk."""
+    k_pixels, k_trace = jax.random.split(key)
+    draws = jax.random.normal(k_pixels, (2, *path.shape[1:]))
+    on, off, eta_on, eta_off, sigma_on, sigma_off = row
+    full = jnp.ones_like(draws[0])
+    camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
+                    jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
+                    eta_on * full, eta_off * full)
+    return statistics(trace_of_camera(k_trace, path, dt_s, camera, fresh, steps), bright)

@@ -1,0 +1,55 @@
+"""What an estimate gives: maps with their errors, the camera's summary, and what to know."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.camera import PARAMETERS, Camera, Summary
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CameraEstimate:
+    """What was measured.
+
+    camera, std: maps (H, W) and their standard deviations; summary, summary_std: the camera's
+    medians and mismatch (scalars); valid: (H, W) bool, pixels that are not hot, with at least 3
+    events in the windows used whose frames are neither saturated nor black there; n_events:
+    (H, W) uint32 events in the windows used; hot, dead: (H, W) bool, pixels that fire by
+    themselves, and pixels that never do amid others that do; windows: how many were used, 0
+    without frames; warnings: what to know before trusting it, a sentence each.
+    """
+
+    camera: Camera
+    std: Camera
+    summary: Summary
+    summary_std: Summary
+    valid: np.ndarray
+    n_events: np.ndarray
+    hot: np.ndarray
+    dead: np.ndarray
+    windows: int
+    warnings: tuple[str, ...]
+
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
+        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events."""
+        extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
+        return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
+                                n_events=self.n_events, hot=self.hot, dead=self.dead)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Summary, std and warnings as JSON-ready values."""
+        def floats(s: Summary) -> dict[str, float]:
+            return {k: float(v) for k, v in dataclasses.asdict(s).items()}
+
+        def places(mask: np.ndarray) -> list[list[int]]:
+            return [[int(x), int(y)] for y, x in np.argwhere(mask)]
+
+        return {"summary": floats(self.summary), "summary_std": floats(self.summary_std),
+                "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
+                "hot_pixels": places(self.hot), "dead_pixels": places(self.dead),
+                "windows": self.windows, "warnings": list(self.warnings)}

@@ -1,0 +1,41 @@
+"""`evflow check`: what usually goes wrong with a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import tyro
+
+from evflow.commands.options import Reading
+from evflow.errors import EvflowDataError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Check(Reading):
+    """Check a recording: polarity, units, order, alignment, gaps, frames. Exit code 1 on errors.
+
+    Example: evflow check flight.aedat4
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder of any known format."""
+    json: bool = False
+    """Print JSON."""
+    strict: bool = False
+    """Take warnings for errors."""
+
+    def run(self) -> None:
+        from evflow.inspection import Finding, Report, check
+
+        try:
+            recording = self.read(self.recording)
+        except EvflowDataError as error:
+            report, what = Report((Finding.of(error),)), str(self.recording)
+        else:
+            report, what = check(recording), repr(recording)
+        report = report.strict() if self.strict else report
+        print(report.to_json() if self.json else f"{what}\n{report}")
+        if report.errors:
+            sys.exit(1)

@@ -1,0 +1,68 @@
+"""`evflow compare`: how alike two streams are."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from evflow.commands.options import Reading, write_json
+from evflow.errors import EvflowDataError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Compare(Reading):
+    """Compare a synthetic stream with a real one by rates, pixels, intervals and noise.
+
+    Example: evflow compare flight.aedat4 synth.h5 -o comparison/
+    """
+
+    real: tyro.conf.Positional[Path]
+    """The recorded events, of any known format. The reading options hold for both."""
+    synthetic: tyro.conf.Positional[Path]
+    """The events to hold against them, of a sensor of the same size."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder for compare.json and compare.html (which needs matplotlib)."""
+    plots: bool = True
+    """Write compare.html."""
+    overwrite: bool = False
+    json: bool = False
+    """Print all numbers as JSON."""
+
+    def run(self) -> None:
+        from evflow.metrics.streams import compare
+        from evflow.report import plots
+        from evflow.report.provenance import sha256, versions
+        from evflow.report.streams import write_comparison
+        from evflow.report.verdict import describe_streams, judge_streams, worst
+
+        targets = [] if self.out is None else [self.out / "compare.json"] + (
+            [self.out / "compare.html"] if self.plots else [])
+        for target in targets:
+            if target.exists() and not self.overwrite:
+                raise EvflowDataError("EV013", f"{target} exists.", "Pass --overwrite.")
+        if self.out and self.plots:
+            plots.require()
+        real, synthetic = (self.read(path).events for path in (self.real, self.synthetic))
+        numbers = compare(real, synthetic)
+        words = describe_streams(numbers)
+        facts = {"real": str(self.real), "synthetic": str(self.synthetic),
+                 "grade": worst(judge_streams(numbers)), "verdict": words.splitlines(), **numbers}
+        if self.out:
+            write_json(self.out / "compare.json", facts)
+        if self.out and self.plots:
+            shown = {f"{name} stream": f"{path}, sha256 {sha256(path)}" for name, path in (
+                ("Real", self.real), ("Synthetic", self.synthetic))}
+            shown["Command"] = shlex.join(["evflow", *sys.argv[1:]])
+            shown["Versions"] = ", ".join(f"{k} {v}" for k, v in versions().items())
+            write_comparison(self.out / "compare.html", real, synthetic, numbers, facts=shown,
+                             labels=(self.real.name, self.synthetic.name),
+                             overwrite=self.overwrite)
+        print(json.dumps(facts, indent=2) if self.json else words)
+        if self.out:
+            print(f"written to {self.out}/", file=sys.stderr)

@@ -1,0 +1,55 @@
+"""`evflow convert`: a recording in another format."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import tyro
+
+from evflow.commands.options import Reading
+from evflow.commands.writing import Format, named, need_absent
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Convert(Reading):
+    """Write a recording of any known format, or a part of it, in another.
+
+    Example: evflow convert flight.aedat4 flight.h5
+
+    Example: evflow convert flight.aedat4 flight.zip --start 1 --stop 3
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder of any known format."""
+    out: tyro.conf.Positional[Path]
+    """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
+    aedat4, none (a folder) evreal."""
+    format: Format = "auto"
+    """Format of the output, where it is not what the extension stands for."""
+    overwrite: bool = False
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> None:
+        from evflow import io
+        from evflow.io.base import writer_of
+        from evflow.progress import stoppable
+        from evflow.types import Recording
+
+        writer = writer_of(self.out, named(self.format))
+        need_absent(self.out, self.overwrite)
+        recording = self.read(self.recording)
+        notes = list(recording.notes)
+        if recording.has_frames and (why := writer.refuses(recording.frames.dtype)):
+            notes.append(f"{why}: the {len(recording.frames)} frames were left out.")
+            recording = Recording.of_events(recording.events)
+        with stoppable():
+            io.write_recording(self.out, recording, writer.NAME, overwrite=self.overwrite)
+        for note in notes:
+            print(f"note: {note}", file=sys.stderr)
+        facts = {"out": str(self.out), "format": writer.NAME, "events": len(recording.events),
+                 "frames": len(recording.frames), "notes": notes}
+        print(json.dumps(facts) if self.json else f"{recording} -> {self.out} ({writer.NAME})")

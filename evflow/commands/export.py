@@ -1,0 +1,39 @@
+"""`evflow export`: a measured camera for another simulator."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from evflow.commands.writing import need_absent
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """A measured camera for another simulator: its maps, the nearest settings, a script, and what
+    that program cannot represent.
+
+    Example: evflow export cam/camera.npz --to v2e -o cam/v2e
+    """
+
+    camera: tyro.conf.Positional[Path]
+    """camera.npz from evflow estimate."""
+    to: Literal["v2e", "esim", "openeb", "iebcs"]
+    """The simulator."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for maps.npz, README.txt and the script."""
+    overwrite: bool = False
+
+    def run(self) -> None:
+        from evflow.camera import Camera
+        from evflow.exports import export_camera, write_export
+
+        need_absent(self.out, self.overwrite)
+        export, maps = export_camera(Camera.load(self.camera), self.to)
+        write_export(self.out, export, maps, overwrite=self.overwrite)
+        print(export.text)
+        print(f"written to {self.out}/: {', '.join(sorted([*export.scripts, *export.arrays]))}, "
+              "maps.npz, README.txt")

@@ -1,0 +1,56 @@
+"""`evflow render`: events as a film or a picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from evflow.commands.options import Reading
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render(Reading):
+    """Show events: a film (.mp4, .gif), or a sheet of one instant (.png). Red: ON. Blue: OFF.
+
+    Example: evflow render flight.aedat4 -o flight.mp4 --slow 10
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder of any known format."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """.mp4, .gif, or .png."""
+    fps: float = 30.0
+    """Pictures per second of the film."""
+    window_ms: float = 33.0
+    """How long a picture gathers events."""
+    slow: float = 1.0
+    """How many times slower than life."""
+    over_frames: bool = False
+    """Draw the events over the frames nearest in time."""
+    at: float | None = None
+    """Instant of the .png, seconds from the first event; without it the busiest."""
+    scale: int | None = None
+    """Screen pixels per pixel; without it as many as make the film 640 wide."""
+    codec: Literal["mpeg4", "vp9"] = "mpeg4"
+    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
+    overwrite: bool = False
+
+    def run(self) -> None:
+        from evflow.progress import bar, stoppable
+        from evflow.report.movie import Film, write_film, write_sheet
+
+        film = Film(fps=self.fps, window_us=round(1000 * self.window_ms), slow=self.slow,
+                    over_frames=self.over_frames, scale=self.scale, codec=self.codec)
+        film.check_target(self.out, overwrite=self.overwrite)
+        recording = self.read(self.recording)
+        if self.out.suffix.lower() == ".png":
+            said = write_sheet(self.out, recording, film, at_s=self.at, overwrite=self.overwrite)
+        else:
+            with stoppable(), bar("rendering") as progress:
+                said = write_film(self.out, recording, film, overwrite=self.overwrite,
+                                  progress=progress)
+        print(f"{said} -> {self.out}", file=sys.stderr)

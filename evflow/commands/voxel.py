@@ -1,0 +1,124 @@
+"""`evflow voxel`: the voxel grids of a recording's windows."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from evflow.commands.options import Reading
+from evflow.commands.writing import need_absent
+from evflow.errors import EvflowDataError
+
+if TYPE_CHECKING:
+    from evflow.types import Recording
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Voxel(Reading):
+    """Voxel grids (Eq. 2) of a recording's windows, for a network or a notebook.
+
+    The .npz holds voxels (N, H, W, 2 * bins) float32 [ON bins..., OFF bins...], t0_us and
+    window_us (N,) int64, and dlogI (N, H, W) float32, the change of the log intensity from the
+    window's first frame to its last. Windows run from frame to frame as in evflow estimate; a
+    recording without frames is cut into windows of --window-ms, and has no dlogI.
+
+    Example: evflow voxel flight.aedat4 -o voxels.npz --stop 10
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder of any known format."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Output, .npz (compressed; one grid is in memory at a time)."""
+    bins: int = 16
+    """Bins per polarity."""
+    window_ms: float = 40.0
+    """Shortest window where there are frames, the length of every window where there are none."""
+    overwrite: bool = False
+
+    def run(self) -> None:
+        from evflow.files import atomic_write
+        from evflow.progress import bar, stoppable
+        from evflow.voxel import voxelize
+
+        if self.bins < 2 or not self.window_ms >= 0.001:
+            raise EvflowDataError("EV020", f"--bins {self.bins}, --window-ms {self.window_ms:g}.",
+                                  "Need two bins and 0.001 ms at least.")
+        need_absent(self.out, self.overwrite)
+        recording = self.read(self.recording)
+        pairs, starts, lengths, notes = _windows(recording, round(self.window_ms * 1000))
+        width, height = recording.events.size
+        shape = (len(starts), height, width, 2 * self.bins)
+
+        def grids() -> Iterator[np.ndarray]:
+            for i, (t0, length) in enumerate(zip(starts, lengths, strict=True)):
+                yield voxelize(recording.events, int(t0), int(length), self.bins)
+                progress(i + 1, len(starts))
+
+        with (stoppable(), bar("voxels") as progress,
+              atomic_write(self.out, overwrite=self.overwrite) as temporary,
+              zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive):
+            _store(archive, "voxels", shape, np.float32, grids())
+            _store(archive, "t0_us", starts.shape, np.int64, [starts])
+            _store(archive, "window_us", lengths.shape, np.int64, [lengths])
+            if len(pairs):
+                _store(archive, "dlogI", shape[:3], np.float32, _changes(recording, pairs))
+        for note in (*recording.notes, *notes):
+            print(f"note: {note}", file=sys.stderr)
+        print(f"{len(starts)} windows, {width}x{height}, {self.bins} bins "
+              f"({4e-9 * np.prod(shape, dtype=float):.3g} GB in memory) -> {self.out}")
+
+
+def _windows(
+    recording: Recording, window_us: int
+) -> tuple[tuple[tuple[int, int], ...], np.ndarray, np.ndarray, tuple[str, ...]]:
+    """The frames that bound each window, their begins and lengths (N,) int64 us, and notes.
+
+    Raises EV001, EV011, EV012 as `plan_windows`, EV017 where no window is left.
+    """
+    from evflow import io
+
+    t = recording.events.t
+    if recording.has_frames:
+        plan = io.plan_windows(recording, window_us)
+        ends = recording.frame_times[np.array(plan.pairs, int).reshape(-1, 2)]
+        pairs, starts, lengths, notes = (
+            plan.pairs, ends[:, 0], ends[:, 1] - ends[:, 0], plan.skipped)
+    else:
+        if not len(t):
+            raise EvflowDataError("EV001", "the recording has no events.")
+        starts = np.arange(t[0], t[-1] + 2 - window_us, window_us)
+        pairs, lengths = (), np.full(len(starts), window_us)
+        notes = ("no frames: windows of equal length, without dlogI.",)
+    if not len(starts):
+        raise EvflowDataError(
+            "EV017", f"no window of {window_us / 1e3:g} ms can be used "
+            f"({'; '.join(notes[:3]) or 'the frames span less than that'}).",
+            "Record longer, or lower --window-ms.")
+    return pairs, starts, lengths, notes
+
+
+def _changes(recording: Recording, pairs: tuple[tuple[int, int], ...]) -> Iterator[np.ndarray]:
+    from evflow.intensity import delta_log_intensity
+
+    for first, last in pairs:
+        yield np.asarray(delta_log_intensity(recording.frame_dn(first), recording.frame_dn(last)))
+
+
+def _store(
+    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: Any,
+    parts: Iterable[np.ndarray],
+) -> None:
+    """A member of an .npz, written part by part."""
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as f:
+        np.lib.format.write_array_header_1_0(f, {
+            "descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False,
+            "shape": shape})
+        for part in parts:
+            f.write(np.ascontiguousarray(part, dtype).data)

@@ -1,0 +1,32 @@
+"""What events are used for: networks that turn them into video (E2VID, FireNet) and optical flow
+(EV-FlowNet), usable alone, with the weights that others have published.
+
+    network, params = load_published("E2VID_plus.pth.tar")
+    images = reconstruct(network, params, events, frame_times_us)
+"""
+
+from evflow.downstream.e2vid import E2VID, E2VID_LIGHTWEIGHT, E2VID_PLUS, E2VID_SMALL
+from evflow.downstream.evflownet import EVFlowNet
+from evflow.downstream.firenet import FireNet
+from evflow.downstream.network import Network, run
+from evflow.downstream.published import load_published
+from evflow.downstream.tensor import event_tensor, normalise, reconstruct, signed
+from evflow.downstream.torch_file import Checkpoint, read_checkpoint
+
+__all__ = [
+    "E2VID",
+    "E2VID_LIGHTWEIGHT",
+    "E2VID_PLUS",
+    "E2VID_SMALL",
+    "Checkpoint",
+    "EVFlowNet",
+    "FireNet",
+    "Network",
+    "event_tensor",
+    "load_published",
+    "normalise",
+    "read_checkpoint",
+    "reconstruct",
+    "run",
+    "signed",
+]

@@ -1,0 +1,179 @@
+"""Published weights in our params: by the names and shapes of the PyTorch modules they come from.
+
+E2VID, E2VID+, FireNet (2020 and S2R's), EV-FlowNet (S2R's). The structure (sizes, decoder, norm,
+skips) is read off the arrays, so that networks of other sizes trained by the same code load too.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.downstream.e2vid import E2VID
+from evflow.downstream.evflownet import EVFlowNet
+from evflow.downstream.firenet import FireNet
+from evflow.downstream.network import Network, Params
+from evflow.downstream.torch_file import read_checkpoint
+from evflow.errors import EvflowDataError, naming
+
+Arrays = dict[str, np.ndarray]
+
+PREFIXES = ("unetrecurrent.", "unet.", "net.")
+# Published module -> ours, by the first pattern that fits the whole name.
+RULES: dict[str, tuple[tuple[str, str], ...]] = {
+    "E2VID": (
+        (r"head\.conv2d", "head/conv"),
+        (r"encoders\.(\d)\.conv\.conv2d", r"encoder_\1/conv"),
+        (r"encoders\.(\d)\.conv\.norm_layer", r"encoder_\1/norm"),
+        (r"encoders\.(\d)\.recurrent_block\.Gates", r"lstm_\1/gates"),
+        (r"resblocks\.(\d)\.conv([12])", r"block_\1/half\2/conv"),
+        (r"resblocks\.(\d)\.bn([12])", r"block_\1/half\2/norm"),
+        (r"decoders\.(\d)\.conv2d", r"decoder_\1/layer/conv"),
+        (r"decoders\.(\d)\.transposed_conv2d", r"decoder_\1"),
+        (r"decoders\.(\d)\.norm_layer", r"decoder_\1/norm"),
+        (r"pred\.conv2d", "prediction/conv"),
+        (r"pred\.norm_layer", "prediction/norm"),
+    ),
+    "FireNet": (
+        (r"head(?:\.conv)?\.conv2d", "head/conv"),
+        (r"G1\.(reset|update|out)_gate", r"gru_0/\1"),
+        (r"G2\.(reset|update|out)_gate", r"gru_1/\1"),
+        (r"R1\.conv([12])", r"block_0/half\1/conv"),
+        (r"R2\.conv([12])", r"block_1/half\1/conv"),
+        (r"head\.recurrent_block\.(reset|update|out)_gate", r"gru_0/\1"),
+        (r"resblocks\.0\.recurrent_block\.(reset|update|out)_gate", r"gru_1/\1"),
+        (r"resblocks\.0\.conv\.conv([12])", r"block_0/half\1/conv"),
+        (r"resblocks\.1\.conv([12])", r"block_1/half\1/conv"),
+        (r"pred\.conv2d", "prediction/conv"),
+    ),
+    "EVFlowNet": (
+        (r"encoders\.(\d)\.conv2d", r"encoder_\1/conv"),
+        (r"resblocks\.(\d)\.conv([12])", r"block_\1/half\2/conv"),
+        (r"decoders\.(\d)\.conv2d", r"decoder_\1/conv"),
+        (r"pred\.conv2d", "prediction/conv"),
+    ),
+}
+LEAVES = {"weight": "kernel", "bias": "bias", "running_mean": "mean", "running_var": "var"}
+
+
+def load_published(path: str | os.PathLike) -> tuple[Network, Params]:
+    """The network and params of a published PyTorch checkpoint; no PyTorch is needed.
+
+    Raises what `read_checkpoint` does, EV018 where the weights are of no known network.
+    """
+    checkpoint = read_checkpoint(path)
+    with naming(path):
+        network = recognise(checkpoint.arrays, checkpoint.settings)
+        return network, to_params(network, checkpoint.arrays)
+
+
+def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network:
+    """The structure behind a state dict; EV018 where it is of no known network.
+
+    The output's activation and the padding are not in the weights: E2VID's own files, which
+    have settings under "model" or batch norm, are sigmoid and mirrored, S2R's linear and zeros.
+    """
+    arrays = _stripped(arrays)
+    names = " ".join(arrays)
+
+    def count(pattern: str) -> int:
+        return sum(re.fullmatch(pattern, name) is not None for name in arrays)
+
+    if "recurrent_block.Gates" in names:
+        base, bins = _conv_sizes(arrays, "head.conv2d.weight")
+        batch = "running_mean" in names
+        original = batch or "model" in (settings or {})
+        return E2VID(
+            bins=bins, base=base,
+            encoders=count(r"encoders\.\d\.recurrent_block\.Gates\.weight"),
+            blocks=count(r"resblocks\.\d\.conv1\.weight"),
+            decoder="transposed" if "transposed_conv2d" in names else "upsample",
+            norm="batch" if batch else "none",
+            skip="sum" if _conv_sizes(arrays, "pred.conv2d.weight")[1] == base else "concat",
+            output="sigmoid" if original else "linear",
+            padding="reflect" if original else "zeros")
+    if "update_gate" in names:
+        legacy = "head.conv.conv2d.weight"
+        base, bins = _conv_sizes(arrays, legacy if legacy in arrays else "head.conv2d.weight")
+        return FireNet(bins=bins, base=base)
+    if count(r"encoders\.\d\.conv2d\.weight") and count(r"pred\.conv2d\.weight"):
+        base, bins = _conv_sizes(arrays, "encoders.0.conv2d.weight")
+        return EVFlowNet(bins=bins, base=base)
+    raise EvflowDataError(
+        "EV018", f"the weights are of no known network (they begin with {sorted(arrays)[:3]}).",
+        "E2VID, E2VID+, FireNet and S2R's EV-FlowNet are known.")
+
+
+def to_params(network: Network, arrays: Arrays) -> Params:
+    """The state dict as params of `network`; EV018 where a name or a shape does not fit."""
+    expected = {_join(keys): leaf.shape for keys, leaf in jax.tree_util.tree_leaves_with_path(
+        jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16))))}
+    found = {}
+    for name, array in _stripped(arrays).items():
+        if not name.endswith(".num_batches_tracked"):
+            path, value = _renamed(network, name, array)
+            found[path] = value
+    if missing := sorted(expected.keys() - found.keys()):
+        raise EvflowDataError("EV018", f"the weights of {_called(network)} lack {missing[:3]}.")
+    params: Params = {}
+    for path, value in found.items():
+        if expected.get(path) != value.shape:
+            raise EvflowDataError(
+                "EV018", f"{path} is {value.shape}; {_called(network)} has "
+                f"{expected.get(path, 'no such layer')}.")
+        *parents, leaf = path.split("/")
+        node = params
+        for part in parents:
+            node = node.setdefault(part, {})
+        node[leaf] = jnp.asarray(value, jnp.float32)
+    return params
+
+
+def _renamed(network: Network, name: str, array: np.ndarray) -> tuple[str, np.ndarray]:
+    """Our path and layout of one published array."""
+    module, _, leaf = name.rpartition(".")
+    for pattern, ours in RULES[_called(network)]:
+        match = re.fullmatch(pattern, module)
+        if match and leaf in LEAVES:
+            path = match.expand(ours).replace("half1", "first").replace("half2", "second")
+            break
+    else:
+        raise EvflowDataError("EV018", f"{_called(network)} has nothing called {name[:80]!r}.")
+    if path.startswith("decoder") and path.endswith("/norm"):
+        path = path if getattr(network, "decoder", "") == "transposed" else path.replace(
+            "/norm", "/layer/norm")
+    if leaf == "weight" and array.ndim == 1:
+        return f"{path}/scale", array
+    if leaf == "weight" and array.ndim == 4:
+        if "transposed" in module:  # (in, out, h, w), of which a convolution takes the mirror image
+            return f"{path}/kernel", array[:, :, ::-1, ::-1].transpose(2, 3, 0, 1)
+        return f"{path}/kernel", array.transpose(2, 3, 1, 0)
+    return f"{path}/{LEAVES[leaf]}", array
+
+
+def _stripped(arrays: Arrays) -> Arrays:
+    """Without the prefix that all names share."""
+    for prefix in PREFIXES:
+        if all(name.startswith(prefix) for name in arrays):
+            return {name.removeprefix(prefix): array for name, array in arrays.items()}
+    return arrays
+
+
+def _conv_sizes(arrays: Arrays, name: str) -> tuple[int, int]:
+    """(out, in) channels of a convolution."""
+    if name not in arrays or arrays[name].ndim != 4 or not arrays[name].size:
+        raise EvflowDataError("EV018", f"{name} is no kernel of a convolution, or absent.")
+    return arrays[name].shape[0], arrays[name].shape[1]
+
+
+def _called(network: Network) -> str:
+    return type(network).__name__
+
+
+def _join(keys: Any) -> str:
+    return "/".join(str(k.key) for k in keys)

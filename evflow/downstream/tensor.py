@@ -1,0 +1,96 @@
+"""Event tensors as E2VID, FireNet and EV-FlowNet take them, and video from a stream of events.
+
+B signed bins: t* = (B - 1)(t - t_first) / (t_last - t_first) between the first and the last
+EVENT of a window, polarity +-1, bilinear in time. E2VID and FireNet want it normalised, E2VID+
+and FireNet+ (S2R) raw, which keeps the scale of the camera's thresholds in it.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.downstream.network import Network, Params, State
+from evflow.errors import EvflowDataError
+from evflow.types import Events
+
+Array = jax.Array
+
+BINS = 5
+
+
+def event_tensor(events: Events, bins: int = BINS) -> np.ndarray:
+    """Events of one window -> float32 (H, W, bins); zeros where there are none."""
+    width, height = events.size
+    if not len(events):
+        return np.zeros((height, width, bins), np.float32)
+    span = max(int(events.t[-1] - events.t[0]), 1)
+    position = (events.t - events.t[0]) * ((bins - 1) / span)
+    low = np.floor(position).astype(np.int64)
+    index = (events.y.astype(np.int64) * width + events.x) * bins + low
+    sign = np.where(events.p, 1.0, -1.0)
+    late = position - low
+    size = height * width * bins
+    grid = np.bincount(index, sign * (1.0 - late), size)
+    inside = low < bins - 1  # the last event falls on the last bin: nothing is left for a next
+    grid += np.bincount(index[inside] + 1, (sign * late)[inside], size)
+    return grid.astype(np.float32).reshape(height, width, bins)
+
+
+def signed(voxels: Array) -> Array:
+    """A voxel grid (..., H, W, 2B) of `voxelize` or the simulator, ON minus OFF: (..., H, W, B)."""
+    on, off = jnp.split(voxels, 2, -1)
+    return on - off
+
+
+def normalise(tensor: Array) -> Array:
+    """(..., H, W, B): its entries other than 0 with mean 0 and standard deviation 1 over the
+    whole tensor, 0 kept. One value alone becomes 0."""
+    axes = (-3, -2, -1)
+    some = (tensor != 0).astype(tensor.dtype)
+    count = jnp.maximum(some.sum(axes, keepdims=True), 1.0)
+    off_mean = some * (tensor - tensor.sum(axes, keepdims=True) / count)
+    variance = (off_mean**2).sum(axes, keepdims=True) / count
+    return off_mean * jnp.where(variance > 0, jax.lax.rsqrt(jnp.maximum(variance, 1e-30)), 0.0)
+
+
+def windows_between(times_us: np.ndarray, frame_times_us: np.ndarray) -> list[slice]:
+    """Which events make each frame: those since the one before, up to its time stamp; of the
+    first frame, since the beginning."""
+    stops = np.searchsorted(times_us, frame_times_us, "right")
+    return [slice(int(a), int(b)) for a, b in zip([0, *stops[:-1]], stops, strict=True)]
+
+
+@functools.partial(jax.jit, static_argnames=("network", "normalised"))
+def _step(
+    network: Network, params: Params, tensor: Array, state: State, normalised: bool
+) -> tuple[Array, State]:
+    return network.apply(params, normalise(tensor) if normalised else tensor, state)
+
+
+def reconstruct(
+    network: Network, params: Params, events: Events, frame_times_us: np.ndarray, *,
+    normalised: bool = False,
+) -> np.ndarray:
+    """Output of a network at each of the T frame times, from the events between them: images
+    (T, H, W) of E2VID and FireNet, about 0..1 and not clipped, or flow (T, 2, H, W).
+
+    normalised: True for E2VID and FireNet, False for E2VID+, FireNet+ and EV-FlowNet.
+    Raises EV001 without frame times, EV004 where they fall.
+    """
+    times = np.asarray(frame_times_us, np.int64)
+    if not times.size:
+        raise EvflowDataError("EV001", "frame_times_us is empty.")
+    if np.any(np.diff(times) < 0):
+        raise EvflowDataError("EV004", "frame_times_us falls.", "Pass them in order.")
+    width, height = events.size
+    state, images = network.start((height, width)), []
+    for window in windows_between(events.t, times):
+        part = Events.unchecked(events.x[window], events.y[window], events.t[window],
+                                events.p[window], events.size)
+        image, state = _step(network, params, event_tensor(part, network.bins), state, normalised)
+        images.append(np.asarray(image))
+    return np.stack(images)

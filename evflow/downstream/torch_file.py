@@ -1,0 +1,244 @@
+"""PyTorch checkpoints as NumPy arrays, without PyTorch and without running what they hold.
+
+Both containers are read: the zip of PyTorch 1.6 and later, and the chain of pickles before it
+(the published E2VID, FireNet and EV-FlowNet files). Names are allow-listed: tensors are built,
+objects of the training code (configuration, paths) are dropped, anything else is refused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import io
+import math
+import os
+import struct
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from evflow import pickles
+from evflow.errors import EvflowDataError
+from evflow.io.archives import unzipped
+
+MAGIC = 0x1950A86A20F9469CFC6C  # of the chain of pickles
+PROTOCOL = 1001
+MOST_BYTES = 2**31  # E2VID with its optimiser takes 128 MB
+MOST_AXES = 8
+STORAGES = {
+    "Float": "<f4", "Double": "<f8", "Half": "<f2", "Long": "<i8", "Int": "<i4", "Short": "<i2",
+    "Char": "i1", "Byte": "u1", "Bool": "?", "BFloat16": "<u2",
+}
+# What a training program puts beside its weights, of which nothing is needed.
+DROPPED = (
+    "parse_config.ConfigParser", "pathlib.PosixPath", "pathlib.PurePosixPath",
+    "pathlib.WindowsPath", "pathlib.PureWindowsPath", "pathlib._local.PosixPath",
+    "builtins.object", "__builtin__.object", "torch.device", "torch.Size", "_codecs.encode",
+    "numpy.dtype", "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Storage:
+    """A flat buffer elsewhere in the file: its key, type and number of elements."""
+
+    key: str
+    kind: str
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tensor:
+    """A view of a storage that is yet to be read; offset, shape and strides in elements."""
+
+    storage: _Storage
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """arrays: the weights by their published names (bfloat16 as float32). settings: numbers and
+    strings beside them, and dicts of such."""
+
+    arrays: dict[str, np.ndarray]
+    settings: dict[str, Any]
+
+
+def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
+    """Weights from a file of torch.save: its "state_dict", or the dict itself.
+
+    Raises EV016 (no file), EV008 (not a PyTorch file), EV009 (damaged, or it holds what no
+    checkpoint needs), EV018 (no weights in it), EV020 (larger than 2 GiB).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise EvflowDataError("EV016", f"no checkpoint at {path}.")
+    if path.stat().st_size > MOST_BYTES:
+        raise EvflowDataError("EV020", f"{path} has {path.stat().st_size} bytes.",
+                              f"The largest that is read has {MOST_BYTES}.")
+    try:
+        read = _read_zip if zipfile.is_zipfile(path) else _read_chain
+        content, storages = read(path)
+        return _checkpoint(path, content, storages)
+    except (ValueError, struct.error) as e:
+        raise EvflowDataError(
+            "EV009", f"{path}: {e}.",
+            "Copy it again; only files of torch.save with a state dict are read.") from e
+
+
+def _read_chain(path: Path) -> tuple[Any, dict[str, bytes]]:
+    """Magic, protocol, system, object, keys; then each storage, its length before it."""
+    with open(path, "rb") as f:
+        try:
+            known = pickles.load(f, {}) == MAGIC
+        except ValueError:
+            known = False
+        if not known:
+            raise EvflowDataError(
+                "EV008", f"{path} is not a PyTorch checkpoint (neither a zip nor its magic "
+                "number).", "Is it still packed, or a page that was saved in its place?")
+        if pickles.load(f, {}) != PROTOCOL:
+            raise ValueError("its protocol is unknown")
+        system = pickles.load(f, {})
+        if not isinstance(system, dict) or not system.get("little_endian"):
+            raise ValueError("it was written on a big-endian machine")
+        needed: dict[str, _Storage] = {}
+        content = pickles.load(f, _names(), functools.partial(_refer, needed))
+        found = _read_storages(f, pickles.load(f, {}), needed)
+    return content, found
+
+
+def _read_storages(f: IO[bytes], keys: Any, needed: dict[str, _Storage]) -> dict[str, bytes]:
+    if not isinstance(keys, list) or set(keys) != set(needed):
+        raise ValueError("its list of storages is not that of its tensors")
+    found = {}
+    for key in keys:
+        storage = needed[key]
+        (count,) = struct.unpack("<q", f.read(8))
+        if count != storage.count:
+            raise ValueError(f"storage {key[:40]} has {count} elements, not {storage.count}")
+        found[key] = f.read(_bytes_of(storage))
+    return found
+
+
+def _read_zip(path: Path) -> tuple[Any, dict[str, bytes]]:
+    """The members data.pkl and data/<key> of the archive's one folder."""
+    with unzipped(path) as archive:
+        members = {info.filename: info for info in archive.infolist()}
+        roots = [n.removesuffix("data.pkl") for n in members if n.endswith("/data.pkl")]
+        if len(roots) != 1:
+            raise EvflowDataError("EV008", f"{path} is a zip, but not one of torch.save.")
+        root = roots[0]
+        order = root + "byteorder"
+        if order in members and archive.read(order) != b"little":
+            raise ValueError("it was written on a big-endian machine")
+        needed: dict[str, _Storage] = {}
+        pickle = io.BytesIO(archive.read(root + "data.pkl"))
+        content = pickles.load(pickle, _names(), functools.partial(_refer, needed))
+        names = {key: f"{root}data/{key}" for key in needed}
+        missing = [name for name in names.values() if name not in members]
+        if missing:
+            raise ValueError(f"it lacks {missing[0][:80]}")
+        found = {key: archive.read(members[name]) for key, name in names.items()}
+    return content, found
+
+
+def _names() -> dict[str, pickles.Builder]:
+    return {
+        "collections.OrderedDict": _ordered,
+        "torch._utils._rebuild_tensor_v2": _tensor,
+        "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
+        "copyreg._reconstructor": pickles.Inert,
+        "copy_reg._reconstructor": pickles.Inert,
+        **{f"torch.{kind}Storage": pickles.Inert for kind in STORAGES},
+        **dict.fromkeys(DROPPED, pickles.Inert),
+    }
+
+
+def _ordered(*items: Any) -> dict[Any, Any]:
+    if items:
+        raise ValueError("an OrderedDict is built from a list")  # torch sets its items one by one
+    return {}
+
+
+def _refer(needed: dict[str, _Storage], identity: Any) -> _Storage:
+    """("storage", type, key, location, elements, None): a storage, noted in `needed`."""
+    if not (isinstance(identity, tuple) and len(identity) in (5, 6) and identity[0] == "storage"):
+        raise ValueError("a storage is referred to in an unknown way")
+    _, kind, key, _, count, *view = identity
+    if not (isinstance(kind, pickles.Named) and isinstance(key, str) and _whole(count)
+            and view in ([], [None])):
+        raise ValueError("a storage is described in an unknown way")
+    name = kind.name.removeprefix("torch.").removesuffix("Storage")
+    if name not in STORAGES:
+        raise ValueError(f"a storage is of the type {kind.name}")
+    storage = _Storage(key, name, count)
+    if needed.setdefault(key, storage) != storage:
+        raise ValueError(f"storage {key[:40]} is described twice")
+    if sum(_bytes_of(s) for s in needed.values()) > MOST_BYTES:
+        raise ValueError(f"its storages take more than {MOST_BYTES} bytes")
+    return storage
+
+
+def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
+    good = isinstance(storage, _Storage) and _whole(offset) and all(
+        isinstance(v, tuple) and len(v) <= MOST_AXES and all(map(_whole, v))
+        for v in (shape, strides))
+    if not good or len(shape) != len(strides):
+        raise ValueError("a tensor is described in an unknown way")
+    last = offset + sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
+    size = math.prod(shape)
+    if size > storage.count or (size and last >= storage.count):
+        raise ValueError(f"a tensor {shape} lies outside of its storage of {storage.count}")
+    return _Tensor(storage, offset, shape, strides)
+
+
+def _whole(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= MOST_BYTES
+
+
+def _bytes_of(storage: _Storage) -> int:
+    return storage.count * np.dtype(STORAGES[storage.kind]).itemsize
+
+
+def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpoint:
+    content = content if isinstance(content, dict) else {}
+    state = content.get("state_dict", content)
+    tensors = {name.removeprefix("module."): value for name, value in state.items()
+               if isinstance(value, _Tensor)} if isinstance(state, dict) else {}
+    if not tensors:
+        raise EvflowDataError(
+            "EV018", f"{path} holds no weights, but {sorted(map(str, content))[:8]}.",
+            "Expected a state dict, or a dict with one under 'state_dict'.")
+    if sum(8 * math.prod(t.shape) for t in tensors.values()) > 2 * MOST_BYTES:
+        raise ValueError("its tensors are more than its storages")
+    arrays = {name: _array(tensor, storages[tensor.storage.key])
+              for name, tensor in tensors.items()}
+    settings = {key: _plain(value) for key, value in content.items() if key != "state_dict"}
+    return Checkpoint(arrays, {str(k): v for k, v in settings.items() if v is not None})
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    """Numbers, strings and dicts of such to a depth of 2; None for all else."""
+    if isinstance(value, str | int | float):
+        return value
+    if isinstance(value, dict) and depth < 2:
+        return {str(k): _plain(v, depth + 1) for k, v in value.items()}
+    return None
+
+
+def _array(tensor: _Tensor, data: bytes) -> np.ndarray:
+    if len(data) != _bytes_of(tensor.storage):
+        raise ValueError(f"storage {tensor.storage.key[:40]} is cut off: {len(data)} bytes of "
+                         f"{_bytes_of(tensor.storage)}")
+    flat: np.ndarray = np.frombuffer(data, STORAGES[tensor.storage.kind])
+    if tensor.storage.kind == "BFloat16":  # the upper half of a float32
+        flat = (flat.astype(np.uint32) << 16).view(np.float32)
+    if not math.prod(tensor.shape):
+        return np.zeros(tensor.shape, flat.dtype)
+    strides = tuple(s * flat.itemsize for s in tensor.strides)
+    return np.lib.stride_tricks.as_strided(flat[tensor.offset:], tensor.shape, strides).copy()

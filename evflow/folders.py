@@ -1,0 +1,44 @@
+"""Folders that appear whole or not at all, as `files.atomic_write` does for a file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+
+
+@contextlib.contextmanager
+def atomic_folder(
+    path: str | os.PathLike, *, names: Collection[str], overwrite: bool = False
+) -> Iterator[Path]:
+    """Yield a new folder beside `path`; rename it into place only if the block succeeds.
+
+    names: the files that such a folder holds. One that holds anything else is never replaced,
+    overwrite or not, because somebody may miss it.
+    Raises EV013 and EV019 as `atomic_write`; nothing is left behind by any failure.
+    """
+    path = Path(path).resolve()
+    old = sorted(p.name for p in path.iterdir()) if path.is_dir() else []
+    if foreign := [name for name in old if name not in names]:
+        raise EvflowDataError(
+            "EV013", f"{path} is a folder that holds {foreign[:5]}.", "Choose another output.")
+    aside = path.with_name(f".{path.name}.{os.getpid()}.old")
+    temporary: Path | None = None
+    try:
+        with atomic_write(path, overwrite=overwrite) as temporary:
+            temporary.mkdir()
+            yield temporary
+            if path.is_dir():
+                os.replace(path, aside)
+    except BaseException:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        if aside.exists():
+            os.replace(aside, path)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

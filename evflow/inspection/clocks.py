@@ -1,0 +1,92 @@
+"""Time: its unit, gaps and jumps of the events' clock, dropped frames."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.inspection.findings import Finding
+from evflow.io.windows import DROPPED
+from evflow.types import Recording
+
+UNITS = {-6: "s", -3: "ms", 3: "ns"}  # log10 of (span as read) / (true span): what the times are
+NEAR = 0.4  # of log10: the ratio of two spans of one recording, events and frames
+FAST_HZ, SLOW_HZ = 100.0, 1.0  # events per second and pixel: few sensors send more, or less
+LEAST_EVENTS = 1_000
+MOST_HZ = 5_000.0  # events per second and pixel, mean of a whole sensor: none sends as many
+PACKET = 64  # events: the time they take says how dense the recording is
+SAMPLES = 1_000_000  # packets looked at
+GAP_PACKETS, GAP_US = 50, 30_000  # a gap is longer than both
+JUMP_US = 10_000_000  # a jump is longer, and longer than all the rest of the recording
+
+
+def clocks(recording: Recording) -> list[Finding]:
+    """EV023 (unit), EV025 (gaps), EV026 (jump), EV030 (dropped frames)."""
+    wrong = _unit(recording)
+    return [wrong] if wrong else [*_gaps(recording), *_dropped(recording)]
+
+
+def _unit(recording: Recording) -> Finding | None:
+    events, times = recording.events, recording.frame_times
+    if len(events) < 2:
+        return None
+    span = max(events.duration_us, 1)
+    rate = len(events) / span * 1e6 / (events.size[0] * events.size[1])
+    if len(times) > 1:
+        frames_us = int(times[-1] - times[0])
+        ratio = np.log10(span / frames_us)
+        for power, unit in UNITS.items():  # a short cut of a long recording has a usual rate
+            odd = rate > FAST_HZ if power < 0 else rate < SLOW_HZ
+            if odd and abs(ratio - power) < NEAR:
+                return Finding(
+                    "EV023", "error", f"events span {span:,} us but frames {frames_us:,} us: the "
+                    f"event times look like {unit}.", f"Pass --time-unit {unit}.")
+    if len(events) >= LEAST_EVENTS and rate > MOST_HZ:
+        return Finding(
+            "EV023", "error", f"{len(events):,} events in {span:,} us are {rate:,.0f} per second "
+            "and pixel, more than a sensor sends: milliseconds read as microseconds?",
+            "Pass --time-unit ms (or s).")
+    return None
+
+
+def _gaps(recording: Recording) -> list[Finding]:
+    t = recording.events.t
+    if len(t) < 4 * PACKET:
+        return []
+    between = np.diff(t)
+    stride = len(t) // SAMPLES + 1
+    packet = float(np.median(t[PACKET::stride] - t[:-PACKET:stride]))
+    at = np.flatnonzero(between > max(GAP_PACKETS * packet, GAP_US))
+    if not len(at):
+        return []
+    rest = int(t[-1] - t[0]) - int(between[at].sum())
+    longest = int(at[np.argmax(between[at])])
+    lost_us = int(between[longest])
+    from_s, to_s = ((int(t[i]) - int(t[0])) / 1e6 for i in (longest, longest + 1))
+    if lost_us > max(JUMP_US, rest):
+        return [Finding(
+            "EV026", "warning", f"event times jump from {from_s:.3f} s to {to_s:.3f} s, by more "
+            f"than the {rest / 1e6:.3f} s that hold events: another clock from event "
+            f"{longest + 1:,} on?", f"Read the parts alone: --stop {from_s:.3f} and "
+            f"--start {to_s:.3f}.")]
+    more = f" ({len(at)} gaps, {between[at].sum() / 1e6:.2f} s in all)" if len(at) > 1 else ""
+    return [Finding(
+        "EV025", "warning", f"no events between {from_s:.3f} s and {to_s:.3f} s{more}: dropped "
+        "packets, or a scene that stood still?",
+        f"If packets were lost, leave the gap out: --stop {from_s:.3f} or --start {to_s:.3f}.")]
+
+
+def _dropped(recording: Recording) -> list[Finding]:
+    times = recording.frame_times
+    if len(times) < 3:
+        return []
+    between = np.diff(times)
+    usual = float(np.median(between))
+    at = np.flatnonzero(between > DROPPED * usual)
+    if not len(at):
+        return []
+    lost = int(np.rint(between[at] / usual - 1).sum())
+    places = "1 place" if len(at) == 1 else f"{len(at)} places"
+    return [Finding(
+        "EV030", "warning", f"about {lost} frames are missing in {places}, first after frame "
+        f"{at[0]} ({between[at[0]] / 1e3:.1f} ms where {usual / 1e3:.1f} ms are usual).",
+        "No window crosses them; lower the camera's frame rate or its load.")]

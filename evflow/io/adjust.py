@@ -1,0 +1,117 @@
+"""A recording put right: frames from elsewhere, another clock, turned round, linear in light.
+
+Each function returns a new `Recording` with a note of what was done; events are never touched.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.source import open_frames
+from evflow.types import Recording
+
+MARGIN_US = 1_000_000  # frames that far outside the events are kept: their clock may be off
+FLIPS: dict[str, int | tuple[int, int]] = {"horizontal": 2, "vertical": 1, "both": (1, 2)}  # axes
+GAMMA = 2.2
+
+
+def _gamma(code: np.ndarray) -> np.ndarray:
+    return code ** np.float32(GAMMA)
+
+
+def _srgb(code: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1."""
+    curved = ((code + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    return np.where(code <= 0.04045, code / np.float32(12.92), curved)
+
+
+RESPONSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {"gamma": _gamma, "srgb": _srgb}
+
+
+def linearised(recording: Recording, response: str) -> Recording:
+    """The recording with frames proportional to light, float32 DN on 0..255.
+
+    response: what the frames are coded by: "linear" (nothing to do), "gamma" (code = light^(1/2.2))
+    or "srgb" (IEC 61966-2-1). Thresholds are measured against the log of light: of frames with a
+    gamma of 2.2 they come out 2.2 times too small. EV020 on any other response.
+    """
+    if response == "linear":
+        return recording
+    if response not in RESPONSES:
+        raise EvflowDataError(
+            "EV020", f"response={response!r}.", f"Choose from linear, {', '.join(RESPONSES)}.")
+    frames = np.empty(recording.frames.shape, np.float32)
+    for i in range(len(frames)):
+        code = recording.frame_dn(i) * np.float32(1 / 255)
+        frames[i] = np.minimum(RESPONSES[response](code), 1) * np.float32(255)
+    return _changed(recording, f"frames linearised ({response})", frames=frames)
+
+
+def shifted(recording: Recording, offset_us: int) -> Recording:
+    """The recording with offset_us added to its frame times."""
+    if not offset_us:
+        return recording
+    return _changed(recording, f"frame times moved by {offset_us / 1e3:+g} ms",
+                    frame_times=recording.frame_times + offset_us)
+
+
+def flipped(recording: Recording, side: str) -> Recording:
+    """The recording with its frames mirrored: "horizontal", "vertical" or "both"; EV020."""
+    if side not in FLIPS:
+        raise EvflowDataError("EV020", f"side={side!r}.", f"Choose from {sorted(FLIPS)}.")
+    return _changed(recording, f"frames flipped ({side})",
+                    frames=np.flip(recording.frames, FLIPS[side]))
+
+
+def with_frames(
+    recording: Recording, path: str | os.PathLike, *, offset_us: int = 0, **hints: Any
+) -> Recording:
+    """The recording with the frames of `path` in place of its own: a folder of images, a video, a
+    NumPy stack, another recording.
+
+    hints: fps, timestamps, time_unit, full_scale, partial, as in `open_frames`; times are those
+    of the events' clock, after offset_us is added. Frames more than a second away from all events
+    are left out.
+    Raises EV012 (no frame near the events), EV015 (another size), and what `open_frames` raises.
+    """
+    try:
+        source = open_frames(path, **hints)
+    except EvflowDataError as e:
+        raise EvflowDataError(e.code, _reworded(e.seen), _reworded(e.fix)) from e
+    t = recording.events.t
+    if not len(t):
+        raise EvflowDataError("EV001", "the recording has no events.")
+    if source.size != recording.events.size:
+        raise EvflowDataError(
+            "EV015", f"frames of {path} are {source.size[0]}x{source.size[1]}, the events "
+            f"{recording.events.size[0]}x{recording.events.size[1]}.",
+            "Both must come from one sensor, uncropped.")
+    kept, times, seen = [], [], []
+    for frame, time in source.open():
+        seen.append(time + offset_us)
+        if t[0] - MARGIN_US <= seen[-1] <= t[-1] + MARGIN_US:
+            kept.append(frame)
+            times.append(seen[-1])
+    if not kept:
+        raise EvflowDataError(
+            "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but the frames of {path} "
+            f"{seen[0]:,}..{seen[-1]:,} us.",
+            f"On another clock? Pass --frames-offset-ms {(int(t[0]) - seen[0]) / 1e3:.3f} if both "
+            "begin together; in another unit, --timestamps-unit.")
+    notes = (*recording.notes, f"frames are those of {path}", *map(_reworded, source.notes))
+    return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes)
+
+
+def _reworded(text: str) -> str:
+    """Beside a recording, --time-unit is that of the events, and --fps a video's to be written."""
+    return text.replace("--time-unit", "--timestamps-unit").replace("--fps", "--frames-fps")
+
+
+def _changed(recording: Recording, note: str, **fields: Any) -> Recording:
+    return dataclasses.replace(recording, notes=(*recording.notes, note), **fields)

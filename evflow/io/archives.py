@@ -1,0 +1,82 @@
+"""Zip archives and .npy headers of unknown origin: whatever Python's readers raise on damage
+becomes EV009, bombs are refused before they are unpacked, pickles are never loaded."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.limits import check_expansion
+
+MAX_HEADER = 10_000  # bytes, NumPy's own bound
+DAMAGE = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError,
+          OSError)  # what zipfile raises on a damaged archive
+
+
+@contextlib.contextmanager
+def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.ZipFile]:
+    """The open archive; EV009 where it, or what the block reads of it, is damaged or a bomb.
+
+    streamed: members that are read piece by piece, and so may be of any size."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sizes = [info.file_size for info in archive.infolist() if info.filename not in streamed]
+            check_expansion(sum(sizes), os.path.getsize(path), path)
+            yield archive
+    except DAMAGE as e:
+        raise EvflowDataError(
+            "EV009", f"{path} is damaged ({e or type(e).__name__}).", "Copy it again.") from e
+
+
+def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, Fortran order and dtype of the .npy that f begins; ValueError where it is damaged or
+    holds Python objects."""
+    begin = f.read(8)  # magic and version
+    first = begin[6:7] == b"\x01"
+    length = f.read(2 if first else 4)
+    if int.from_bytes(length, "little") > MAX_HEADER:  # NumPy would take memory for all of it
+        raise ValueError("its header is damaged")
+    whole = io.BytesIO(begin + length + f.read(int.from_bytes(length, "little")))
+    try:
+        np.lib.format.read_magic(whole)
+        read: Any = (np.lib.format.read_array_header_1_0 if first
+                     else np.lib.format.read_array_header_2_0)
+        shape, fortran, dtype = read(whole)
+    except Exception as e:  # a dozen kinds: tokenize's, and MemoryError where brackets are nested
+        raise ValueError(str(e) or f"its header is damaged ({type(e).__name__})") from None
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects: pickles are refused")
+    if min(shape, default=0) < 0:
+        raise ValueError(f"its shape is {shape}")
+    return shape, fortran, dtype
+
+
+def load_npz(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an .npz by key; EV009 where any of them is damaged or pickled."""
+    with unzipped(path) as archive:
+        return {info.filename.removesuffix(".npy"): load_member(archive, info)
+                for info in archive.infolist()}
+
+
+def load_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One array of an open .npz; ValueError and what zipfile raises where it is damaged."""
+    if not info.filename.endswith(".npy"):  # skipping it could lose the frames unseen
+        raise ValueError(f"{info.filename} is not an array")
+    with archive.open(info) as f:
+        shape, fortran, dtype = npy_header(f)
+        count = math.prod(shape)
+        if count * dtype.itemsize > info.file_size:
+            raise ValueError(f"{info.filename} is cut off: {dtype} {shape}")
+        data = f.read()  # to its end, where the checksum is compared
+    flat = np.frombuffer(data, dtype, count)
+    return flat.reshape(shape, order="F" if fortran else "C")

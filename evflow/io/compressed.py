@@ -1,0 +1,54 @@
+"""How much zstd and LZ4 frames can expand to, by the headers of their blocks alone.
+
+Decoders that take no limit are asked only after this: a zstd block of 4 bytes stands for 128 KiB of
+one byte, so that 1 MB of them fill 32 GB (RFC 8878, 3.1.1; lz4_Frame_format.md).
+"""
+
+from __future__ import annotations
+
+import struct
+
+ZSTD, LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
+ZSTD_BLOCK = 1 << 17
+LZ4_RATIO = 255
+
+
+def most_bytes(data: bytes) -> int:
+    """Bytes that the frames in `data` hold at most; its own length where it is not compressed.
+    What is behind damage does not count: no decoder gets there."""
+    read = {ZSTD: _zstd, LZ4: _lz4}
+    at = total = 0
+    try:
+        while (magic := bytes(data[at : at + 4])) in read:
+            at, size = read[magic](data, at + 4)
+            total += size
+    except (struct.error, IndexError):
+        pass
+    return max(total, len(data))
+
+
+def _zstd(data: bytes, at: int) -> tuple[int, int]:
+    """(where the frame that begins at `at`, behind its magic, ends; bytes it holds at most)."""
+    told = data[at]
+    single, checksum = told >> 5 & 1, told >> 2 & 1
+    dictionary, content = (0, 1, 2, 4)[told & 3], (single, 2, 4, 8)[told >> 6]
+    at += 1 + (1 - single) + dictionary + content
+    total = last = 0
+    while not last and at < len(data):
+        header = int.from_bytes(data[at : at + 3], "little")
+        last, kind, size = header & 1, header >> 1 & 3, header >> 3
+        total += ZSTD_BLOCK if kind == 2 else min(size, ZSTD_BLOCK)  # 0: raw, 1: one byte repeated
+        at += 3 + (1 if kind == 1 else size)
+    return at + 4 * checksum, total
+
+
+def _lz4(data: bytes, at: int) -> tuple[int, int]:
+    told, block = data[at], 1 << 8 + 2 * (data[at + 1] >> 4 & 7)  # 64 KiB to 4 MiB
+    per_block, content, checksum, dictionary = (told >> shift & 1 for shift in (4, 3, 2, 0))
+    at += 3 + 8 * content + 4 * dictionary
+    total = 0
+    while size := struct.unpack_from("<I", data, at)[0]:
+        packed, stored = size >> 31 == 0, size & 0x7FFFFFFF
+        total += min(block, LZ4_RATIO * stored) if packed else stored
+        at += 4 + stored + 4 * per_block
+    return at + 4 + 4 * checksum, total

@@ -1,0 +1,193 @@
+"""What every writer does: events and frames in parts, checked, and all or nothing.
+
+A format's writer derives from `EventWriter`, says what it can hold, and stores what `_write` and
+`_write_frames` are given. Memory: `FLUSH` events, and what the caller appends at once. The file
+appears, under its name, when the `with` block ends well; nothing is left behind otherwise.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import ClassVar, TypeVar
+
+import numpy as np
+
+from evflow.checks import COLUMNS, Size, check_frames, check_size, check_times
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+from evflow.types import Events, Recording
+
+FLUSH = 1 << 20  # events gathered before they are written: what a compressor likes
+DEPTHS = ("uint8", "uint16", "float32")
+SECONDS_US = 2**31 * 10**6  # float64 seconds keep the microsecond up to here, the year 2038
+
+Self = TypeVar("Self", bound="EventWriter")
+
+
+class EventWriter(abc.ABC):
+    """Write a recording of one camera part by part.
+
+    >>> with open_writer("out.zip", (346, 260)) as out:
+    ...     for events in simulate_stream(...):
+    ...         out.append(events)
+
+    NAME: the format. DEPTHS: the dtypes of frames it can hold, () for none. MAX_SIDE: pixels of
+    its largest sensor. TIMES_US: its first and last time.
+    """
+
+    NAME: ClassVar[str]
+    DEPTHS: ClassVar[tuple[str, ...]] = DEPTHS
+    MAX_SIDE: ClassVar[int] = 65536
+    TIMES_US: ClassVar[tuple[int, int]] = (-(2**63), 2**63 - 1)
+
+    def __init__(self, path: str | os.PathLike, size: Size, *, overwrite: bool = False) -> None:
+        self.path, self.size, self.overwrite = Path(path), check_size(size), overwrite
+        if max(self.size) > self.MAX_SIDE:
+            raise EvflowDataError(
+                "EV003", f"{self.NAME} holds sensors of up to {self.MAX_SIDE} pixels a side, not "
+                f"{self.size[0]}x{self.size[1]}.", "Write dsec or npz.")
+        self._waiting: list[Events] = []
+        self._last_us = self._last_frame_us = np.zeros(0, np.int64)
+        self._depth: np.dtype | None = None
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self: Self) -> Self:
+        with contextlib.ExitStack() as stack:
+            self._open(stack.enter_context(self._place()), stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, e: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        if e is not None:
+            self._stack.__exit__(kind, e, tb)
+            return
+        with self._stack:
+            self._flush()
+            self._finish()
+
+    def append(self, events: Events) -> None:
+        """Add events that follow those appended before; EV003 (times), EV004 (order), EV015."""
+        if events.size != self.size:
+            raise EvflowDataError(
+                "EV015", f"events of size {events.size} for a file of size {self.size}.")
+        if len(events) == 0:
+            return
+        check_times(np.append(self._last_us, events.t[:1]), "t", strict=False)
+        self._check_times(events.t[[0, -1]], "events")
+        self._check(events)
+        self._last_us = events.t[-1:]
+        self._waiting.append(events)
+        if sum(map(len, self._waiting)) >= FLUSH:
+            self._flush()
+
+    def append_frames(self, frames: np.ndarray, frame_times: np.ndarray) -> None:
+        """Add frames (T, H, W) at frame_times (T,) int64 us.
+
+        Raises EV020 (the format has no frames), EV003 (none of this dtype, or of several; float
+        frames outside 0..255; times), EV004 (order), EV002 and EV015 (shape), EV007 (NaN).
+        """
+        frames, times = _sound_frames(frames, frame_times, self.size)
+        if why := self.refuses(frames.dtype):
+            raise EvflowDataError("EV003" if self.DEPTHS else "EV020", f"{why}.",
+                                  "Leave the frames out, or write dsec or npz.")
+        if self._depth not in (None, frames.dtype):
+            raise EvflowDataError(
+                "EV003", f"frames of {frames.dtype} after {self._depth}.",
+                "All frames of a recording have one dtype.")
+        if not len(frames):
+            return
+        check_times(np.append(self._last_frame_us, times), "frame_times", strict=True)
+        self._check_times(times[[0, -1]], "frames")
+        self._depth, self._last_frame_us = frames.dtype, times[-1:]
+        self._write_frames(frames, times)
+
+    @classmethod
+    def refuses(cls, depth: np.dtype) -> str:
+        """Why frames of this dtype cannot be written, "" where they can."""
+        if not cls.DEPTHS:
+            return f"{cls.NAME} holds events only"
+        return "" if depth.name in cls.DEPTHS else (
+            f"{cls.NAME} holds frames of {', '.join(cls.DEPTHS)}, not {depth}")
+
+    def _place(self) -> contextlib.AbstractContextManager[Path]:
+        return atomic_write(self.path, overwrite=self.overwrite)
+
+    @abc.abstractmethod
+    def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
+        """Begin the file `temporary`; what must be closed goes on the stack."""
+
+    @abc.abstractmethod
+    def _write(self, events: Events) -> None:
+        """Store events, one or more, that follow those before."""
+
+    def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
+        """Store frames (T, H, W) of one dtype, T > 0, that follow those before."""
+        raise NotImplementedError
+
+    def _finish(self) -> None:  # noqa: B027 (most have nothing)
+        """Write what is known only at the end."""
+
+    def _check(self, events: Events) -> None:  # noqa: B027 (most have nothing)
+        """Refuse events that the format cannot hold."""
+
+    def _check_times(self, ends: np.ndarray, what: str) -> None:
+        low, high = self.TIMES_US
+        if ends[0] < low or ends[-1] > high:
+            raise EvflowDataError(
+                "EV003", f"{what} at {ends[0]:,}..{ends[-1]:,} us; {self.NAME} holds times from "
+                f"{low:,} to {high:,} us.",
+                "Wrong time unit? Pass --time-unit when reading; or write dsec or npz.")
+
+    def _flush(self) -> None:
+        if self._waiting:
+            events, self._waiting = Events.concatenate(self._waiting), []
+            self._write(events)
+
+
+def copy(recording: Recording, out: EventWriter) -> None:
+    """All of a recording, each frame behind the events before it, as a camera sends them."""
+    events, first = recording.events, 0
+    cuts = np.searchsorted(events.t, recording.frame_times)
+    for index, last in enumerate(cuts.tolist()):
+        out.append(_part(events, first, last))
+        out.append_frames(recording.frames[index : index + 1],
+                          recording.frame_times[index : index + 1])
+        first = last
+    out.append(_part(events, first, len(events)))
+
+
+def _sound_frames(
+    frames: np.ndarray, times: np.ndarray, size: Size
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frames and times of any part of a recording: float frames, dark as they may be, in DN."""
+    frames, times = np.asarray(frames), np.asarray(times)
+    check_frames(frames[:0], size)
+    if times.shape != frames.shape[:1]:
+        raise EvflowDataError(
+            "EV002", f"frame_times has shape {times.shape} for {len(frames)} frames.",
+            "Give one mid-exposure time in microseconds per frame.")
+    if frames.dtype == np.float32 and len(frames):
+        low, high = float(frames.min()), float(frames.max())
+        if not 0 <= low <= high <= 255:
+            raise EvflowDataError(
+                "EV007" if not np.isfinite(low + high) else "EV003",
+                f"float frames span {low:g}..{high:g}; expected DN 0..255.", "Rescale them.")
+    return frames, check_times(times, "frame_times", strict=True)
+
+
+def blocks(events: Events, rows: int) -> Iterator[Events]:
+    """The events in parts of up to `rows`, as views."""
+    for first in range(0, len(events), rows):
+        yield _part(events, first, first + rows)
+
+
+def _part(events: Events, first: int, last: int) -> Events:
+    x, y, t, p = (getattr(events, name)[first:last] for name in COLUMNS)
+    return Events.unchecked(x, y, t, p, events.size)

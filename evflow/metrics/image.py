@@ -1,0 +1,131 @@
+"""How alike images are: MSE, RMSE, PSNR, SSIM, and the change of intensity.
+
+Images are (..., H, W) on [0, 1], results (...): one number an image. Pure, jit-able; leading
+axes batch. SSIM is one name for several numbers (the same pair: .61 by `evreal`, .75 by `etnet`,
+.91 by `global`), so the preset is always said.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.errors import EvflowDataError
+
+Array = jax.Array
+
+FULL_SCALE = 255.0  # DN of RMSE
+K1, K2 = 0.01, 0.03  # of SSIM's constants (K range)^2
+
+
+@dataclasses.dataclass(frozen=True)
+class SsimPreset:
+    """A convention of SSIM. window: normalised weights of the taps along an axis, () for one
+    window over the image; sample: variances are unbiased; data_range: of the constants."""
+
+    window: tuple[float, ...]
+    sample: bool
+    data_range: float
+
+
+def _gaussian(sigma: float, radius: int) -> tuple[float, ...]:
+    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    return tuple((taps / taps.sum()).tolist())
+
+
+SSIM = {
+    # EVREAL; Wang et al. 2004: Gaussian of sigma 1.5, 11 x 11, range 1.
+    "evreal": SsimPreset(_gaussian(1.5, 5), False, 1.0),
+    # ET-Net, S2R and their time: uniform 7 x 7; range 2, an old default for floats in [0, 1].
+    "etnet": SsimPreset((1.0 / 7.0,) * 7, True, 2.0),
+    # ECC's evaluation: one covariance over the image, means by column.
+    "global": SsimPreset((), True, 1.0),
+}
+
+
+def mse(image: Array, reference: Array) -> Array:
+    """Mean squared error."""
+    return jnp.mean((image - reference) ** 2, (-2, -1))
+
+
+def rmse(image: Array, reference: Array) -> Array:
+    """Root mean squared error in DN, 0..255."""
+    return FULL_SCALE * jnp.sqrt(mse(image, reference))
+
+
+def psnr(image: Array, reference: Array) -> Array:
+    """Peak signal to noise ratio in dB, 10 log10(1 / MSE); inf for equal images."""
+    return -10.0 / math.log(10.0) * jnp.log(mse(image, reference))
+
+
+def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
+    """Structural similarity by a convention of `SSIM`: "evreal", "etnet" or "global".
+
+    Raises EV020 for another preset, EV002 for images smaller than its window.
+    """
+    if preset not in SSIM:
+        raise EvflowDataError("EV020", f"SSIM preset {preset!r}.", f"Choose one of {list(SSIM)}.")
+    how = SSIM[preset]
+    if min(image.shape[-2:]) < max(len(how.window), 2):
+        raise EvflowDataError("EV002", f"images of {image.shape[-2:]} pixels.",
+                              f"SSIM by {preset!r} needs at least {max(len(how.window), 2)}.")
+    return (_ssim_windowed if how.window else _ssim_global)(image, reference, how)
+
+
+def _ssim_windowed(x: Array, y: Array, how: SsimPreset) -> Array:
+    """Mean of the local index where the window is wholly inside the image."""
+    taps = len(how.window)
+    mean_x, mean_y = _blur(x, how.window), _blur(y, how.window)
+    unbiased = taps**2 / (taps**2 - 1) if how.sample else 1.0
+    var_x = unbiased * (_blur(x * x, how.window) - mean_x**2)
+    var_y = unbiased * (_blur(y * y, how.window) - mean_y**2)
+    covariance = unbiased * (_blur(x * y, how.window) - mean_x * mean_y)
+    c1, c2 = (K1 * how.data_range) ** 2, (K2 * how.data_range) ** 2
+    above = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    below = (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
+    return jnp.mean(above / below, (-2, -1))
+
+
+def _ssim_global(x: Array, y: Array, how: SsimPreset) -> Array:
+    """The index of each column's means and the image's covariance, as one number: the factor
+    that maps the denominators to the numerators best, which is MATLAB's row / row."""
+    centred = [a - jnp.mean(a, (-2, -1), keepdims=True) for a in (x, y)]
+    pixels = x.shape[-2] * x.shape[-1] - 1
+
+    def moment(a: Array, b: Array) -> Array:
+        return jnp.sum(a * b, (-2, -1))[..., None] / pixels
+
+    mean_x, mean_y = jnp.mean(x, -2), jnp.mean(y, -2)
+    c1, c2 = (K1 * how.data_range) ** 2, (K2 * how.data_range) ** 2
+    above = (2 * mean_x * mean_y + c1) * (2 * moment(*centred) + c2)
+    spread = moment(centred[0], centred[0]) + moment(centred[1], centred[1])
+    below = (mean_x**2 + mean_y**2 + c1) * (spread + c2)
+    return jnp.sum(above * below, -1) / jnp.sum(below**2, -1)
+
+
+def _blur(x: Array, window: tuple[float, ...]) -> Array:
+    """Separable filter of (..., H, W), where it fits: (..., H - n + 1, W - n + 1)."""
+    height, width = (n - len(window) + 1 for n in x.shape[-2:])
+    rows = [w * x[..., i:i + height, :] for i, w in enumerate(window)]
+    x = functools.reduce(jnp.add, rows)
+    columns = [w * x[..., i:i + width] for i, w in enumerate(window)]
+    return functools.reduce(jnp.add, columns)
+
+
+def log_map(image: Array) -> Array:
+    """[0, 1] -> [0, 1] by log(1 + 255 I) / log 256: the log domain of these metrics."""
+    return jnp.log1p(FULL_SCALE * jnp.clip(image, 0.0, 1.0)) / math.log(1.0 + FULL_SCALE)
+
+
+def mae_intensity_change(change: Array, reference: Array, *, magnitude: bool = False) -> Array:
+    """Mean absolute error of changes of log intensity (..., H, W), natural log, in units of
+    ln 255 (Table XI). magnitude: of their absolute values, limited to 0..1, as the paper's."""
+    x, y = change / math.log(FULL_SCALE), reference / math.log(FULL_SCALE)
+    if magnitude:
+        x, y = jnp.clip(jnp.abs(x), 0.0, 1.0), jnp.clip(jnp.abs(y), 0.0, 1.0)
+    return jnp.mean(jnp.abs(x - y), (-2, -1))

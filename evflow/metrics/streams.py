@@ -1,0 +1,188 @@
+"""How alike two event streams are: when, where, how often and in what company pixels fire.
+
+Everything is measured over the time both streams cover, on the same pixels, and comes out as
+plain numbers, lists and None (undefined: no such events, nothing varies), ready for JSON. Host
+side, NumPy only. Memory: about 100 bytes an event.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.types import Events
+
+CURVE_STEPS = 120  # about as many points as a rate curve has
+CURVE_STEP_US = 1_000  # the shortest step of one
+LOG_EDGES = np.linspace(-6.0, 2.0, 65)  # log10 s: 1 us to 100 s, eight bins a decade
+ALONE_US = 5_000  # no neighbour fired for this long: what a background-activity filter takes away
+NEIGHBOURS = tuple((dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy)
+ASKED_EVENTS = 400_000  # events whose neighbourhood is looked at, evenly taken from the stream
+
+
+def compare(
+    real: Events, synthetic: Events, *, span_us: tuple[int, int] | None = None
+) -> dict[str, Any]:
+    """How alike a recorded and a synthetic stream are; a JSON-ready dict.
+
+    span_us: (t0, t1), the time [t0, t1) that is compared; without it, what both streams cover.
+
+    size, duration_s, span_us, aligned_at ("clock", or "beginnings" where the streams share no
+    time and the synthetic one was moved to begin with the real one), events;
+    rate_hz: events per second and pixel, per polarity, and their ratio synthetic / real;
+    on_off: ON events per OFF event; curve: the rates over time and their correlation r;
+    counts: correlation r of the events per pixel; active: share of pixels that fire, and
+    `common`, those in both over those in either;
+    intervals: between successive events of a pixel; neighbours: since the latest event of the
+    eight pixels around, with `alone`, the share of events without one within 5 ms (mostly noise).
+    Both have ks (Kolmogorov-Smirnov, 0..1), wasserstein_decades (of log10 time), median_s and
+    a histogram; same_polarity: share of a pixel's events that repeat the polarity before.
+
+    Raises EV001 (a stream is empty), EV015 (different sizes).
+    """
+    moved, shift = _aligned(real, synthetic, move=span_us is None)
+    t0, t1 = span_us or (int(max(real.t[0], moved.t[0])), int(min(real.t[-1], moved.t[-1])) + 1)
+    sides = {"real": real.slice(t0, t1), "synthetic": moved.slice(t0, t1)}
+    seconds = (t1 - t0) * 1e-6
+    counts = {name: events.count_map().astype(np.float64) for name, events in sides.items()}
+    pixels = real.size[0] * real.size[1]
+    rates = {name: _per_polarity(c.reshape(2, -1).sum(1) / (seconds * pixels))
+             for name, c in counts.items()}
+    return {
+        "size": list(real.size), "duration_s": seconds, "span_us": [t0, t1],
+        "aligned_at": "clock" if shift is None else "beginnings", "shift_us": shift or 0,
+        "events": {name: len(events) for name, events in sides.items()},
+        "rate_hz": {**rates, "ratio": {
+            p: _ratio(rates["synthetic"][p], rates["real"][p]) for p in ("on", "off", "both")}},
+        "on_off": {name: _ratio(r["on"], r["off"]) for name, r in rates.items()},
+        "curve": _curves(sides, t0, t1, pixels),
+        "counts": {"r": {p: _correlation(_side(counts["real"], p), _side(counts["synthetic"], p))
+                         for p in ("on", "off", "both")}},
+        "active": _active(counts["real"].sum(0) > 0, counts["synthetic"].sum(0) > 0),
+        **_company(sides),
+    }
+
+
+def _aligned(real: Events, synthetic: Events, *, move: bool) -> tuple[Events, int | None]:
+    """The synthetic stream, and by how many us it was moved: None where the clocks agree."""
+    if real.size != synthetic.size:
+        raise EvflowDataError(
+            "EV015", f"the real stream is {real.size[0]}x{real.size[1]}, the synthetic one "
+            f"{synthetic.size[0]}x{synthetic.size[1]}.",
+            "Compare streams of one sensor; was the video resized? Where only the header is "
+            "wrong: --size.")
+    for name, events in (("real", real), ("synthetic", synthetic)):
+        if not len(events):
+            raise EvflowDataError("EV001", f"the {name} stream has no events.",
+                                  "There is nothing to compare it by.")
+    if not move or (synthetic.t[0] <= real.t[-1] and real.t[0] <= synthetic.t[-1]):
+        return synthetic, None
+    shift = int(real.t[0] - synthetic.t[0])
+    return dataclasses.replace(synthetic, t=synthetic.t + shift), shift
+
+
+def _per_polarity(pair: np.ndarray) -> dict[str, float]:
+    on, off = (float(v) for v in pair)
+    return {"on": on, "off": off, "both": on + off}
+
+
+def _side(counts: np.ndarray, polarity: str) -> np.ndarray:
+    return {"on": counts[0], "off": counts[1], "both": counts.sum(0)}[polarity]
+
+
+def _ratio(a: float, b: float) -> float | None:
+    return a / b if b > 0 else None
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Pearson's r; None where one of the two does not vary."""
+    a, b = a.ravel() - a.mean(), b.ravel() - b.mean()
+    scale = np.sqrt((a @ a) * (b @ b))
+    return float(np.clip(a @ b / scale, -1.0, 1.0)) if scale > 0 else None
+
+
+def _curves(sides: dict[str, Events], t0: int, t1: int, pixels: int) -> dict[str, Any]:
+    """Rates over time in steps of at least 1 ms, and how their ups and downs correlate."""
+    step = max(CURVE_STEP_US, -(-(t1 - t0) // CURVE_STEPS))
+    steps = max(1, (t1 - t0) // step)  # whole steps: the rest would look like a drop
+    edges = t0 + step * np.arange(steps + 1)
+    curves = {name: {p: np.histogram(events.t[events.p == on], edges)[0] / (step * 1e-6 * pixels)
+                     for p, on in (("on", True), ("off", False))}
+              for name, events in sides.items()}
+    r = {p: _correlation(curves["real"][p], curves["synthetic"][p]) for p in ("on", "off")}
+    return {"start_us": t0, "step_us": int(step), "r": r,
+            **{name: {p: c.tolist() for p, c in both.items()} for name, both in curves.items()}}
+
+
+def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:
+    return {"real": float(real.mean()), "synthetic": float(synthetic.mean()),
+            "common": _ratio(float((real & synthetic).sum()), float((real | synthetic).sum()))}
+
+
+def _company(sides: dict[str, Events]) -> dict[str, Any]:
+    """What the events of a pixel have to do with those before and around it."""
+    found = {name: _own_intervals(events) for name, events in sides.items()}
+    own = {name: intervals for name, (intervals, _) in found.items()}
+    around = {name: _neighbour_delays(events) for name, events in sides.items()}
+    alone = {name: float((d > ALONE_US).mean()) if d.size else None for name, d in around.items()}
+    near = {name: d[np.isfinite(d)] for name, d in around.items()}
+    return {"intervals": _times_alike(own), "neighbours": {**_times_alike(near), "alone": alone},
+            "same_polarity": {name: same for name, (_, same) in found.items()}}
+
+
+def _own_intervals(events: Events) -> tuple[np.ndarray, float | None]:
+    """(M,) us between successive events of a pixel; the share of them of one polarity."""
+    order = np.argsort(_pixels(events), kind="stable")
+    pixel, t, p = _pixels(events)[order], events.t[order], events.p[order]
+    same = pixel[1:] == pixel[:-1]
+    repeats = (p[1:] == p[:-1])[same]
+    return np.diff(t)[same].astype(np.float64), float(repeats.mean()) if repeats.size else None
+
+
+def _neighbour_delays(events: Events) -> np.ndarray:
+    """(M,) us from the latest event of the eight pixels around to an event, inf without one;
+    M <= ASKED_EVENTS events, evenly taken."""
+    n = len(events)
+    width, height = events.size
+    keys = np.sort(_pixels(events) * n + np.arange(n))  # by pixel, then by time
+    asked = np.linspace(0, n - 1, min(n, ASKED_EVENTS)).astype(np.int64)
+    x, y = events.x[asked].astype(np.int64), events.y[asked].astype(np.int64)
+    latest = np.full(len(asked), -1)
+    for dx, dy in NEIGHBOURS:
+        inside = (x + dx >= 0) & (x + dx < width) & (y + dy >= 0) & (y + dy < height)
+        pixel = (y + dy) * width + x + dx
+        before = np.searchsorted(keys, pixel * n + asked) - 1
+        key = keys[np.maximum(before, 0)]
+        known = inside & (before >= 0) & (key // n == pixel)
+        latest = np.maximum(latest, np.where(known, key % n, -1))
+    delay = (events.t[asked] - events.t[np.maximum(latest, 0)]).astype(np.float64)
+    return np.where(latest >= 0, delay, np.inf)
+
+
+def _pixels(events: Events) -> np.ndarray:
+    return events.y.astype(np.int64) * events.size[0] + events.x
+
+
+def _times_alike(us: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Distances, medians and histograms of two sets of times, in log10 seconds (at least 1 us)."""
+    logs = {name: np.sort(np.log10(np.maximum(v, 1.0) * 1e-6)) for name, v in us.items()}
+    ks, wasserstein = distances(logs["real"], logs["synthetic"])
+    shares = {name: (np.histogram(np.clip(v, LOG_EDGES[0], LOG_EDGES[-1]), LOG_EDGES)[0]
+                     / max(1, v.size)).tolist() for name, v in logs.items()}
+    medians = {name: float(10 ** np.median(v)) if v.size else None for name, v in logs.items()}
+    return {"ks": ks, "wasserstein_decades": wasserstein, "median_s": medians,
+            "histogram": {"log10_s_edges": LOG_EDGES.tolist(), **shares}}
+
+
+def distances(a: np.ndarray, b: np.ndarray) -> tuple[float | None, float | None]:
+    """Kolmogorov-Smirnov max |F - G| and Wasserstein-1 (integral of |F - G|) of two sorted samples
+    (N,), (M,); None for both where one is empty."""
+    if not (a.size and b.size):
+        return None, None
+    at = np.sort(np.concatenate([a, b]))
+    apart = np.abs(np.searchsorted(a, at, side="right") / a.size
+                   - np.searchsorted(b, at, side="right") / b.size)
+    return float(apart.max()), float(apart[:-1] @ np.diff(at))

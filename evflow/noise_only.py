@@ -1,0 +1,137 @@
+"""A camera's noise from a static scene, without frames: rates per pixel, thresholds unknown.
+
+Noise comes alone, events of a moving edge come in company: other pixels near by send the same
+polarity within milliseconds. Given how many events each cell of pixels sent in all, independent
+noise makes pairs within a time bin at a known rate; the excess over it, per event, tells whether
+anything moved. Measured: .016 in 2 s of a static scene (DVXplorer), .13 to 15 in nine recordings
+with motion.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Camera, Summary
+from evflow.camera_estimate import CameraEstimate
+from evflow.config import PRESETS
+from evflow.errors import EvflowDataError
+from evflow.refine import dead_pixels, fires_alone
+from evflow.types import Events, Recording
+
+CELL, BIN_US = 8, 2_000  # pixels, us: what counts as near by
+MOVING = 0.05  # excess pairs per event
+LEAST_US, LEAST_EVENTS = 500_000, 1_000
+MOST_EVENTS = 4_000_000  # looked at for company: the first ones
+HOT_PASSES, MOST_HOT = 10, 0.01  # of the pixels; more are not faults but a scene
+SPREAD = (0.3, 1000.0)  # shape of the gamma distribution of rates over pixels: its range
+
+
+def estimate_noise(recording: Recording) -> CameraEstimate:
+    """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
+
+    A pixel's rate is the mean of its posterior: a gamma distribution fitted to all pixels that
+    are not hot, times the Poisson likelihood of its events; a hot pixel's is its own count. The
+    summary is the mean over pixels that are not hot. Thresholds are those of the prior that the
+    network was trained on, with its width; `valid` is False everywhere.
+    Raises EV011 where the scene moves, or is too short to tell.
+    """
+    events = recording.events
+    counts = events.count_map()
+    hot = _hot(counts.sum(0))
+    _require_static(events, hot)
+    seconds = events.duration_us * 1e-6
+    rates, errors, means, mean_errors = zip(
+        *(_rates(n, hot, seconds) for n in counts), strict=True)
+    low, high = PRESETS["default"].prior.theta
+    middle, width = 0.5 * (low + high), (high - low) / np.sqrt(12.0)
+    spread = PRESETS["default"].prior.mismatch
+    mismatch, mismatch_width = 0.5 * sum(spread), (spread[1] - spread[0]) / np.sqrt(12.0)
+
+    def camera(theta: float, eta: tuple[np.ndarray, ...]) -> Camera:
+        flat = jnp.full(hot.shape, theta, jnp.float32)
+        return Camera(flat, flat, *(jnp.asarray(e, jnp.float32) for e in eta))
+
+    def summary(theta: float, eta: tuple[float, ...], sigma: float) -> Summary:
+        return Summary(*(jnp.float32(v) for v in (theta, theta, *eta, sigma, sigma)))
+
+    total = counts.sum(0, dtype=np.uint32)
+    return CameraEstimate(
+        camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
+        summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
+        dead_pixels(total), 0, _warnings(hot, total))
+
+
+def company(events: Events, hot: np.ndarray) -> float:
+    """Pairs of events of one polarity, of different pixels of a cell and within a time bin, beyond
+    those of independent noise, per event; hot (H, W) pixels left out."""
+    events = events.slice(int(events.t[0]), int(events.t[min(len(events), MOST_EVENTS) - 1]) + 1)
+    kept = ~hot[events.y, events.x]
+    x, y, t = (getattr(events, n)[kept].astype(np.int64) for n in ("x", "y", "t"))
+    on, width = events.p[kept], events.size[0]
+    moment = (t - int(events.t[0])) // BIN_US
+    bins = events.duration_us // BIN_US + 1
+    cell = 2 * (y // CELL * -(-width // CELL) + x // CELL) + on
+    pixel = 2 * (y * width + x) + on
+    seen = _squares(cell * bins + moment) - _squares(pixel * bins + moment)
+    expected = (_squares(cell) - _squares(pixel)) / bins
+    return float((seen - expected) / max(len(t), 1))
+
+
+def _squares(key: np.ndarray) -> float:
+    """Sum of squares of how often each value occurs."""
+    counts = np.unique(key, return_counts=True)[1].astype(np.float64)
+    return float(counts @ counts)
+
+
+def _require_static(events: Events, hot: np.ndarray) -> None:
+    seen = "the recording has events but no frames"
+    fix = ("Thresholds are measured against intensity: give frames, --frames DIR --timestamps "
+           "FILE. The noise alone needs some seconds of a static scene.")
+    if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
+        raise EvflowDataError(
+            "EV011", f"{seen}, and only {len(events):,} events in {events.duration_us / 1e6:.3f} s "
+            "to tell its noise.", fix)
+    excess = company(events, hot)
+    if excess > MOVING or hot.mean() > MOST_HOT:
+        raise EvflowDataError(
+            "EV011", f"{seen}, and the scene moves (events come in company: {excess:.2f} pairs "
+            f"per event beyond chance; {MOVING} is the most of noise).", fix)
+
+
+def _hot(counts: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels far above the mean of the others."""
+    hot = np.zeros(counts.shape, bool)
+    for _ in range(HOT_PASSES):
+        more = fires_alone(counts, float(counts[~hot].mean()))
+        if (more == hot).all():
+            break
+        hot = more
+    return hot
+
+
+def _rates(
+    counts: np.ndarray, hot: np.ndarray, seconds: float
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Rates (H, W) of one polarity in Hz and their std, the mean of the others than hot pixels
+    and its std."""
+    normal = counts[~hot].astype(np.float64)
+    mean, variance = float(normal.mean()), float(normal.var())
+    # Poisson counts of gamma-distributed rates: variance = mean + mean^2 / shape
+    shape = np.clip(mean**2 / max(variance - mean, 1e-9), *SPREAD)
+    worth = shape / max(mean, 1.0 / normal.size)  # exposures that the prior is worth
+    rate = np.where(hot, counts, (counts + shape) / (1.0 + worth))
+    error = np.where(hot, np.sqrt(counts + 1.0), np.sqrt(counts + shape) / (1.0 + worth))
+    mean_error = np.sqrt(max(variance, mean, 1.0 / normal.size) / normal.size)
+    return rate / seconds, error / seconds, mean / seconds, float(mean_error) / seconds
+
+
+def _warnings(hot: np.ndarray, total: np.ndarray) -> tuple[str, ...]:
+    found = ["no frames: theta_on and theta_off are undetermined, their values are the prior's; "
+             "the noise rates are those of a static scene."]
+    if hot.any():
+        share = float(total[hot].sum()) / float(total.sum())
+        y, x = np.unravel_index(int(np.argmax(np.where(hot, total, 0))), total.shape)
+        found.append(f"{hot.sum()} hot pixels send {share:.0%} of the events, most of them "
+                     f"x={x}, y={y}: left out of the summary.")
+    return tuple(found)

@@ -1,0 +1,275 @@
+"""The report on an estimated camera: ten panels in one HTML file, for whoever has to believe it.
+
+The recording's own frames are simulated again with the estimate and laid beside what was
+recorded; an estimate from the first half is tried on the second. What cannot be shown says why.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.inspection import check
+from evflow.inspection.agreement import frame_steps
+from evflow.recording import CameraEstimate, Progress
+from evflow.report import page
+from evflow.report.maps import fault_panel, map_panel, scatter_panel
+from evflow.report.page import Panel, bullets, number, paragraph, plural, spread, table
+from evflow.report.plots import require
+from evflow.report.provenance import sha256, versions, weights_hash
+from evflow.report.resimulate import (
+    LEARNT_SECONDS,
+    PIXELS,
+    SECONDS,
+    Trial,
+    busiest,
+    held_out,
+    resimulate,
+    usable_runs,
+)
+from evflow.report.streams import (
+    Names,
+    count_panel,
+    image_panel,
+    rate_panel,
+    time_panel,
+    verdict_rows,
+)
+from evflow.report.verdict import (
+    GRADES,
+    HEADLINES,
+    RULE,
+    Judged,
+    advice,
+    judge_estimate,
+    known,
+    poorer,
+    worst,
+)
+from evflow.types import Recording
+from evflow.weights import load_weights
+
+NAMES: Names = ("recorded", "re-simulated")
+STAGES = 4
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evidence:
+    """trial: the estimate, re-simulated; half: the estimate from the first half; held: that one
+    on the second half. Where one is None, the reason stands in why_not or why_not_held."""
+
+    trial: Trial | None
+    half: CameraEstimate | None
+    held: Trial | None
+    why_not: str = ""
+    why_not_held: str = ""
+
+
+def write_report(
+    path: str | os.PathLike, found: CameraEstimate, recording: Recording, *,
+    weights: str | os.PathLike = "default", source: str | os.PathLike | None = None,
+    command: str = "", min_window_us: int = 40_000, seed: int = 0, overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write a self-contained HTML report on an estimate and return its numbers.
+
+    found: of `estimate_camera(recording)`; weights: those it was made with, for the held-out
+    half; source: the file or folder of the recording, whose sha256 is shown; command: the command
+    line, shown; min_window_us: as given to `estimate_camera`; seed: of the re-simulations.
+    At most 3 s of the recording are simulated, in its busiest part, and at most the 5 s before its
+    middle are estimated again. progress(done, total) is called after each stage.
+    The numbers, JSON-ready: "grade" ("good", "fair", "poor"), "trial" and "held_out" (each None,
+    or what `compare` says, with the "ceiling" of the counts' r), which also lie in the page.
+
+    Raises EV010 (matplotlib is missing), EV013 (exists), EV015 (the recording's size is not that
+    of the estimate), EV019 (cannot be written).
+    """
+    require()
+    if recording.events.size != found.n_events.shape[::-1]:
+        raise EvflowDataError(
+            "EV015", f"the estimate is of {found.n_events.shape[::-1]} pixels, the recording of "
+            f"{recording.events.size}.", "Pass the recording that the camera was estimated from.")
+    done = itertools.count(1)
+
+    def step() -> None:
+        (progress or (lambda *_: None))(next(done), STAGES)
+
+    evidence = gather(found, recording, weights, min_window_us, seed, step)
+    judged = judge_estimate(found, evidence.trial, evidence.held)
+    panels = [_verdict(found, evidence, judged), map_panel(found), scatter_panel(found),
+              *_trial_panels(recording, evidence), fault_panel(found), _held_panel(found, evidence),
+              _assumptions(found, recording, evidence, weights, source, command)]
+    step()
+    numbers = {"grade": worst(judged), "trial": _numbers(evidence.trial),
+               "held_out": _numbers(evidence.held)}
+    name = Path(source).name if source else "an event camera"
+    page.write_page(path, f"Camera report: {name}", repr(recording), panels, numbers,
+                    overwrite=overwrite)
+    step()
+    return numbers
+
+
+def gather(
+    found: CameraEstimate, recording: Recording, weights: str | os.PathLike, min_window_us: int,
+    seed: int, step: Callable[[], None],
+) -> Evidence:
+    """Put the estimate to the test; step() is called twice."""
+    trial = half = held = None
+    why = why_held = ""
+    try:
+        if not (known(found, "on") and known(found, "off")):
+            raise EvflowDataError("EV017", "the thresholds are undetermined.")
+        runs = usable_runs(recording)
+        trial = resimulate(recording, found.camera, busiest(recording, runs), seed)
+    except EvflowDataError as error:
+        why = why_held = error.seen
+    step()
+    if trial:
+        try:
+            half, held = held_out(recording, load_weights(weights), runs, min_window_us, seed)
+        except EvflowDataError as error:
+            why_held = error.seen
+    step()
+    return Evidence(trial, half, held, why, why_held)
+
+
+def _numbers(trial: Trial | None) -> dict[str, Any] | None:
+    return {**trial.numbers, "ceiling": trial.ceiling} if trial else None
+
+
+def _verdict(found: CameraEstimate, evidence: Evidence, judged: list[Judged]) -> Panel:
+    grade = worst(judged)
+    if evidence.trial:
+        worse = poorer(judged)
+        gravest = max((j for j in judged if j.about == worse), key=lambda j: j.badness)
+        headline, tail = HEADLINES[grade], f"The poorer polarity is {worse}. " + (
+            f"What speaks most against it: {gravest.seen}" if gravest.grade != "good" else "")
+    else:
+        headline = ("Measured, but not put to the test." if known(found, "on")
+                    and known(found, "off") else "Not all of the camera is known.")
+        tail = f"The estimate could not be put to the test: {evidence.why_not}"
+        grade = max(grade, "fair", key=GRADES.index)
+    body = (f'<div class="verdict {grade}"><strong class="grade">{headline}</strong>'
+            f"{paragraph(f'{_measured(found)} {tail}')}</div>" + verdict_rows(judged)
+            + "<h3>What to do</h3>" + bullets(advice(judged) or [
+                "Nothing: simulate with it (evflow simulate VIDEO --camera camera.npz -o "
+                "synth.h5)." if evidence.trial else "Record with frames, to test it."]))
+    return Panel("verdict", "Verdict", body + paragraph(RULE, "note"))
+
+
+def _measured(found: CameraEstimate) -> str:
+    """The camera's summary in a sentence."""
+    def value(name: str) -> str:
+        return spread(*(float(getattr(s, name)) for s in (found.summary, found.summary_std)))
+
+    theta = [f"θ {side.upper()} {value(f'theta_{side}')}" for side in ("on", "off")
+             if known(found, side)]
+    eta = [f"η {side.upper()} {value(f'eta_{side}')}" for side in ("on", "off")]
+    where = f"in {plural(found.windows, 'window')}" if found.windows else "of a static scene"
+    thresholds = f"{' and '.join(theta)} (natural log), " if theta else ""
+    return (f"From {int(found.n_events.sum()):,} events {where}: {thresholds}"
+            f"{' and '.join(eta)} Hz per pixel.")
+
+
+def _trial_panels(recording: Recording, evidence: Evidence) -> list[Panel]:
+    """The four panels that lay the re-simulation beside the recording."""
+    trial = evidence.trial
+    if trial is None:
+        return [Panel(name, title, paragraph(f"Absent: {evidence.why_not}", "note"))
+                for name, title in (("rates", "Event rate over time"), ("images", "The same 30 ms"),
+                                    ("counts", "Events per pixel"),
+                                    ("intervals", "Intervals between events"))]
+    middle = trial.instant_us + 15_000
+    index = int(np.argmin(np.abs(recording.frame_times - middle)))
+    return [rate_panel(trial.numbers, NAMES, paragraph(_stretch(recording, trial))),
+            image_panel(trial.real, trial.made, trial.instant_us, trial.span_us[0], NAMES,
+                        recording.frame_dn(index)),
+            count_panel(trial.real, trial.made, trial.numbers, NAMES, trial.ceiling),
+            time_panel(trial.numbers, NAMES)]
+
+
+def _stretch(recording: Recording, trial: Trial) -> str:
+    """Which part of the recording was simulated, and how."""
+    zero = int(recording.events.t[0])
+    t0, t1 = (int(recording.frame_times[i]) for i in trial.frames)
+    words = (f"The recording's frames {trial.frames[0]} to {trial.frames[1]} "
+             f"({(t0 - zero) / 1e6:.3f} to {(t1 - zero) / 1e6:.3f} s after its first event), "
+             "interpolated by optical flow to one pixel of motion, seen by the estimated camera. ")
+    if trial.span_us[0] > t0:
+        words += (f"The first {(trial.span_us[0] - t0) / 1e3:.0f} ms are left out: there the "
+                  "simulation still remembers its first frame. ")
+    return words + f"At most {SECONDS:g} s, the busiest, are simulated. " + " ".join(
+        note[0].upper() + note[1:] for note in trial.notes)
+
+
+def _held_panel(found: CameraEstimate, evidence: Evidence) -> Panel:
+    title = "Held out: estimated on the first half, tried on the second"
+    half, held = evidence.half, evidence.held
+    if half is None or held is None:
+        return Panel("held-out", title, paragraph(f"Absent: {evidence.why_not_held}", "note"))
+    rates, r = held.numbers["rate_hz"], held.numbers["counts"]["r"]
+    rows = [[f"events / pixel / s, {p.upper()}", number(rates["real"][p]),
+             number(rates["synthetic"][p]), number(rates["ratio"][p])] for p in ("on", "off")]
+    estimates = [[label, *(
+        spread(float(getattr(f.summary, n)), float(getattr(f.summary_std, n)))
+        for f in (half, found))]
+                 for n, label in (("theta_on", "θ ON"), ("theta_off", "θ OFF"),
+                                  ("eta_on", "η ON [Hz]"), ("eta_off", "η OFF [Hz]"))]
+    counts = [["r, recorded against re-simulated", *(number(r[k], 3)
+                                                     for k in ("on", "off", "both"))],
+              ["r of two re-simulations, the ceiling", *(number(held.ceiling[k], 3)
+                                                         for k in ("on", "off", "both"))]]
+    return Panel("held-out", title, paragraph(
+        "The longest stretch without a gap is halved. The camera is estimated from its first half "
+        f"(at most the last {LEARNT_SECONDS:g} s of it, {plural(half.windows, 'window')}) and has "
+        f"not seen the second, of which {held.numbers['duration_s']:.3f} s are simulated.")
+        + table(["second half", *NAMES, "ratio"], rows)
+        + table(["events per pixel", "ON", "OFF", "both"], counts)
+        + table(["estimate", "first half", "all"], estimates))
+
+
+def _assumptions(
+    found: CameraEstimate, recording: Recording, evidence: Evidence,
+    weights: str | os.PathLike, source: str | os.PathLike | None, command: str,
+) -> Panel:
+    events = recording.events
+    report = check(recording)
+    facts = {
+        "Units": "θ in natural-log units of brightness; η in Hz per pixel and polarity, at the "
+                 "recording's mean intensity; times in microseconds.",
+        "Polarity": f"ON = brighter; {events.p.mean():.1%} of the events are ON." + _agreement(
+            recording),
+        "Alignment": "Frames and events on one clock; frame times taken as mid-exposure.",
+        "Response": f"Frames taken as linear in light, {recording.frames.dtype} with white at "
+                    f"{recording.full_scale}; logarithm as in v2e, linear below 20 of 255.",
+        "Read": " ".join(f"{n[0].upper()}{n[1:].rstrip('.')}." for n in recording.notes) or "–",
+        "Re-simulation": f"At most {SECONDS:g} s and {PIXELS / 1e6:.0f} million pixels of frames; "
+                         "noise resets a pixel's memory; two keys.",
+        "Weights": f"{weights}, sha256 {weights_hash(weights)}",
+        "Recording": f"{source}, sha256 {sha256(source)}" if source else "given from Python",
+        "Command": command or "–",
+        "Versions": ", ".join(f"{k} {v}" for k, v in versions().items())}
+    if not recording.has_frames:
+        facts["Alignment"] = facts["Response"] = "No frames."
+    coded = {"Weights", "Recording", "Command"}
+    rows = [[page.text(k), f"<code>{page.text(v)}</code>" if k in coded else page.text(v)]
+            for k, v in facts.items()]
+    said = [*found.warnings, *map(str, report.findings)]
+    return Panel("assumptions", "What was assumed, and where it comes from",
+                 table(["", ""], rows, numeric=False) + "<h3>Warnings</h3>"
+                 + (bullets(dict.fromkeys(said)) if said else paragraph("None.", "note")))
+
+
+def _agreement(recording: Recording) -> str:
+    """How the events' polarity goes with the frames."""
+    steps = frame_steps(recording)
+    r = steps.correlation() if steps else float("nan")
+    return (f" ON minus OFF goes with the frames' change of brightness, r = {r:+.2f}."
+            if np.isfinite(r) else "")

@@ -1,0 +1,132 @@
+"""The proof of an estimate: the recording's own frames, seen again by the estimated camera.
+
+A stretch of the recording is simulated twice, with two keys: what the two have in common is the
+most that the recording and one of them could. Bounded work: the busiest seconds, and for the
+held-out half an estimate from the seconds before its middle. Host side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from evflow import io
+from evflow.camera import Camera
+from evflow.errors import EvflowDataError
+from evflow.metrics.streams import compare
+from evflow.recording import CameraEstimate, estimate_camera
+from evflow.sensors import SensorModel
+from evflow.simulator import simulate_stream
+from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
+from evflow.types import Events, Recording
+
+SECONDS = 3.0  # of recording at most that are simulated
+PIXELS = 100 * 346 * 260  # of frames at most: 100 frames of a DAVIS346
+LEARNT_SECONDS = 5.0  # of the first half that the held-out estimate is made from
+SETTLING = 3  # intervals from which on the first is left out of the comparison
+INSTANT_US = 30_000  # an event image
+
+Run = tuple[int, int]  # first and last frame
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trial:
+    """A stretch of a recording beside its re-simulation.
+
+    real, made: their events over span_us = (t0, t1), which begins a frame after the simulation
+    where there is room; frames: (first, last) of those simulated; numbers: `compare(real,
+    made)`; ceiling: correlation of the counts of two re-simulations, per polarity; instant_us:
+    when the busiest 30 ms begin; notes: what the interpolation said.
+    """
+
+    real: Events
+    made: Events
+    span_us: tuple[int, int]
+    frames: Run
+    numbers: dict[str, Any]
+    ceiling: dict[str, float | None]
+    instant_us: int
+    notes: tuple[str, ...]
+
+
+def usable_runs(recording: Recording) -> list[Run]:
+    """(first, last) frames of the runs without a gap or fault that the events cover.
+
+    Raises EV011, EV012 where frames are missing, EV017 where no two neighbours can be used.
+    """
+    runs: list[Run] = []
+    for first, last in io.plan_windows(recording, 1).pairs:
+        if runs and runs[-1][1] == first:
+            runs[-1] = (runs[-1][0], last)
+        else:
+            runs.append((first, last))
+    if not runs or max(recording.frames.shape[1:]) < MIN_SIDE:
+        raise EvflowDataError("EV017", "no two frames that the events cover can be used.",
+                              "Re-simulation needs a moving picture.")
+    return runs
+
+
+def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> Run:
+    """The part of a run, at most `seconds` and PIXELS long, with the most events."""
+    times = recording.frame_times
+    width, height = recording.events.size
+    most = max(2, PIXELS // (width * height))
+    before = np.searchsorted(recording.events.t, times)
+    best, found = -1, runs[0]
+    for first, end in runs:
+        for start in range(first, end):
+            reach = int(np.searchsorted(times, times[start] + seconds * 1e6, side="right")) - 1
+            stop = min(end, start + most, max(start + 1, reach))
+            events = int(before[stop] - before[start])
+            if events > best:
+                best, found = events, (start, stop)
+    return found
+
+
+def resimulate(recording: Recording, camera: Camera, run: Run, seed: int) -> Trial:
+    """Simulate the frames of `run` twice, interpolated to 1 px of motion, and compare."""
+    notes: list[str] = []
+    model = SensorModel(noise_resets_memory=True)
+
+    def seen(key: jax.Array) -> Events:
+        pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
+                 for i in range(run[0], run[1] + 1))
+        frames, times = unzip(upsample(pairs, warn=notes.append))
+        return Events.concatenate(list(simulate_stream(key, frames, times, camera, model=model)))
+
+    begin = run[0] + 1 if run[1] - run[0] >= SETTLING else run[0]
+    span = (int(recording.frame_times[begin]), int(recording.frame_times[run[1]]))
+    made, again = (seen(key).slice(*span) for key in jax.random.split(jax.random.key(seed)))
+    real = recording.events.slice(*span)
+    ceiling = compare(made, again, span_us=span)["counts"]["r"]
+    return Trial(real, made, span, run, compare(real, made, span_us=span), ceiling,
+                 busiest_instant(real, span), tuple(dict.fromkeys(notes)))
+
+
+def busiest_instant(events: Events, span_us: tuple[int, int], length_us: int = INSTANT_US) -> int:
+    """When the `length_us` with the most events begin, within the span (us)."""
+    starts = np.arange(span_us[0], max(span_us[0] + 1, span_us[1] - length_us + 1),
+                       max(1, length_us // 3))
+    inside = np.searchsorted(events.t, starts + length_us) - np.searchsorted(events.t, starts)
+    return int(starts[int(np.argmax(inside))])
+
+
+def held_out(
+    recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int
+) -> tuple[CameraEstimate, Trial]:
+    """An estimate from the first half of the longest run (its last LEARNT_SECONDS), tried on the
+    second half. Raises EV017 where a half is too short to estimate from."""
+    first, last = max(runs, key=lambda r: r[1] - r[0])
+    times = recording.frame_times
+    middle = int(np.searchsorted(times, (int(times[first]) + int(times[last])) // 2))
+    if not first < middle < last:
+        raise EvflowDataError("EV017", f"the frames {first} to {last} cannot be halved.",
+                              "Record longer.")
+    begin = max(first, int(np.searchsorted(times, times[middle] - LEARNT_SECONDS * 1e6)))
+    half = Recording(recording.events.slice(int(times[begin]), int(times[middle])),
+                     recording.frames[begin:middle + 1], times[begin:middle + 1])
+    found = estimate_camera(half, params, min_window_us=min_window_us)
+    return found, resimulate(recording, found.camera, busiest(recording, [(middle, last)]), seed)

@@ -1,0 +1,216 @@
+"""Numbers into words: is an estimate good enough, are two streams alike, and what to do.
+
+The bounds are judgements, and are printed with the verdict: a stream is good within a quarter of
+the rate, with at least .8 of the correlation that is possible; poor beyond twice the rate or below
+half of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import numpy as np
+
+from evflow.recording import CameraEstimate
+from evflow.report.resimulate import Trial
+
+Grade = Literal["good", "fair", "poor"]
+GRADES: tuple[Grade, ...] = ("good", "fair", "poor")
+
+RATE = (1.25, 2.0)  # factor between the rates
+SHAPE = (0.8, 0.5)  # count correlation, as a share of what two re-simulations reach
+ERROR = (0.10, 0.30)  # std of a threshold, relative
+APART = (0.25, 0.6)  # Wasserstein distance of intervals, in decades
+OWN = 0.05  # share of pixels with events of their own below which maps say little
+HOT = 0.01  # share of hot pixels that is worth a word
+RULE = (f"Good (green): rates within a factor {RATE[0]:g}; counts of the pixels that correlate at "
+        f"least {SHAPE[0]:g} times as well as those of two re-simulations; thresholds known to "
+        f"{ERROR[0]:.0%}. Poor (red): beyond a factor {RATE[1]:g}, below {SHAPE[1]:g} times, above "
+        f"{ERROR[1]:.0%}.")
+RULE_STREAMS = (f"Good (green): rates within a factor {RATE[0]:g}, r of at least {SHAPE[0]:g}, "
+                f"times less than {APART[0]:g} decades apart. Poor (red): beyond a factor "
+                f"{RATE[1]:g}, r below {SHAPE[1]:g}, more than {APART[1]:g} decades apart.")
+THRESHOLD = "threshold θ"
+PLACES = {
+    True: "Events fall on other pixels than recorded: slower motion, or a higher frame rate, makes "
+          "the frames in between truer.",
+    False: "Events fall on other pixels than the real ones: another scene, a mirrored or shifted "
+           "image, or frames too far apart?"}
+HEADLINES = {"good": "Good enough to simulate with.", "fair": "Usable, with care.",
+             "poor": "Not good enough yet."}
+ALIKE = {"good": "Alike.", "fair": "Alike in part.", "poor": "Not alike."}
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """grade of one matter; about: "ON", "OFF", or "" for both; badness: how far from ideal, to
+    tell which is poorer; seen: a sentence; matter and short: row and entry of the table of
+    verdicts; advice: what to do, "" where nothing needs doing."""
+
+    grade: Grade
+    about: str
+    badness: float
+    seen: str
+    matter: str = ""
+    short: str = ""
+    advice: str = ""
+
+
+def graded(value: float, bounds: tuple[float, float]) -> Grade:
+    """Small is good."""
+    return GRADES[int(value > bounds[0]) + int(value > bounds[1])]
+
+
+def worst(judged: list[Judged]) -> Grade:
+    """The gravest grade."""
+    return max((j.grade for j in judged), key=GRADES.index, default="good")
+
+
+def poorer(judged: list[Judged]) -> str:
+    """"ON" or "OFF", whichever is the further from ideal."""
+    return max(("ON", "OFF"), key=lambda p: sum(j.badness for j in judged if j.about == p))
+
+
+def judge_estimate(found: CameraEstimate, trial: Trial | None, held: Trial | None) -> list[Judged]:
+    """Everything that bears on whether the camera can be simulated with."""
+    judged = [_threshold(found, key) for key in ("on", "off")]
+    for test, where in ((trial, "re-simulated"), (held, "held out")):
+        if test:
+            judged += [j for key in ("on", "off")
+                       for j in judge_stream(test.numbers, key, where, test.ceiling)]
+    return judged + _pixels(found)
+
+
+def _threshold(found: CameraEstimate, key: str) -> Judged:
+    theta, std = (float(getattr(s, f"theta_{key}")) for s in (found.summary, found.summary_std))
+    name = key.upper()
+    if not known(found, key):
+        return Judged("poor", name, 9.0, f"θ {name} is undetermined.", THRESHOLD,
+                      "undetermined", "Record moving texture in good light, together with "
+                      "frames: without it thresholds cannot be told.")
+    if any(f"theta_{key} = " in w for w in found.warnings):
+        return Judged("fair", name, 1.5, f"θ {name} lies outside what the network was trained on.",
+                      THRESHOLD, f"{theta:.3f} ± {std:.3f}", "A threshold outside the trained "
+                      "range is an extrapolation: are the frames linear in light (--response), "
+                      "and dark ones without an offset?")
+    error = std / theta
+    grade = graded(error, ERROR)
+    return Judged(grade, name, error / ERROR[0], f"θ {name} is known to {error:.0%}.",
+                  THRESHOLD, f"{theta:.3f} ± {std:.3f}", "" if grade == "good" else
+                  "Record longer, with more motion and texture, to know the thresholds better.")
+
+
+def known(found: CameraEstimate, key: str) -> bool:
+    """Whether the recording determined this polarity's threshold at all."""
+    theta, std = (float(getattr(s, f"theta_{key}")) for s in (found.summary, found.summary_std))
+    said = not found.windows or any(f"theta_{key} is undetermined" in w for w in found.warnings)
+    return bool(np.isfinite(theta) and np.isfinite(std) and theta > 0 and not said)
+
+
+def judge_stream(
+    numbers: dict[str, Any], key: str, where: str, ceiling: dict[str, float | None] | None = None
+) -> list[Judged]:
+    """One polarity of a synthetic stream: how many events, and in which pixels. ceiling: r of two
+    re-simulations, which r is held against; without it, 1."""
+    name, matter = key.upper(), f"rate {where} / recorded"
+    ratio = numbers["rate_hz"]["ratio"][key]
+    if not ratio:
+        who = "recorded" if ratio is None else "synthetic"
+        return [Judged("poor", name, 9.0, f"No {who} {name} events ({where}).", matter, "none",
+                       "Was a polarity lost in a conversion? See evflow check.")]
+    factor = max(ratio, 1 / ratio)
+    grade = graded(factor, RATE)
+    judged = [Judged(
+        grade, name, float(np.log(factor) / np.log(RATE[0])),
+        f"{name} has {ratio:.2f} times the recorded rate ({where}).", matter, f"{ratio:.2f} ×",
+        "" if grade == "good" else _rate_advice(ratio, tested=ceiling is not None))]
+    r, best = numbers["counts"]["r"][key], ceiling[key] if ceiling else 1.0
+    if r is not None and best is not None and best > 0:
+        lost = 1 - r / best
+        grade = graded(lost, (1 - SHAPE[0], 1 - SHAPE[1]))
+        of = f" of {best:.2f}" if ceiling else ""
+        judged.append(Judged(
+            grade, name, lost / (1 - SHAPE[0]), f"{name} counts of the pixels correlate with r = "
+            f"{r:.2f}{of} ({where}).", f"r of the pixels' counts, {where}", f"{r:.2f}{of}",
+            "" if grade == "good" else PLACES[ceiling is not None]))
+    return judged
+
+
+def _rate_advice(ratio: float, *, tested: bool) -> str:
+    """tested: the stream is of an estimate on its own recording."""
+    many = ratio > 1
+    if tested:
+        return (f"Too {'many' if many else 'few'} events are simulated: look for motion too fast "
+                "for the frames, frames with a gamma, flickering light, or clocks that are not "
+                "aligned (evflow check).")
+    return (f"Too {'many' if many else 'few'} synthetic events: {'raise' if many else 'lower'} the "
+            "thresholds of the simulation, or measure them (evflow estimate).")
+
+
+def _pixels(found: CameraEstimate) -> list[Judged]:
+    judged = []
+    own, hot = float(found.valid.mean()), float(found.hot.mean())
+    if found.windows and own < OWN:
+        judged.append(Judged(
+            "fair", "", 1.0, f"Only {own:.1%} of the pixels have events of their own.", advice=
+            "For maps rather than the camera's medians, let motion cover the whole sensor."))
+    if hot > HOT:
+        judged.append(Judged(
+            "fair", "", 1.0, f"{hot:.1%} of the pixels are hot.", advice=
+            "Mask the hot pixels, or record brighter and cooler."))
+    return judged
+
+
+def judge_streams(numbers: dict[str, Any]) -> list[Judged]:
+    """Whether a synthetic stream of any origin passes for the real one."""
+    judged = [j for key in ("on", "off")
+              for j in judge_stream(numbers, key, "synthetic")]
+    for kind, what in (("intervals", "Intervals between a pixel's events"),
+                       ("neighbours", "Delays after a neighbour's event")):
+        apart = numbers[kind]["wasserstein_decades"]
+        if apart is not None:
+            grade = graded(apart, APART)
+            judged.append(Judged(
+                grade, "", apart / APART[0], f"{what} differ by {apart:.2f} decades (KS "
+                f"{numbers[kind]['ks']:.2f}).",
+                advice="" if grade == "good" else _timing(numbers, kind)))
+    real, made = (numbers["neighbours"]["alone"][s] or 0.0 for s in ("real", "synthetic"))
+    gap = abs(real - made)
+    judged.append(Judged(
+        graded(gap, (0.1, 0.3)), "", gap / 0.1, f"Events without company, mostly noise: {real:.0%} "
+        f"recorded, {made:.0%} synthetic.", advice="" if gap <= 0.1 else
+        f"{'Raise' if real > made else 'Lower'} the noise rates of the simulation."))
+    return judged
+
+
+def _timing(numbers: dict[str, Any], kind: str) -> str:
+    median = numbers[kind]["median_s"]
+    slow = median["synthetic"] > median["real"]
+    return (f"Synthetic events follow each other too {'slowly' if slow else 'quickly'} (median "
+            f"{1e3 * median['synthetic']:.2f} against {1e3 * median['real']:.2f} ms): look at the "
+            "refractory period, the thresholds and the frame rate of the simulation.")
+
+
+def describe_streams(numbers: dict[str, Any]) -> str:
+    """A comparison in words: the verdict, what was seen, what to do; a sentence a line."""
+    judged = judge_streams(numbers)
+    seen = [j.seen[0].upper() + j.seen[1:] for j in judged]
+    return "\n".join([ALIKE[worst(judged)], how_compared(numbers), *seen, *advice(judged)])
+
+
+def how_compared(numbers: dict[str, Any]) -> str:
+    """Over which time, on which clock, from how many events."""
+    real, made = numbers["events"]["real"], numbers["events"]["synthetic"]
+    words = (f"{real:,} real and {made:,} synthetic events in the {numbers['duration_s']:.3f} s "
+             "that both cover.")
+    if numbers["aligned_at"] == "clock":
+        return words
+    return words + (" They share no time by their clocks: both were laid at their beginnings "
+                    f"(synthetic moved by {numbers['shift_us'] / 1e6:+.6f} s).")
+
+
+def advice(judged: list[Judged]) -> list[str]:
+    """What to do, the gravest first, each once."""
+    order = sorted(judged, key=lambda j: -GRADES.index(j.grade))
+    return list(dict.fromkeys(j.advice for j in order if j.advice))

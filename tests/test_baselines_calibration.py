@@ -1,0 +1,181 @@
+"""Bench calibration on simulated screens: steps of several sizes, rests, noise."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow import Recording, simulate
+from evflow.baselines.calibration import calibrate_static, calibrate_step, find_rests
+from evflow.camera import Camera, CameraPrior
+from evflow.errors import EvflowDataError
+from evflow.types import Events
+
+SHAPE = (24, 32)
+CYCLES = [25, 225, 25, 225, 25, 225, 25]
+STAIRS = [25, 40, 64, 100, 160, 225, 160, 100, 64, 40, 25]
+
+
+def screen(levels: list[float], rest: int = 100, ramp: int = 20) -> np.ndarray:
+    """DN over time, a frame every ms: `rest` ms at each level, `ramp` ms (even in log) between."""
+    logs = [np.full(rest, np.log(levels[0]))]
+    for a, b in itertools.pairwise(levels):
+        logs += [np.linspace(np.log(a), np.log(b), ramp + 1)[1:], np.full(rest, np.log(b))]
+    return np.exp(np.concatenate(logs)).astype(np.float32)
+
+
+def bench(camera: Camera, levels: list[float], before: tuple[float, ...] = ()) -> Recording:
+    """Events of a screen and its frames every 10 ms. before: levels that the camera saw first."""
+    lead = len(screen([*before, levels[0]])) - 100 if before else 0
+    dn = screen([*before, *levels])
+    frames, times = np.broadcast_to(dn[:, None, None], (len(dn), *SHAPE)), 1000 * np.arange(len(dn))
+    events = simulate(jax.random.key(0), frames, times, camera)
+    kept = np.arange(lead, len(dn), 10)
+    events = events.slice(int(times[lead]) + 1, int(times[-1]) + 1)
+    return Recording(events, np.ascontiguousarray(frames[kept]), times[kept])
+
+
+def cameras(mismatch: float, noise: str = "none") -> Camera:
+    prior = CameraPrior(theta=(0.15, 0.35), mismatch=(mismatch, mismatch), noise=noise)
+    return Camera.sample(jax.random.key(3), SHAPE, prior)
+
+
+def errors(found, camera: Camera, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the valid pixels, and in units of the std."""
+    off = np.asarray(getattr(found.camera, name)) - np.asarray(getattr(camera, name))
+    return off[found.valid], (off / np.asarray(getattr(found.std, name)))[found.valid]
+
+
+@pytest.mark.parametrize("levels", [CYCLES, STAIRS, [25, 225, 25]], ids=["cycles", "stairs", "two"])
+@pytest.mark.parametrize("mismatch", [0.03, 0.1])
+def test_steps_tell_every_pixels_thresholds(levels: list[float], mismatch: float) -> None:
+    """Unbiased to .003, each pixel within its std; the literal ratio is biased by .02 and more."""
+    camera = cameras(mismatch)
+    recording = bench(camera, levels)
+    found = calibrate_step(recording, fresh=True)
+    literal = calibrate_step(recording, literal=True)
+    assert found.valid.mean() > 0.98
+    for name in ("theta_on", "theta_off"):
+        off, sigmas = errors(found, camera, name)
+        assert abs(off.mean()) < 0.003
+        assert np.abs(off).mean() < 0.015
+        assert 0.7 < np.sqrt((sigmas**2).mean()) < 1.4
+        assert errors(literal, camera, name)[0].mean() > 0.02
+        true = np.median(getattr(camera, name))
+        assert float(getattr(found.summary, name)) == pytest.approx(true, abs=0.012)
+        spread = float(getattr(found.summary, f"sigma_{name[6:]}"))
+        assert spread == pytest.approx(mismatch, abs=0.015)
+
+
+def test_a_running_camera_starts_anywhere() -> None:
+    """Light that came down before the first rest: up to theta_off to go back. The std covers it."""
+    camera = cameras(0.03)
+    found = calibrate_step(bench(camera, CYCLES, before=(150.0, 60.0)))
+    for name in ("theta_on", "theta_off"):
+        off, sigmas = errors(found, camera, name)
+        assert abs(off.mean()) < 0.006
+        assert np.sqrt((sigmas**2).mean()) < 1.4
+
+
+def test_quantisation_shrinks_with_the_step() -> None:
+    """One step: the error is that of a count of dlogI / theta, the std says so."""
+    camera = cameras(0.03)
+    stds = []
+    for top in (50, 100, 225):
+        found = calibrate_step(bench(camera, [25, top]), fresh=True)
+        _, sigmas = errors(found, camera, "theta_on")
+        assert 0.6 < np.sqrt((sigmas**2).mean()) < 1.4
+        stds.append(np.median(np.asarray(found.std.theta_on)[found.valid]))
+        assert "no step sends OFF events" in " ".join(found.warnings)
+    assert stds[0] > 1.5 * stds[1] > 1.5 * stds[2]
+
+
+def test_noise_is_taken_off_and_measured() -> None:
+    camera = cameras(0.03, "eq12")
+    found = calibrate_step(bench(camera, CYCLES), fresh=True)
+    for name in ("theta_on", "theta_off"):
+        off, sigmas = errors(found, camera, name)
+        assert abs(off.mean()) < 0.004
+        assert np.sqrt((sigmas**2).mean()) < 1.4
+    rest = 0.56 * SHAPE[0] * SHAPE[1]  # pixel seconds
+    for name in ("eta_on", "eta_off"):
+        true = float(np.mean(getattr(camera, name)))
+        seen = float(getattr(found.summary, name))
+        assert abs(seen - true) < 3.5 * np.sqrt(true / rest)
+
+
+def test_light_may_be_given_instead_of_frames() -> None:
+    camera = cameras(0.03)
+    recording = bench(camera, CYCLES)
+    times = recording.frame_times
+    rests = [(int(times[a]), int(times[b])) for a, b in find_rests(recording)]
+    assert len(rests) == len(CYCLES)
+    alone = calibrate_step(Recording.of_events(recording.events), rests_us=rests,
+                           light=[4.0 * x for x in CYCLES], fresh=True)
+    framed = calibrate_step(recording, fresh=True)
+    np.testing.assert_allclose(alone.camera.theta_on, framed.camera.theta_on, atol=1e-4)
+
+
+def test_a_scene_at_rest_tells_noise() -> None:
+    """Rates of a camera to their Poisson error; maps are shrunk to it, and hot pixels are told."""
+    seconds = 60.0
+    rng = np.random.default_rng(0)
+    eta = (0.2 * np.exp(0.5 * rng.standard_normal(SHAPE))).astype(np.float32)
+    eta[3, 4] = 40.0
+    theta = jnp.full(SHAPE, 0.2)
+    camera = Camera(theta, theta, jnp.asarray(eta), jnp.full(SHAPE, 0.05))
+    times = np.linspace(0, 1e6 * seconds, 61).astype(np.int64)
+    frames = np.full((61, *SHAPE), 100, np.uint8)
+    events = simulate(jax.random.key(1), frames, times, camera)
+    found = calibrate_static(Recording.of_events(events), start_us=0, stop_us=int(1e6 * seconds))
+    assert np.argwhere(found.hot).tolist() == [[3, 4]]
+    assert not found.valid[3, 4]
+    assert float(found.summary.eta_on) == pytest.approx(0.2, rel=0.1)
+    assert float(found.summary.eta_off) == pytest.approx(0.05, rel=0.03)
+    seen, raw = np.asarray(found.camera.eta_on), events.count_map()[0] / seconds
+    good = found.valid
+    shrunk, plain = (np.sqrt(np.mean((v - eta)[good] ** 2)) for v in (seen, raw))
+    assert shrunk < 0.95 * plain
+    z = ((seen - eta) / np.asarray(found.std.eta_on))[good]
+    assert 0.8 < np.sqrt((z**2).mean()) < 1.2
+    assert "does not tell thresholds" in found.warnings[0]
+
+
+def test_results_are_written_like_an_estimate(tmp_path: Path) -> None:
+    found = calibrate_step(bench(cameras(0.03), [25, 225, 25]), fresh=True)
+    path = found.save(tmp_path / "camera.npz")
+    np.testing.assert_array_equal(Camera.load(path).theta_on, found.camera.theta_on)
+    assert found.as_dict()["windows"] == 2
+
+
+def test_what_is_no_bench_is_refused() -> None:
+    recording = bench(cameras(0.03), [25, 225])
+    none = np.zeros(0, np.int64)
+    empty = Events(none, none, none, none, (SHAPE[1], SHAPE[0]))
+    cases = {
+        "EV001": lambda: calibrate_step(Recording.of_events(empty)),
+        "EV011": lambda: calibrate_step(Recording.of_events(recording.events)),
+        "EV017": lambda: calibrate_step(bench(cameras(0.03, "eq12"), [100, 105])),
+        "EV020": lambda: calibrate_step(recording, rests_us=[(0, 10), (5, 20)], light=[1, 2]),
+    }
+    for code, call in cases.items():
+        with pytest.raises(EvflowDataError, match=code):
+            call()
+    with pytest.raises(EvflowDataError, match="EV020"):
+        calibrate_step(recording, rests_us=[(0, 10), (15, 20)], light=[1, 0])
+    with pytest.raises(EvflowDataError, match="EV001"):
+        calibrate_static(Recording.of_events(empty))
+
+
+def test_no_noise_in_a_minute_is_no_rate() -> None:
+    none = np.zeros(0, np.int64)
+    empty = Events(none, none, none, none, (SHAPE[1], SHAPE[0]))
+    found = calibrate_static(Recording.of_events(empty), start_us=0, stop_us=60_000_000)
+    assert np.asarray(found.camera.eta_on).max() < 1e-6
+    assert float(found.summary.eta_on) < 1e-6
+    assert float(found.summary_std.eta_on) > 0

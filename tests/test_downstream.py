@@ -1,0 +1,297 @@
+"""The event networks: PyTorch's numbers on published weights, pure functions, event tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.util
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from published_networks import (
+    CASES,
+    HEIGHT,
+    WIDTH,
+    case_input,
+    case_state,
+    e2vid,
+    evflownet,
+    firenet,
+    write_legacy,
+    write_zip,
+)
+
+from evflow import save_weights
+from evflow.downstream import (
+    E2VID,
+    E2VID_LIGHTWEIGHT,
+    E2VID_PLUS,
+    E2VID_SMALL,
+    EVFlowNet,
+    FireNet,
+    Network,
+    event_tensor,
+    load_published,
+    normalise,
+    reconstruct,
+    run,
+    signed,
+)
+from evflow.downstream.published import recognise, to_params
+from evflow.downstream.tensor import windows_between
+from evflow.errors import EvflowDataError
+from evflow.types import Events
+from evflow.voxel import voxelize
+from evflow.weights import load_weights
+
+DATA = Path(__file__).parent / "data"
+TINY = [E2VID(base=4, encoders=1, blocks=1), FireNet(base=4), EVFlowNet(base=4, scales=4),
+        E2VID(base=4, encoders=1, blocks=0, skip="concat", norm="batch", decoder="transposed",
+              output="sigmoid")]
+tiny = pytest.mark.parametrize("network", TINY, ids=str)
+
+
+apply = jax.jit(lambda network, *args: network.apply(*args), static_argnums=0)
+run_jit = jax.jit(run, static_argnames=("network", "train"))
+
+
+@functools.cache
+def outputs(name: str) -> np.ndarray:
+    """(T, H, W) or (T, 2, H, W) of our network with the weights of a case."""
+    state = case_state(name)
+    network = recognise(state)
+    images, _ = run_jit(network, to_params(network, state), jnp.asarray(case_input()))
+    return np.asarray(images)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_outputs_are_those_of_pytorch(name: str) -> None:
+    ours = outputs(name)
+    with np.load(DATA / "downstream.npz") as stored:
+        assert np.std(stored[name]) > 0.02  # weights that let something through
+        np.testing.assert_allclose(ours, stored[name], rtol=0, atol=1e-5)
+    if importlib.util.find_spec("torch") is not None:
+        import torch_reference
+        np.testing.assert_allclose(ours, torch_reference.case_output(name), rtol=0, atol=1e-5)
+
+
+def test_recurrence_matters() -> None:
+    """The parity would not see a state that is lost, were the images the same without."""
+    for name in ("e2vid_plus", "firenet_plus"):
+        state = case_state(name)
+        network, x = recognise(state), jnp.asarray(case_input())
+        params = to_params(network, state)
+        alone, _ = apply(network, params, x[-1])
+        assert float(jnp.abs(alone - outputs(name)[-1]).max()) > 1e-2
+
+
+def test_structures_are_recognised() -> None:
+    assert recognise(case_state("e2vid_plus")) == dataclasses.replace(E2VID_PLUS, base=4)
+    assert recognise(case_state("e2vid_lightweight")) == dataclasses.replace(
+        E2VID_LIGHTWEIGHT, base=4)
+    assert recognise(case_state("e2vid_concat")) == E2VID(
+        base=4, encoders=2, blocks=1, skip="concat")
+    assert recognise(case_state("firenet_plus")) == recognise(
+        case_state("firenet_2020")) == FireNet()
+    assert recognise(case_state("evflownet")) == EVFlowNet(base=4)
+
+
+@pytest.mark.parametrize(("network", "shapes", "count"), [
+    (E2VID_PLUS, e2vid(), 10_710_401), (E2VID_LIGHTWEIGHT, e2vid(batch=True, transposed=True),
+                                        10_712_098),
+    (FireNet(), firenet(), 37_777), (EVFlowNet(), evflownet(), 14_125_346),
+], ids=["E2VID+", "E2VID", "FireNet", "EV-FlowNet"])
+def test_full_sizes_are_the_published_ones(network, shapes, count) -> None:
+    params = jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16)))
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    assert sum(np.prod(leaf.shape) for path, leaf in leaves
+               if path[-1].key not in ("mean", "var")) == count
+    filled = to_params(network, {name: np.zeros(shape, np.float32)
+                                 for name, shape in shapes.items()})
+    assert jax.tree.map(jnp.shape, filled) == jax.tree.map(lambda leaf: leaf.shape, params)
+    assert sum(np.prod(shape) for name, shape in shapes.items()
+               if not name.endswith(("mean", "var", "tracked"))) == count
+
+
+def test_small_network_is_small() -> None:
+    params = jax.eval_shape(lambda: E2VID_SMALL.init(jax.random.key(0), (48, 48)))
+    assert 0.13e6 < sum(np.prod(leaf.shape) for leaf in jax.tree.leaves(params)) < 0.16e6
+
+
+@pytest.mark.parametrize("write", [write_legacy, write_zip])
+def test_published_files_load_and_are_kept_as_weights(write, tmp_path: Path) -> None:
+    state = case_state("firenet_plus")
+    path = tmp_path / "model.pth"
+    write(path, {"arch": "FireNet", "state_dict": state})
+    network, params = load_published(path)
+    expected = to_params(FireNet(), state)
+    assert network == FireNet()
+    jax.tree.map(np.testing.assert_array_equal, params, expected)
+    save_weights(tmp_path / "firenet.safetensors", params, {"network": str(network)})
+    again = load_weights(tmp_path / "firenet.safetensors")
+    jax.tree.map(np.testing.assert_array_equal, again, expected)
+
+
+def test_settings_of_the_original_e2vid_make_it_sigmoid(tmp_path: Path) -> None:
+    path = tmp_path / "e2vid.pth.tar"
+    write_legacy(path, {"model": {"num_bins": 5}, "state_dict": case_state("e2vid_plus")})
+    network, _ = load_published(path)
+    assert (network.output, network.padding) == ("sigmoid", "reflect")
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda s: s.pop("head.conv2d.bias"), "lack"),
+    (lambda s: s.update({"head.conv2d.bias": np.zeros(3, np.float32)}), "head/conv/bias"),
+    (lambda s: s.update({"extra.weight": np.zeros(3, np.float32)}), "extra.weight"),
+    (lambda s: s.update({"G1.reset_gate.running_mean": np.zeros(16, np.float32)}), "no such layer"),
+    (lambda s: s.update({"head.conv2d.weight": np.zeros(3, np.float32)}), "kernel"),
+    (lambda s: s.clear() or s.update(other=np.zeros(2)), "no known network"),
+], ids=["missing", "shape", "name", "layer", "axes", "foreign"])
+def test_weights_that_do_not_fit_are_refused(change, says: str) -> None:
+    state = case_state("firenet_plus")
+    change(state)
+    with pytest.raises(EvflowDataError, match=says) as e:
+        to_params(recognise(state), state)
+    assert e.value.code == "EV018"
+
+
+@tiny
+def test_networks_are_pure_functions_on_any_batch(network: Network) -> None:
+    params = network.init(jax.random.key(0), (HEIGHT, WIDTH))
+    x = jnp.asarray(case_input())[:3]
+    image, state = apply(network, params, x)  # three scenes at once, no state
+    again, _ = apply(network, params, x)
+    np.testing.assert_array_equal(image, again)
+    lead = (3, 2) if isinstance(network, EVFlowNet) else (3,)
+    assert image.shape == (*lead, HEIGHT, WIDTH)
+    assert image.dtype == jnp.float32
+    assert jax.tree.map(jnp.shape, state) == jax.tree.map(
+        jnp.shape, network.start((3, HEIGHT, WIDTH)))
+    one, _ = apply(network, params, x[1])
+    np.testing.assert_allclose(one, image[1], atol=2e-6)
+    with pytest.raises(EvflowDataError, match="EV002"):
+        network.apply(params, x[..., :3])
+
+
+@tiny
+def test_scanned_unrolled_and_stepped_sequences_agree(network: Network) -> None:
+    params = network.init(jax.random.key(0), (16, 16))
+    x = jnp.asarray(case_input())[:4, :16, :16]
+    scanned, end = run_jit(network, params, x)
+    unrolled, _ = run_jit(network, params, x, train=True)
+    np.testing.assert_allclose(scanned, unrolled, atol=1e-5)
+    first, state = run_jit(network, params, x[:2])
+    second, rest = run_jit(network, params, x[2:], state)
+    np.testing.assert_allclose(jnp.concatenate([first, second]), scanned, atol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), rest, end)
+
+
+def test_double_precision_follows_the_input() -> None:
+    network = TINY[0]
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64),
+                              network.init(jax.random.key(0), (16, 16)))
+        image, state = apply(network, params, jnp.asarray(case_input()[0], jnp.float64))
+    assert image.dtype == jnp.float64
+    assert {leaf.dtype for leaf in jax.tree.leaves(state)} == {jnp.dtype("float64")}
+
+
+def test_statistics_of_batch_norm_get_no_gradient() -> None:
+    network = TINY[-1]
+    params = network.init(jax.random.key(0), (8, 8))
+    x = jnp.asarray(case_input())[0, :8, :8]
+    grads = jax.jit(jax.grad(lambda p: jnp.sum(network.apply(p, x)[0] ** 2)))(params)
+    sizes = {path[-1].key: float(jnp.abs(g).sum())
+             for path, g in jax.tree_util.tree_leaves_with_path(grads["decoder_0"])}
+    assert sizes["mean"] == sizes["var"] == 0
+    assert sizes["scale"] > 0
+
+
+def test_the_four_scales_of_flow() -> None:
+    network = EVFlowNet(base=4, scales=4)
+    params = network.init(jax.random.key(0), (32, 48))
+    pyramid = jax.jit(network.pyramid)
+    flows = pyramid(params, jnp.ones((2, 32, 48, 5)))
+    assert [f.shape for f in flows] == [(2, 2, 32 >> i, 48 >> i) for i in (3, 2, 1, 0)]
+    flow, state = apply(network, params, jnp.ones((2, 32, 48, 5)))
+    np.testing.assert_allclose(flow, flows[-1], atol=1e-5)
+    assert state == ()
+    # Each scale hears of the coarser one: a change of the first prediction reaches the last.
+    params["prediction_0"]["conv"]["bias"] = params["prediction_0"]["conv"]["bias"] + 0.1
+    other = pyramid(params, jnp.ones((2, 32, 48, 5)))
+    assert float(jnp.abs(other[-1] - flows[-1]).max()) > 1e-3
+
+
+@pytest.mark.parametrize("options", [
+    {"decoder": "nearest"}, {"norm": "group"}, {"skip": "none"}, {"output": "relu"},
+    {"encoders": 0}, {"base": 0}, {"padding": "wrap"}])
+def test_unknown_options_are_refused(options) -> None:
+    with pytest.raises(EvflowDataError, match="EV020"):
+        E2VID(**options)
+
+
+def some_events(n: int = 400, seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    return Events(rng.integers(0, 12, n), rng.integers(0, 8, n), np.sort(rng.integers(0, 9000, n)),
+                  rng.integers(0, 2, n).astype(bool), (12, 8))
+
+
+@given(n=st.integers(1, 60), bins=st.integers(2, 7), seed=st.integers(0, 99))
+@settings(max_examples=40, deadline=None)
+def test_event_tensors_spread_each_event_over_two_bins(n: int, bins: int, seed: int) -> None:
+    events = some_events(n, seed)
+    grid = np.zeros((8, 12, bins))
+    span = max(int(events.t[-1] - events.t[0]), 1)
+    for x, y, t, p in zip(events.x, events.y, events.t, events.p, strict=True):
+        at = (bins - 1) * (int(t) - int(events.t[0])) / span
+        grid[y, x] += (1 if p else -1) * np.maximum(0, 1 - np.abs(np.arange(bins) - at))
+    np.testing.assert_allclose(event_tensor(events, bins), grid, atol=1e-5)
+
+
+def test_silence_is_a_tensor_of_zeros() -> None:
+    silent = some_events().slice(20_000, 30_000)
+    assert not event_tensor(silent).any()
+    assert not np.asarray(normalise(jnp.asarray(event_tensor(silent)))).any()
+
+
+def test_signed_voxels_are_on_minus_off() -> None:
+    events = some_events()
+    both = voxelize(events, 0, 10_000, 5)
+    ours = np.asarray(signed(jnp.asarray(both)))
+    assert ours.shape == (8, 12, 5)
+    np.testing.assert_allclose(ours.sum(), 2.0 * events.p.sum() - len(events), atol=1e-3)
+
+
+def test_normalised_tensors_have_mean_0_and_deviation_1_where_not_0() -> None:
+    tensor = jnp.asarray(np.stack([event_tensor(some_events(seed=i)) * (i + 1) for i in (0, 1)]))
+    out = np.asarray(normalise(tensor))
+    for one, was in zip(out, np.asarray(tensor), strict=True):
+        some = was != 0
+        np.testing.assert_allclose([one[some].mean(), one[some].std()], [0, 1], atol=1e-5)
+        assert not one[~some].any()
+
+
+def test_each_frame_sees_the_events_since_the_one_before() -> None:
+    times = np.array([0, 5, 5, 10, 20])
+    windows = windows_between(times, np.array([5, 7, 15]))
+    assert [times[w].tolist() for w in windows] == [[0, 5, 5], [], [10]]
+
+
+def test_reconstruct_is_apply_window_by_window() -> None:
+    events, network = some_events(), FireNet(base=4)
+    params = network.init(jax.random.key(0), (8, 12))
+    images = reconstruct(network, params, events, np.array([3000, 6000, 9000]), normalised=True)
+    tensors = [normalise(jnp.asarray(event_tensor(events.slice(a, b))))
+               for a, b in ((0, 3001), (3001, 6001), (6001, 9001))]
+    expected, _ = run_jit(network, params, jnp.stack(tensors))
+    np.testing.assert_allclose(images, expected, atol=1e-5)
+    for times, code in (([], "EV001"), ([5, 3], "EV004")):
+        with pytest.raises(EvflowDataError, match=code):
+            reconstruct(network, params, events, np.array(times))
+
+

@@ -1,0 +1,195 @@
+"""Numbers of two streams on cases with known answers, and their page and command."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import evflow
+from evflow import Events, EvflowDataError, Recording, write_events
+from evflow.cli import main
+from evflow.metrics.streams import distances
+from evflow.report.verdict import describe_streams, judge_streams, worst
+
+SIZE = (32, 24)
+
+
+def noise(seed: int, n: int = 4000, span: int = 1_000_000, share_on: float = 0.5) -> Events:
+    """Independent events all over the sensor: rates differ from pixel to pixel."""
+    rng = np.random.default_rng(seed)
+    likely = np.random.default_rng(7).gamma(0.5, size=SIZE[0] * SIZE[1])
+    pixel = rng.choice(likely.size, n, p=likely / likely.sum())
+    t = np.sort(rng.integers(0, span, n))
+    return Events(pixel % SIZE[0], pixel // SIZE[0], t, rng.random(n) < share_on, SIZE)
+
+
+def edge(width: int = 32, speed_us: int = 1000, turns: int = 20) -> Events:
+    """A bright bar that sweeps over the sensor: ON at its front, OFF at its back four pixels
+    behind."""
+    rows = np.arange(SIZE[1])
+    t, x, y, p = [], [], [], []
+    for step in range(turns * width):
+        for behind, on in ((0, True), (4, False)):
+            t.append(np.full(len(rows), step * speed_us) + rows)
+            x.append(np.full(len(rows), (step - behind) % width))
+            y.append(rows)
+            p.append(np.full(len(rows), on))
+    t, x, y, p = (np.concatenate(v) for v in (t, x, y, p))
+    order = np.argsort(t, kind="stable")
+    return Events(x[order], y[order], t[order], p[order], SIZE)
+
+
+def test_a_stream_is_like_itself() -> None:
+    events = noise(0)
+    numbers = evflow.compare(events, events)
+    assert numbers["aligned_at"] == "clock"
+    for p in ("on", "off", "both"):
+        assert numbers["counts"]["r"][p] == pytest.approx(1.0)
+        assert numbers["rate_hz"]["ratio"][p] == 1.0
+    for p in ("on", "off"):
+        assert numbers["curve"]["r"][p] == pytest.approx(1.0)
+    for kind in ("intervals", "neighbours"):
+        assert numbers[kind]["ks"] == 0.0
+        assert numbers[kind]["wasserstein_decades"] == 0.0
+    assert numbers["active"]["common"] == 1.0
+    assert worst(judge_streams(numbers)) == "good"
+    assert describe_streams(numbers).startswith("Alike.\n")
+
+
+def test_shuffled_pixels_keep_the_rates_and_lose_the_places() -> None:
+    events = noise(1)
+    where = np.random.default_rng(2).permutation(SIZE[0] * SIZE[1])
+    pixel = where[events.y.astype(int) * SIZE[0] + events.x]
+    numbers = evflow.compare(events, Events(
+        pixel % SIZE[0], pixel // SIZE[0], events.t, events.p, SIZE))
+    assert numbers["rate_hz"]["ratio"]["both"] == 1.0
+    assert numbers["intervals"]["ks"] == 0.0  # a pixel's events moved together
+    assert abs(numbers["counts"]["r"]["both"]) < 0.15
+    assert worst(judge_streams(numbers)) == "poor"
+
+
+def test_twice_the_rate() -> None:
+    """The same events at half the spacing, and once more: rate 2, every interval halved."""
+    events = noise(3, 60_000)
+    half = [dataclasses.replace(events, t=(events.t + k * 1_000_000) // 2) for k in (0, 1)]
+    numbers = evflow.compare(events, Events.concatenate(half))
+    assert numbers["rate_hz"]["ratio"]["both"] == pytest.approx(2.0, rel=0.01)
+    assert numbers["counts"]["r"]["both"] > 0.999
+    assert numbers["intervals"]["wasserstein_decades"] == pytest.approx(np.log10(2), abs=0.03)
+
+
+def test_polarities_are_counted_apart() -> None:
+    numbers = evflow.compare(noise(4), noise(4, share_on=0.8))
+    assert numbers["on_off"]["real"] == pytest.approx(1.0, abs=0.1)
+    assert numbers["on_off"]["synthetic"] == pytest.approx(4.0, rel=0.1)
+    assert numbers["rate_hz"]["ratio"]["both"] == pytest.approx(1.0)
+    rates = numbers["rate_hz"]["real"]
+    total = rates["both"] * numbers["duration_s"] * SIZE[0] * SIZE[1]
+    assert total == pytest.approx(numbers["events"]["real"])
+
+
+def test_noise_comes_alone_and_signal_in_company() -> None:
+    numbers = evflow.compare(edge(), noise(5, 4000))
+    alone = numbers["neighbours"]["alone"]
+    assert alone["real"] < 0.05
+    assert alone["synthetic"] > 0.7
+    # A bar turns every pixel on, then off.
+    assert numbers["same_polarity"]["real"] == 0.0
+    assert numbers["same_polarity"]["synthetic"] == pytest.approx(0.5, abs=0.05)
+    assert "noise rates" in describe_streams(numbers)
+
+
+def test_neighbour_delays_agree_with_a_loop() -> None:
+    events = noise(6, 300)
+    found = evflow.compare(events, events)["neighbours"]
+    expected = []
+    for i in range(300):
+        apart = np.maximum(abs(events.x[:i].astype(int) - int(events.x[i])),
+                           abs(events.y[:i].astype(int) - int(events.y[i])))
+        near = events.t[:i][apart == 1]
+        expected.append(float(events.t[i] - near[-1]) if near.size else np.inf)
+    delays = np.array(expected)
+    assert found["alone"]["real"] == pytest.approx((delays > 5000).mean())
+    near_by = np.maximum(delays[np.isfinite(delays)], 1.0)
+    assert found["median_s"]["real"] == pytest.approx(10 ** np.median(np.log10(near_by * 1e-6)))
+
+
+def test_distances_of_shifted_samples() -> None:
+    a = np.sort(np.random.default_rng(0).normal(size=500))
+    assert distances(a, a) == (0.0, 0.0)
+    ks, wasserstein = distances(a, a + 10.0)
+    assert (ks, wasserstein) == (1.0, pytest.approx(10.0))
+    assert distances(a, a[:0]) == (None, None)
+
+
+def test_streams_of_other_clocks_are_laid_at_their_beginnings() -> None:
+    events = noise(8)
+    later = dataclasses.replace(events, t=events.t + 10**12)
+    numbers = evflow.compare(events, later)
+    assert numbers["aligned_at"] == "beginnings"
+    assert numbers["shift_us"] == -(10**12)
+    assert numbers["counts"]["r"]["both"] == pytest.approx(1.0)
+    assert "laid at their beginnings" in describe_streams(numbers)
+    partly = dataclasses.replace(events, t=events.t + 400_000)
+    numbers = evflow.compare(events, partly)
+    assert numbers["aligned_at"] == "clock"
+    assert numbers["duration_s"] == pytest.approx(0.6, abs=0.01)
+
+
+def test_what_cannot_be_compared() -> None:
+    events = noise(9)
+    other = dataclasses.replace(events, size=(40, 24))
+    silent = events.slice(0, 0)
+    for code, pair in (("EV015", (events, other)), ("EV001", (events, silent))):
+        with pytest.raises(EvflowDataError) as raised:
+            evflow.compare(*pair)
+        assert raised.value.code == code
+    one = events.slice(int(events.t[0]), int(events.t[0]) + 1)
+    numbers = evflow.compare(one, one)  # nothing varies, nothing follows: undefined, not wrong
+    assert numbers["intervals"]["ks"] is None
+    assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
+    assert "decades" not in describe_streams(numbers)
+
+
+@pytest.fixture(scope="module")
+def streams(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("streams")
+    paths = folder / "real.npz", folder / "synthetic.npz"
+    for seed, path in enumerate(paths):
+        write_events(path, Recording.of_events(noise(seed)), format="npz")
+    return paths
+
+
+def test_compare_on_the_command_line(
+    streams: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "cmp"
+    command = ["compare", *map(str, streams), "-o", str(out)]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[0] in ("Alike.", "Alike in part.", "Not alike.")
+    facts = json.loads((out / "compare.json").read_text())
+    assert facts["rate_hz"]["ratio"]["both"] == pytest.approx(1.0, abs=0.05)
+    assert facts["verdict"] == printed.splitlines()
+    page = (out / "compare.html").read_text()
+    for name in ("verdict", "rates", "images", "counts", "intervals", "facts"):
+        assert f'<section id="{name}">' in page
+    assert page.count("sha256") == 2
+    assert main(command) == 1
+    assert "EV013" in capsys.readouterr().err
+    assert main(["compare", *map(str, streams), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["grade"] == facts["grade"]
+
+
+def test_compare_refuses_other_sizes(
+    streams: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wide = tmp_path / "wide.npz"
+    write_events(wide, dataclasses.replace(noise(0), size=(64, 24)), format="npz")
+    assert main(["compare", str(streams[0]), str(wide), "-o", str(tmp_path / "no")]) == 1
+    assert "EV015" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
