@@ -10,6 +10,8 @@ camera's summary, with a wide std.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 import os
 from collections.abc import Callable, Iterator
 from typing import Literal
@@ -206,7 +208,8 @@ def _with_regression(
 ) -> tuple[Camera, Camera]:
     """The maps with each pixel's thresholds from its regression on the path; the summary's own
     error, which all pixels share, is added to the std."""
-    theta, error = pixel_posterior(np.sum([c.equations for c in chunks], 0), summary)
+    evidence = functools.reduce(operator.add, (c.evidence for c in chunks))
+    theta, error = pixel_posterior(evidence, summary)
     shared = (float(summary_std.theta_on), float(summary_std.theta_off))
     on, off = (jnp.sqrt(e**2 + s**2) for e, s in zip(jnp.asarray(error), shared, strict=True))
     camera = dataclasses.replace(

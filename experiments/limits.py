@@ -13,7 +13,9 @@ and by speed.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
+import operator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +28,7 @@ from evflow.intensity import lin_log
 from evflow.recording import pool_recording, refinement_chunks
 from evflow.refine import Chunk, pixel_posterior, refine_summary
 from evflow.refine.path import STEPS
-from evflow.refine.pixels import pixel_equations
+from evflow.refine.pixels import pixel_evidence
 from experiments.cameras import Hidden, Protocol
 from experiments.common import write_result
 from experiments.evaluate import ENOUGH, protocols
@@ -62,8 +64,8 @@ def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
     step, part = low - low[0], (at - low)[:, None, None].astype(np.float32)
     path = log_video[step] * (1 - part) + log_video[step + 1] * part
     times = hidden.recording.frame_times[first:first + len(kept)]
-    equations = pixel_equations(hidden.recording.events, times, path, STEPS)
-    return dataclasses.replace(chunk, path=path.astype(np.float32), equations=equations)
+    evidence = pixel_evidence(hidden.recording.events, times, path, STEPS)
+    return dataclasses.replace(chunk, path=path.astype(np.float32), evidence=evidence)
 
 
 def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] | None:
@@ -78,7 +80,8 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     start, std = finish(params, stats)
     unsure = jax.tree.map(lambda s: FAR * s, std)  # what is known must not hold it back
     best = refine_summary(known, start, unsure).summary
-    maps, _ = pixel_posterior(np.sum([c.equations for c in known], 0), best)
+    maps, _ = pixel_posterior(
+        functools.reduce(operator.add, (c.evidence for c in known)), best)
     found = estimate_camera(recording, params)
     signal, counts = hidden.signal_events(), recording.events.count_map()
     exposure = 1e-6 * recording.events.duration_us * counts[0].size

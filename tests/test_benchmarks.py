@@ -3,6 +3,7 @@ computes. Nothing here looks at a time."""
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any

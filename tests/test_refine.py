@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.stats import norm
 from networks import hidden
 
 from evflow import Recording, simulate
@@ -17,9 +18,10 @@ from evflow.intensity import lin_log
 from evflow.io import plan_windows
 from evflow.recording import refinement_chunks
 from evflow.refine import fused, hot_pixels, pixel_posterior, plan_chunks, refine_summary
+from evflow.refine.bounds import ERROR, EXCESS, NOTHING, bounded
 from evflow.refine.fit import FusionNet
 from evflow.refine.moments import measure
-from evflow.refine.pixels import pixel_equations
+from evflow.refine.pixels import PixelEvidence, pixel_evidence
 from evflow.refine.trace import NEVER, trace_of_camera, trace_of_events
 from evflow.types import Events
 
@@ -113,18 +115,64 @@ def test_regression_finds_each_pixels_thresholds(
 ) -> None:
     """True path, no noise: far better than the prior; without events, the prior."""
     frames, times = video
-    equations = pixel_equations(events, times[::STEPS], np.asarray(lin_log(frames)), STEPS)
-    np.testing.assert_array_equal(equations[6], events.count_map().sum(0))
+    evidence = pixel_evidence(events, times[::STEPS], np.asarray(lin_log(frames)), STEPS)
+    np.testing.assert_array_equal(evidence.equations[6], events.count_map().sum(0))
     known = Summary(*(jnp.float32(v) for v in (0.22, 0.22, 0.0, 0.0, 0.08, 0.08)))
-    theta, std = pixel_posterior(equations, known)
+    theta, std = pixel_posterior(evidence, known)
     true = np.stack([camera.theta_on, camera.theta_off])
     many = events.count_map().min(0) >= 3
     assert many.sum() > 20
     assert np.abs(theta - true)[:, many].mean() < 0.3 * np.abs(0.22 - true)[:, many].mean()
     assert (np.abs(theta - true) < 3 * std).mean() > 0.97
-    empty, wide = pixel_posterior(np.zeros_like(equations), known)
+    empty, wide = pixel_posterior(PixelEvidence.nothing(SHAPE), known)
     np.testing.assert_allclose(empty, 0.22, rtol=1e-5)
     np.testing.assert_allclose(wide, 0.08, rtol=1e-5)
+
+
+def test_no_change_beyond_a_threshold_goes_unanswered(
+    video: tuple[np.ndarray, np.ndarray], camera: Camera, events: Events
+) -> None:
+    """On the true path every bound holds, and the widest come close to what they bound."""
+    frames, times = video
+    path = np.asarray(lin_log(frames))
+    rise, fall, span = pixel_evidence(events, times[::STEPS], path, STEPS).bounds
+    on, off = np.asarray(camera.theta_on), np.asarray(camera.theta_off)
+    for bound, most in ((rise, on), (fall, off), (span, on + off)):
+        known = bound != NOTHING
+        assert known.mean() > 0.3
+        assert (bound[known] < most[known] + 2e-3).all()
+        assert np.quantile(bound[known] / most[known], 0.95) > 0.6
+
+
+def test_bounds_move_the_belief_only_where_they_contradict_it() -> None:
+    mean = np.full((2, 3), 0.2)
+    covariance = np.einsum("ij,k->ijk", np.diag([0.01, 0.01]), np.ones(3))
+    bounds = np.full((3, 3), NOTHING)
+    bounds[0] = NOTHING, 0.05, 0.6  # unknown, far below, far above
+    after, spread = bounded(mean, covariance, bounds)
+    np.testing.assert_allclose(after[:, 0], 0.2)
+    assert abs(after[0, 1] - 0.2) < 0.02 < 0.1 < after[0, 2] - 0.2
+    assert spread[0, 0, 2] < 0.8 * 0.01
+    np.testing.assert_allclose(after[1], 0.2)  # theta_off is not concerned
+    draws = np.random.default_rng(0).normal(0.2, 0.1, 1_000_000)
+    weight = np.asarray(norm.cdf((draws - (0.6 - EXCESS)) / ERROR[0]))
+    np.testing.assert_allclose(after[0, 2], np.average(draws, weights=weight), atol=1e-3)
+
+
+@pytest.mark.parametrize(("passages", "least"), [(1, 0.3), (5, 0.12)])
+def test_passages_between_frames_shrink_thresholds_little(passages: int, least: float) -> None:
+    """The frames saw nothing, the events went up three thresholds and back within an interval,
+    for which a path taken at its word has thresholds of zero."""
+    times = 25_000 * np.arange(2 * passages + 1)
+    within = np.array([6, 8, 10, 12, 14, 16]) * 1000
+    t = (times[:-1:2, None] + within).ravel()
+    on = np.tile([True] * 3 + [False] * 3, passages)
+    events = Events(np.zeros(len(t), int), np.zeros(len(t), int), t, on, (1, 1))
+    path = np.full((2 * passages * STEPS + 1, 1, 1), 5.0)
+    known = Summary(*(jnp.float32(v) for v in (0.4, 0.4, 0.0, 0.0, 0.1, 0.1)))
+    theta, std = pixel_posterior(pixel_evidence(events, times, path, STEPS), known)
+    assert (theta > least).all()
+    assert (std > 0.03).all()
 
 
 def test_chunks_are_runs_of_equal_length() -> None:

@@ -20,6 +20,7 @@ from evflow.refine.noise import (
     with_tie,
 )
 from evflow.refine.path import Chunk
+from evflow.refine.pixels import PixelEvidence
 from evflow.refine.trace import Trace
 
 SHAPE, INTERVALS, STEPS = (60, 80), 8, 2
@@ -31,7 +32,7 @@ def chunk(counts: np.ndarray, path: np.ndarray) -> Chunk:
     blank = np.zeros(SHAPE)
     trace = Trace(blank.astype(np.int32), blank, blank > 0, counts.astype(np.float32))
     return Chunk(path, np.ones(SHAPE, bool), np.full(INTERVALS, 0.025, np.float32),
-                 np.zeros(INTERVALS, np.float32), trace, np.zeros((7, *SHAPE)),
+                 np.zeros(INTERVALS, np.float32), trace, PixelEvidence.nothing(SHAPE),
                  np.zeros((2, *SHAPE)))
 
 

@@ -23,7 +23,7 @@ from evflow.recording import refinement_chunks
 from evflow.refine import Chunk, make_chunk
 from evflow.refine.noise import combined_rate, quiet_events
 from evflow.refine.path import STEPS
-from evflow.refine.pixels import pixel_equations
+from evflow.refine.pixels import pixel_evidence
 from evflow.refine.trace import Trace, trace_of_camera
 from evflow.types import Recording
 
@@ -84,8 +84,8 @@ def _given(recording: Recording, run: list[int], steps: int) -> Chunk:
     coarse = Recording(events, recording.frames[index[::steps]], times)
     chunk = make_chunk(coarse, list(range(len(times) - 1)), steps)
     path = np.asarray(lin_log(np.stack([recording.frame_dn(int(i)) for i in index])))
-    equations = pixel_equations(events, times, path, steps)
-    return dataclasses.replace(chunk, path=path, equations=equations)
+    evidence = pixel_evidence(events, times, path, steps)
+    return dataclasses.replace(chunk, path=path, evidence=evidence)
 
 
 def _runs(found: list[int]) -> list[list[int]]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from evflow.intensity import lin_log
 from evflow.io.glitches import SATURATED_DN, exposed
-from evflow.refine.pixels import pixel_equations
+from evflow.refine.pixels import PixelEvidence, pixel_evidence
 from evflow.refine.trace import Trace, trace_of_events
 from evflow.simulator.interpolate import Interpolator
 from evflow.types import Recording
@@ -31,7 +31,7 @@ class Chunk:
     path: (K * steps + 1, H, W) float32 log intensity, the frames at every `steps`-th;
     bright: (H, W) bool, pixels whose frames are neither near black nor saturated; dt_s: (K,)
     interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
-    equations: (7, H, W) of each pixel's regression, see pixels.py; quiet: (2, H, W) events in
+    evidence: about each pixel's thresholds; quiet: (2, H, W) events in
     intervals in which the pixel's path stays within QUIET, and their seconds. Intervals with a
     saturated or black frame are in neither.
     """
@@ -41,7 +41,7 @@ class Chunk:
     dt_s: np.ndarray
     motion_px: np.ndarray
     recorded: Trace
-    equations: np.ndarray
+    evidence: PixelEvidence
     quiet: np.ndarray
 
 
@@ -81,13 +81,13 @@ def make_chunk(recording: Recording, run: list[int], steps: int = STEPS) -> Chun
         motion.append(moved)
     stack, fine = np.stack(frames), np.asarray(lin_log(np.stack(path)))
     bright = (stack.min(0) >= DARK_DN) & (stack.max(0) <= SATURATED_DN)
-    shown = np.stack([exposed(*pair) for pair in itertools.pairwise(frames)])
+    seen = np.stack([exposed(frame) for frame in frames])
     dt_s = np.diff(times).astype(np.float32) * 1e-6
     trace = trace_of_events(recording.events, times, steps)
     return Chunk(
         fine, bright, dt_s, np.array(motion, np.float32), trace,
-        pixel_equations(recording.events, times, fine, steps, shown),
-        _quiet(fine, trace, dt_s, shown))
+        pixel_evidence(recording.events, times, fine, steps, seen),
+        _quiet(fine, trace, dt_s, seen[1:] & seen[:-1]))
 
 
 def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, shown: np.ndarray) -> np.ndarray:

@@ -1,0 +1,66 @@
+"""A pixel's events beside the path of its brightness.
+
+Events are ordered by pixel, then time; each is placed in its frame interval and given the path's
+value at its instant. pixels.py and bounds.py read what the two tell of the pixel's thresholds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from evflow.types import Events
+
+Array = np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sightings:
+    """Events, arrays (N,): pixel (flat index), interval, fraction of it, on (bool), and path, the
+    path's value at the event.
+
+    first: index of each pixel's first event; frames: (K + 1, H*W) path at the frames; inner: (K,
+    H*W) range of the path within each interval; seen: (K + 1, H*W) bool, frames that show what
+    their pixel saw; shape: (H, W).
+    """
+
+    pixel: Array
+    interval: Array
+    fraction: Array
+    on: Array
+    path: Array
+    first: Array
+    frames: Array
+    inner: Array
+    seen: Array
+    shape: tuple[int, int]
+
+    @property
+    def shown(self) -> Array:
+        """(N,) bool: events between two frames that show what the pixel saw."""
+        at = self.interval, self.pixel
+        return np.asarray(self.seen[at] & self.seen[self.interval + 1, self.pixel])
+
+
+def sight(
+    events: Events, times_us: Array, path: Array, steps: int, seen: Array | None = None
+) -> Sightings:
+    """The events between frames at times_us (K + 1,) beside the path (K*steps + 1, H, W) in log
+    units. seen: (K + 1, H, W) bool, everything if left out."""
+    width, height = events.size
+    used = events.slice(int(times_us[0]) + 1, int(times_us[-1]) + 1)
+    k, flat = len(times_us) - 1, path.reshape(len(path), -1)
+    pixel = used.y.astype(np.int64) * width + used.x
+    order = np.argsort(pixel, kind="stable")
+    pixel, t, on = pixel[order], used.t[order], used.p[order]
+    interval = np.searchsorted(times_us, t, side="left") - 1
+    fraction = (t - times_us[interval]) / np.diff(times_us)[interval]
+    position = np.minimum((interval + fraction) * steps, k * steps - 1e-9)
+    step = position.astype(np.int64)
+    value = flat[step, pixel] + (position - step) * (flat[step + 1, pixel] - flat[step, pixel])
+    parts = flat[1:].reshape(k, steps, -1)
+    everything = np.ones((k + 1, height, width), bool) if seen is None else seen
+    return Sightings(
+        pixel, interval, fraction, on, value, np.flatnonzero(np.diff(pixel, prepend=-1)),
+        flat[::steps], parts.max(1) - parts.min(1), everything.reshape(k + 1, -1), (height, width))
