@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from evflow import Recording, simulate
 from evflow.baselines.calibration import calibrate_static, calibrate_step, find_rests
 from evflow.camera import Camera, CameraPrior
 from evflow.errors import EvflowDataError
+from evflow.io import write_recording
 from evflow.types import Events
 
 SHAPE = (24, 32)
@@ -179,3 +181,25 @@ def test_no_noise_in_a_minute_is_no_rate() -> None:
     assert np.asarray(found.camera.eta_on).max() < 1e-6
     assert float(found.summary.eta_on) < 1e-6
     assert float(found.summary_std.eta_on) > 0
+
+
+@pytest.mark.parametrize("protocol", ["step", "static"])
+def test_command(protocol: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The bench by the command line: a screen's steps, or what its noise sends at rest."""
+    from evflow.cli import main
+
+    camera = Camera.constant(SHAPE, 0.2, 0.25, 1.0, 0.5)
+    recording = bench(camera, CYCLES if protocol == "step" else [100, 100])
+    source, out = tmp_path / "screen.npz", tmp_path / "camera"
+    write_recording(source, recording)
+    assert main(["estimate", str(source), "-o", str(out), "--protocol", protocol, "--no-plots",
+                 "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["protocol"] == protocol
+    assert not (out / "report.html").exists()
+    found = Camera.load(out / "camera.npz")
+    if protocol == "step":
+        assert abs(float(jnp.median(found.theta_on)) - 0.2) < 0.01
+        assert abs(float(jnp.median(found.theta_off)) - 0.25) < 0.01
+    else:
+        assert not any(facts["summary"][f"sigma_{p}"] for p in ("on", "off"))

@@ -7,7 +7,7 @@ import json
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -26,12 +26,18 @@ class Estimate(Reading):
     """Measure a camera: per-pixel thresholds and noise rates, from events and frames.
 
     Example: evflow estimate flight.aedat4 -o cam/
+
+    Example: evflow estimate screen.aedat4 -o bench/ --protocol step
     """
 
     recording: tyro.conf.Positional[Path]
     """A recording with frames; of a static scene without frames the noise alone is measured."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for camera.npz, camera.json, the pictures and report.html."""
+    protocol: Literal["motion", "step", "static"] = "motion"
+    """How it was recorded: motion of any kind; step, a screen that fills the view and steps
+    between levels of light (thresholds are the change per event); static, a scene at rest, all of
+    whose events are noise."""
     weights: str = "default"
     """Name of released weights, or a .safetensors path."""
     window_ms: float = 40.0
@@ -40,7 +46,7 @@ class Estimate(Reading):
     """Write maps and histograms as PNG (needs matplotlib)."""
     report: bool = True
     """Write report.html: the recording re-simulated, a held-out half, in ten panels (needs
-    matplotlib; takes about as long as the estimate)."""
+    matplotlib; takes about as long as the estimate; protocol motion only)."""
     checks: bool = True
     """Stop where `evflow check` finds errors."""
     overwrite: bool = False
@@ -48,19 +54,36 @@ class Estimate(Reading):
     """Print the summary as JSON."""
 
     def run(self) -> None:
-        from evflow.inspection import check
-        from evflow.progress import bar
-        from evflow.recording import estimate_camera
         from evflow.report import plots
         from evflow.report.text import describe
-        from evflow.weights import load_weights, model_card
 
         if (self.out / "camera.npz").exists() and not self.overwrite:
             raise EvflowDataError(
                 "EV013", f"{self.out / 'camera.npz'} exists.", "Pass --overwrite.")
-        if self.plots or self.report:
+        moving = self.protocol == "motion"
+        if self.plots or (self.report and moving):
             plots.require()
         recording = self.read(self.recording)
+        found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
+        found.save(self.out / "camera.npz", overwrite=self.overwrite)
+        facts = {**found.as_dict(), "recording": str(self.recording), "protocol": self.protocol,
+                 "notes": list(recording.notes), **facts}
+        write_json(self.out / "camera.json", facts)
+        if self.plots:
+            plots.camera_maps(found, self.out / "maps.png")
+            plots.camera_histograms(found, self.out / "histograms.png")
+        if self.report and moving:
+            self._report(found, recording)
+        print(json.dumps(facts, indent=2) if self.json else describe(found))
+        print(f"written to {self.out}/", file=sys.stderr)
+
+    def _estimated(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
+        """Of a recording of something that moves: checks first, then the network."""
+        from evflow.inspection import check
+        from evflow.progress import bar
+        from evflow.recording import estimate_camera
+        from evflow.weights import load_weights, model_card
+
         report = check(recording)
         if self.checks:
             report.raise_if_failed()
@@ -71,19 +94,15 @@ class Estimate(Reading):
         with bar("estimating") as progress:
             found = estimate_camera(
                 recording, params, min_window_us=round(self.window_ms * 1000), progress=progress)
-        found = dataclasses.replace(found, warnings=(*doubts, *found.warnings))
-        found.save(self.out / "camera.npz", overwrite=self.overwrite)
-        facts = {**found.as_dict(), "recording": str(self.recording),
-                 "notes": list(recording.notes), "weights": self.weights,
-                 "weights_steps": model_card(self.weights).get("steps")}
-        write_json(self.out / "camera.json", facts)
-        if self.plots:
-            plots.camera_maps(found, self.out / "maps.png")
-            plots.camera_histograms(found, self.out / "histograms.png")
-        if self.report:
-            self._report(found, recording)
-        print(json.dumps(facts, indent=2) if self.json else describe(found))
-        print(f"written to {self.out}/", file=sys.stderr)
+        card = model_card(self.weights)
+        return (dataclasses.replace(found, warnings=(*doubts, *found.warnings)),
+                {"weights": self.weights, "weights_steps": card.get("steps")})
+
+    def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
+        from evflow.baselines.calibration import calibrate_static, calibrate_step
+
+        measure = calibrate_step if self.protocol == "step" else calibrate_static
+        return measure(recording), {}
 
     def _report(self, found: CameraEstimate, recording: Recording) -> None:
         from evflow.progress import bar
