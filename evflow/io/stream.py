@@ -3,8 +3,9 @@
 A decoder yields `Chunk`s and raises `Damage` where the bytes stop making sense; `gather` makes
 `Events` of them. It keeps what lies between start_s and stop_s alone, reads no further than
 stop_s, and names the place of the first event that cannot be right; damage behind stop_s does not
-matter. Memory: the columns kept, 13 bytes per event, one of them twice while it is joined, and
-the temporaries of one chunk. A file of F bytes holds F/4 events at most, of EVT3 6 F.
+matter. Memory: the columns kept, 13 bytes per event, one of them twice while it is joined, or
+what `spool` keeps of them, and the temporaries of one chunk. A file of F bytes holds F/4 events at
+most, of EVT3 6 F.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from evflow.checks import COLUMNS, RESET_US, Size
 from evflow.errors import EvflowDataError
 from evflow.io.hints import Hints, dropped, within
+from evflow.io.spool import Spool
 from evflow.types import Events, Recording
 
 CHUNK = 1 << 18  # bytes decoded at a time: the temporaries of 64k words stay in a core's cache
@@ -151,7 +153,8 @@ class _Gathered:
 
     def __init__(self, path: Path, hints: Hints, size: Size | None, native: str) -> None:
         self.path, self.hints, self.size, self.native = path, hints, size, native
-        self.columns: dict[str, list[np.ndarray]] = {name: [] for name in COLUMNS}
+        self.columns = {name: Spool(KINDS[name]) for name in COLUMNS}
+        self.signs: set[int] = set()  # values of p kept, where they are not bool
         self.seen = self.kept = self.first = self.last = self.outside = 0
         self.reach = (0, 0)
         self.start, self.stop = hints.span_us(0)
@@ -259,11 +262,12 @@ class _Gathered:
             self.reach = max(x, int(chunk.x.max())), max(y, int(chunk.y.max()))
         if a < b:
             self.kept += b - a
-            for name, column in zip(COLUMNS, (chunk.x, chunk.y, t, chunk.p), strict=True):
-                kind = column.dtype if name == "p" else KINDS[name]
+            if chunk.p.dtype != bool:
+                self.signs.update(v for v in (-1, 0, 1) if (chunk.p[a:b] == v).any())
+            for name, column in zip(COLUMNS, (chunk.x, chunk.y, t, chunk.p > 0), strict=True):
                 # copied where it is a part or a view, which would keep the whole chunk alive
                 own = column.base is None and b - a == len(column)
-                self.columns[name].append(column[a:b].astype(kind, copy=not own))
+                self.columns[name].append(column[a:b].astype(KINDS[name], copy=not own))
 
     def so_far(self) -> str:
         span = (self.last - self.first) // 1000 / 1000
@@ -280,13 +284,11 @@ class _Gathered:
         if self.outside and self.size:
             self.hints.remarks.append(dropped(self.outside, self.seen + self.outside, self.size))
         size = self.hints.sensor(size, reach=self.reach if self.seen else None)
-        joined = {}
-        for name, kind in KINDS.items():
-            parts = self.columns.pop(name)
-            joined[name] = np.concatenate(parts) if parts else np.zeros(0, kind)
-            del parts
-        return Events.unchecked(
-            joined["x"], joined["y"], joined["t"], self.hints.on(joined["p"]), size)
+        self.hints.on(np.array(sorted(self.signs), np.int8))  # is it one convention?
+        x, y, t, on = (self.columns.pop(name).array() for name in COLUMNS)
+        if self.hints.polarity == "invert":
+            np.logical_not(on, out=on)
+        return Events.unchecked(x, y, t, on, size)
 
 
 def _place(path: Path, unit: str, number: int) -> str:
