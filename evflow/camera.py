@@ -66,6 +66,19 @@ class Camera:
         nominal = sample_nominal(k_nominal, shape[:-2], prior)
         return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)
 
+    def drawn(self, key: Array, std: Camera) -> Camera:
+        """A camera whose pixels are drawn from estimates and their std, both (..., H, W).
+
+        The most likely value of every pixel makes a camera more even than the one measured: what
+        was not seen of a pixel is the camera's median.
+        """
+        draws = jax.random.normal(key, (len(PARAMETERS), *self.shape))
+        least = {"theta_on": THETA_MIN, "theta_off": THETA_MIN}
+        return Camera(**{
+            name: jnp.maximum(getattr(self, name) + getattr(std, name) * draw,
+                              least.get(name, 0.0))
+            for name, draw in zip(PARAMETERS, draws, strict=True)})
+
     def validate(self) -> Camera:
         """Return self, or raise EV002, EV014, EV015 (host side; skipped on traced arrays)."""
         leaves = {name: getattr(self, name) for name in PARAMETERS}
@@ -107,6 +120,11 @@ class Camera:
     @staticmethod
     def load(path: str | os.PathLike) -> Camera:
         """Read the maps written by `save` (pickled arrays are refused)."""
+        return Camera.load_with_std(path)[0]
+
+    @staticmethod
+    def load_with_std(path: str | os.PathLike) -> tuple[Camera, Camera | None]:
+        """The maps and their standard deviations, where the file holds an estimate."""
         path = Path(path)
         if not path.is_file():
             raise EvflowDataError(
@@ -122,12 +140,26 @@ class Camera:
                 "EV008", f"{path} holds {sorted(data)} but not {missing}.",
                 "Expected a camera.npz written by evflow estimate or Camera.save.",
             )
+        errors = [f"{name}_std" for name in PARAMETERS]
         with naming(path):
-            for name in PARAMETERS:
+            for name in {*PARAMETERS, *errors} & set(data):
                 if data[name].dtype.kind not in "fiu":
                     raise EvflowDataError("EV009", f"{name} has dtype {data[name].dtype}.",
                                           "Expected float32.")
-            return Camera(*(jnp.asarray(data[n], jnp.float32) for n in PARAMETERS)).validate()
+            maps = Camera(*(jnp.asarray(data[n], jnp.float32) for n in PARAMETERS)).validate()
+            if not all(name in data for name in errors):
+                return maps, None
+            std = Camera(*(jnp.asarray(data[n], jnp.float32) for n in errors))
+            jax.tree.map(_check_std, maps, std)
+            return maps, std
+
+
+def _check_std(values: Array, std: Array) -> None:
+    """EV009 unless the std of a map (..., H, W) is one."""
+    if std.shape != values.shape or not bool(jnp.all(jnp.isfinite(std) & (std >= 0))):
+        raise EvflowDataError(
+            "EV009", f"standard deviations of shape {std.shape} for maps of shape "
+            f"{values.shape}, or negative or infinite ones.", "Make the file again.")
 
 
 @dataclasses.dataclass(frozen=True)

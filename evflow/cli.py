@@ -10,6 +10,7 @@ from typing import Annotated, Union
 
 import tyro
 
+from evflow.commands.bench import Bench
 from evflow.commands.check import Check
 from evflow.commands.compare import Compare
 from evflow.commands.convert import Convert
@@ -18,6 +19,8 @@ from evflow.commands.export import Export
 from evflow.commands.info import Info
 from evflow.commands.render import Render
 from evflow.commands.simulate import Simulate
+from evflow.commands.source_tree import forwarded
+from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
@@ -34,14 +37,17 @@ Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these ann
     Annotated[Convert, tyro.conf.subcommand("convert")],
     Annotated[Voxel, tyro.conf.subcommand("voxel")],
     Annotated[Export, tyro.conf.subcommand("export")],
+    Annotated[Train, tyro.conf.subcommand("train")],
+    Annotated[Bench, tyro.conf.subcommand("bench")],
     Annotated[Version, tyro.conf.subcommand("version")],
 ]
 
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the `evflow` command."""
+    arguments = forwarded(sys.argv[1:] if argv is None else argv)
     command = tyro.cli(
-        Command, args=argv, prog="evflow",
+        Command, args=arguments, prog="evflow",
         description="Measure an event camera from its recording; simulate any video as it "
         "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
     try:

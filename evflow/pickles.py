@@ -13,7 +13,7 @@ import pickletools
 from collections.abc import Callable, Mapping
 from typing import IO, Any
 
-MOST_INSTRUCTIONS = 1_000_000  # the optimiser state of a large network takes some 50 000
+MOST_INSTRUCTIONS = 1_000_000  # a tensor takes about 50, and networks have hundreds
 Builder = Callable[..., Any]
 
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}

@@ -1,10 +1,10 @@
 """Intensity changes of one recording by every system, scored against its frames (Table XI).
 
 All systems know the same thresholds, those that `estimate_camera` finds, and answer alike: the
-change of their state since a frame was taken in. "next": up to the next frame, the paper's protocol; the
-encoder and the published filter are told that frame, which makes it easy for them. "middle": up
-to the middle one of three frames, when only the outer two are known: nobody is told the answer.
-"path": up to instants between two frames, against a fast video (simulated recordings only).
+change of their state since a frame was taken in. "next": up to the next frame, the paper's
+protocol; the encoder and the published filter are told that frame, which makes it easy for them.
+"middle": up to the middle one of three frames, when only the outer two are known: nobody is told
+the answer. "path": up to instants between two frames, against a fast video (simulated only).
 """
 
 from __future__ import annotations
@@ -52,6 +52,15 @@ class Scene:
         return np.asarray(lin_log(self.recording.frame_dn(index)))
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Told:
+    """Changes since `frame` (H, W) DN: the true ones (T, H, W), and every system's."""
+
+    frame: np.ndarray
+    true: np.ndarray
+    made: Changes
+
+
 def cut(recording: Recording, span_s: tuple[float, float] | None) -> Recording:
     """The part between two instants, in seconds after the first frame."""
     if span_s is None or not recording.has_frames:
@@ -67,9 +76,9 @@ def make_scene(params: Any, recording: Recording, video: np.ndarray | None = Non
     return Scene(recording, found.camera, found.summary, usable(recording), video)
 
 
-def next_frame(scene: Scene, params: Any) -> Iterator[tuple[np.ndarray, Changes]]:
-    """For each usable interval: the true changes (T, H, W) from its first frame on, and every
-    system's. T is 1, the next frame, or PARTS with a video (whose last is the next frame)."""
+def next_frame(scene: Scene, params: Any) -> Iterator[Told]:
+    """The changes in each usable interval; T is 1, the next frame, or PARTS with a video (whose
+    last is the next frame)."""
     times = scene.recording.frame_times
     steps = 1 if scene.video is None else PARTS
     instants = np.array([_instants(times[i:i + 2], steps) for i in scene.good])
@@ -84,12 +93,13 @@ def next_frame(scene: Scene, params: Any) -> Iterator[tuple[np.ndarray, Changes]
             scene.log_frame(i + 1) - start)[None]
         made["encoder"] = _encoded(scene, params, i, i + 1)[PARTS // steps::PARTS // steps]
         made["no change"] = np.zeros_like(true)
-        yield true - (start if scene.video is None else scene.video[i, 0])[None], made
+        true = true - (start if scene.video is None else scene.video[i, 0])[None]
+        yield Told(scene.recording.frame_dn(i), true, made)
 
 
-def middle_frame(scene: Scene, params: Any) -> Iterator[tuple[np.ndarray, Changes]]:
-    """For each two usable intervals: the change (1, H, W) from the first frame to the second as
-    told by frames 1 and 3, and the true one."""
+def middle_frame(scene: Scene, params: Any) -> Iterator[Told]:
+    """For each two usable intervals: the change (1, H, W) from the first frame to the second, as
+    told by the first and the third."""
     times, pairs = scene.recording.frame_times, [i for i in scene.good if i + 1 in scene.good]
     for parity in (0, 1):
         mine = [i for i in pairs if i % 2 == parity]
@@ -104,7 +114,8 @@ def middle_frame(scene: Scene, params: Any) -> Iterator[tuple[np.ndarray, Change
             made["frames alone"] = share * (scene.log_frame(i + 2) - start)[None]
             made["encoder"] = _between(_encoded(scene, params, i, i + 2), share)[None]
             made["no change"] = np.zeros((1, *start.shape))
-            yield (scene.log_frame(i + 1) - start)[None], made
+            true = (scene.log_frame(i + 1) - start)[None]
+            yield Told(scene.recording.frame_dn(i), true, made)
 
 
 def _instants(ends: np.ndarray, steps: int) -> np.ndarray:

@@ -45,6 +45,7 @@ HELD = ("ijrr_slider_depth", "newton_cradle_davis346.aedat4")
 FRAME_MS = 32  # of simulated recordings: 16 parts of 2 frames of the 1 kHz video
 MEASURES = ("log", "log_255", "magnitude", "fired")
 TITLES = {"next": "up to the next frame", "middle": "up to the held-out middle of three frames"}
+CHANGE: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -0.6, "vmax": 0.6, "interpolation": "nearest"}
 SHOWN = ("AKF", "AKF, latest frame", "complementary", "integration", "encoder")
 
 
@@ -121,46 +122,49 @@ def recordings(options: Options) -> Iterator[tuple[str, Recording, np.ndarray | 
         prior=CameraPrior(theta=(0.1, 0.4), mismatch=(0.03, 0.03)), frame_ms=FRAME_MS,
         scene=SceneConfig(speed_px_s=(40.0, 300.0), static_fraction=0.0, contrast=(0.5, 1.0)),
         shape=(96, 128) if full else (48, 64))
-    for seed in range(options.seeds or (20 if full else 2)):
+    for seed in range(options.seeds or (20 if full else 3)):
         hidden = hidden_recording(jax.random.fold_in(k_data, seed), bank, protocol)
         fine = hidden.kept[:-1, None] + np.arange(systems.PARTS + 1) * FRAME_MS // systems.PARTS
         video = np.asarray(lin_log(hidden.video[fine.ravel()]))
         yield "simulated", hidden.recording, video.reshape(*fine.shape, *video.shape[1:])
 
 
-def scored(scene: systems.Scene, params: Any) -> dict[str, dict[str, np.ndarray]]:
-    """Mean MEASURES (4,) of each protocol and system over a recording's intervals."""
+def scored(
+    scene: systems.Scene, params: Any
+) -> tuple[dict[str, dict[str, np.ndarray]], systems.Told | None]:
+    """Mean MEASURES (4,) of each protocol and system over a recording's intervals; and what was
+    told of the held-out frame that changed most, None where there is no such frame."""
     rows: dict[str, dict[str, list[list[float]]]] = {}
+    most, largest = None, -1.0
     for name, task in (("next", systems.next_frame), ("middle", systems.middle_frame)):
-        for true, made in task(scene, params):
-            fired = made["integration"][-1] != 0
-            for system, change in made.items():
+        for told in task(scene, params):
+            fired = told.made["integration"][-1] != 0
+            for system, change in told.made.items():
                 row = rows.setdefault(name, {}).setdefault(system, [])
-                row.append(systems.errors(true[-1:], change[-1:], fired))
-                if len(true) > 1:
+                row.append(systems.errors(told.true[-1:], change[-1:], fired))
+                if len(told.true) > 1:
                     rows.setdefault("path", {}).setdefault(system, []).append(
-                        systems.errors(true, change, fired))
+                        systems.errors(told.true, change, fired))
+            size = float(np.abs(told.true).mean())
+            if name == "middle" and size > largest:
+                most, largest = told, size
     return {task: {s: np.nanmean(found, 0) for s, found in row.items()}
-            for task, row in rows.items()}
+            for task, row in rows.items()}, most
 
 
-def picture(out: Path, scenes: list[tuple[str, systems.Scene]], params: Any) -> None:
-    """Fig. 15: a frame, the change to the held-out next one, and what every system says of it,
-    the median active interval of each recording."""
-    figure = plots.new_figure(2.6 * (len(SHOWN) + 2), 2.2 * len(scenes))
-    axes = figure.subplots(len(scenes), len(SHOWN) + 2, squeeze=False)
-    for row, (name, scene) in zip(axes, scenes, strict=True):
-        every = list(systems.middle_frame(scene, params))
-        sizes = [float(np.abs(true).mean()) for true, _ in every]
-        true, made = every[int(np.argsort(sizes)[len(sizes) // 2])]
-        row[0].imshow(scene.recording.frame_dn(scene.good[0]), cmap="gray", vmin=0, vmax=255)
+def picture(out: Path, shown: list[tuple[str, systems.Told]]) -> None:
+    """Fig. 15: a frame, the change to the held-out next one, and what every system says of it."""
+    figure = plots.new_figure(2.6 * (len(SHOWN) + 2), 2.2 * len(shown))
+    axes = figure.subplots(len(shown), len(SHOWN) + 2, squeeze=False)
+    for row, (name, told) in zip(axes, shown, strict=True):
+        row[0].imshow(told.frame, cmap="gray", vmin=0, vmax=255)
         row[0].set_title(name, fontsize=9)
-        for axis, (title, change) in zip(
-            row[1:], {"true change": true, **{s: made[s] for s in SHOWN}}.items(), strict=True
-        ):
-            error = np.abs(change[-1] - true[-1]).mean()
-            axis.imshow(change[-1], cmap="RdBu_r", vmin=-0.6, vmax=0.6, interpolation="nearest")
-            axis.set_title(title if change is true else f"{title}: {error:.3f}", fontsize=9)
+        row[1].imshow(told.true[-1], **CHANGE)
+        row[1].set_title("change of the frames", fontsize=9)
+        for axis, system in zip(row[2:], SHOWN, strict=True):
+            change = told.made[system][-1]
+            axis.imshow(change, **CHANGE)
+            axis.set_title(f"{system}: {np.abs(change - told.true[-1]).mean():.3f}", fontsize=9)
         for axis in row:
             axis.set_axis_off()
     plots.save_figure(figure, out)
@@ -192,22 +196,24 @@ def main(options: Options) -> dict[str, Any]:
     params = load_weights(options.weights)
     result = windows(options, params)
     found: dict[str, list[dict[str, dict[str, np.ndarray]]]] = {}
-    shown: dict[str, systems.Scene] = {}
+    shown: dict[str, systems.Told] = {}
     with bar("recordings") as progress:
         for number, (name, recording, video) in enumerate(recordings(options), 1):
-            scene = systems.make_scene(params, recording, video)
-            found.setdefault(name, []).append(scored(scene, params))
-            shown.setdefault(name, scene)
+            scores, told = scored(systems.make_scene(params, recording, video), params)
+            found.setdefault(name, []).append(scores)
+            if told is not None:
+                shown.setdefault(name, told)
             progress(number, number)
     result["recordings"] = {name: {task: {system: {
-        m: mean_ci(np.array([s[task][system][i] for s in scores]))
-        for i, m in enumerate(MEASURES)} for system in scores[0][task]} for task in scores[0]}
-        for name, scores in found.items()}
+        m: mean_ci(np.array([s[task][system][i] for s in every]))
+        for i, m in enumerate(MEASURES)} for system in every[0][task]} for task in every[0]}
+        for name, every in found.items()}
     text = table(result)
     print(text)
     write_result(options.out / "changes.json", result, dataclasses.asdict(options))
     (options.out / "changes.md").write_text(text + "\n")
-    picture(options.out / "changes.png", list(shown.items()), params)
+    if shown:
+        picture(options.out / "changes.png", list(shown.items()))
     return result
 
 

@@ -79,6 +79,9 @@ def main(options: Options) -> Metrics:
     distributed.initialise(options.coordinator, options.processes, options.process_id)
     mesh = distributed.make_mesh()
     config = configuration(options, mesh.size)
+    if options.resume == "must" and not options.out.is_dir():  # before a folder is made
+        raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
+                              "Check --out, or pass --resume auto.")
     tx = optimiser(config)
     with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
         resumed = goes_on(checkpoints, config, options)
@@ -107,6 +110,8 @@ def configuration(options: Options, devices: int) -> TrainConfig:
     changes = {k: getattr(options, k) for k in ("seed", "steps", "scenes", "parts")}
     config = dataclasses.replace(
         preset(options.preset), **{k: v for k, v in changes.items() if v is not None})
+    if config.scenes < 1:
+        raise EvflowDataError("EV020", f"scenes={config.scenes}.", "A step takes one or more.")
     if config.scenes % devices:
         raise EvflowDataError(
             "EV020", f"{config.scenes} scenes a step do not divide among {devices} devices.",

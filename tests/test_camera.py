@@ -273,3 +273,30 @@ def test_leading_axes_are_independent_cameras() -> None:
 def test_bad_priors_are_named(bad: dict) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         CameraPrior(**bad)
+
+
+def test_a_drawn_camera_is_as_uneven_as_estimates_and_errors_together() -> None:
+    mean = Camera.constant((200, 200), 0.2, 0.3, 0.1, 0.1)
+    std = Camera.constant((200, 200), 0.03, 0.04, 0.02, 1e-6)
+    drawn = mean.drawn(jax.random.key(0), std)
+    assert abs(float(drawn.theta_on.std()) - 0.03) < 1e-3
+    assert abs(float(drawn.theta_off.mean()) - 0.3) < 1e-3
+    np.testing.assert_allclose(drawn.eta_off, 0.1, atol=1e-5)
+    wide = mean.drawn(jax.random.key(1), Camera.constant((200, 200), 5.0, 5.0, 5.0, 5.0))
+    assert float(wide.validate().theta_on.min()) == pytest.approx(0.01)
+    assert float(wide.eta_on.min()) == 0.0
+
+
+def test_standard_deviations_come_with_an_estimate(tmp_path: Path) -> None:
+    camera = Camera.constant((4, 5), 0.2, 0.3)
+    plain, estimate, broken = (tmp_path / f"{n}.npz" for n in ("plain", "estimate", "broken"))
+    camera.save(plain)
+    assert Camera.load_with_std(plain)[1] is None
+    errors = {f"{name}_std": np.full((4, 5), 0.01, np.float32) for name in PARAMETERS}
+    camera.save(estimate, **errors)
+    std = Camera.load_with_std(estimate)[1]
+    assert std is not None
+    np.testing.assert_allclose(std.eta_off, 0.01)
+    camera.save(broken, **errors | {"theta_on_std": np.full((4, 5), -1.0)})
+    with pytest.raises(EvflowDataError, match="EV009"):
+        Camera.load_with_std(broken)

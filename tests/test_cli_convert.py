@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from recordings import SIZE, T0, equal, make
@@ -243,6 +244,16 @@ def test_export_has_maps_scripts_and_words(
         compile(script.read_text(), str(script), "exec")
     assert run(capsys, "export", camera, "--to", to, "-o", out)[0] == 1
     assert run(capsys, "export", camera, "--to", to, "-o", out, "--overwrite")[0] == 0
+
+
+def test_the_spread_is_that_of_the_camera_not_of_its_estimates() -> None:
+    """Half of what makes pixels differ is in the maps, half in their errors."""
+    true = Camera.sample(jax.random.key(0), (60, 80), CameraPrior(mismatch=(0.05, 0.05)))
+    middle = jax.tree.map(lambda m: jnp.full_like(m, jnp.median(m)), true)
+    maps = jax.tree.map(lambda m, mid: mid + (m - mid) * 0.5**0.5, true, middle)
+    std = jax.tree.map(lambda m: jnp.full_like(m, 0.05 * 0.5**0.5), true)
+    words = export_camera(maps, "v2e", std)[0].text.split()
+    assert float(words[words.index("--sigma_thres") + 1]) == pytest.approx(0.05, rel=0.05)
 
 
 def test_scalars_are_the_nearest(camera: Path) -> None:

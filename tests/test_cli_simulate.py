@@ -20,6 +20,7 @@ import pytest
 from videos import drifting
 
 from evflow import read_events, write_events
+from evflow.camera import PARAMETERS, Camera
 from evflow.cli import main
 from evflow.colour import mosaic
 from evflow.io.frames import FrameSource
@@ -278,3 +279,24 @@ def test_sensors_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str], sen
     fewer, _, _ = simulate(capsys, tmp_path / "a.npy", tmp_path / "b.h5", *options,
                            "--theta-on", "0.6")
     assert fewer.p.sum() < 0.7 * events.p.sum()
+
+
+def test_a_measured_camera_is_drawn_only_where_it_has_errors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "v.npy", colour_frames())
+    plain, estimate = tmp_path / "plain.npz", tmp_path / "estimate.npz"
+    camera = Camera.constant(SHAPE, 0.2, 0.2)
+    camera.save(plain)
+    camera.save(estimate, **{f"{n}_std": np.full(SHAPE, 0.05, np.float32) for n in PARAMETERS})
+    given = (tmp_path / "v.npy", "--fps", "100", "--no-interpolate")
+    even, uneven, again = (
+        simulate(capsys, given[0], tmp_path / f"{i}.h5", *given[1:], "--camera", str(estimate),
+                 *more)[0] for i, more in enumerate(((), ("--draw",), ("--draw",))))
+    assert not same(even, uneven)
+    assert same(uneven, again)
+    for options in (("--camera", str(plain), "--draw"),
+                    ("--camera", str(plain), "--theta-on", "0.3"),
+                    ("--camera", str(plain), "--eta-off", "1")):
+        assert main(["simulate", *map(str, given), "-o", str(tmp_path / "no.h5"), *options]) == 1
+        assert "EV020" in capsys.readouterr().err

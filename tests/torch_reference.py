@@ -162,6 +162,41 @@ def oddities() -> dict[str, Any]:
         "module.parameter": torch.nn.Parameter(torch.ones(2))}}
 
 
+def lpips(params: dict[str, Any], image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """LPIPS (N,) of RGB images (N, H, W, 3) on [0, 1], with the weights of `load_lpips`."""
+    alex = "AlexNet_0" in params
+    layers = params["AlexNet_0" if alex else "VGG16_0"]
+
+    def conv(i: int, x: Tensor, stride: int, pad: int) -> Tensor:
+        kernel, bias = (torch.from_numpy(np.array(layers[f"Conv_{i}"][k])) for k in (
+            "kernel", "bias"))
+        return torch.relu(F.conv2d(x, kernel.permute(3, 2, 0, 1), bias, stride, pad))
+
+    def features(image: np.ndarray) -> list[Tensor]:
+        x = 2 * torch.from_numpy(image).permute(0, 3, 1, 2) - 1
+        x = (x - torch.tensor([-0.030, -0.088, -0.188])[:, None, None]) / torch.tensor(
+            [0.458, 0.448, 0.450])[:, None, None]
+        if alex:
+            out = [conv(0, x, 4, 2)]
+            out.append(conv(1, F.max_pool2d(out[-1], 3, 2), 1, 2))
+            out.append(conv(2, F.max_pool2d(out[-1], 3, 2), 1, 1))
+            return [*out, y := conv(3, out[-1], 1, 1), conv(4, y, 1, 1)]
+        out, last = [], (1, 3, 6, 9, 12)
+        for i in range(13):
+            x = conv(i, x, 1, 1)
+            if i in last:
+                out.append(x)
+                x = F.max_pool2d(x, 2)
+        return out
+
+    total = torch.zeros(len(image))
+    for i, (x, y) in enumerate(zip(features(image), features(reference), strict=True)):
+        x, y = (f / (f.pow(2).sum(1, keepdim=True).sqrt() + 1e-10) for f in (x, y))
+        head = torch.from_numpy(np.array(params[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]))
+        total += F.conv2d((x - y) ** 2, head.permute(3, 2, 0, 1)).mean((1, 2, 3))
+    return total.numpy()
+
+
 if __name__ == "__main__":
     DATA.mkdir(exist_ok=True)
     np.savez_compressed(DATA / "downstream.npz", **{name: case_output(name) for name in CASES})

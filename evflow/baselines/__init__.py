@@ -9,12 +9,16 @@ equations of the papers they name; where a published rule and the strongest fair
 both are here.
 """
 
+from evflow.baselines.akf import Akf
 from evflow.baselines.base import Fitted, Solution, System
 from evflow.baselines.calibration import calibrate_static, calibrate_step
+from evflow.baselines.complementary import Complementary
 from evflow.baselines.ecc import Ecc, EccEvents
+from evflow.baselines.integration import Integration
 from evflow.baselines.jaer import Jaer
 from evflow.baselines.match import Match
 from evflow.baselines.noise_forms import v2e_noise, voltmeter_noise
+from evflow.baselines.reconstruction import Reconstructor
 from evflow.baselines.s2r import S2r
 
 # By name, in the order of the table; an experiment is a loop over them.
@@ -32,7 +36,16 @@ SYSTEMS: dict[str, System] = {
     "match": Match(),
 }
 
+# Brightness from events and frames at known thresholds: RECONSTRUCTORS[name].reconstruct(...).
+RECONSTRUCTORS: dict[str, Reconstructor] = {
+    "integration": Integration(),
+    "complementary": Complementary(),
+    "akf": Akf(),
+    "akf, latest frame": Akf(reference="latest"),
+}
+
 __all__ = [
-    "SYSTEMS", "Ecc", "EccEvents", "Fitted", "Jaer", "Match", "S2r", "Solution", "System",
+    "RECONSTRUCTORS", "SYSTEMS", "Akf", "Complementary", "Ecc", "EccEvents", "Fitted",
+    "Integration", "Jaer", "Match", "Reconstructor", "S2r", "Solution", "System",
     "calibrate_static", "calibrate_step", "v2e_noise", "voltmeter_noise",
 ]

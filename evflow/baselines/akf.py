@@ -39,7 +39,9 @@ Values = jax.Array | np.ndarray
 
 PRECISION = 7e5  # 1/R per second of a frame at mid-range, in units of 1/255 of its range
 LEAST_CERTAINTY = 0.09  # of a black or saturated pixel
-SHARPNESS = 6  # certainty 1 - |2 DN/255 - 1|^6: above .9 from 40 to 215 DN
+# Certainty 1 - |2 DN/255 - 1|^6, above .9 from 41 to 214 DN: the shape of the published table,
+# which was measured on one camera.
+SHARPNESS = 6
 BORDER_VARIANCE = 10.0  # Q of a pixel without eight neighbours
 SCALE_RANGE = (0.6, 100.0)  # of the contrast of an interval's events over its frame difference
 LANES, GROWTH = 4096, 4  # pixels at a time; their events padded to powers of 4: few programs

@@ -32,7 +32,8 @@ class Export:
         from evflow.exports import export_camera, write_export
 
         need_absent(self.out, self.overwrite)
-        export, maps = export_camera(Camera.load(self.camera), self.to)
+        camera, std = Camera.load_with_std(self.camera)
+        export, maps = export_camera(camera, self.to, std)
         write_export(self.out, export, maps, overwrite=self.overwrite)
         print(export.text)
         print(f"written to {self.out}/: {', '.join(sorted([*export.scripts, *export.arrays]))}, "

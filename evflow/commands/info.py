@@ -35,7 +35,9 @@ class Info(Reading):
             return
         print(recording)
         for name, value in facts.items():
-            print(f"  {name:16} {value}")
+            lines = value if name in ("notes", "skipped") else [value]
+            for line in lines:
+                print(f"  {name:16} {'x'.join(map(str, line)) if name == 'size' else line}")
 
 
 def _facts(recording: Recording) -> dict[str, Any]:

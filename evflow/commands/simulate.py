@@ -40,14 +40,17 @@ class Simulate:
     """Write the video's frames beside the events: grey, at their own times."""
     camera: Path | None = None
     """camera.npz from evflow estimate; without it the thresholds below, or the sensor's own."""
+    draw: bool = False
+    """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
+    the most likely values are too even."""
     sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
     """Pixel circuit: v2e's presets and defaults, ESIM, DVS-Voltmeter, the paper's."""
     theta_on: float | None = None
     """The same threshold everywhere (natural log); default: the sensor's, with its mismatch."""
     theta_off: float | None = None
-    eta_on: float = 0.0
-    """Noise rate in Hz per pixel, added to the sensor's own."""
-    eta_off: float = 0.0
+    eta_on: float | None = None
+    """Noise rate in Hz per pixel, added to the sensor's own (default: none)."""
+    eta_off: float | None = None
     fps: float | None = None
     """Frames per second: for images without times, or where the video's own are wrong."""
     timestamps: Path | None = None
@@ -136,15 +139,24 @@ def _camera(command: Simulate, size: tuple[int, int]) -> Any:
     from evflow.camera import PARAMETERS, Camera, CameraPrior
     from evflow.sensors import known_sensor
 
-    shape = size[::-1]
+    shape, key = size[::-1], jax.random.key(command.seed)
+    given = {name: jnp.full(shape, value) for name in PARAMETERS
+             if (value := getattr(command, name)) is not None}
     if command.camera:
-        camera = Camera.load(command.camera)
+        if given:
+            raise EvflowDataError(
+                "EV020", f"--camera and {', '.join(given)} contradict each other.",
+                "Leave out one of them.")
+        camera, std = Camera.load_with_std(command.camera)
+        if command.draw:
+            if std is None:
+                raise EvflowDataError("EV020", f"{command.camera} holds no standard deviations.",
+                                      "--draw needs the camera.npz of evflow estimate.")
+            camera = camera.drawn(key, std)
     else:
         known = known_sensor(command.sensor)
-        camera = Camera.sample(jax.random.key(command.seed), shape, CameraPrior(
+        camera = Camera.sample(key, shape, CameraPrior(
             (known.theta,) * 2, (known.mismatch,) * 2, noise="none"))
-        given = {name: jnp.full(shape, value) for name in PARAMETERS
-                 if (value := getattr(command, name)) is not None}
         camera = dataclasses.replace(camera, **given).validate()
     if camera.shape != shape:
         raise EvflowDataError(

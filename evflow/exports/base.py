@@ -61,11 +61,15 @@ class Settings:
     eta_off: float
 
     @staticmethod
-    def of(maps: Maps) -> Settings:
-        """From maps (H, W); hot and dead pixels move neither median nor spread."""
+    def of(maps: Maps, std: Maps | None = None) -> Settings:
+        """From maps (H, W) and their standard deviations; hot and dead pixels move neither median
+        nor spread, which is that of the estimates and that within each, together."""
         middle = {name: float(np.median(values)) for name, values in maps.items()}
-        sigma = {f"sigma_{p}": MAD * float(np.median(np.abs(
-            maps[f"theta_{p}"] - middle[f"theta_{p}"]))) for p in ("on", "off")}
+        sigma = {}
+        for name in ("theta_on", "theta_off"):
+            spread = MAD * float(np.median(np.abs(maps[name] - middle[name])))
+            within = float(np.median(std[name])) if std else 0.0
+            sigma[name.replace("theta", "sigma")] = float(np.hypot(spread, within))
         height, width = maps["theta_on"].shape
         return Settings(width, height, **middle, **sigma)
 
@@ -85,8 +89,9 @@ class Export:
     arrays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
-def export_camera(camera: Camera, to: str) -> tuple[Export, Maps]:
-    """A camera of maps (H, W) in the words of a simulator, and the maps as float32.
+def export_camera(camera: Camera, to: str, std: Camera | None = None) -> tuple[Export, Maps]:
+    """A camera of maps (H, W) in the words of a simulator, and the maps as float32. std: of an
+    estimate's maps, which are more even than the camera.
 
     Raises EV020 (no such simulator), EV002 (several cameras at once).
     """
@@ -98,8 +103,10 @@ def export_camera(camera: Camera, to: str) -> tuple[Export, Maps]:
     if len(camera.shape) != 2:
         raise EvflowDataError(
             "EV002", f"the camera's maps have shape {camera.shape}.", "Export one camera, (H, W).")
-    maps = {name: np.asarray(getattr(camera, name), np.float32) for name in PARAMETERS}
-    return known[to](maps, Settings.of(maps)), maps
+    maps, errors = ({name: np.asarray(getattr(c, name), np.float32) for name in PARAMETERS}
+                    if c is not None else None for c in (camera, std))
+    assert maps is not None
+    return known[to](maps, Settings.of(maps, errors)), maps
 
 
 def write_export(

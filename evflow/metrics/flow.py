@@ -162,10 +162,10 @@ def aee(
     """Average endpoint error in px, and the percentage of pixels beyond `outlier_px`; of flows
     (..., 2, H, W) where mask (..., H, W) is true: by custom, pixels with events and a valid truth.
     Both NaN where the mask is empty."""
-    error = endpoint_error(flow, truth)
-    known = jnp.ones_like(error) if mask is None else mask.astype(error.dtype)
+    if mask is None:
+        mask = jnp.ones((*flow.shape[:-3], *flow.shape[-2:]), bool)
     # The truth may be NaN where it is unknown.
-    error = jnp.where(known > 0, error, 0.0)
-    count = known.sum((-2, -1))
+    error = endpoint_error(flow, jnp.where(mask[..., None, :, :], truth, flow))
+    count = mask.sum((-2, -1))
     beyond = (error > outlier_px).astype(error.dtype)
     return error.sum((-2, -1)) / count, 100.0 * beyond.sum((-2, -1)) / count

@@ -90,7 +90,7 @@ def _unit(x: Array) -> Array:
 def _conv(layer: Params, x: Array, stride: int, pad: int) -> Array:
     x = jax.lax.conv_general_dilated(
         x, layer["kernel"], (stride, stride), ((pad, pad), (pad, pad)),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest")
     return jax.nn.relu(x + layer["bias"].reshape(1, 1, 1, -1))
 
 

@@ -1,0 +1,274 @@
+"""LGAN: maps of mean thresholds and of their spread, learnt against critics of event patches.
+
+Gu, Li, Zhang, Tian, "How to Learn a Domain-Adaptive Event Simulator?" (ACM MM 2021). A network sees
+a frame and says mean and spread of each pixel's thresholds; a simulator draws thresholds and makes
+the events that follow; critics compare patches of them with the recorded ones. It is trained anew
+for every recording.
+
+Two readings. "published": free maps that ON and OFF share, no noise, a memory up to .2 below the
+first frame, patches that have ten events, tanh of the counts. That cannot tell ON from OFF, and
+chooses real and made patches by what is compared. "fair": a mean and a spread for each polarity,
+the noise of what is at rest, a memory that has been running, patches chosen by the light alone,
+log(1 + counts), the moving average of the generator.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from functools import partial
+from typing import Any, ClassVar, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from evflow.baselines import critics
+from evflow.baselines.base import UNKNOWN, Solution, System, nothing
+from evflow.baselines.critics import Patches
+from evflow.baselines.lgan_simulator import Runs, compared, lead, runs_of, simulate_runs
+from evflow.baselines.resimulate import Path, scene_of
+from evflow.baselines.unet import UNet
+from evflow.camera import THETA_MIN
+from evflow.intensity import lin_log_inverse
+from evflow.progress import bar
+from evflow.types import Recording
+
+Array = jax.Array
+Params = Any
+
+PIXEL_MEAN, PIXEL_STD = 0.449, 0.226  # of frames / 255, as published
+START_STD, MEAN_UNIT = 0.05, 0.1  # log units: where the spread starts, and the free maps' scale
+DEPARTURE = 0.2  # of log mean and log spread, from one pixel to the next
+FEW_EVENTS = 10  # the published least of a patch
+MOVED = 0.05  # log units: mean path length in a patch that a fair comparison wants
+KL = 1e-5  # weight of the published pull of N(mean, spread) to N(0, 1)
+CHECK_EVERY = 10  # iterations between looks at the clock
+EXPLAINED = np.log(1.5)  # counts made and seen: further apart, the fit has not converged
+
+
+@dataclasses.dataclass(frozen=True)
+class Lgan(System):
+    """reading: see above. iterations, seconds: the budget; a fit that runs out of seconds is what
+    it is by then, and says so; else the seed alone decides. clip: frame intervals per clip. patch,
+    classes: px, and how many angles, strengths and coherences (published: 40 px of 160,
+    24 x 3 x 3, for thousands of clips; a short recording has some hundred patches). hidden: layers
+    of a critic. groups, draws: critics per step and patches for each; critic_steps: per step of
+    the generator. rate, critic_rate: of the optimisers. average: decay of the generator's moving
+    average. shown: with a bar of the iterations."""
+
+    reading: Literal["fair", "published"] = "fair"
+    iterations: int = 300
+    seconds: float = 300.0
+    clip: int = 2
+    patch: int = 16
+    classes: tuple[int, int, int] = (4, 1, 2)
+    hidden: tuple[int, ...] = (64, 64)
+    groups: int = 8
+    draws: int = 8
+    critic_steps: int = 5
+    rate: float = 1e-2
+    critic_rate: float = 1e-3
+    average: float = 0.98
+    path: Path = "flow"
+    shown: bool = False
+    seed: int = 0
+
+    # It learns for a minute per recording: a table takes this many recordings of it.
+    most_recordings: ClassVar[int] = 6
+
+    @property
+    def published(self) -> bool:
+        return self.reading == "published"
+
+    def solve(self, recording: Recording) -> Solution:
+        scene = scene_of(recording, self.path)
+        width, height = recording.events.size
+        if min(height, width) < self.patch:
+            return nothing((height, width), f"smaller than a patch of {self.patch} px")
+        runs = runs_of(scene, self.clip, apart=self.published)
+        patches = patches_of(runs, self)
+        events = np.asarray(compared(runs, runs.seen)).sum((0, 2, 3))
+        if patches is None or not events.any():
+            return nothing((height, width), "no patch with enough events or motion")
+        state, ratio, done = train(runs, patches, self)
+        mean, spread = (np.asarray(a) for a in thresholds(state.average, runs, self))
+        if not (np.isfinite(ratio).all() and np.isfinite(mean).all()):
+            return nothing((height, width), f"diverged after {done} iterations")
+        found = (np.abs(ratio) < EXPLAINED) & (events > 0)
+        notes = [f"{done} iterations", f"mismatch {float(spread.mean()):.3f}"]
+        notes += ["stopped by the clock"] * (done < self.iterations)
+        notes += ["the counts are not explained"] * (not found.all())
+        theta = mean.mean(0)
+        valid = np.broadcast_to(found[:, None, None], theta.shape)
+        return Solution(theta, valid, (float(runs.eta[0]), float(runs.eta[1])), tuple(notes))
+
+
+PUBLISHED = Lgan("published", classes=(24, 3, 3), hidden=(256, 128), rate=4e-4, critic_rate=4e-4,
+                 average=0.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class LganState:
+    """Of the training: the generator, its moving average and optimiser; the stacked critics and
+    theirs."""
+
+    generator: Params
+    average: Params
+    generator_opt: Any
+    critics: Params
+    critics_opt: Any
+
+
+class Thresholds(nn.Module):
+    """Mean and spread (N, 2, H, W) of the thresholds, from frames (N, H, W, 1). published: free
+    maps that ON and OFF share. Else each polarity has a constant, in logs, from which the map
+    departs by a fifth at most: free maps run away where nothing fires, since only events have a
+    gradient, and get stuck at the clamp."""
+
+    published: bool
+
+    @nn.compact
+    def __call__(self, image: Array) -> tuple[Array, Array]:
+        maps = UNet(outputs=2 if self.published else 4, base=8, encoders=2, name="maps")(image)
+        mean, log_std = jnp.split(jnp.moveaxis(maps[-1], -1, 1), 2, 1)
+        if self.published:
+            mean, log_std = UNKNOWN + MEAN_UNIT * mean, np.log(START_STD) + 0.5 * log_std
+            shape = (len(mean), 2, *mean.shape[2:])
+            return jnp.broadcast_to(mean, shape), jnp.broadcast_to(jnp.exp(log_std), shape)
+        constant = self.param("mean", lambda _: jnp.log(jnp.full((2, 1, 1), UNKNOWN)))
+        spread = self.param("spread", lambda _: jnp.log(jnp.full((2, 1, 1), START_STD)))
+        mean = jnp.exp(constant[None] + DEPARTURE * jnp.tanh(mean))
+        return mean, jnp.exp(spread[None] + DEPARTURE * jnp.tanh(log_std))
+
+
+@partial(jax.jit, static_argnames="system")
+def thresholds(generator: Params, runs: Runs, system: Lgan) -> tuple[Array, Array]:
+    """Mean and spread (N, 2, H, W), from each run's first frame."""
+    image = (lin_log_inverse(runs.frames)[..., None] / 255.0 - PIXEL_MEAN) / PIXEL_STD
+    found: Any = Thresholds(system.published).apply({"params": generator}, image)
+    return found
+
+
+def patches_of(runs: Runs, system: Lgan) -> Patches | None:
+    """Patches to compare: where the light moved, or as published where events were recorded."""
+    size, skipped = system.patch, lead(runs)
+    path = np.asarray(runs.path)[:, skipped:]
+    if system.published:
+        seen = np.asarray(compared(runs, runs.seen)).sum(1)
+        enough = critics.window_sums(seen, size) >= FEW_EVENTS
+    else:
+        moved = np.abs(np.diff(path, axis=2)).sum(2) * np.asarray(runs.bright)[:, None]
+        enough = critics.window_sums(moved.reshape(-1, *path.shape[3:]), size) >= MOVED * size**2
+    frames = path[:, :, path.shape[2] // 2].reshape(-1, *path.shape[3:])
+    return critics.sort_patches(frames, enough, size, size // 4, system.classes)
+
+
+def _made(generator: Params, key: Array, runs: Runs, system: Lgan) -> tuple[Array, Array]:
+    """Counts (M, 2, H, W) of the compared clips by the generator's thresholds, and the divergence
+    of N(mean, spread) from N(0, 1)."""
+    k_theta, k_runs = jax.random.split(key)
+    mean, spread = thresholds(generator, runs, system)
+    theta = jnp.maximum(mean + spread * jax.random.normal(k_theta, mean.shape), THETA_MIN)
+    counts = simulate_runs(k_runs, runs, theta, blind=system.published)
+    divergence = 0.5 * (mean**2 + spread**2 - 1.0) - jnp.log(spread)
+    return compared(runs, counts), divergence.mean()
+
+
+def _optimisers(system: Lgan) -> tuple[optax.GradientTransformation, ...]:
+    schedule = optax.cosine_decay_schedule(system.rate, system.iterations, 0.05)
+    if system.published:
+        return optax.adabelief(schedule), optax.adabelief(system.critic_rate)
+    return optax.adam(schedule, b1=0.5), optax.adam(system.critic_rate, b1=0.5)
+
+
+def start(key: Array, runs: Runs, patches: Patches, system: Lgan) -> LganState:
+    """A fresh generator, whose thresholds are about .3, and critics."""
+    k_generator, k_critics = jax.random.split(key)
+    tx, critics_tx = _optimisers(system)
+    image = jnp.zeros((1, *runs.frames.shape[1:], 1))
+    generator = jax.jit(Thresholds(system.published).init)(k_generator, image)["params"]
+    params, opt = critics.init(
+        k_critics, len(patches.share), system.patch, system.hidden, critics_tx)
+    average = jax.tree.map(jnp.copy, generator)  # a donated buffer belongs to one leaf
+    return LganState(generator, average, tx.init(generator), params, opt)
+
+
+@partial(jax.jit, static_argnames="system", donate_argnums=0)
+def step(
+    state: LganState, key: Array, runs: Runs, patches: Patches, system: Lgan
+) -> tuple[LganState, Array]:
+    """`critic_steps` of some of the critics, one of the generator. Also the log ratio (2,) of the
+    counts made and seen."""
+    k_made, k_chosen, k_critics, k_score = jax.random.split(key, 4)
+    (counts, divergence), pull = jax.vjp(
+        lambda g: _made(g, k_made, runs, system), state.generator)
+    seen, hidden = compared(runs, runs.seen), system.hidden
+    active = patches.share > 0
+    chosen = jax.random.choice(k_chosen, len(active), (min(system.groups, len(active)),),
+                               replace=False, p=active / active.sum())
+    places, weight = patches.places[chosen], patches.share[chosen]
+    picked = jax.tree.map(lambda a: a[chosen], (state.critics, state.critics_opt))
+    tx, critics_tx = _optimisers(system)
+
+    def learn(picked: Any, key: Array) -> tuple[Any, None]:
+        k_draw, k_mix = jax.random.split(key)
+        at = _draw(k_draw, places, system.draws)
+        pair = _features(seen, at, system)[0], *_features(counts, at, system)
+        slope = jax.grad(lambda p: critics.losses(p, k_mix, *pair, hidden).sum())(picked[0])
+        change, opt = jax.vmap(critics_tx.update)(slope, picked[1], picked[0])
+        return (optax.apply_updates(picked[0], change), opt), None
+
+    picked, _ = jax.lax.scan(learn, picked, jax.random.split(k_critics, system.critic_steps))
+
+    def missing(counts: Array) -> Array:
+        made, counted = _features(counts, _draw(k_score, places, 2 * system.draws), system)
+        mean = (critics.score(picked[0], made, hidden) * counted).sum(1)
+        return -(mean / jnp.maximum(counted.sum(1), 1.0) * weight).sum() / weight.sum()
+
+    (slope,) = pull((jax.grad(missing)(counts), jnp.full_like(divergence, KL)))
+    change, opt = tx.update(slope, state.generator_opt, state.generator)
+    generator = optax.apply_updates(state.generator, change)
+    average = optax.incremental_update(generator, state.average, 1.0 - system.average)
+    whole = jax.tree.map(
+        lambda a, b: a.at[chosen].set(b), (state.critics, state.critics_opt), picked)
+    ratio = jnp.log((counts.sum((0, 2, 3)) + 0.5) / (seen.sum((0, 2, 3)) + 0.5))
+    return LganState(generator, average, opt, *whole), ratio
+
+
+def _draw(key: Array, places: Array, count: int) -> Array:
+    """Places (G, count, 3) out of (G, M, 3)."""
+    index = jax.random.randint(key, (len(places), count), 0, places.shape[1])
+    return jnp.take_along_axis(places, index[..., None], 1)
+
+
+def _features(counts: Array, places: Array, system: Lgan) -> tuple[Array, Array]:
+    """Features (G, n, P, P, CHANNELS) of counts at places (G, n, 3), and whether they count."""
+    seen = critics.cut(critics.features(counts, system.published), places, system.patch)
+    if not system.published:
+        return seen, jnp.ones(places.shape[:-1])
+    total = critics.cut(counts.sum(1)[..., None], places, system.patch).sum((-3, -2, -1))
+    return seen, jax.lax.stop_gradient((total >= FEW_EVENTS).astype(counts.dtype))
+
+
+def train(runs: Runs, patches: Patches, system: Lgan) -> tuple[LganState, np.ndarray, int]:
+    """The state within the budget, the mean log ratio (2,) of counts over the last tenth of the
+    iterations (not finite where they diverged), and how many there were."""
+    k_start, k_steps = jax.random.split(jax.random.key(system.seed))
+    state, begun = start(k_start, runs, patches, system), time.monotonic()
+    ratios: list[Array] = []
+    with bar("lgan") if system.shown else contextlib.nullcontext(lambda *_: None) as progress:
+        for i in range(system.iterations):
+            state, ratio = step(state, jax.random.fold_in(k_steps, i), runs, patches, system)
+            ratios.append(ratio)
+            if i % CHECK_EVERY == 0:
+                late = time.monotonic() - begun > system.seconds
+                if late or not bool(jnp.isfinite(ratio).all()):
+                    break
+            progress(i + 1, system.iterations)
+    recent = ratios[-max(1, len(ratios) // 10):]
+    return state, np.mean([np.asarray(r) for r in recent], 0), len(ratios)

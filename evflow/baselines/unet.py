@@ -1,0 +1,71 @@
+"""The U-Net that the adversarial systems share: images (..., H, W, C) of any size -> maps.
+
+A head at full resolution, encoders that halve, residual blocks, decoders that double (nearest) and
+take in what the encoder of their size saw, and a linear 1x1 prediction at every scale. The channels
+of each pixel are normalised by themselves: batch statistics of the few small crops that two cores
+can take are noise, and those of an image would change with its size.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from evflow.downstream.layers import conv
+
+Array = jax.Array
+
+BLOCKS = 2
+
+
+class UNet(nn.Module):
+    """Predictions (..., h, w, outputs) from coarse to full resolution, the last one (..., H, W,
+    outputs). scales: how many; base: features of the head, doubled by each of the encoders."""
+
+    outputs: int
+    base: int = 32
+    encoders: int = 4
+    scales: int = 1
+
+    @nn.compact
+    def __call__(self, x: Array) -> list[Array]:
+        height, width = x.shape[-3:-1]
+        x = _filled(x, 2**self.encoders)
+        x = nn.relu(conv(self.base, 3, name="head")(x))
+        skips = []
+        for i in range(self.encoders):
+            skips.append(x)
+            x = Layer(self.base << (i + 1), stride=2, name=f"encoder_{i}")(x)
+        for i in range(BLOCKS):
+            y = Layer(x.shape[-1], name=f"block_{i}_a")(x)
+            x = nn.relu(x + Layer(x.shape[-1], relu=False, name=f"block_{i}_b")(y))
+        found = []
+        for i, skip in enumerate(reversed(skips)):
+            left = self.encoders - 1 - i  # halvings that are still to be undone
+            x = jnp.concatenate([jnp.repeat(jnp.repeat(x, 2, -3), 2, -2), skip], -1)
+            x = Layer(self.base << left, name=f"decoder_{i}")(x)
+            if left < self.scales:
+                y = nn.Conv(self.outputs, (1, 1), name=f"prediction_{left}")(x)
+                found.append(y[..., :-(-height >> left), :-(-width >> left), :])
+        return found
+
+
+class Layer(nn.Module):
+    """3x3 convolution, normalised over the channels of each pixel, ReLU or none."""
+
+    features: int
+    stride: int = 1
+    relu: bool = True
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        x = conv(self.features, 3, self.stride, bias=False, name="conv")(x)
+        x = nn.LayerNorm(name="norm")(x)
+        return nn.relu(x) if self.relu else x
+
+
+def _filled(x: Array, stride: int) -> Array:
+    """x with its last rows and columns repeated to a multiple of `stride`."""
+    spare = [(0, -n % stride) for n in x.shape[-3:-1]]
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 3) + [*spare, (0, 0)], mode="edge")

@@ -1,0 +1,58 @@
+"""What the event networks are trained by: looking right, and not flickering; true flow.
+
+Every loss is a scalar of sequences with time first; pure and differentiable.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.ndimage import map_coordinates
+
+from evflow.metrics.image import ssim
+from evflow.metrics.lpips import Params, lpips
+
+Array = jax.Array
+
+OCCLUSION = 50.0  # of exp(-50 (I1 - W(I0))^2): frames that differ by .14 count e^-1
+
+
+def reconstruction(images: Array, frames: Array, lpips_params: Params | None = None) -> Array:
+    """Images and true frames (T, B, H, W) on [0, 1]: LPIPS with its weights, else L1 plus
+    1 - SSIM; both see structure rather than brightness, which events do not tell."""
+    if lpips_params is not None:
+        return jnp.mean(lpips(lpips_params, images, frames))
+    return jnp.mean(jnp.abs(images - frames)) + jnp.mean(1.0 - ssim(images, frames))
+
+
+def temporal(images: Array, frames: Array, back: Array, visible: Array, skip: int = 2) -> Array:
+    """Temporal consistency (Lai et al., ECCV 2018) of images after the first `skip`: the image
+    before, moved along the true flow, should be this one, where the frames themselves agree.
+
+    images, frames, visible: (T, B, H, W); back (T, B, 2, H, W): from frame t to where its points
+    were in frame t - 1.
+    """
+    before, now = slice(skip, -1), slice(skip + 1, None)
+    moved_frame = warp(frames[before], back[now])
+    moved_image = warp(images[before], back[now])
+    trust = jnp.exp(-OCCLUSION * (frames[now] - moved_frame) ** 2) * visible[now]
+    size = jnp.abs(images[now]) + jnp.abs(moved_image) + 1e-5
+    return jnp.mean(trust * jnp.abs(images[now] - moved_image) / size)
+
+
+def warp(images: Array, back: Array) -> Array:
+    """Images (..., H, W) read bilinearly at each pixel plus back (..., 2, H, W); 0 outside."""
+    height, width = images.shape[-2:]
+    x = jnp.arange(width, dtype=back.dtype)[None, :]
+    y = jnp.arange(height, dtype=back.dtype)[:, None]
+
+    def one(image: Array, back: Array) -> Array:
+        return map_coordinates(image, [y + back[1], x + back[0]], order=1, mode="constant")
+
+    flat = jax.vmap(one)(images.reshape(-1, height, width), back.reshape(-1, 2, height, width))
+    return flat.reshape(images.shape)
+
+
+def flow_l1(flow: Array, truth: Array) -> Array:
+    """Mean absolute error of flows (T, B, 2, H, W), px."""
+    return jnp.mean(jnp.abs(flow - truth))

@@ -1,0 +1,178 @@
+"""Training sequences for the event networks, simulated where they are used: scene, camera, event
+tensors, the frames and the flow they should give. One pure function of (key, bank, config).
+
+The camera is drawn from a prior, or is a measured one, of which every sequence sees a random
+crop: training data as that very camera would have recorded them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from evflow.camera import Camera, CameraPrior, sample_nominal, sample_pixels
+from evflow.dataset.motion import optical_flow
+from evflow.downstream.tensor import BINS, signed
+from evflow.errors import EvflowDataError
+from evflow.intensity import lin_log, noise_factor, normalised_intensity
+from evflow.scenes import Scene, TextureBank, render, sample_scene
+from evflow.scenes.config import SceneConfig
+from evflow.sensors import SensorModel
+from evflow.simulator import noise, sensor
+from evflow.simulator.voxels import simulate_window
+
+Array = jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class SequenceConfig:
+    """What the networks are trained on.
+
+    sequences: a batch; windows: T of each; steps_per_window: rendered frames in one; crop: side
+    in pixels; window_s: of a window. prior, model, scene: as everywhere.
+    pause, resume: chance a window that the scene stops, and that it goes on (S2R: .05, .1).
+    noise: deviation of Gaussian noise on every bin but of the first window; hot_pixels: at most
+    this share of pixels carries, in all bins and windows, a constant of the same deviation.
+    """
+
+    sequences: int = 8
+    windows: int = 14
+    steps_per_window: int = 8
+    crop: int = 48
+    window_s: float = 0.03
+    bins: int = BINS
+    prior: CameraPrior = CameraPrior()
+    model: SensorModel = SensorModel(eta_intensity=True)
+    scene: SceneConfig = SceneConfig(contrast=(0.3, 1.0), static_fraction=0.0)
+    pause: float = 0.05
+    resume: float = 0.1
+    noise: float = 0.1
+    hot_pixels: float = 0.001
+
+    def __post_init__(self) -> None:
+        least = {"sequences": 1, "windows": 2, "steps_per_window": 1, "crop": 16, "bins": 2}
+        for name, bound in least.items():
+            self._require(name, getattr(self, name) >= bound, f">= {bound}")
+        for name in ("pause", "resume", "hot_pixels"):
+            self._require(name, 0 <= getattr(self, name) <= 1, "in [0, 1]")
+        self._require("window_s", self.window_s > 0, "> 0")
+        self._require("noise", self.noise >= 0, ">= 0")
+
+    def _require(self, name: str, good: bool, rule: str) -> None:
+        if not good:
+            raise EvflowDataError("EV020", f"SequenceConfig({name}={getattr(self, name)!r}).",
+                                  f"It must be {rule}.")
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Sequences:
+    """T windows of B sequences, time first as the networks run.
+
+    tensors (T, B, H, W, bins): signed events of each window. frames (T, B, H, W): at its end, on
+    [0, 1]. flow (T, B, 2, H, W): (x, y) px over the window, at its start. back (T, B, 2, H, W):
+    from its end to where that point was at its start; visible (T, B, H, W): it was seen there.
+    """
+
+    tensors: Array
+    frames: Array
+    flow: Array
+    back: Array
+    visible: Array
+
+
+def sample_sequences(
+    key: Array, bank: TextureBank, config: SequenceConfig, camera: Camera | None = None
+) -> Sequences:
+    """A batch. camera: maps of at least crop x crop pixels; None draws cameras from the prior."""
+    if camera is not None and min(camera.shape[-2:]) < config.crop:
+        raise EvflowDataError("EV015", f"the camera has {camera.shape} pixels, the crop "
+                              f"{config.crop}.", "Choose a smaller crop.")
+    keys = jax.random.split(key, config.sequences)
+    one = functools.partial(_sequence, bank=bank, config=config, camera=camera)
+    return jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), jax.vmap(one)(keys))
+
+
+def _sequence(
+    key: Array, bank: TextureBank, config: SequenceConfig, camera: Camera | None
+) -> Sequences:
+    k_scene, k_pause, k_camera, k_sim, k_noise = jax.random.split(key, 5)
+    shape = (config.crop, config.crop)
+    scene = sample_scene(k_scene, bank, config.scene, shape)
+    clock = scene_clock(k_pause, config)
+    frames = render(scene, clock, shape)
+    if camera is None:
+        light = noise_factor(jnp.mean(normalised_intensity(frames[0])))
+        nominal = sample_nominal(k_camera, (), config.prior, light)
+        seen = sample_pixels(k_camera, nominal, shape, config.prior.eta_spread)
+    else:
+        seen = _crop(k_camera, camera, shape)
+    tensors = add_noise(k_noise, _simulate(k_sim, frames, seen, config), config)
+    edges = clock[::config.steps_per_window]
+    flow, back, visible = _flows(scene, edges, shape)
+    ends = frames[config.steps_per_window::config.steps_per_window]
+    return Sequences(tensors, ends / 255.0, flow, back, visible)
+
+
+def scene_clock(key: Array, config: SequenceConfig) -> Array:
+    """Scene time (T * steps + 1,) in s: it stands still in some windows, as the world does."""
+    def window(running: Array, draw: Array) -> tuple[Array, Array]:
+        running = jnp.where(running, draw >= config.pause, draw < config.resume)
+        return running, running
+
+    draws = jax.random.uniform(key, (config.windows,))
+    _, running = jax.lax.scan(window, jnp.array(True), draws)
+    # Whole steps are added: a sum of seconds would drift, and never quite stand still.
+    steps = jnp.cumsum(jnp.repeat(running.astype(jnp.int32), config.steps_per_window))
+    steps = jnp.concatenate([jnp.zeros(1, steps.dtype), steps])
+    return steps.astype(jnp.float32) * (config.window_s / config.steps_per_window)
+
+
+def _crop(key: Array, camera: Camera, shape: tuple[int, int]) -> Camera:
+    """A random part of a camera's maps."""
+    k_row, k_column = jax.random.split(key)
+    rows, columns = camera.shape[-2:]
+    start = (jax.random.randint(k_row, (), 0, rows - shape[0] + 1),
+             jax.random.randint(k_column, (), 0, columns - shape[1] + 1))
+    return jax.tree.map(lambda m: jax.lax.dynamic_slice(m, start, shape), camera)
+
+
+def _simulate(key: Array, frames: Array, camera: Camera, config: SequenceConfig) -> Array:
+    """Event tensors (T, H, W, bins) of a camera that has been running for a while."""
+    k_phase, k_sim = jax.random.split(key)
+    shape = frames.shape[1:]
+    log_frames = lin_log(frames)
+    phase = jax.random.uniform(k_phase, shape) * (camera.theta_on + camera.theta_off)
+    medians = noise.nominal_thresholds(config.model, camera)
+    pixels, state = sensor.start(
+        k_sim, log_frames[0], camera, config.model, medians, phase - camera.theta_off)
+    windows = log_frames[1:].reshape(config.windows, config.steps_per_window, *shape)
+    dt = config.window_s / config.steps_per_window
+
+    def window(state: sensor.SimState, part: Array) -> tuple[sensor.SimState, Array]:
+        return simulate_window(config.model, pixels, state, part, dt, config.bins)
+
+    return signed(jax.lax.scan(window, state, windows)[1])
+
+
+def add_noise(key: Array, tensors: Array, config: SequenceConfig) -> Array:
+    """Gaussian noise and hot pixels, so that a network does not trust a single event."""
+    k_noise, k_share, k_where, k_value = jax.random.split(key, 4)
+    later = (jnp.arange(config.windows) > 0).astype(tensors.dtype)[:, None, None, None]
+    tensors = tensors + config.noise * later * jax.random.normal(k_noise, tensors.shape)
+    share = config.hot_pixels * jax.random.uniform(k_share)
+    hot = jax.random.bernoulli(k_where, share, tensors.shape[1:3])
+    value = config.noise * hot * jax.random.normal(k_value, hot.shape)
+    return tensors + value[None, :, :, None]
+
+
+def _flows(scene: Scene, edges: Array, shape: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """Flow of every window forward and back, and what of its end was visible at its start."""
+    def window(start: Array, stop: Array) -> tuple[Array, Array, Array]:
+        there, _ = optical_flow(scene, start, stop, shape)
+        return there, *optical_flow(scene, stop, start, shape)
+
+    return jax.vmap(window)(edges[:-1], edges[1:])

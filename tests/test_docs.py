@@ -1,0 +1,208 @@
+"""The documents keep their word: README.md and docs/*.md run as they are printed.
+
+Every fenced block of bash or python runs, in order, in a folder with a small recording, a video and
+a folder of frames. On the line above a block may stand `<!-- not run: reason -->`, `<!-- slow -->`
+or `<!-- needs PACKAGE -->`; installation is not run. The quick test leaves out what `SLOW` names
+and lays a camera ready in its place; the slow one runs it all, with a small preset for a large one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import typing
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+import evflow as ef
+from evflow.cli import Command, main
+from evflow.errors import CODES
+from evflow.io import write_recording
+from evflow.io.base import FORMATS, WRITERS
+from experiments import make_dataset
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"(?:<!-- (?P<mark>[^>]+) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)^```$",
+                   re.DOTALL | re.MULTILINE)
+MARK = re.compile(r"slow|needs \w+|not run: .+")
+SLOW = re.compile(r"evflow (estimate|train|bench)|python -m|estimate_camera")
+SMALLER = {"--preset full": "--preset debug"}
+SHAPE = (48, 64)
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """A fenced block: mark: of the comment above it, or ""; kind: its language, or ""."""
+
+    mark: str
+    kind: str
+    text: str
+
+
+def blocks(document: Path) -> list[Block]:
+    return [Block(b["mark"] or "", b["kind"], b["text"])
+            for b in BLOCK.finditer(document.read_text("utf-8"))]
+
+
+WITH_CODE = [d for d in DOCUMENTS if any(b.kind for b in blocks(d))]
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """flight.aedat4, ride.mp4, frames/ with times.txt, and the camera that recorded the flight."""
+    folder = tmp_path_factory.mktemp("material")
+    camera = ef.Camera.sample(jax.random.key(3), SHAPE, ef.CameraPrior(theta=(0.2, 0.3)))
+    times = np.arange(281)
+    video = np.stack([texture(t / 1e3) for t in times])
+    events = ef.simulate(jax.random.key(0), video, 1000 * times, camera)
+    kept = slice(20, None, 40)
+    frames = np.rint(video[kept]).astype(np.uint8)
+    write_recording(folder / "flight.aedat4", ef.Recording(events, frames, 1000 * times[kept]))
+    camera.save(folder / "camera.npz")
+    film = cv2.VideoWriter(
+        str(folder / "ride.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, SHAPE[::-1])
+    (folder / "frames").mkdir()
+    for i, frame in enumerate(frames):
+        film.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
+        cv2.imwrite(str(folder / f"frames/{i}.png"), frame)
+    film.release()
+    (folder / "times.txt").write_text("".join(f"{0.04 * i:.2f}\n" for i in range(len(frames))))
+    return folder
+
+
+def texture(seconds: float) -> np.ndarray:
+    """(48, 64) float32 DN: a random pattern that moves by 150 and 60 px/s."""
+    noise = np.random.default_rng(0).uniform(0, 1, (160, 260)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    image = 30 + 200 * (smooth - smooth.min()) / np.ptp(smooth)
+    shift = np.array([[1, 0, 10 + 150 * seconds], [0, 1, 10 + 60 * seconds]], np.float32)
+    return cv2.warpAffine(image, shift, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+
+def given() -> dict[str, Any]:
+    """What the Python of a document takes for granted: a video as DN, as log light, as changes."""
+    video = np.stack([texture(t / 1e3) for t in range(9)])
+    wide = np.random.default_rng(1).uniform(3.0, 5.0, (260, 346)).astype(np.float32)
+    changes = np.random.default_rng(2).normal(0, 0.02, (260, 346, 16)).astype(np.float32)
+    log_frames = wide + np.cumsum(np.moveaxis(changes, -1, 0), 0)
+    return {"frames": video, "times_us": 1000 * np.arange(9), "dL": changes,
+            "log_frames": log_frames}
+
+
+def run_document(document: Path, *, quick: bool) -> int:
+    """Run the blocks in the present folder; returns how many commands and Python blocks ran."""
+    names, ran = given(), 0
+    for block in blocks(document):
+        needed = block.mark.removeprefix("needs ") if block.mark.startswith("needs ") else ""
+        if (block.mark.startswith("not run") or (quick and block.mark == "slow")
+                or (needed and not importlib.util.find_spec(needed))):
+            continue
+        if block.kind == "bash":
+            ran += sum(run_line(line, quick=quick)
+                       for line in block.text.replace("\\\n", " ").splitlines())
+        elif block.kind == "python" and not (quick and SLOW.search(block.text)):
+            exec(compile(block.text, document.name, "exec"), names)
+            ran += 1
+    return ran
+
+
+def run_line(line: str, *, quick: bool) -> bool:
+    """Run one command, where it is to be run; it must succeed."""
+    for large, small in SMALLER.items():
+        line = line.replace(large, small)
+    words = shlex.split(line, comments=True)
+    if not words or words[0] == "pip" or (quick and SLOW.search(line)):
+        return False
+    assert not {"|", "&&", ";", ">"} & set(words), f"one command a line: {line}"
+    if words[0] == "evflow":
+        assert main(words[1:]) == 0, line
+    else:
+        assert words[:2] == ["python", "-m"], f"which program is this? {line}"
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        subprocess.run([sys.executable, *words[1:]], check=True, env=environment)
+    return True
+
+
+@pytest.mark.parametrize("document", WITH_CODE, ids=lambda d: d.name)
+def test_documents_run(
+    document: Path, material: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(material, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "camera.npz").rename(tmp_path / "cam/camera.npz")
+    monkeypatch.chdir(tmp_path)
+    assert run_document(document, quick=True) >= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("document", WITH_CODE, ids=lambda d: d.name)
+def test_documents_run_to_the_last_line(
+    document: Path, material: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(material, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    assert run_document(document, quick=False) >= 3
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: d.name)
+def test_blocks_are_marked_as_agreed(document: Path) -> None:
+    text = document.read_text("utf-8")
+    assert text.count("```") == 2 * len(blocks(document))
+    for block in blocks(document):
+        assert block.kind in ("bash", "python", "")
+        assert not block.mark or MARK.fullmatch(block.mark)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: d.name)
+def test_links_lead_somewhere(document: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)", document.read_text("utf-8")):
+        assert target.startswith("https://") or (document.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("document", DOCUMENTS[1:], ids=lambda d: d.name)
+def test_options_exist(document: Path) -> None:
+    known = {"--help"}
+    commands = [typing.get_args(c)[0] for c in typing.get_args(Command)]
+    for options in (*commands, make_dataset.Options):
+        for field in dataclasses.fields(options):
+            flag = field.name.replace("_", "-")
+            known |= {f"--{flag}", f"--no-{flag}"}
+    text = document.read_text("utf-8")
+    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known
+
+
+def rows(document: str) -> list[list[str]]:
+    """The cells of every table row."""
+    lines = (ROOT / "docs" / document).read_text("utf-8").splitlines()
+    return [[cell.strip() for cell in line.strip("|").split(" | ")]
+            for line in lines if line.startswith("|")]
+
+
+def test_every_code_is_explained() -> None:
+    table = [row for row in rows("errors.md") if re.fullmatch(r"EV\d+", row[0])]
+    assert [tuple(row[:2]) for row in table] == list(CODES.items())
+    assert all(len(row) == 4 and all(row) for row in table)
+
+
+def test_every_format_is_listed_with_what_it_can() -> None:
+    names = [f"`{format.NAME}`" for format in FORMATS]
+    table = {row[0]: row for row in rows("formats.md") if len(row) == 5 and row[0] in names}
+    assert list(table) == names
+    for format in FORMATS:
+        _, read, write, frames, _ = table[f"`{format.NAME}`"]
+        writer = WRITERS.get(format.NAME)
+        assert (read, write) == ("yes", "yes" if writer else "no")
+        assert ("written" in frames) == bool(writer and writer.DEPTHS)
+        assert ("uint8 only" in frames) == bool(writer and writer.DEPTHS == ("uint8",))

@@ -1,0 +1,152 @@
+"""Training of the event networks: sequences that agree with themselves, losses, one step."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow.camera import Camera
+from evflow.downstream import E2VID, EVFlowNet, losses
+from evflow.downstream.simulated import (
+    SequenceConfig,
+    Sequences,
+    add_noise,
+    sample_sequences,
+    scene_clock,
+)
+from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
+from evflow.errors import EvflowDataError
+from evflow.scenes import TextureBank, make_bank
+from evflow.sensors import SensorModel
+
+DATA = SequenceConfig(sequences=4, windows=4, steps_per_window=4, crop=16, noise=0.0,
+                      hot_pixels=0.0, model=SensorModel())
+SMALL = E2VID(base=4, encoders=1, blocks=0)
+sample = jax.jit(sample_sequences, static_argnames="config")
+
+
+@functools.cache
+def bank() -> TextureBank:
+    return make_bank(jax.random.key(0), procedural=4, photos=False, size=64, cutout_size=24)
+
+
+@functools.cache
+def sequences(config: SequenceConfig = DATA) -> Sequences:
+    return sample(jax.random.key(3), bank(), config)
+
+
+def test_sequences_have_time_first_and_frames_on_0_to_1() -> None:
+    s = sequences()
+    lead = (DATA.windows, DATA.sequences)
+    assert s.tensors.shape == (*lead, 16, 16, 5)
+    assert s.frames.shape == s.visible.shape == (*lead, 16, 16)
+    assert s.flow.shape == s.back.shape == (*lead, 2, 16, 16)
+    assert 0 <= float(s.frames.min()) < float(s.frames.max()) <= 1
+    jax.tree.map(np.testing.assert_array_equal, s, sample(jax.random.key(3), bank(), DATA))
+
+
+def test_events_follow_the_light_between_frames() -> None:
+    s = sequences()
+    change = np.diff(np.log(np.asarray(s.frames) + 0.08), axis=0)
+    events = np.asarray(s.tensors.sum(-1))[1:]
+    some = np.abs(change) > 0.15
+    assert some.sum() > 100
+    assert np.corrcoef(change[some], events[some])[0, 1] > 0.6
+
+
+def test_frames_moved_along_the_flow_are_the_next_frames() -> None:
+    s = sequences()
+    inside = np.asarray(s.visible[1:], bool)
+    still = np.abs(np.asarray(s.frames[:-1] - s.frames[1:]))[inside].mean()
+    moved = np.abs(np.asarray(losses.warp(s.frames[:-1], s.back[1:]) - s.frames[1:]))[inside].mean()
+    assert moved < 0.6 * still
+
+
+def test_the_scene_stands_still_in_pauses_and_time_never_falls() -> None:
+    config = SequenceConfig(windows=400, steps_per_window=2, pause=0.2, resume=0.5, window_s=0.1)
+    clock = np.asarray(scene_clock(jax.random.key(0), config))
+    assert clock.shape == (801,)
+    moved = np.diff(clock[::2])
+    still = moved == 0
+    np.testing.assert_allclose(moved[~still], 0.1, rtol=1e-3)
+    assert abs(still.mean() - 0.2 / 0.7) < 0.08  # of the two-state chain
+    never = scene_clock(jax.random.key(0), SequenceConfig(pause=0.0))
+    np.testing.assert_allclose(never[-1], 14 * 0.03, rtol=1e-4)
+
+
+def test_noise_spares_the_first_window_and_hot_pixels_stay() -> None:
+    config = SequenceConfig(windows=4, crop=64, noise=0.1, hot_pixels=0.0)
+    nothing, key = jnp.zeros((4, 64, 64, 5)), jax.random.key(5)
+    noisy = np.asarray(add_noise(key, nothing, config))
+    assert not noisy[0].any()
+    assert abs(noisy[1:].std() - 0.1) < 0.002
+    hot = np.asarray(add_noise(key, nothing, dataclasses.replace(config, hot_pixels=1.0))) - noisy
+    assert 0.02 < (hot[0] != 0).any(-1).mean() < 0.98
+    np.testing.assert_allclose(hot, np.broadcast_to(hot[:1, ..., :1], hot.shape), atol=1e-6)
+
+
+def test_a_measured_camera_is_the_one_that_looks() -> None:
+    """A camera of high thresholds has fewer events, and its dead columns have none."""
+    silent = {"eta_on": 0.0, "eta_off": 0.0}
+    low = Camera.constant((16, 16), theta_on=0.1, theta_off=0.1, **silent)
+    dead = jnp.full((16, 16), 0.6).at[:, 5].set(50.0)
+    high = dataclasses.replace(low, theta_on=dead, theta_off=dead)
+    many, few = (sample(jax.random.key(3), bank(), DATA, camera) for camera in (low, high))
+    assert float(jnp.abs(few.tensors).sum()) < 0.5 * float(jnp.abs(many.tensors).sum())
+    assert not np.asarray(few.tensors[..., 5, :]).any()
+    assert np.asarray(few.tensors[..., 6, :]).any()
+    with pytest.raises(EvflowDataError, match="EV015"):
+        sample_sequences(jax.random.key(0), bank(), DATA, Camera.constant((8, 20)))
+
+
+def test_the_truth_costs_nothing_and_flicker_does() -> None:
+    s = sequences()
+    assert float(losses.reconstruction(s.frames, s.frames)) < 1e-5
+    steady = float(losses.temporal(s.frames, s.frames, s.back, s.visible, 1))
+    sign = jnp.array([1.0, -1.0, 1.0, -1.0]).reshape(4, 1, 1, 1)
+    flicker = float(losses.temporal(s.frames + 0.2 * sign, s.frames, s.back, s.visible, 1))
+    assert steady < 0.3 * flicker
+    assert float(losses.flow_l1(s.flow + 0.5, s.flow)) == pytest.approx(0.5, rel=1e-5)
+
+
+def test_warp_is_bilinear() -> None:
+    image = jnp.arange(12.0).reshape(1, 3, 4)
+    back = jnp.stack([jnp.full((3, 4), 0.5), jnp.full((3, 4), 1.0)])[None]
+    moved = np.asarray(losses.warp(image, back))[0]
+    np.testing.assert_allclose(moved[0, :3], [4.5, 5.5, 6.5])
+    np.testing.assert_allclose(moved[2], 0)
+
+
+@pytest.mark.parametrize("network", [
+    SMALL, pytest.param(EVFlowNet(base=4), marks=pytest.mark.slow)], ids=["E2VID", "EV-FlowNet"])
+def test_steps_learn_a_batch_and_repeat_themselves(network) -> None:
+    config = LearningConfig(data=DATA, steps=40, warmup=2, rate=1e-2, skip=1)
+    tx = optimiser(config)
+    step = jax.jit(make_step(network, config, tx))
+    state = start = init_state(network, config, tx)
+    history = []
+    for _ in range(40):
+        state, metrics = step(dataclasses.replace(state, step=start.step), bank())
+        history.append(float(metrics["loss"]))
+    assert history[-1] < 0.8 * history[0]
+    first, _ = step(start, bank())
+    second, metrics = step(first, bank())
+    assert int(second.step) == 2
+    assert float(metrics["loss"]) != history[1]  # the next step draws other sequences
+    again, _ = step(first, bank())
+    jax.tree.map(np.testing.assert_array_equal, again.params, second.params)
+
+
+@pytest.mark.parametrize("make", [
+    lambda: SequenceConfig(windows=1), lambda: SequenceConfig(pause=2.0),
+    lambda: SequenceConfig(window_s=0.0), lambda: LearningConfig(rate=-1.0),
+    lambda: LearningConfig(data=DATA, skip=3),
+    lambda: make_step(E2VID(bins=4), LearningConfig(), optimiser(LearningConfig()))])
+def test_impossible_options_are_refused(make) -> None:
+    with pytest.raises(EvflowDataError, match="EV020"):
+        make()

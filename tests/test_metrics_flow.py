@@ -1,0 +1,184 @@
+"""Flow metrics: sharpness of warped events, by real data and by definition; endpoint errors."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow import metrics
+from evflow.errors import EvflowDataError
+from evflow.metrics.flow import FwlConvention, splat
+from evflow.types import Events
+
+SIZE = (32, 24)  # width, height
+fwl = jax.jit(metrics.fwl, static_argnames="convention")
+
+
+def edge(velocity: float = 12.0, n: int = 1500, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Events of three vertical edges that move to the right, px per window: x, y, t, p, weight."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.random(n))
+    x = rng.choice([4.0, 9.0, 13.0], n) + velocity * t
+    columns = (x, rng.integers(0, 24, n), t, rng.choice([-1, 1], n), np.ones(n))
+    return tuple(c.astype(np.float32) for c in columns)
+
+
+def constant(u: float, v: float = 0.0) -> jnp.ndarray:
+    return jnp.stack([jnp.full(SIZE[::-1], u), jnp.full(SIZE[::-1], v)])
+
+
+def slow_fwl(events: tuple[np.ndarray, ...], u: float, how: FwlConvention) -> float:
+    """FWL of a constant flow, written out."""
+    def image(u: float) -> np.ndarray:
+        x, y, t, p, _ = (a.astype(np.float64) for a in events)
+        to = t.max() if how.reference == "last" else t.min()
+        out = np.zeros(SIZE[::-1])
+        for xi, yi, ti, pi in zip(x, y, t, p, strict=True):
+            at, vote = xi + (to - ti) * u, pi if how.polarity == "signed" else 1.0
+            spots = ([(round(at), vote)] if how.splat == "round" else
+                     [(int(np.floor(at)) + d, vote * abs(1 - d - at % 1)) for d in (0, 1)])
+            for column, value in spots:
+                if 0 <= column < SIZE[0]:
+                    out[int(yi), column] += value
+        return cv2.GaussianBlur(out, (0, 0), how.blur, borderType=cv2.BORDER_REPLICATE
+                                ) if how.blur else out
+
+    return image(u).var() / image(0.0).var()
+
+
+@pytest.mark.parametrize("how", [
+    FwlConvention(), FwlConvention(reference="first"), FwlConvention(splat="round"),
+    FwlConvention(polarity="signed"), FwlConvention(blur=1.0),
+], ids=lambda how: "-".join(map(str, how.as_dict().values())))
+def test_fwl_is_its_definition(how: FwlConvention) -> None:
+    for u in (12.0, -5.0, 3.3):
+        expected = slow_fwl(edge(), u, how)
+        # cv2 cuts its Gaussian off earlier than 4 sigma.
+        rtol = 2e-2 if how.blur else 1e-3
+        np.testing.assert_allclose(
+            float(fwl(*edge(), constant(u), convention=how)), expected, rtol=rtol)
+
+
+def test_true_flow_is_the_sharpest_and_no_flow_is_1() -> None:
+    values = {u: float(fwl(*edge(), constant(u))) for u in (-12.0, 0.0, 6.0, 12.0, 18.0)}
+    assert max(values, key=values.__getitem__) == 12.0
+    assert values[12.0] > 2
+    assert values[0.0] == 1.0
+    assert values[-12.0] < 1
+    ratios = {u: float(metrics.rsat(*edge(), constant(u))) for u in (0.0, 12.0, -12.0)}
+    assert ratios[12.0] < ratios[0.0] == 1.0 < ratios[-12.0] + 0.2
+
+
+def test_padding_weighs_nothing() -> None:
+    padded = [np.pad(column, (0, 500), constant_values=99.0) for column in edge()]
+    padded[4][-500:] = 0
+    for how in (FwlConvention(), FwlConvention(reference="first")):
+        np.testing.assert_allclose(fwl(*padded, constant(9.0), convention=how),
+                                   fwl(*edge(), constant(9.0), convention=how), rtol=1e-6)
+    np.testing.assert_allclose(metrics.rsat(*padded, constant(9.0)),
+                               metrics.rsat(*edge(), constant(9.0)), rtol=1e-5)
+
+
+def test_votes_are_kept_inside_and_lost_outside() -> None:
+    rng = np.random.default_rng(1)
+    x, y = (jnp.asarray(rng.uniform(0, n - 1, 300), jnp.float32) for n in SIZE)
+    weight = jnp.asarray(rng.random(300), jnp.float32)
+    np.testing.assert_allclose(splat(x, y, weight, SIZE[::-1]).sum(), weight.sum(), rtol=1e-5)
+    outside = splat(jnp.array([-1.5, 40.0, -0.25]), jnp.array([3.0, 3.0, 3.0]), jnp.ones(3),
+                    SIZE[::-1])
+    assert float(outside.sum()) == 0.75
+    assert float(outside[3, 0]) == 0.75
+
+
+def test_flow_metrics_batch_and_differentiate() -> None:
+    flows = jnp.stack([constant(u) for u in (0.0, 6.0, 12.0)])
+    many = jax.vmap(lambda flow: metrics.fwl(*edge(), flow))(flows)
+    np.testing.assert_allclose(
+        many, [fwl(*edge(), constant(u)) for u in (0.0, 6.0, 12.0)], rtol=1e-5)
+    rise = jax.grad(lambda u: metrics.fwl(*edge(), constant(1.0) * u))(11.0)
+    assert float(rise) > 0
+
+
+ROTATIONS = {"boxes": 1.56, "dynamic": 2.06}
+
+
+@pytest.mark.parametrize("name", ROTATIONS)
+def test_fwl_of_rotations_by_the_flow_of_their_gyroscope(
+    name: str, data_file: Callable[[str], Path]
+) -> None:
+    """DAVIS240, 30 000 events: undistorted (the flow is on that grid), warped to the first
+    event by the flow over the slice, counted bilinearly."""
+    folder = data_file(f"data/recordings/ijrr_{name}_rotation")
+    with np.load(folder / "events.npz") as e, np.load(folder / "extra.npz") as extra:
+        fx, fy, cx, cy, *distortion = extra["calib_fx_fy_cx_cy_k1_k2_p1_p2_k3"]
+        flow = jnp.asarray(extra["flow_xy_px_per_slice"])
+        t, p, xy = e["t"], e["p"], np.stack([e["x"], e["y"]], -1).astype(np.float32)
+    k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    new, _ = cv2.getOptimalNewCameraMatrix(k, np.array(distortion), (240, 180), 0)
+    xy = cv2.undistortPoints(xy[:, None], k, np.array(distortion), P=new)[:, 0]
+    time = ((t - t[0]) / (t[-1] - t[0])).astype(np.float32)
+    events = (xy[:, 0], xy[:, 1], time, p.astype(np.float32), np.ones(len(t), np.float32))
+    how = FwlConvention(reference="first")
+    right, wrong, half = (float(fwl(*events, s * flow, convention=how)) for s in (1.0, -1.0, 0.5))
+    np.testing.assert_allclose(right, ROTATIONS[name], atol=0.01)
+    assert wrong < 1 < half < right
+    assert float(metrics.rsat(*events, flow)) < 1 < float(metrics.rsat(*events, -flow))
+
+
+def test_endpoint_errors_by_hand() -> None:
+    truth = np.zeros((2, 2, 3), np.float32)
+    flow = truth.copy()
+    flow[:, 0, 0], flow[0, 0, 1], truth[:, 1, 2] = (3.0, 4.0), 1.0, np.nan
+    mask = np.array([[1, 1, 1], [1, 0, 0]], bool)
+    error, outliers = jax.jit(metrics.aee)(flow, truth, mask)
+    np.testing.assert_allclose([error, outliers], [1.5, 25.0])
+    _, outliers = metrics.aee(flow, truth, mask, outlier_px=6.0)
+    assert float(outliers) == 0
+    error, _ = metrics.aee(flow[None, ..., :2], truth[None, ..., :2])
+    np.testing.assert_allclose(error, [1.5])
+    assert bool(jnp.isnan(metrics.aee(flow, truth, mask & False)[0]))
+    gradient = jax.grad(lambda f: metrics.aee(f, truth, mask)[0])(jnp.zeros((2, 2, 3)))
+    assert bool(jnp.isfinite(gradient).all())
+
+
+def recorded(seed: int = 0) -> Events:
+    x, y, t, p, _ = edge(seed=seed)
+    x, y, t = (column.astype(np.int64) for column in (x, y, 50_000 * t))
+    return Events(x, y, t, p > 0, SIZE)
+
+
+def test_scores_say_how_they_were_made() -> None:
+    edges = np.array([0, 25_000, 50_000, 75_000])  # the last window is silent
+    flow = np.broadcast_to(np.asarray(constant(6.0)), (3, 2, *SIZE[::-1]))
+    scores = metrics.score_flow(recorded(), edges, flow, truth=flow * 1.0)
+    assert json.loads(json.dumps(scores)) == scores
+    assert scores["convention"] == FwlConvention().as_dict()
+    assert (scores["windows"], scores["window_ms"]) == (2, 25.0)
+    assert scores["events_per_window"] == 500.0
+    assert scores["aee"] == scores["outlier_percent"] == 0.0
+    assert scores["fwl"] == scores["fwl_truth"] > 1.2
+    valid = np.zeros((3, *SIZE[::-1]), bool)
+    nowhere = metrics.score_flow(recorded(), edges, flow, truth=flow * 2.0, valid=valid)
+    assert nowhere["aee"] is None
+    off = metrics.score_flow(recorded(), edges, flow, truth=flow * 2.0, valid=~valid)
+    np.testing.assert_allclose([off["aee"], off["outlier_percent"]], [6.0, 100.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("call", "code"), [
+    (lambda e, f: metrics.score_flow(e, np.array([0, 1]), f), "EV002"),
+    (lambda e, f: metrics.score_flow(e, np.array([0, 5, 5]), f), "EV004"),
+    (lambda e, f: metrics.score_flow(e, np.array([0, 5, 9]), f, truth=f[:1]), "EV002"),
+    (lambda e, f: metrics.score_flow(e, np.array([0, 5, 9]), f, valid=f > 0), "EV002"),
+    (lambda e, f: FwlConvention(splat="cubic"), "EV020"),
+    (lambda e, f: FwlConvention(blur=-1.0), "EV020"),
+])
+def test_what_cannot_be_scored_is_refused(call, code: str) -> None:
+    with pytest.raises(EvflowDataError, match=code):
+        call(recorded(), np.zeros((2, 2, *SIZE[::-1]), np.float32))
