@@ -128,7 +128,8 @@ def pixels_torch(setting: Setting, rows: int | None, compiled: bool = False) -> 
     net = peer_torch.weights(next(iter(params.values())))
 
     estimate = partial(peer_torch.estimate, config=config)
-    estimate = torch.compile(estimate, dynamic=False) if compiled else estimate
+    if compiled and not setting.quick:  # which takes minutes, and a C++ compiler
+        estimate = torch.compile(estimate, dynamic=False)
 
     def call() -> Any:
         with torch.no_grad():

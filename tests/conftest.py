@@ -3,13 +3,27 @@ so that tests of the NumPy-only rooms never load it and subprocesses inherit it.
 
 from __future__ import annotations
 
+import gc
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+MOST_MB = 2500  # of memory, that compiled programs may fill before they are forgotten
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _bounded_memory() -> Iterator[None]:
+    """Hundreds of compiled programs take gigabytes a process, on a machine that runs two."""
+    yield
+    status = Path("/proc/self/status")
+    resident = status.read_text().split("VmRSS:")[1].split()[0] if status.exists() else 0
+    if "jax" in sys.modules and int(resident) > MOST_MB * 1024:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from evflow.baselines.unet import KERNEL
+
 Array = jax.Array
 Params = Any
 
@@ -43,8 +45,8 @@ class Critic(nn.Module):
     def __call__(self, x: Array) -> Array:
         x = x.reshape(*x.shape[:-3], -1)
         for width in self.hidden:
-            x = nn.leaky_relu(nn.Dense(width)(x), 0.2)
-        return nn.Dense(1)(x)[..., 0]
+            x = nn.leaky_relu(nn.Dense(width, kernel_init=KERNEL)(x), 0.2)
+        return nn.Dense(1, kernel_init=KERNEL)(x)[..., 0]
 
 
 def sort_patches(

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import optax
 
 from evflow.baselines.eventgan_losses import Pair, critic_loss, flow_loss, reconstruction_loss
-from evflow.baselines.unet import UNet
+from evflow.baselines.unet import KERNEL, UNet, fresh
 from evflow.batch import Batch, sample_batch
 from evflow.camera import CameraPrior
 from evflow.config import NuisanceConfig, TrainConfig
@@ -109,9 +109,10 @@ class PatchCritic(nn.Module):
     def __call__(self, x: Array) -> Array:
         for i in range(STRIDED + 1):
             stride = 2 if i < STRIDED else 1
-            x = nn.Conv(self.features << i, (4, 4), (stride, stride), name=f"layer_{i}")(x)
+            x = nn.Conv(self.features << i, (4, 4), (stride, stride), kernel_init=KERNEL,
+                        name=f"layer_{i}")(x)
             x = nn.leaky_relu(x, 0.2)
-        return nn.Conv(1, (4, 4), name="logits")(x)[..., 0]
+        return nn.Conv(1, (4, 4), kernel_init=KERNEL, name="logits")(x)[..., 0]
 
 
 def networks(config: GanConfig) -> dict[str, nn.Module]:
@@ -166,13 +167,14 @@ def optimisers(config: GanConfig) -> dict[str, optax.GradientTransformation]:
             "flow": cycle, "reconstruction": cycle}
 
 
+@partial(jax.jit, static_argnames="config")
 def init_state(config: GanConfig) -> GanState:
     """Fresh state."""
     side, volume = config.data.crop, 2 * config.bins
     channels = {"generator": 2, "critic": volume + 2, "flow": volume, "reconstruction": 2}
     *keys, k_run = jax.random.split(jax.random.key(config.seed), 5)
     params = {
-        name: jax.jit(network.init)(key, jnp.zeros((1, side, side, channels[name])))["params"]
+        name: fresh(key, network, jnp.zeros((1, side, side, channels[name])))
         for key, (name, network) in zip(keys, networks(config).items(), strict=True)}
     opt_state = {name: tx.init(params[name]) for name, tx in optimisers(config).items()}
     return GanState(jnp.zeros((), jnp.int32), params, opt_state, k_run)

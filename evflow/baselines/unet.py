@@ -8,15 +8,43 @@ can take are noise, and those of an image would change with its size.
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from evflow.downstream.layers import conv
-
 Array = jax.Array
 
 BLOCKS = 2
+KERNEL = nn.initializers.he_uniform()  # compiles in a fifth of the time of a truncated normal
+
+
+def conv(features: int, stride: int = 1, *, bias: bool = True, name: str) -> nn.Conv:
+    """3x3, which keeps H and W, or halves them, rounded up."""
+    return nn.Conv(features, (3, 3), (stride, stride), ((1, 1), (1, 1)), use_bias=bias,
+                   kernel_init=KERNEL, name=name)
+
+
+def fresh(key: Array, network: nn.Module, x: Array) -> dict[str, Any]:
+    """Params as `network.init(key, x)` gives them, of networks whose kernels are KERNEL's: one draw
+    for all of them, since XLA:CPU takes .2 s and more to compile each."""
+    shapes: Any = jax.eval_shape(network.init, key, x)["params"]
+    leaves, tree = jax.tree_util.tree_flatten_with_path(shapes)
+    ends = [0]
+    for _, leaf in leaves:
+        ends.append(ends[-1] + math.prod(leaf.shape))
+    drawn = jax.random.uniform(key, (ends[-1],), minval=-1.0)
+    made = []
+    for i, (path, leaf) in enumerate(leaves):
+        name = path[-1].key
+        if name == "kernel":
+            bound = math.sqrt(6.0 / math.prod(leaf.shape[:-1]))
+            made.append(bound * drawn[ends[i]:ends[i + 1]].reshape(leaf.shape))
+        else:
+            made.append(jnp.full(leaf.shape, float(name == "scale")))
+    return jax.tree.unflatten(tree, made)
 
 
 class UNet(nn.Module):
@@ -32,7 +60,7 @@ class UNet(nn.Module):
     def __call__(self, x: Array) -> list[Array]:
         height, width = x.shape[-3:-1]
         x = _filled(x, 2**self.encoders)
-        x = nn.relu(conv(self.base, 3, name="head")(x))
+        x = nn.relu(conv(self.base, name="head")(x))
         skips = []
         for i in range(self.encoders):
             skips.append(x)
@@ -46,7 +74,8 @@ class UNet(nn.Module):
             x = jnp.concatenate([jnp.repeat(jnp.repeat(x, 2, -3), 2, -2), skip], -1)
             x = Layer(self.base << left, name=f"decoder_{i}")(x)
             if left < self.scales:
-                y = nn.Conv(self.outputs, (1, 1), name=f"prediction_{left}")(x)
+                y = nn.Conv(
+                    self.outputs, (1, 1), kernel_init=KERNEL, name=f"prediction_{left}")(x)
                 found.append(y[..., :-(-height >> left), :-(-width >> left), :])
         return found
 
@@ -60,7 +89,7 @@ class Layer(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        x = conv(self.features, 3, self.stride, bias=False, name="conv")(x)
+        x = conv(self.features, self.stride, bias=False, name="conv")(x)
         x = nn.LayerNorm(name="norm")(x)
         return nn.relu(x) if self.relu else x
 

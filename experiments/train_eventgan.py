@@ -1,0 +1,146 @@
+"""Train EventGAN (paper, Tables V and VI) on simulated windows, and measure what it makes.
+
+    python -m experiments.train_eventgan --preset small --out runs/eventgan --max-seconds 1200
+
+Writes checkpoints, metrics.jsonl, generator.safetensors and, on held-out scenes, eventgan.json and
+.md: events per polarity relative to the simulator's, |value| where two simulations of the camera
+are both silent, and the per-pixel correlation with a simulation beside that of two simulations.
+Ctrl-C (or SIGTERM) saves a checkpoint and stops; the same command goes on, bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from evflow.baselines.eventgan import GANS, GanConfig, GanState, generate, init_state, run_step
+from evflow.checkpoint import Checkpoints
+from evflow.config import as_dict
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+from evflow.intensity import lin_log_inverse
+from evflow.progress import bar
+from evflow.scenes import TextureBank, make_bank
+from evflow.weights import save_weights
+from experiments import generate as inverse
+from experiments.common import provenance, write_result
+from experiments.train import goes_on, lines_until, stop_requests
+
+HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
+COLUMNS = ("on", "off", "empty", "correlation", "two simulations", "relative")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train EventGAN."""
+
+    out: Path
+    """Folder of the run."""
+    preset: Literal["published", "small", "small paired", "debug"] = "small"
+    steps: int | None = None
+    """Number of steps (default: the preset's)."""
+    seed: int = 0
+    max_seconds: float = math.inf
+    """Stop after this long, with a checkpoint."""
+    resume: Literal["auto", "never", "must"] = "auto"
+    """Go on with the run in --out: if there is one, never, or always."""
+    save_every: int = 200
+    """Steps between checkpoints."""
+    scenes: int = 40
+    """Held-out scenes to measure on."""
+
+
+def main(options: Options) -> dict[str, Any]:
+    """One run; returns the figures on held-out scenes."""
+    config = dataclasses.replace(GANS[options.preset], seed=options.seed)
+    if options.steps is not None:
+        config = dataclasses.replace(config, steps=options.steps)
+    state = init_state(config)
+    with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
+        if goes_on(checkpoints, config, options) and checkpoints.latest is not None:
+            state = checkpoints.restore(state)
+        bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.data.textures)
+        state = run(state, bank, config, options, checkpoints, requests)
+    params = state.params["generator"]
+    result = measure(params, config, options.scenes) | {"steps": int(state.step)}
+    card = {"preset": options.preset, "steps": int(state.step), "seed": config.seed,
+            "figures": result, "config": as_dict(config), **provenance()}
+    save_weights(options.out / "generator.safetensors", params, card, overwrite=True)
+    write_result(options.out / "eventgan.json", result, as_dict(config))
+    text = table(result)
+    print(text)
+    (options.out / "eventgan.md").write_text(text + "\n")
+    return result
+
+
+def run(
+    state: GanState, bank: TextureBank, config: GanConfig, options: Options,
+    checkpoints: Checkpoints, requests: list[int],
+) -> GanState:
+    """Steps until the end, the time limit or a signal; the last step is saved."""
+    started, step = time.monotonic(), int(state.step)
+    path = options.out / "metrics.jsonl"
+    kept = "".join(f"{line}\n" for line in lines_until(path, step))
+    with atomic_write(path, overwrite=True) as temporary:
+        temporary.write_text(kept)
+    with bar("training") as progress, path.open("a", buffering=1) as log:
+        while (step < config.steps and not requests
+               and time.monotonic() - started < options.max_seconds):
+            state, metrics = run_step(state, bank, config)
+            step += 1
+            values = {k: float(v) for k, v in jax.device_get(metrics).items()}
+            seconds = time.monotonic() - started
+            log.write(json.dumps({"step": step, "time": seconds, **values}) + "\n")
+            progress(step, config.steps)
+            if step % options.save_every == 0:
+                checkpoints.save(step, state)
+    checkpoints.save(step, state)
+    return state
+
+
+def measure(params: dict[str, Any], config: GanConfig, scenes: int) -> dict[str, Any]:
+    """Generated voxels of the two frames of held-out windows against two simulations of the
+    camera that made them, and the mean of all generated counts against that of all simulated."""
+    low, high = config.data.window_s
+    options = inverse.Options(prior=config.data.prior, window_s=math.sqrt(low * high))
+    k_bank, k_data = jax.random.split(jax.random.key(HELD_OUT))
+    bank = make_bank(k_bank, 48, photos=False)
+    run_generator = jax.jit(generate)
+    everywhere = jnp.ones(options.shape, bool)
+    total: inverse.Row = {}
+    with bar("scenes") as progress:
+        for i in range(scenes):
+            k_scene, k_one, k_two = jax.random.split(jax.random.fold_in(k_data, i), 3)
+            frames, camera = inverse.scene_of(k_scene, bank, options)
+            one, two = (inverse.simulated(k, frames, camera, options.window_s)
+                        for k in (k_one, k_two))
+            made = run_generator(params, *(lin_log_inverse(frames[j]) for j in (0, -1)))
+            row = inverse.compare(made, one, two, everywhere)
+            total = jax.tree.map(np.add, total, row) if total else row
+            progress(i + 1, scenes)
+    return inverse.figures(total)
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown, one row."""
+    cells = " | ".join(f"{result[name]:.3f}" for name in COLUMNS)
+    return "\n".join((
+        "| steps | events ON, generated / simulated | OFF | mean \\|value\\| of empty pixels | "
+        "correlation with a simulation | of two simulations | ratio |",
+        "|" + "---|" * 7, f"| {result['steps']} | {cells} |"))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options, description=__doc__))
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None
