@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory.
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated, Union
 
@@ -24,8 +25,9 @@ from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
+from evflow.progress import stoppable
 
-RESOURCES = ("EV019",)
+EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
 
 Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these annotations
     Annotated[Info, tyro.conf.subcommand("info")],
@@ -45,18 +47,25 @@ Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these ann
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the `evflow` command."""
-    arguments = forwarded(sys.argv[1:] if argv is None else argv)
-    command = tyro.cli(
-        Command, args=arguments, prog="evflow",
-        description="Measure an event camera from its recording; simulate any video as it "
-        "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
     try:
-        command.run()
+        with stoppable():
+            arguments = forwarded(sys.argv[1:] if argv is None else argv)
+            tyro.cli(
+                Command, args=arguments, prog="evflow",
+                description="Measure an event camera from its recording; simulate any video as it "
+                "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/").run()
+            sys.stdout.flush()
     except EvflowDataError as e:
         print(e, file=sys.stderr)
-        return 3 if e.code in RESOURCES else 1
+        return EXITS.get(e.code, 1)
     except MemoryError as e:
         print(f"out of memory: {e}", file=sys.stderr)
+        return 3
+    except BrokenPipeError:  # `evflow info ... | head`: nobody reads on, and nothing is wrong
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as e:
+        print(f"the output cannot be written: {e}", file=sys.stderr)
         return 3
     except KeyboardInterrupt:
         print("interrupted; no half-written file is left.", file=sys.stderr)

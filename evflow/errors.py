@@ -44,6 +44,7 @@ CODES: dict[str, str] = {
     "EV031": "bit depth of the frames",
     "EV032": "colour frames",
     "EV033": "pixels far busier than their neighbours",
+    "EV034": "events and frames are unrelated",
 }
 
 

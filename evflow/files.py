@@ -15,12 +15,16 @@ from evflow.errors import EvflowDataError
 def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it into place only if the block succeeds.
 
-    Raises EV013 where `path` exists and `overwrite` is false, EV019 where the disk is full or
-    the path cannot be written. The temporary file is removed on any failure, Ctrl-C included.
+    Raises EV013 where `path` exists and `overwrite` is false, or is no file, EV019 where the disk
+    is full or the path cannot be written. The temporary file is removed on any failure, Ctrl-C
+    included.
     """
     path = Path(path)
     if os.path.exists(path) and not overwrite:  # false, not an error, for an impossible path
         raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).")
+    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
+        raise EvflowDataError(
+            "EV013", f"{path} is a device or a pipe.", "It is never replaced: choose a file.")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -28,7 +32,7 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
         os.replace(temporary, path)
     except OSError as e:
         reasons = {errno.ENOSPC: "no space left", errno.EACCES: "permission denied",
-                   errno.EROFS: "read-only file system",
+                   errno.EROFS: "read-only file system", errno.ENOENT: "no such folder",
                    errno.ENOTDIR: "its folder is a file", errno.EEXIST: "its folder is a file",
                    errno.EISDIR: "it is a folder", errno.ENAMETOOLONG: "the name is too long"}
         if e.errno in reasons:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
@@ -42,3 +42,36 @@ def atomic_folder(
             os.replace(aside, path)
         raise
     shutil.rmtree(aside, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool = False
+           ) -> Iterator[Path]:
+    """Yield an empty folder; move what the block leaves there into `folder` once it succeeds.
+
+    names: all files that the block may write, of which those in `folder` from another time are
+    removed, so that nothing stale lies beside the new ones; other files stay.
+    Raises EV013 where one of them exists and `overwrite` is false, EV019 where the folder cannot
+    be written.
+    """
+    folder = Path(folder)
+    if not overwrite and (old := [name for name in names if (folder / name).exists()]):
+        raise EvflowDataError("EV013", f"{folder} holds {', '.join(old)}.",
+                              "Pass --overwrite (overwrite=True).")
+    stage = folder / f".{os.getpid()}.tmp"
+    new = not folder.exists()
+    try:
+        with atomic_write(folder / ".probe", overwrite=True) as probe:  # before any long work
+            probe.touch()
+        (folder / ".probe").unlink()
+        stage.mkdir()
+        yield stage
+        for name in names:
+            (folder / name).unlink(missing_ok=True)
+        for path in stage.iterdir():
+            os.replace(path, folder / path.name)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        if new:
+            with contextlib.suppress(OSError):  # unless something was written
+                folder.rmdir()

@@ -100,7 +100,7 @@ def estimate_camera(
     return CameraEstimate(
         camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         len(plan.pairs),
-        (*_condensed(plan.skipped), *_warnings(stats, n_events, summary, hot, dead)))
+        (*io.condensed(plan.skipped), *_warnings(stats, n_events, summary, hot, dead)))
 
 
 def window_inputs(window: Window) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
@@ -215,17 +215,6 @@ def _with_regression(
     camera = dataclasses.replace(
         camera, theta_on=jnp.asarray(theta[0]), theta_off=jnp.asarray(theta[1]))
     return camera, dataclasses.replace(std, theta_on=on, theta_off=off)
-
-
-def _condensed(skipped: tuple[str, ...]) -> list[str]:
-    """What was skipped, windows of one reason in one sentence ("frames 3-5: reason")."""
-    reasons: dict[str, list[str]] = {}
-    for sentence in skipped:
-        frames, _, reason = sentence.partition(": ")
-        reasons.setdefault(reason, []).append(frames)
-    return [f"{frames[0]} skipped: {reason}" if len(frames) == 1 else
-            f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {reason}"
-            for reason, frames in reasons.items()]
 
 
 def _warnings(

@@ -12,6 +12,10 @@ from pathlib import Path
 import pytest
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+# What one worker, or one process that a test starts, has compiled the others need not.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR",
+                      str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 MOST_MB = 2500  # of memory, that compiled programs may fill before they are forgotten
 
 

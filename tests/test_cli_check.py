@@ -75,8 +75,8 @@ def test_what_cannot_be_read_is_the_finding(
 def test_late_frames_are_put_right(
     folder: Path, offset: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("check", folder / "late.npz", "--json") == 0
-    assert found(capsys) == {"warnings": ["EV024"]}
+    assert run("check", folder / "late.npz", "--json") == 1
+    assert found(capsys) == {"errors": ["EV024"]}
     assert run("check", folder / "late.npz", "--json", "--frames-offset-ms", offset) == 0
     assert found(capsys) == {}
     assert run("info", folder / "late.npz", "--frames-offset-ms", offset) == 0
@@ -111,7 +111,10 @@ def test_estimate_stops_at_errors_and_keeps_warnings(
     assert run(*estimate, "--polarity", "invert", "--frames-offset-ms", "-50") == 1
     assert "EV021" in capsys.readouterr().err
     assert not out.exists()
-    assert run(*estimate) == 0
+    assert run(*estimate) == 1
+    assert "EV024" in capsys.readouterr().err
+    assert not out.exists()
+    assert run(*estimate, "--no-checks") == 0
     assert "warning: EV024" in capsys.readouterr().err
     saved = json.loads((out / "camera.json").read_text())
     assert sum("EV024" in w for w in saved["warnings"]) == 1

@@ -10,6 +10,7 @@ import pytest
 
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
+from evflow.folders import staged
 
 
 def write(path: Path, text: str, *, overwrite: bool = False) -> None:
@@ -101,3 +102,30 @@ def test_a_folder_is_never_replaced(tmp_path: Path) -> None:
     assert refusal(tmp_path / "out", overwrite=True).code == "EV019"
     assert (tmp_path / "out").is_dir()
     assert os.listdir(tmp_path) == ["out"]
+
+
+def test_devices_are_never_replaced() -> None:
+    with pytest.raises(EvflowDataError, match="EV013"), atomic_write("/dev/null", overwrite=True):
+        pytest.fail("a device was opened for writing")
+
+
+def test_a_staged_folder_is_new_as_a_whole(tmp_path: Path) -> None:
+    folder, names = tmp_path / "out", ("a.txt", "b.txt")
+    def interrupted() -> None:
+        with staged(folder, names=names) as stage:
+            (stage / "a.txt").write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert not folder.exists()
+    with staged(folder, names=names) as stage:
+        (stage / "a.txt").write_text("one")
+        (stage / "b.txt").write_text("one")
+    (folder / "mine.txt").write_text("dear to me")
+    with pytest.raises(EvflowDataError, match="EV013"), staged(folder, names=names):
+        pytest.fail("files were there")
+    with staged(folder, names=names, overwrite=True) as stage:
+        (stage / "a.txt").write_text("two")
+    assert sorted(p.name for p in folder.iterdir()) == ["a.txt", "mine.txt"]  # b.txt was stale
+    assert (folder / "a.txt").read_text() == "two"

@@ -83,9 +83,9 @@ def test_mistake_3_unsorted(sound: Recording) -> None:
 @pytest.mark.parametrize("offset_ms", [-50, 40, 70])
 def test_mistake_4_frames_misaligned(sound: Recording, offset_ms: int) -> None:
     moved = shifted(sound, offset_ms * 1000)
-    (warning,) = check(moved).warnings
-    assert warning.code == "EV024"
-    assert "--frames-offset-ms" in warning.fix
+    (finding,) = check(moved).findings
+    assert finding.code == "EV024"
+    assert "--frames-offset-ms" in finding.fix
     assert frames_offset(moved) == pytest.approx(-offset_ms * 1000, abs=6_000)
     assert moved.notes == (f"frame times moved by {offset_ms:+g} ms",)
 
@@ -291,3 +291,27 @@ def test_real_recordings_without_frames_lack_frames_alone(
     report = check(data_file(f"data/{name}"))
     assert report.errors == ()
     assert [f.code for f in report.warnings] == ["EV011"]
+
+
+def test_events_and_frames_that_are_unrelated_are_an_error(sound: Recording) -> None:
+    e = sound.events
+    order = np.random.default_rng(0).permutation(64 * 48)
+    pixel = order[e.y.astype(int) * 64 + e.x]
+    scattered = dataclasses.replace(e, x=pixel % 64, y=pixel // 64)
+    assert "EV034" in codes(dataclasses.replace(sound, events=scattered))
+
+
+@pytest.mark.parametrize("offset_ms", [-40, 30])
+def test_inversion_and_offset_are_told_together(sound: Recording, offset_ms: int) -> None:
+    swapped = dataclasses.replace(sound.events, p=~sound.events.p)
+    moved = shifted(dataclasses.replace(sound, events=swapped), offset_ms * 1000)
+    (finding,) = check(moved).errors
+    assert finding.code == "EV021"
+    assert frames_offset(moved) == pytest.approx(-offset_ms * 1000, abs=8_000)
+
+
+def test_mirrored_and_inverted_are_told_together(sound: Recording) -> None:
+    swapped = dataclasses.replace(sound.events, p=~sound.events.p)
+    (finding,) = check(flipped(dataclasses.replace(sound, events=swapped), "horizontal")).errors
+    assert finding.code == "EV029"
+    assert "--polarity invert" in finding.fix

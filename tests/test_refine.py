@@ -232,3 +232,14 @@ def test_hot_pixels_are_those_that_fire_while_nothing_moves() -> None:
     recording = Recording(events, np.broadcast_to(scene, (9, *shape)).astype(np.uint8), edges)
     chunks = refinement_chunks(recording, ((0, 2), (2, 4), (4, 6), (6, 8)))
     np.testing.assert_array_equal(hot_pixels(chunks, 0.3), hot)
+
+
+def test_hot_pixels_come_alone() -> None:
+    """A hundredfold rate in one pixel, or two, is a fault; in a patch of them something moved."""
+    class Quiet:
+        quiet = np.stack([np.full((40, 40), 1.0), np.full((40, 40), 10.0)])
+
+    Quiet.quiet[0, 5, 5] = Quiet.quiet[0, 20, 30] = Quiet.quiet[0, 20, 31] = 100.0
+    Quiet.quiet[0, 28:33, 5:9] = 100.0
+    found = hot_pixels([Quiet()], 0.1)  # type: ignore[list-item]
+    assert np.argwhere(found).tolist() == [[5, 5], [20, 30], [20, 31]]

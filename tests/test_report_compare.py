@@ -193,3 +193,13 @@ def test_compare_refuses_other_sizes(
     assert main(["compare", str(streams[0]), str(wide), "-o", str(tmp_path / "no")]) == 1
     assert "EV015" in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
+
+
+def test_swapped_polarity_is_told() -> None:
+    """Counts per pixel are the same, and so are all times."""
+    events = edge()
+    numbers = evflow.compare(events, dataclasses.replace(events, p=~events.p))
+    assert numbers["net_r"] == pytest.approx(-1.0)
+    assert worst(judge_streams(numbers)) == "poor"
+    assert "swapped" in describe_streams(numbers)
+    assert "swapped" not in describe_streams(evflow.compare(events, events))

@@ -11,7 +11,7 @@ both are here.
 
 from evflow.baselines.akf import Akf
 from evflow.baselines.base import Fitted, Solution, System
-from evflow.baselines.calibration import calibrate_static, calibrate_step
+from evflow.baselines.calibration import calibrate_step
 from evflow.baselines.complementary import Complementary
 from evflow.baselines.ecc import Ecc, EccEvents
 from evflow.baselines.integration import Integration
@@ -47,5 +47,5 @@ RECONSTRUCTORS: dict[str, Reconstructor] = {
 __all__ = [
     "RECONSTRUCTORS", "SYSTEMS", "Akf", "Complementary", "Ecc", "EccEvents", "Fitted",
     "Integration", "Jaer", "Match", "Reconstructor", "S2r", "Solution", "System",
-    "calibrate_static", "calibrate_step", "v2e_noise", "voltmeter_noise",
+    "calibrate_step", "v2e_noise", "voltmeter_noise",
 ]

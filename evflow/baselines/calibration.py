@@ -3,7 +3,7 @@
 The paper's ground truth (Section III-B): a screen that fills the view brightens or darkens by a
 known dlogI, and a pixel's threshold is dlogI over its events; what a scene at rest sends is noise.
 Here recordings become counts at rests of the light and results become a `CameraEstimate`; how
-counts become thresholds is in steps.py.
+counts become thresholds is in steps.py. The noise alone: evflow/noise_only.py.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.baselines.steps import (
-    THETA_PRIOR,
-    THETA_PRIOR_STD,
     camera_rate,
     camera_wide,
     is_hot,
@@ -67,6 +65,7 @@ def calibrate_step(
     median. Raises EV001 (no events), EV011 (no frames and no light), EV017 (no two rests), EV020.
     """
     steps = _steps(recording, rests_us, light)
+    _check_polarity(steps)
     hz, _ = camera_rate(steps.rest, steps.rest_s)
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
@@ -92,36 +91,14 @@ def calibrate_step(
                      n_events, hot, len(steps.counts), notes)
 
 
-def calibrate_static(
-    recording: Recording, *, start_us: int | None = None, stop_us: int | None = None,
-) -> CameraEstimate:
-    """Noise rates from a scene at rest: every event of it is noise, eta = events / seconds.
-
-    start_us, stop_us: the part to use (default: from the first event or frame to the last). The
-    maps are shrunk to the camera by as much as their counts' Poisson spread asks for. Thresholds
-    are not told: they hold the prior's mean and std. Raises EV001 (no duration), EV020.
-    """
-    events, times = recording.events, recording.frame_times
-    known = [*events.t[[0, -1]]] if len(events) else []
-    known += [*times[[0, -1]]] if len(times) else []
-    begin = min(known, default=0) if start_us is None else start_us
-    end = max(known, default=0) + 1 if stop_us is None else stop_us
-    if end - begin < 2:
-        raise EvflowDataError("EV001", f"the scene at rest lasts {end - begin} us.",
-                              "Give start_us and stop_us of a silent camera's recording.")
-    counts = events.slice(int(begin), int(end)).count_map().astype(np.float64)
-    seconds = (int(end) - int(begin)) * 1e-6
-    hz, _ = camera_rate(counts, seconds)
-    hot = is_hot(counts.sum(0), float(hz.sum()), seconds)
-    eta, eta_std = shrunk_rates(counts, seconds)
-    flat = np.full(counts.shape, THETA_PRIOR)
-    notes = ["a scene at rest does not tell thresholds: they are the prior's."]
-    if counts.sum() < 100:
-        notes.append(f"only {int(counts.sum())} noise events: record longer.")
-    return _estimate(flat, np.full(counts.shape, THETA_PRIOR_STD),
-                     [(THETA_PRIOR, THETA_PRIOR_STD)] * 2, [0.0, 0.0], eta, eta_std,
-                     np.ones(counts.shape[1:], bool) & ~hot, counts.sum(0).astype(np.uint32), hot,
-                     1, notes)
+def _check_polarity(steps: Steps) -> None:
+    """EV021 where OFF events come with steps up."""
+    change = np.median(np.diff(steps.levels, axis=0), (1, 2))
+    net = (steps.counts[:, 0] - steps.counts[:, 1]).sum((1, 2))
+    if (change * net).sum() < 0:
+        raise EvflowDataError(
+            "EV021", "ON events come where the light falls, OFF events where it rises.",
+            "Pass --polarity invert (polarity='invert'), or are frames and events not aligned?")
 
 
 def find_rests(recording: Recording) -> list[tuple[int, int]]:
@@ -129,7 +106,7 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
     joined; EV011 without frames, EV017 where there are not two."""
     if len(recording.frames) < 4:
         raise EvflowDataError("EV011", f"the recording has {len(recording.frames)} frames.",
-                              "Give rests_us and light.")
+                              "Record frames too; in Python, rests_us and light take their place.")
     level = np.array([np.median(np.asarray(lin_log(recording.frame_dn(i))))
                       for i in range(len(recording.frames))])
     still = np.abs(np.diff(level)) < STILL

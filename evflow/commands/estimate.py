@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from evflow.commands.options import Reading, write_json
+from evflow.commands.options import Reading, check_finite, write_json
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
     from evflow.recording import CameraEstimate
     from evflow.types import Recording
 
+FILES = ("camera.npz", "camera.json", "maps.png", "histograms.png", "report.html")
 SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate warns of these itself
 
 
@@ -54,35 +55,37 @@ class Estimate(Reading):
     """Print the summary as JSON."""
 
     def run(self) -> None:
+        from evflow.folders import staged
         from evflow.report import plots
         from evflow.report.text import describe
 
-        if (self.out / "camera.npz").exists() and not self.overwrite:
-            raise EvflowDataError(
-                "EV013", f"{self.out / 'camera.npz'} exists.", "Pass --overwrite.")
+        check_finite(self)
         moving = self.protocol == "motion"
+        if not moving and (self.weights != "default" or self.window_ms != 40.0):
+            raise EvflowDataError("EV020", f"--weights and --window-ms with --protocol "
+                                  f"{self.protocol}.", "They belong to protocol motion.")
         if self.plots or (self.report and moving):
             plots.require()
-        recording = self.read(self.recording)
-        found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
-        found.save(self.out / "camera.npz", overwrite=self.overwrite)
-        facts = {**found.as_dict(), "recording": str(self.recording), "protocol": self.protocol,
-                 "notes": list(recording.notes), **facts}
-        write_json(self.out / "camera.json", facts)
-        if self.plots:
-            plots.camera_maps(found, self.out / "maps.png")
-            plots.camera_histograms(found, self.out / "histograms.png")
-        if self.report and moving:
-            self._report(found, recording)
+        with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
+            recording = self.read(self.recording)
+            doubts = self._checked(recording)
+            found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
+            found = dataclasses.replace(found, warnings=(*doubts, *found.warnings))
+            found.save(out / "camera.npz")
+            facts = {**found.as_dict(), "recording": str(self.recording),
+                     "protocol": self.protocol, "notes": list(recording.notes), **facts}
+            write_json(out / "camera.json", facts)
+            if self.plots:
+                plots.camera_maps(found, out / "maps.png")
+                plots.camera_histograms(found, out / "histograms.png")
+            if self.report and moving:
+                self._report(out, found, recording)
         print(json.dumps(facts, indent=2) if self.json else describe(found))
         print(f"written to {self.out}/", file=sys.stderr)
 
-    def _estimated(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
-        """Of a recording of something that moves: checks first, then the network."""
+    def _checked(self, recording: Recording) -> list[str]:
+        """What `evflow check` doubts; raises its errors, unless told not to."""
         from evflow.inspection import check
-        from evflow.progress import bar
-        from evflow.recording import estimate_camera
-        from evflow.weights import load_weights, model_card
 
         report = check(recording)
         if self.checks:
@@ -90,26 +93,32 @@ class Estimate(Reading):
         doubts = [str(f) for f in (*report.errors, *report.warnings) if f.code not in SAID_BELOW]
         for doubt in doubts:
             print(f"warning: {doubt}", file=sys.stderr)
+        return doubts
+
+    def _estimated(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
+        from evflow.progress import bar
+        from evflow.recording import estimate_camera
+        from evflow.weights import load_weights, model_card
+
         params = load_weights(self.weights)
         with bar("estimating") as progress:
             found = estimate_camera(
                 recording, params, min_window_us=round(self.window_ms * 1000), progress=progress)
-        card = model_card(self.weights)
-        return (dataclasses.replace(found, warnings=(*doubts, *found.warnings)),
-                {"weights": self.weights, "weights_steps": card.get("steps")})
+        return found, {"weights": self.weights,
+                       "weights_steps": model_card(self.weights).get("steps")}
 
     def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
-        from evflow.baselines.calibration import calibrate_static, calibrate_step
+        from evflow.baselines.calibration import calibrate_step
+        from evflow.noise_only import estimate_noise
 
-        measure = calibrate_step if self.protocol == "step" else calibrate_static
-        return measure(recording), {}
+        return (calibrate_step if self.protocol == "step" else estimate_noise)(recording), {}
 
-    def _report(self, found: CameraEstimate, recording: Recording) -> None:
+    def _report(self, out: Path, found: CameraEstimate, recording: Recording) -> None:
         from evflow.progress import bar
         from evflow.report.camera import write_report
 
         with bar("reporting") as progress:
             write_report(
-                self.out / "report.html", found, recording, weights=self.weights,
+                out / "report.html", found, recording, weights=self.weights,
                 source=self.recording, command=shlex.join(["evflow", *sys.argv[1:]]),
-                min_window_us=round(self.window_ms * 1000), overwrite=True, progress=progress)
+                min_window_us=round(self.window_ms * 1000), progress=progress)

@@ -56,5 +56,5 @@ def _facts(recording: Recording) -> dict[str, Any]:
     }
     if len(times) > 1 and len(events):
         plan = io.plan_windows(recording)
-        facts["windows"], facts["skipped"] = len(plan.pairs), list(plan.skipped)
+        facts["windows"], facts["skipped"] = len(plan.pairs), io.condensed(plan.skipped)
     return facts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -54,6 +55,7 @@ class Reading:
         from evflow import io
         from evflow.io import adjust
 
+        check_finite(self)
         recording = io.read_recording(
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
             polarity=self.polarity, size=parse_size(self.size), partial=self.partial,
@@ -82,6 +84,15 @@ def _aligned(recording: Recording) -> Recording:
     from evflow.io import adjust
 
     return adjust.shifted(recording, frames_offset(recording))
+
+
+def check_finite(options: Any) -> None:
+    """EV020 where a number among the options is NaN or infinite."""
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise EvflowDataError("EV020", f"--{field.name.replace('_', '-')} {value}.",
+                                  "Give a finite number.")
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

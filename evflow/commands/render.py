@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from evflow.commands.options import Reading
+from evflow.commands.options import Reading, check_finite
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,6 +43,7 @@ class Render(Reading):
         from evflow.progress import bar, stoppable
         from evflow.report.movie import Film, write_film, write_sheet
 
+        check_finite(self)
         film = Film(fps=self.fps, window_us=round(1000 * self.window_ms), slow=self.slow,
                     over_frames=self.over_frames, scale=self.scale, codec=self.codec)
         film.check_target(self.out, overwrite=self.overwrite)

@@ -142,7 +142,12 @@ def _camera(command: Simulate, size: tuple[int, int]) -> Any:
     shape, key = size[::-1], jax.random.key(command.seed)
     given = {name: jnp.full(shape, value) for name in PARAMETERS
              if (value := getattr(command, name)) is not None}
+    if command.draw and not command.camera:
+        raise EvflowDataError("EV020", "--draw without --camera.", "It draws a measured camera.")
     if command.camera:
+        if command.sensor != "clean":
+            print(f"note: --sensor {command.sensor} adds its own noise and limits to the camera's "
+                  "measured noise.", file=sys.stderr)
         if given:
             raise EvflowDataError(
                 "EV020", f"--camera and {', '.join(given)} contradict each other.",

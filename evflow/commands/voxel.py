@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from evflow.commands.options import Reading
+from evflow.commands.options import Reading, check_finite
 from evflow.commands.writing import need_absent
 from evflow.errors import EvflowDataError
 
@@ -47,6 +47,7 @@ class Voxel(Reading):
         from evflow.progress import bar, stoppable
         from evflow.voxel import voxelize
 
+        check_finite(self)
         if self.bins < 2 or not self.window_ms >= 0.001:
             raise EvflowDataError("EV020", f"--bins {self.bins}, --window-ms {self.window_ms:g}.",
                                   "Need two bins and 0.001 ms at least.")

@@ -10,6 +10,7 @@ offset only said beyond max(half a frame interval, 10 ms).
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 
@@ -25,6 +26,8 @@ DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, a log change 
 LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer cannot tell
 INVERTED = -0.2  # correlation below which polarity is inverted
 AGREES, BETTER = 0.2, 0.1  # least correlation of another reading, and its gain over the present
+UNRELATED = 0.06  # the most of any reading; the least of 26 recordings that agree is .12
+SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # that many leave chance .03 at most
 SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # the sweep reaches that far: intervals, at most us
 SWEEP_STEP_US = 5_000
 LATENCY_US = 4_000
@@ -71,6 +74,12 @@ class Steps:
         """Pearson's r as the recording is."""
         return float(self.correlations(np.zeros(1, np.int64), flip)[0])
 
+    def enough(self) -> bool:
+        """Whether a correlation near zero means that there is none."""
+        first, last = int(self.bounds[0, 0]), int(self.bounds[-1, 1])
+        cells = int(np.isfinite(self.changes[""]).sum())
+        return cells >= SURE_CELLS and len(self.events.slice(first, last)) >= SURE_EVENTS
+
     def sweep(self) -> tuple[np.ndarray, np.ndarray]:
         """Offsets of the frames' clock in us, and r at each."""
         reach = min(SWEEP_INTERVALS * self.interval_us, SWEEP_US)
@@ -103,39 +112,65 @@ def frame_steps(recording: Recording) -> Steps | None:
 
 
 def agreement(recording: Recording) -> list[Finding]:
-    """EV021 (polarity inverted), EV024 (clocks not aligned), EV029 (frames mirrored)."""
+    """EV021 (polarity inverted), EV024 (clocks not aligned), EV029 (frames mirrored), EV034 (no
+    reading of the frames agrees with the events)."""
     steps = frame_steps(recording)
     if steps is None or np.isnan(here := steps.correlation()):
         return []
     offsets, r = steps.sweep()
-    if np.nanmin(r) < min(INVERTED, -np.nanmax(r)) and here < INVERTED:
+    flips = {flip: steps.correlation(flip=flip) for flip in FLIPS}
+    flip = max(flips, key=lambda f: abs(flips[f]))
+    over = f"r={here:+.2f} over {len(steps.bounds)} frame steps"
+    if abs(flips[flip]) > AGREES and abs(flips[flip]) > np.nanmax(np.abs(r)) + BETTER:
+        swapped = " and with ON and OFF swapped" if flips[flip] < 0 else ""
+        also = " --polarity invert" if flips[flip] < 0 else ""
+        axis = "both axes" if flip == "both" else f"the {flip} axis"
+        return [Finding(
+            "EV029", "error", f"events and frames agree only with the frames mirrored in {axis}"
+            f"{swapped} (r {here:+.2f} -> {abs(flips[flip]):+.2f}).",
+            f"Pass --flip-frames {flip}{also}.")]
+    inverted = _inverted(r)
+    if inverted:
+        offset, best = _peak(offsets, -r)
+        late = _is_offset(steps, offset, best, -here)
+        also = (" The frame times are off too: --frames-offset-ms "
+                f"{offset / 1e3:.1f}." if late else "")
         return [Finding(
             "EV021", "error", "events and frame brightness anti-correlate "
-            f"(r={here:+.2f} over {len(steps.bounds)} frame steps): ON and OFF are swapped.",
-            "Pass --polarity invert (polarity='invert'), or check the exporter.")]
-    flip, flipped = max(((f, steps.correlation(flip=f)) for f in FLIPS), key=lambda v: v[1])
-    if flipped > AGREES and flipped > np.nanmax(r) + BETTER:
-        return [Finding(
-            "EV029", "error", f"events and frames agree only after a {flip} flip of the frames "
-            f"(r {here:+.2f} -> {flipped:+.2f}).", f"Pass --flip-frames {flip}.")]
+            f"({over}{f', {-best:+.2f} at its clearest' if late else ''}): ON and OFF are swapped.",
+            f"Pass --polarity invert (polarity='invert'), or check the exporter.{also}")]
     offset, best = _peak(offsets, r)
     if _is_offset(steps, offset, best, here):
         side = "late" if offset < 0 else "early"
+        severity: Literal["error", "warning"] = "error" if here < 0.5 * best else "warning"
         return [Finding(
-            "EV024", "warning", f"frame times are about {abs(offset) / 1e3:.1f} ms too {side} for "
+            "EV024", severity, f"frame times are about {abs(offset) / 1e3:.1f} ms too {side} for "
             f"the events (r {here:+.2f}, {best:+.2f} where they agree best).",
             f"Pass --frames-offset-ms {offset / 1e3:.1f}, or --frames-offset-ms auto.")]
+    if max(best, abs(flips[flip])) < UNRELATED and steps.enough():
+        return [Finding(
+            "EV034", "error", f"events and frames have nothing to do with each other ({over}, and "
+            "no shift, flip or polarity makes it better).",
+            "Are they of one camera and one time? Coordinates transposed, another time unit "
+            "(--time-unit)? Nothing can be measured from them.")]
     return []
 
 
 def frames_offset(recording: Recording) -> int:
-    """By how many us the frame times should move to agree with the events; 0 where they do, or
-    where nothing can be told."""
+    """By how many us the frame times should move to agree with the events, of either polarity; 0
+    where they do, or where nothing can be told."""
     steps = frame_steps(recording)
     if steps is None or np.isnan(here := steps.correlation()):
         return 0
-    offset, best = _peak(*steps.sweep())
-    return offset if _is_offset(steps, offset, best, here) else 0
+    offsets, r = steps.sweep()
+    sign = -1.0 if _inverted(r) else 1.0
+    offset, best = _peak(offsets, sign * r)
+    return offset if _is_offset(steps, offset, best, sign * here) else 0
+
+
+def _inverted(r: np.ndarray) -> bool:
+    """Whether the sweep is at its clearest where events and frames disagree."""
+    return bool(np.nanmin(r) < min(INVERTED, -np.nanmax(r)))
 
 
 def _is_offset(steps: Steps, offset: int, best: float, here: float) -> bool:

@@ -27,7 +27,7 @@ def check(recording_or_path: Recording | str | os.PathLike, **hints: Any) -> Rep
     Codes: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events, EV021 polarity
     inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned, EV025 gaps, EV026
     clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029 mirrored frames,
-    EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels.
+    EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034 unrelated frames.
     """
     if not isinstance(recording_or_path, Recording):
         try:

@@ -8,11 +8,12 @@ from evflow.io.base import (
     write_recording,
 )
 from evflow.io.dsec import DsecWriter
-from evflow.io.windows import WindowPlan, iter_windows, plan_windows
+from evflow.io.windows import WindowPlan, condensed, iter_windows, plan_windows
 
 __all__ = [
     "DsecWriter",
     "WindowPlan",
+    "condensed",
     "iter_windows",
     "open_writer",
     "plan_windows",

@@ -88,6 +88,17 @@ def iter_windows(
     return (_window(recording, pair, index) for index, pair in enumerate(plan.pairs))
 
 
+def condensed(skipped: tuple[str, ...]) -> list[str]:
+    """What was skipped, windows of one reason in one sentence ("frames 3-5: reason")."""
+    reasons: dict[str, list[str]] = {}
+    for sentence in skipped:
+        frames, _, reason = sentence.partition(": ")
+        reasons.setdefault(reason, []).append(frames)
+    return [f"{frames[0]} skipped: {reason}" if len(frames) == 1 else
+            f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {reason}"
+            for reason, frames in reasons.items()]
+
+
 def _window(recording: Recording, pair: tuple[int, int], index: int) -> Window:
     t0, t1 = (int(recording.frame_times[i]) for i in pair)
     frame0, frame1 = (recording.frame_dn(i) for i in pair)

@@ -19,6 +19,7 @@ CURVE_STEPS = 120  # about as many points as a rate curve has
 CURVE_STEP_US = 1_000  # the shortest step of one
 LOG_EDGES = np.linspace(-6.0, 2.0, 65)  # log10 s: 1 us to 100 s, eight bins a decade
 ALONE_US = 5_000  # no neighbour fired for this long: what a background-activity filter takes away
+NET_CELL, NET_US, NET_STEPS = 8, 20_000, 2_000  # pixels; us; most steps: memory
 NEIGHBOURS = tuple((dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy)
 ASKED_EVENTS = 400_000  # events whose neighbourhood is looked at, evenly taken from the stream
 
@@ -34,7 +35,8 @@ def compare(
     time and the synthetic one was moved to begin with the real one), events;
     rate_hz: events per second and pixel, per polarity, and their ratio synthetic / real;
     on_off: ON events per OFF event; curve: the rates over time and their correlation r;
-    counts: correlation r of the events per pixel; active: share of pixels that fire, and
+    counts: correlation r of the events per pixel; net_r: of ON less OFF events over cells of 8x8
+    pixels and 20 ms, negative where polarity is swapped; active: share of pixels that fire, and
     `common`, those in both over those in either;
     intervals: between successive events of a pixel; neighbours: since the latest event of the
     eight pixels around, with `alone`, the share of events without one within 5 ms (mostly noise).
@@ -61,6 +63,7 @@ def compare(
         "curve": _curves(sides, t0, t1, pixels),
         "counts": {"r": {p: _correlation(_side(counts["real"], p), _side(counts["synthetic"], p))
                          for p in ("on", "off", "both")}},
+        "net_r": _correlation(*(_net(side, t0, t1) for side in sides.values())),
         "active": _active(counts["real"].sum(0) > 0, counts["synthetic"].sum(0) > 0),
         **_company(sides),
     }
@@ -115,6 +118,16 @@ def _curves(sides: dict[str, Events], t0: int, t1: int, pixels: int) -> dict[str
     r = {p: _correlation(curves["real"][p], curves["synthetic"][p]) for p in ("on", "off")}
     return {"start_us": t0, "step_us": int(step), "r": r,
             **{name: {p: c.tolist() for p, c in both.items()} for name, both in curves.items()}}
+
+
+def _net(events: Events, t0: int, t1: int) -> np.ndarray:
+    """ON less OFF events of each cell and time step."""
+    step = max(NET_US, -(-(t1 - t0) // NET_STEPS))
+    columns, rows = (-(-side // NET_CELL) for side in events.size)
+    cell = (events.y // NET_CELL).astype(np.int64) * columns + events.x // NET_CELL
+    code = (events.t - t0) // step * (columns * rows) + cell
+    size = -(-(t1 - t0) // step) * columns * rows
+    return np.bincount(code, np.where(events.p, 1.0, -1.0), size)
 
 
 def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:

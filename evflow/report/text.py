@@ -18,7 +18,8 @@ def describe(found: CameraEstimate) -> str:
     lines = [f"{LABELS[name]:22} {float(value):7.3f} ± {float(std[name]):.3f}"
              for name, value in dataclasses.asdict(found.summary).items()]
     events = f"from {int(found.n_events.sum()):,} events"
-    lines.append(f"{events} in {found.windows} windows; {found.valid.mean():.0%} of the pixels "
-                 "have events of their own" if found.windows else f"{events}, without frames")
+    windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
+    lines.append(f"{events} in {windows}; {found.valid.mean():.0%} of the pixels have events of "
+                 "their own" if found.windows else f"{events}, without frames")
     lines += [f"note: {warning}" for warning in found.warnings]
     return "\n".join(lines)

@@ -21,6 +21,7 @@ GRADES: tuple[Grade, ...] = ("good", "fair", "poor")
 RATE = (1.25, 2.0)  # factor between the rates
 SHAPE = (0.8, 0.5)  # count correlation, as a share of what two re-simulations reach
 ERROR = (0.10, 0.30)  # std of a threshold, relative
+SWAPPED = -0.2  # correlation of net events below which the polarity of one is inverted
 APART = (0.25, 0.6)  # Wasserstein distance of intervals, in decades
 OWN = 0.05  # share of pixels with events of their own below which maps say little
 HOT = 0.01  # share of hot pixels that is worth a word
@@ -166,6 +167,11 @@ def judge_streams(numbers: dict[str, Any]) -> list[Judged]:
     """Whether a synthetic stream of any origin passes for the real one."""
     judged = [j for key in ("on", "off")
               for j in judge_stream(numbers, key, "synthetic")]
+    if (net := numbers["net_r"]) is not None and net < SWAPPED:
+        judged.insert(0, Judged(
+            "poor", "", 9.0, "ON and OFF are swapped in one of them: net events of small areas "
+            f"and times anti-correlate (r = {net:.2f}).",
+            advice="Read one of them with --polarity invert."))
     for kind, what in (("intervals", "Intervals between a pixel's events"),
                        ("neighbours", "Delays after a neighbour's event")):
         apart = numbers[kind]["wasserstein_decades"]
