@@ -120,6 +120,7 @@ def test_one_draw_initialises_as_flax_does(fresh: GanState) -> None:
     np.testing.assert_array_equal(params["head"]["bias"], 0.0)
 
 
+@pytest.mark.slow
 def test_training_on_one_batch_lowers_the_losses(fresh: GanState, pair: Pair) -> None:
     """30 steps on a fixed batch: all losses finite, the cycle networks learn what true events
     tell, and the events made approach the true ones; the same again is the same."""

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import io
 import pickle
+import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -182,3 +183,14 @@ def test_endless_programs_are_cut() -> None:
     program = b"N" * (pickles.MOST_INSTRUCTIONS + 1) + b"."
     with pytest.raises(ValueError, match="instructions"):
         pickles.load(io.BytesIO(program), {})
+
+
+def test_a_zip_that_claims_several_disks_is_damaged(tmp_path: Path) -> None:
+    """Python raises while it only asks whether this is a zip."""
+    content = files()[1]
+    end = content.rindex(b"PK\x05\x06")
+    locator = b"PK\x06\x07" + struct.pack("<LQL", 1, 0, 2)
+    path = tmp_path / "x.pt"
+    path.write_bytes(content[:end] + locator + content[end:])
+    with pytest.raises(EvflowDataError, match="EV009"):
+        read_checkpoint(path)

@@ -13,7 +13,6 @@ import io
 import math
 import os
 import struct
-import zipfile
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from evflow import pickles
 from evflow.errors import EvflowDataError
-from evflow.io.archives import unzipped
+from evflow.io.archives import is_zip, unzipped
 
 MAGIC = 0x1950A86A20F9469CFC6C  # of the chain of pickles
 PROTOCOL = 1001
@@ -81,7 +80,7 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
         raise EvflowDataError("EV020", f"{path} has {path.stat().st_size} bytes.",
                               f"The largest that is read has {MOST_BYTES}.")
     try:
-        read = _read_zip if zipfile.is_zipfile(path) else _read_chain
+        read = _read_zip if is_zip(path) else _read_chain
         content, storages = read(path)
         return _checkpoint(path, content, storages)
     except (ValueError, struct.error) as e:

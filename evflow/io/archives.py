@@ -23,6 +23,14 @@ DAMAGE = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOF
           OSError)  # what zipfile raises on a damaged archive
 
 
+def is_zip(path: Path) -> bool:
+    """Whether a file is a zip archive, or a damaged one, as `unzipped` then says."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:  # its last record claims several disks
+        return True
+
+
 @contextlib.contextmanager
 def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.ZipFile]:
     """The open archive; EV009 where it, or what the block reads of it, is damaged or a bomb.

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.archives import DAMAGE, load_member, npy_header, unzipped
+from evflow.io.archives import DAMAGE, is_zip, load_member, npy_header, unzipped
 from evflow.io.frames import FrameHints, Image
 from evflow.io.limits import check_expansion
 from evflow.io.times import read_times, to_us
@@ -29,7 +29,7 @@ def is_stack(path: Path) -> bool:
     """An .npy, or an .npz that holds frames and no events."""
     if path.suffix.lower() == ".npy":
         return True
-    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+    if path.suffix.lower() != ".npz" or not is_zip(path):
         return False
     try:
         with zipfile.ZipFile(path) as archive:
