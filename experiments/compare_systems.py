@@ -1,7 +1,7 @@
 """Thresholds of the compared systems on the same recordings (paper, Table III).
 
     python -m experiments.compare_systems --preset debug
-    python -m experiments.compare_systems --preset full --data shared/data/recordings
+    python -m experiments.compare_systems --preset full --data data/recordings
 
 The held-out recordings of `experiments.evaluate` (64x64, 8-bit frames every 25 ms), .2 s as there
 and 1 s, at both mismatches: the first `sequences` of them with 200 signal events of each polarity.
