@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import builtins
+import struct
 import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import fuzz_aedat4
 import numpy as np
 import pytest
+from fuzz_aedat4 import STREAM, XML
 from recordings import T0, damage, equal, make, refused, survives
 
+from evflow.errors import EvflowDataError
 from evflow.io import read_events, read_recording, write_events
 from evflow.types import Events
 
@@ -162,3 +166,23 @@ def test_damaged_aedat4_only_raises_data_errors(
     path = tmp_path / "a.aedat4"
     path.write_bytes(data_file("data/formats/dvxplorer320.aedat4").read_bytes())
     damage(path, 120, lambda: survives(path))
+
+
+def test_the_decoder_never_meets_what_it_aborts_on(tmp_path: Path) -> None:
+    """It skips a frame of unknown kind and reads the next packet in the same step: one that claims
+    2 GB."""
+    pytest.importorskip("aedat")
+    recording = make()
+    xml = XML.format(STREAM.format(0, "EVTS") + STREAM.format(1, "FRME"))
+    frame = bytearray(fuzz_aedat4.frame_packet(recording.frames[0], T0))
+    frame[36 + 56] = 197  # its format, in the table at byte 36
+    sound = (fuzz_aedat4.header(xml)
+             + fuzz_aedat4.packet(0, fuzz_aedat4.event_packet(recording.events))
+             + fuzz_aedat4.packet(1, bytes(frame)))
+    path = tmp_path / "a.aedat4"
+    path.write_bytes(sound + struct.pack("<ii", 1, 2_000_000_000) + bytes(100))
+    with pytest.raises(EvflowDataError, match=rf"EV009.*byte {len(sound):,}"):
+        read_recording(path)
+    got = read_recording(path, partial=True)
+    equal(got.events, recording.events)
+    assert any("left something out" in note for note in got.notes)

@@ -1,15 +1,20 @@
 """AEDAT 4 (iniVation DV): events, and frames at mid-exposure, through the `aedat` package.
 
 The decoder aborts the whole process on a header that is not UTF-8 XML, or nested too deeply, and
-on a packet that claims more than there is memory; it panics on damaged ones. So the header, and
-the size of each packet before it is decoded, are checked here first, and whatever the decoder
-raises becomes EV009 with the byte where it stopped. Damage behind `stop_s` does not matter.
+on a packet that claims more than there is memory; it panics on damaged ones. So the header and the
+sizes of all packets are checked here first, the decoder sees no further than they are sound, and
+whatever it raises becomes EV009 with the byte where it stopped. Damage behind `stop_s` does not
+matter.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import struct
+import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -68,21 +73,29 @@ def _decode(
     events: list[Any] = []
     frames: list[Any] = []
     stop, last, byte = np.iinfo(np.int64).max, 0, packets_start
+    starts, damage = _packets(path, packets_start, table)
     try:
-        decoder = iter(_decoder(path))
-        for byte in _packets(path, packets_start, table):  # noqa: B007 (read on failure)
-            packet = next(decoder, None)
-            if packet is None:
-                break
-            if len(packet.get("events", ())):
-                events.append(packet["events"])
-                last = hints.instant(events[-1]["t"][-1], "us")
-                if len(events) == 1 and hints.stop_s is not None:
-                    stop = hints.span_us(hints.instant(events[0]["t"][0], "us"))[1]
-            elif "frame" in packet:
-                frames.append(packet["frame"])
-            if last >= stop + LATE_US:
-                break
+        with _before(path, damage) as sound, warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            decoder = iter(_decoder(sound))
+            end = itertools.repeat(os.path.getsize(sound))
+            for byte in itertools.chain(starts, end):  # noqa: B007 (read on failure)
+                packet = next(decoder, None)
+                if packet is None:
+                    break
+                if len(packet.get("events", ())):
+                    events.append(packet["events"])
+                    last = hints.instant(events[-1]["t"][-1], "us")
+                    if len(events) == 1 and hints.stop_s is not None:
+                        stop = hints.span_us(hints.instant(events[0]["t"][0], "us"))[1]
+                elif "frame" in packet:
+                    frames.append(packet["frame"])
+                if last >= stop + LATE_US:
+                    break
+        hints.remarks.extend(sorted({f"the decoder left something out: {w.message}"
+                                     for w in said}))
+        if damage:
+            raise damage
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as e:  # a Rust panic derives from BaseException
@@ -92,6 +105,26 @@ def _decode(
             error.__cause__ = e
             hints.forgive(error, len(events) > 0)
     return events, frames
+
+
+@contextlib.contextmanager
+def _before(path: Path, damage: Damage | None) -> Iterator[Path]:
+    """A file that ends where the damage begins; `path` itself without damage.
+
+    The decoder must not meet what it aborts on, and it may read several packets in one step: it
+    skips frames of a kind that it does not know.
+    """
+    if damage is None:
+        yield path
+        return
+    with tempfile.NamedTemporaryFile(prefix="evflow-", suffix=".aedat4") as copy:
+        with open(path, "rb") as f:
+            left = damage.byte
+            while left and (part := f.read(min(left, 1 << 20))):
+                copy.write(part)
+                left -= len(part)
+        copy.flush()
+        yield Path(copy.name)
 
 
 def _damaged(
@@ -109,24 +142,24 @@ def _damaged(
         if until else "Copy it again.")
 
 
-def _packets(path: Path, start: int, table: int) -> Iterator[int]:
-    """Where packets begin, each {i32 stream, i32 size, size bytes}, up to the table; then, for
-    ever, where they end. Damage at one that claims more than is left, or expands beyond measure:
-    the decoder would take that much memory."""
+def _packets(path: Path, start: int, table: int) -> tuple[list[int], Damage | None]:
+    """Where packets begin, each {i32 stream, i32 size, size bytes}, up to the table; and the one
+    that claims more than is left, or expands beyond measure: the decoder would take that much
+    memory."""
     total = os.path.getsize(path)
+    starts: list[int] = []
     with open(path, "rb") as f:
         while start + 8 <= total and start != table:
             f.seek(start + 4)
             size = int.from_bytes(f.read(4), "little", signed=True)
             if not 0 <= size <= total - start - 8:
-                raise Damage(start, f"a packet of {size:,} bytes where {total - start - 8:,} are "
-                             "left")
+                return starts, Damage(start, f"a packet of {size:,} bytes where "
+                                      f"{total - start - 8:,} are left")
             if (most := most_bytes(f.read(size))) > FREE + RATIO * size:
-                raise Damage(start, f"a packet of {size:,} bytes that expand to {most:,}")
-            yield start
+                return starts, Damage(start, f"a packet of {size:,} bytes that expand to {most:,}")
+            starts.append(start)
             start += 8 + size
-    while True:
-        yield start
+    return starts, None
 
 
 def _check_header(path: Path) -> tuple[int, int]:
