@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import noise_rates
+from experiments import measured_noise, noise_rates
 from experiments.noise_rates import BENCH, DN, MODELS, SCENES, SYSTEMS, THETA, Options
 
 KEY = jax.random.key(5)
@@ -133,7 +133,7 @@ def test_measured_noise(data_file: Callable[[str], Path]) -> None:
     """Ours counts what the DVXplorer sends without its hot pixels, from half of it too; v2e sees
     no difference between polarities, the voltmeter no OFF."""
     path = data_file("data/recordings/noise_static_dvxplorer640/events.npz")
-    rows = noise_rates.at_rest(path, None)
+    rows = measured_noise.at_rest(path, None)
     np.testing.assert_allclose(rows["counted"], [0.296, 0.248], atol=1e-3)
     np.testing.assert_allclose(rows["counted, without the top .1 %"], [0.232, 0.198], atol=2e-3)
     np.testing.assert_allclose(rows["ours"], [0.232, 0.198], rtol=0.02)
