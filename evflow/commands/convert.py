@@ -36,7 +36,6 @@ class Convert(Reading):
     def run(self) -> None:
         from evflow import io
         from evflow.io.base import writer_of
-        from evflow.progress import stoppable
         from evflow.types import Recording
 
         writer = writer_of(self.out, named(self.format))
@@ -46,8 +45,7 @@ class Convert(Reading):
         if recording.has_frames and (why := writer.refuses(recording.frames.dtype)):
             notes.append(f"{why}: the {len(recording.frames)} frames were left out.")
             recording = Recording.of_events(recording.events)
-        with stoppable():
-            io.write_recording(self.out, recording, writer.NAME, overwrite=self.overwrite)
+        io.write_recording(self.out, recording, writer.NAME, overwrite=self.overwrite)
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": len(recording.events),

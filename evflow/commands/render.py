@@ -40,7 +40,7 @@ class Render(Reading):
     overwrite: bool = False
 
     def run(self) -> None:
-        from evflow.progress import bar, stoppable
+        from evflow.progress import bar
         from evflow.report.movie import Film, write_film, write_sheet
 
         check_finite(self)
@@ -51,7 +51,7 @@ class Render(Reading):
         if self.out.suffix.lower() == ".png":
             said = write_sheet(self.out, recording, film, at_s=self.at, overwrite=self.overwrite)
         else:
-            with stoppable(), bar("rendering") as progress:
+            with bar("rendering") as progress:
                 said = write_film(self.out, recording, film, overwrite=self.overwrite,
                                   progress=progress)
         print(f"{said} -> {self.out}", file=sys.stderr)

@@ -81,7 +81,7 @@ class Simulate:
         from evflow import io
         from evflow.colour import as_seen
         from evflow.io.source import open_frames
-        from evflow.progress import bar, stoppable
+        from evflow.progress import bar
         from evflow.sensors import known_sensor
         from evflow.simulator import simulate_stream
         from evflow.simulator.interpolate import unzip, upsample
@@ -100,7 +100,7 @@ class Simulate:
             frames = done
             progress(done, total)
 
-        with stoppable(), bar("simulating") as progress, io.open_writer(
+        with bar("simulating") as progress, io.open_writer(
                 self.out, source.size, named(self.format), overwrite=self.overwrite) as writer:
             limit = self.max_motion_px if self.interpolate else 0.0
             video = source.watched(shown)

@@ -44,7 +44,7 @@ class Voxel(Reading):
 
     def run(self) -> None:
         from evflow.files import atomic_write
-        from evflow.progress import bar, stoppable
+        from evflow.progress import bar
         from evflow.voxel import voxelize
 
         check_finite(self)
@@ -62,7 +62,7 @@ class Voxel(Reading):
                 yield voxelize(recording.events, int(t0), int(length), self.bins)
                 progress(i + 1, len(starts))
 
-        with (stoppable(), bar("voxels") as progress,
+        with (bar("voxels") as progress,
               atomic_write(self.out, overwrite=self.overwrite) as temporary,
               zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive):
             _store(archive, "voxels", shape, np.float32, grids())
