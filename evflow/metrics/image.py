@@ -80,11 +80,15 @@ def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
 def _ssim_windowed(x: Array, y: Array, how: SsimPreset) -> Array:
     """Mean of the local index where the window is wholly inside the image."""
     taps = len(how.window)
-    mean_x, mean_y = _blur(x, how.window), _blur(y, how.window)
     unbiased = taps**2 / (taps**2 - 1) if how.sample else 1.0
+    # Moments about the image's own mean: less is cancelled than about 0.
+    around_x, around_y = (jnp.mean(a, (-2, -1), keepdims=True) for a in (x, y))
+    x, y = x - around_x, y - around_y
+    mean_x, mean_y = _blur(x, how.window), _blur(y, how.window)
     var_x = unbiased * (_blur(x * x, how.window) - mean_x**2)
     var_y = unbiased * (_blur(y * y, how.window) - mean_y**2)
     covariance = unbiased * (_blur(x * y, how.window) - mean_x * mean_y)
+    mean_x, mean_y = mean_x + around_x, mean_y + around_y
     c1, c2 = (K1 * how.data_range) ** 2, (K2 * how.data_range) ** 2
     above = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     below = (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
@@ -109,12 +113,23 @@ def _ssim_global(x: Array, y: Array, how: SsimPreset) -> Array:
 
 
 def _blur(x: Array, window: tuple[float, ...]) -> Array:
-    """Separable filter of (..., H, W), where it fits: (..., H - n + 1, W - n + 1)."""
-    height, width = (n - len(window) + 1 for n in x.shape[-2:])
-    rows = [w * x[..., i:i + height, :] for i, w in enumerate(window)]
-    x = functools.reduce(jnp.add, rows)
-    columns = [w * x[..., i:i + width] for i, w in enumerate(window)]
-    return functools.reduce(jnp.add, columns)
+    """Separable filter of (..., H, W), where it fits: (..., H - n + 1, W - n + 1).
+
+    As products with banded matrices: the gradient of a sum of shifted slices is a sum of padded
+    ones, which on a CPU takes ten times as long.
+    """
+    across = _banded(x.shape[-1], window).astype(x.dtype)
+    down = _banded(x.shape[-2], window).T.astype(x.dtype)
+    x = jnp.matmul(x, across, precision="highest")
+    return jnp.einsum("hk,...kw->...hw", down, x, precision="highest")
+
+
+@functools.cache
+def _banded(size: int, window: tuple[float, ...]) -> np.ndarray:
+    """(size, size - n + 1): column i holds the window from row i on."""
+    tap = np.arange(size)[:, None] - np.arange(size - len(window) + 1)
+    taps = np.append(window, 0.0)
+    return taps[np.where((tap >= 0) & (tap < len(window)), tap, -1)]
 
 
 def log_map(image: Array) -> Array:
