@@ -5,7 +5,8 @@
 
 The held-out recordings of `experiments.evaluate` (64x64, 8-bit frames every 25 ms), .2 s as there
 and 1 s, at both mismatches: the first `sequences` of them with 200 signal events of each polarity.
-Every system of `evflow.baselines.SYSTEMS`, `estimate_camera`, the constant .3, and MATCH with the
+Every system of `evflow.baselines.SYSTEMS` (LGAN, which learns from each recording for a minute, on
+six of them; in debug for 20 iterations), `estimate_camera`, the constant .3, and MATCH with the
 true 1000 frames/s video (no method that sees the frames alone can do as well). Scored per
 polarity: `mae_sequence` (map against the sequence's value: the paper's footnote 1), `mae_pixel`
 (map against each pixel's own), and |median - θ|. What a system cannot tell counts with the value
@@ -31,7 +32,7 @@ import numpy as np
 import tyro
 
 from evflow import Recording, estimate_camera, load_weights, read_recording
-from evflow.baselines import SYSTEMS, Fitted, Match
+from evflow.baselines import SYSTEMS, Fitted, Lgan, Match, System
 from evflow.baselines.base import intervals, usable
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
@@ -77,9 +78,16 @@ def rows(options: Options) -> dict[str, Protocol]:
     return found
 
 
-def all_fits(params: Any, recording: Recording) -> dict[str, Fitted]:
+def systems_of(options: Options) -> dict[str, System]:
+    """What is compared; a debug run does not wait for what learns."""
+    if options.preset == "full":
+        return SYSTEMS
+    return SYSTEMS | {"lgan": Lgan(iterations=20)}
+
+
+def all_fits(params: Any, recording: Recording, systems: dict[str, System]) -> dict[str, Fitted]:
     """Every system and ours on one recording."""
-    return {name: s.fit(recording) for name, s in SYSTEMS.items()} | {
+    return {name: s.fit(recording) for name, s in systems.items()} | {
         OURS: ours(params, recording)}
 
 
@@ -99,12 +107,15 @@ def flat(recording: Recording, theta: float) -> Fitted:
                   np.zeros((2, height, width), bool), np.full(2, theta), 0.0)
 
 
-def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, Any] | None:
-    """Errors of every system on one recording; None without enough events of both polarities."""
-    if (hidden.signal_events() < ENOUGH).any():
-        return None
+def lively(_params: Any, hidden: Hidden, _protocol: Protocol) -> Hidden | None:
+    """A recording with enough events of both polarities."""
+    return hidden if (hidden.signal_events() >= ENOUGH).all() else None
+
+
+def score(params: Any, hidden: Hidden, systems: dict[str, System]) -> dict[str, Any]:
+    """Errors of every system on one recording."""
     recording = hidden.recording
-    fits = all_fits(params, recording)
+    fits = all_fits(params, recording, systems)
     fits[CONSTANT] = flat(recording, 0.3)
     dense = Recording(recording.events, hidden.video.astype(np.float32),
                       1000 * np.arange(len(hidden.video)))
@@ -125,17 +136,17 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, Any] | 
 
 
 def averages(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means over recordings per system, with the standard error of |median - θ|."""
+    """Means per system over its recordings, with the standard error of |median - θ|."""
     result: dict[str, Any] = {}
     for name in (n for n in found[0] if n != "signal"):
-        keys = [k for k in found[0][name] if "/" in k]
-        one = {k: float(np.mean([r[name][k] for r in found])) for k in keys}
-        one |= {f"error/{p}": float(np.std([r[name][f"median/{p}"] for r in found])
-                                    / np.sqrt(len(found))) for p in POLARITIES}
+        mine = [r[name] for r in found if name in r]
+        one = {k: float(np.mean([r[k] for r in mine])) for k in mine[0] if "/" in k}
+        one |= {f"error/{p}": float(np.std([r[f"median/{p}"] for r in mine])
+                                    / np.sqrt(len(mine))) for p in POLARITIES}
         # A median: the first recording compiles.
-        one["seconds"] = float(np.median([r[name]["seconds"] for r in found]))
-        one["told"] = float(np.mean([r[name]["told"] for r in found]))
-        result[name] = one | {"recordings": len(found)}
+        one["seconds"] = float(np.median([r["seconds"] for r in mine]))
+        one["told"] = float(np.mean([r["told"] for r in mine]))
+        result[name] = one | {"recordings": len(mine)}
     return result
 
 
@@ -162,7 +173,9 @@ def blurred(image: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(np.ascontiguousarray(image, np.float32), (0, 0), SMOOTH)
 
 
-def held_out(params: Any, recording: Recording) -> dict[str, Any]:
+def held_out(
+    params: Any, recording: Recording, systems: dict[str, System]
+) -> dict[str, Any]:
     """Each system's thresholds from the first half, and how well they foretell the second:
     residual over the change, root mean squares, of pixels that changed; `frame regression` is
     fitted to the second half itself and bounds what two numbers can do."""
@@ -180,7 +193,7 @@ def held_out(params: Any, recording: Recording) -> dict[str, Any]:
     result = {"frame regression": {"theta": best.tolist(), "left": left(*(np.full(
         d.shape[1:], t, np.float32) for t in best)), "seconds": 0.0, "notes": [
             f"{used.sum()} changes of {len(usable(second))} frame intervals"]}}
-    for name, fit in all_fits(params, first).items():
+    for name, fit in all_fits(params, first, systems).items():
         maps = (np.asarray(getattr(fit.camera, f"theta_{p}")) for p in POLARITIES)
         result[name] = {"theta": fit.theta.tolist(), "left": left(*maps),
                         "seconds": fit.seconds, "notes": list(fit.notes)}
@@ -241,24 +254,26 @@ def picture(result: dict[str, Any], path: Path) -> None:
 def main(options: Options) -> dict[str, Any]:
     plots.require()
     count = options.sequences or {"debug": 3, "full": 30}[options.preset]
-    setup = Setup(options.weights, options.seed)
+    setup, params = Setup(options.weights, options.seed), load_weights(options.weights)
+    systems = systems_of(options)
     result: dict[str, Any] = {"simulated": {}, "real": {}}
     for name, protocol in rows(options).items():
         jobs = [(i, protocol) for i in range(4 * count)]
-        found = (r for r in scores(score, setup, jobs, 1, f"mismatch {name}") if r is not None)
-        result["simulated"][name] = averages(list(itertools.islice(found, count)))
+        drawn = (h for h in scores(lively, setup, jobs, 1, f"mismatch {name}") if h is not None)
+        result["simulated"][name] = averages([
+            score(params, hidden, {n: s for n, s in systems.items() if i < s.most_recordings})
+            for i, hidden in enumerate(itertools.islice(drawn, count))])
     if options.data is not None:
-        params = load_weights(options.weights)
         for name in REAL:
             try:
                 recording = read_recording(options.data / name)
             except EvflowDataError as error:
                 print(f"{name} left out: {error}")
                 continue
-            result["real"][name] = held_out(params, recording)
+            result["real"][name] = held_out(params, recording, systems)
     text = table(result)
     print(text)
-    config = dataclasses.asdict(options) | {"systems": {k: repr(v) for k, v in SYSTEMS.items()}}
+    config = dataclasses.asdict(options) | {"systems": {k: repr(v) for k, v in systems.items()}}
     write_result(options.out / "compare_systems.json", result, config)
     (options.out / "compare_systems.md").write_text(text + "\n")
     picture(result, options.out / "compare_systems.png")

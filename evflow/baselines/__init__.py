@@ -3,10 +3,10 @@
     SYSTEMS["ecc median"].fit(recording) -> Fitted
 
 ecc.py least squares on frame differences · jaer.py gains that learn · s2r.py event rates ·
-match.py simulation of the same scene (resimulate.py) · noise_forms.py noise rates in closed form ·
-calibration.py and steps.py the paper's own ground truth (Section III-B). Written from the
-equations of the papers they name; where a published rule and the strongest fair reading differ,
-both are here.
+match.py simulation of the same scene (resimulate.py) · lgan.py adversarial, per recording ·
+noise_forms.py noise rates in closed form · calibration.py and steps.py the paper's own ground truth
+(Section III-B). Written from the equations of the papers they name; where a published rule and the
+strongest fair reading differ, both are here.
 """
 
 from evflow.baselines.akf import Akf
@@ -16,6 +16,7 @@ from evflow.baselines.complementary import Complementary
 from evflow.baselines.ecc import Ecc, EccEvents
 from evflow.baselines.integration import Integration
 from evflow.baselines.jaer import Jaer
+from evflow.baselines.lgan import Lgan
 from evflow.baselines.match import Match
 from evflow.baselines.noise_forms import v2e_noise, voltmeter_noise
 from evflow.baselines.reconstruction import Reconstructor
@@ -34,6 +35,7 @@ SYSTEMS: dict[str, System] = {
     "jaer": Jaer(),
     "jaer normalised": Jaer(passes=100, normalised=True),
     "match": Match(),
+    "lgan": Lgan(),
 }
 
 # Brightness from events and frames at known thresholds: RECONSTRUCTORS[name].reconstruct(...).
@@ -46,6 +48,6 @@ RECONSTRUCTORS: dict[str, Reconstructor] = {
 
 __all__ = [
     "RECONSTRUCTORS", "SYSTEMS", "Akf", "Complementary", "Ecc", "EccEvents", "Fitted",
-    "Integration", "Jaer", "Match", "Reconstructor", "S2r", "Solution", "System",
+    "Integration", "Jaer", "Lgan", "Match", "Reconstructor", "S2r", "Solution", "System",
     "calibrate_step", "v2e_noise", "voltmeter_noise",
 ]

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Iterator
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -60,6 +62,9 @@ class Solution:
 
 class System(abc.ABC):
     """A way to tell a camera's thresholds from a recording; its options are its fields."""
+
+    # A table takes this many recordings of it: fewer of one that learns for a minute from each.
+    most_recordings: ClassVar[float] = math.inf
 
     @abc.abstractmethod
     def solve(self, recording: Recording) -> Solution:

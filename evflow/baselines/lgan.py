@@ -77,8 +77,7 @@ class Lgan(System):
     shown: bool = False
     seed: int = 0
 
-    # It learns for a minute per recording: a table takes this many recordings of it.
-    most_recordings: ClassVar[int] = 6
+    most_recordings: ClassVar[float] = 6
 
     @property
     def published(self) -> bool:
