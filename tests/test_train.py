@@ -43,7 +43,7 @@ def leaves(state: TrainState) -> list[np.ndarray]:
 
 def test_every_trainable_leaf_gets_a_gradient(bank: TextureBank, fresh: TrainState) -> None:
     """After one step (couplings start at zero) only actnorm's buffers have none."""
-    batch = sample_batch(jax.random.key(1), bank, CONFIG)
+    batch = jax.jit(sample_batch, static_argnames="config")(jax.random.key(1), bank, CONFIG)
     params = jax.tree.map(lambda p: p + 0.01, fresh.params)
     grads = jax.jit(jax.grad(lambda p: loss_fn(p, batch, jax.random.key(2), CONFIG)[0]))(params)
     for path, leaf in jax.tree_util.tree_leaves_with_path(grads):
