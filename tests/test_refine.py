@@ -96,13 +96,14 @@ def test_moments_add_over_the_sensor(
     frames, times = video
     path, dt_s = lin_log(frames), jnp.full(INTERVALS, STEPS * 1e-3)
     trace = trace_of_events(events, times[::STEPS], STEPS)
+    compiled = jax.jit(measure, static_argnums=4)
 
     def of(rows: slice) -> object:
         part = dataclasses.replace(
             trace, step=trace.step[rows], fraction=trace.fraction[rows],
             first_on=trace.first_on[rows], counts=trace.counts[:, :, rows])
         bright = jnp.ones((rows.stop - rows.start, SHAPE[1]), bool)
-        return measure(part, path[:, rows], dt_s, bright, STEPS)
+        return compiled(part, path[:, rows], dt_s, bright, STEPS)
 
     whole = of(slice(0, SHAPE[0]))
     halves = [of(slice(0, 5)), of(slice(5, SHAPE[0]))]
