@@ -21,7 +21,7 @@ class CameraEstimate:
     events in the windows used whose frames are neither saturated nor black there; n_events:
     (H, W) uint32 events in the windows used; hot, dead: (H, W) bool, pixels that fire by
     themselves, and pixels that never do amid others that do; windows: how many were used, 0
-    without frames; warnings: what to know before trusting it, a sentence each.
+    of a static scene; warnings: what to know before trusting it, a sentence each.
     """
 
     camera: Camera

@@ -1,10 +1,6 @@
-"""A camera's noise from a static scene, without frames: rates per pixel, thresholds unknown.
+"""A camera's noise from a static scene: rates per pixel, thresholds unknown.
 
-Noise comes alone, events of a moving edge come in company: other pixels near by send the same
-polarity within milliseconds. Given how many events each cell of pixels sent in all, independent
-noise makes pairs within a time bin at a known rate; the excess over it, per event, tells whether
-anything moved. Measured: .016 in 2 s of a static scene (DVXplorer), .13 to 15 in nine recordings
-with motion.
+Whether it is static the events themselves tell (stillness.py).
 """
 
 from __future__ import annotations
@@ -16,14 +12,17 @@ from evflow.camera import Camera, Summary
 from evflow.camera_estimate import CameraEstimate
 from evflow.config import PRESETS
 from evflow.errors import EvflowDataError
-from evflow.refine import dead_pixels, fires_alone
+from evflow.faults import dead_pixels
+from evflow.stillness import (
+    LEAST_EVENTS,
+    LEAST_US,
+    MOST_HOT,
+    MOVING,
+    busy_pixels,
+    company,
+)
 from evflow.types import Events, Recording
 
-CELL, BIN_US = 8, 2_000  # pixels, us: what counts as near by
-MOVING = 0.05  # excess pairs per event
-LEAST_US, LEAST_EVENTS = 500_000, 1_000
-MOST_EVENTS = 4_000_000  # looked at for company: the first ones
-HOT_PASSES, MOST_HOT = 10, 0.01  # of the pixels; more are not faults but a scene
 SPREAD = (0.3, 1000.0)  # shape of the gamma distribution of rates over pixels: its range
 
 
@@ -38,7 +37,7 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
     """
     events = recording.events
     counts = events.count_map()
-    hot = _hot(counts.sum(0))
+    hot = busy_pixels(counts.sum(0))
     _require_static(events, hot)
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(
@@ -59,29 +58,7 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
     return CameraEstimate(
         camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
-        dead_pixels(total), 0, _warnings(hot, total))
-
-
-def company(events: Events, hot: np.ndarray) -> float:
-    """Pairs of events of one polarity, of different pixels of a cell and within a time bin, beyond
-    those of independent noise, per event; hot (H, W) pixels left out."""
-    events = events.slice(int(events.t[0]), int(events.t[min(len(events), MOST_EVENTS) - 1]) + 1)
-    kept = ~hot[events.y, events.x]
-    x, y, t = (getattr(events, n)[kept].astype(np.int64) for n in ("x", "y", "t"))
-    on, width = events.p[kept], events.size[0]
-    moment = (t - int(events.t[0])) // BIN_US
-    bins = events.duration_us // BIN_US + 1
-    cell = 2 * (y // CELL * -(-width // CELL) + x // CELL) + on
-    pixel = 2 * (y * width + x) + on
-    seen = _squares(cell * bins + moment) - _squares(pixel * bins + moment)
-    expected = (_squares(cell) - _squares(pixel)) / bins
-    return float((seen - expected) / max(len(t), 1))
-
-
-def _squares(key: np.ndarray) -> float:
-    """Sum of squares of how often each value occurs."""
-    counts = np.unique(key, return_counts=True)[1].astype(np.float64)
-    return float(counts @ counts)
+        dead_pixels(total), 0, _warnings(hot, total, recording.has_frames))
 
 
 def _require_static(events: Events, hot: np.ndarray) -> None:
@@ -104,17 +81,6 @@ def _require_static(events: Events, hot: np.ndarray) -> None:
             "small that moves?", fix)
 
 
-def _hot(counts: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels far above the mean of the others."""
-    hot = np.zeros(counts.shape, bool)
-    for _ in range(HOT_PASSES):
-        more = fires_alone(counts, float(counts[~hot].mean()))
-        if (more == hot).all():
-            break
-        hot = more
-    return hot
-
-
 def _rates(
     counts: np.ndarray, hot: np.ndarray, seconds: float
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
@@ -131,8 +97,9 @@ def _rates(
     return rate / seconds, error / seconds, mean / seconds, float(mean_error) / seconds
 
 
-def _warnings(hot: np.ndarray, total: np.ndarray) -> tuple[str, ...]:
-    found = ["no frames: theta_on and theta_off are undetermined, their values are the prior's; "
+def _warnings(hot: np.ndarray, total: np.ndarray, frames: bool) -> tuple[str, ...]:
+    why = "nothing moves in frames and events" if frames else "no frames"
+    found = [f"{why}: theta_on and theta_off are undetermined, their values are the prior's; "
              "the noise rates are those of a static scene."]
     if hot.any():
         share = float(total[hot].sum()) / float(total.sum())

@@ -26,14 +26,13 @@ from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.camera_estimate import CameraEstimate
 from evflow.config import PRESETS
 from evflow.errors import EvflowDataError
+from evflow.faults import dead_pixels, hot_pixels
 from evflow.inspection.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.intensity import delta_log_intensity, lin_log
 from evflow.io.glitches import exposed
 from evflow.noise_only import estimate_noise
 from evflow.refine import (
     Chunk,
-    dead_pixels,
-    hot_pixels,
     make_chunk,
     pixel_posterior,
     plan_chunks,
@@ -41,6 +40,7 @@ from evflow.refine import (
 )
 from evflow.simulator.interpolate import MIN_SIDE
 from evflow.squash import SCALE, camera_std, per_channel, squash, unsquash_summary
+from evflow.stillness import stands_still
 from evflow.types import Recording, Window
 from evflow.voxel import voxelize
 from evflow.weights import load_weights
@@ -56,12 +56,13 @@ def estimate_camera(
     refine: Literal["auto", "off"] = "auto", min_window_us: int = 40_000,
     progress: Progress | None = None,
 ) -> CameraEstimate:
-    """Estimate a camera from a recording with frames; of a static scene without frames its noise
-    alone (evflow/noise_only.py), thresholds undetermined.
+    """Estimate a camera from a recording with frames; of a scene that stands still its noise
+    alone (evflow/noise_only.py), thresholds undetermined. Without frames only that is possible.
 
     Windows run from frame to frame until at least min_window_us long. refine: "auto" simulates
     stretches of the recording with the estimate and corrects it, which takes the error of
-    theta on held-out cameras from .022 to .011; "off" leaves it to the network alone.
+    theta on held-out cameras from .022 to .011, and counts the noise where nothing moves; "off"
+    leaves it to the network alone.
     progress(done, total) is called after every window. What usually goes wrong with a recording
     is not looked for here: `check(recording).raise_if_failed()` before.
     Raises EV011 (no frames, and the scene moves), EV012, EV017 where the recording cannot tell,
@@ -72,7 +73,7 @@ def estimate_camera(
     recording = recording_or_path
     if not isinstance(recording, Recording):
         recording = io.read_recording(recording)
-    if not recording.has_frames:
+    if not recording.has_frames or (refine == "auto" and stands_still(recording)):
         return estimate_noise(recording)
     params = load_weights() if params is None else params
     plan = io.plan_windows(recording, min_window_us)
@@ -91,7 +92,8 @@ def estimate_camera(
     chunks = refinement_chunks(recording, plan.pairs) if refine == "auto" else []
     hot = np.zeros(n_events.shape, bool)
     if chunks:
-        hot = hot_pixels(chunks, float(summary.eta_on + summary.eta_off))
+        quiet = np.sum([c.quiet for c in chunks], 0)
+        hot = hot_pixels(quiet, float(summary.eta_on + summary.eta_off))
         summary, summary_std = _refined(params, chunks, hot, summary, summary_std)
     camera, std = _fuse(params, windows(), summary, summary_std)
     if chunks:

@@ -1,17 +1,18 @@
-"""Recordings without frames: the noise of a static scene, a refusal of a moving one."""
+"""The noise of a static scene, with frames and without; a refusal of a moving one without."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from networks import hidden
 
-from evflow import Events, Recording, estimate_camera, read_recording
+from evflow import Events, Recording, check, estimate_camera, read_recording
 from evflow.errors import EvflowDataError
-from evflow.noise_only import company
+from evflow.stillness import company, stands_still
 
 SIZE = (64, 48)
 SECONDS = 20.0
@@ -62,6 +63,37 @@ def test_thresholds_are_said_to_be_undetermined() -> None:
     assert "undetermined" in found.warnings[0]
     assert "4 hot pixels" in found.warnings[1]
     assert len(found.as_dict()["hot_pixels"]) == 4
+
+
+def seen(events: Events, drift: float = 0.0) -> Recording:
+    """The recording with noisy frames of a texture, which brightens by `drift` log units."""
+    rng = np.random.default_rng(5)
+    texture = rng.uniform(40, 120, (SIZE[1], SIZE[0]))
+    light = np.exp(drift * np.linspace(0, 1, 41))[:, None, None]
+    frames = texture * light + rng.normal(0, 1, (41, *texture.shape))
+    times = np.linspace(0, SECONDS * 1e6, 41).astype(np.int64)
+    return Recording(events, np.rint(frames).astype(np.uint8), times)
+
+
+def test_frames_that_stand_still_change_nothing() -> None:
+    events = static()[0].events
+    found = estimate_camera(seen(events))
+    jax.tree.map(np.testing.assert_array_equal, found.camera, estimate_camera(static()[0]).camera)
+    assert "nothing moves" in found.warnings[0]
+    assert not found.valid.any()
+    assert check(seen(events)).errors == ()
+
+
+def test_what_moves_in_frames_or_events_does_not_stand_still() -> None:
+    events = static()[0].events
+    assert stands_still(seen(events))
+    assert stands_still(seen(events, drift=0.05))
+    assert not stands_still(seen(events, drift=0.2))
+    moving = hidden(14, 600)[0].events
+    frames = np.full((7, moving.size[1], moving.size[0]), 90, np.uint8)
+    assert len(moving) > 1000
+    assert not stands_still(Recording(moving, frames, 100_000 * np.arange(7)))
+    assert not stands_still(seen(events.slice(0, 400_000)))  # too short to tell
 
 
 def test_a_moving_scene_is_refused() -> None:

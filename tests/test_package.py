@@ -16,7 +16,8 @@ ROOT = Path(evflow.__file__).parent
 FLOORS = (
     ("errors", "checks", "files", "pickles", "folders"),
     ("types", "progress", "distributed", "colour"), ("io",),
-    ("camera", "camera_estimate", "sensors", "metrics"), ("pixels", "intensity"),
+    ("camera", "camera_estimate", "sensors", "metrics", "faults"),
+    ("pixels", "intensity", "stillness"),
     ("voxel", "inspection", "exports"),
     ("flow", "scenes", "simulator"),
     ("config",), ("squash", "dataset"),

@@ -14,10 +14,11 @@ from networks import hidden
 
 from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior, Summary
+from evflow.faults import hot_pixels
 from evflow.intensity import lin_log
 from evflow.io import plan_windows
 from evflow.recording import refinement_chunks
-from evflow.refine import fused, hot_pixels, pixel_posterior, plan_chunks, refine_summary
+from evflow.refine import fused, pixel_posterior, plan_chunks, refine_summary
 from evflow.refine.bounds import ERROR, EXCESS, NOTHING, bounded
 from evflow.refine.fit import FusionNet
 from evflow.refine.moments import measure
@@ -232,15 +233,13 @@ def test_hot_pixels_are_those_that_fire_while_nothing_moves() -> None:
     events = simulate(jax.random.key(3), np.broadcast_to(scene, (201, *shape)), times, camera)
     recording = Recording(events, np.broadcast_to(scene, (9, *shape)).astype(np.uint8), edges)
     chunks = refinement_chunks(recording, ((0, 2), (2, 4), (4, 6), (6, 8)))
-    np.testing.assert_array_equal(hot_pixels(chunks, 0.3), hot)
+    np.testing.assert_array_equal(hot_pixels(np.sum([c.quiet for c in chunks], 0), 0.3), hot)
 
 
 def test_hot_pixels_come_alone() -> None:
     """A hundredfold rate in one pixel, or two, is a fault; in a patch of them something moved."""
-    class Quiet:
-        quiet = np.stack([np.full((40, 40), 1.0), np.full((40, 40), 10.0)])
-
-    Quiet.quiet[0, 5, 5] = Quiet.quiet[0, 20, 30] = Quiet.quiet[0, 20, 31] = 100.0
-    Quiet.quiet[0, 28:33, 5:9] = 100.0
-    found = hot_pixels([Quiet()], 0.1)  # type: ignore[list-item]
+    quiet = np.stack([np.full((40, 40), 1.0), np.full((40, 40), 10.0)])
+    quiet[0, 5, 5] = quiet[0, 20, 30] = quiet[0, 20, 31] = 100.0
+    quiet[0, 28:33, 5:9] = 100.0
+    found = hot_pixels(quiet, 0.1)
     assert np.argwhere(found).tolist() == [[5, 5], [20, 30], [20, 31]]

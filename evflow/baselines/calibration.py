@@ -25,9 +25,9 @@ from evflow.baselines.steps import (
 )
 from evflow.camera import THETA_MIN, Camera, Summary
 from evflow.errors import EvflowDataError
+from evflow.faults import dead_pixels
 from evflow.intensity import lin_log
 from evflow.recording import CameraEstimate
-from evflow.refine.faults import dead_pixels
 from evflow.types import Recording
 
 Span = tuple[int, int]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import THETA_MIN
-from evflow.refine.faults import HOT_EVENTS, HOT_FACTOR
+from evflow.faults import HOT_EVENTS, HOT_FACTOR
 
 THETA_PRIOR, THETA_PRIOR_STD = 0.3, 0.115  # of U(.1, .5), where nothing was measured
 THETA_TOP = 2.0

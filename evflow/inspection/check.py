@@ -14,6 +14,7 @@ from evflow.inspection.contents import contents
 from evflow.inspection.findings import Finding, Report
 from evflow.inspection.images import images
 from evflow.io.windows import check_overlap
+from evflow.stillness import stands_still
 from evflow.types import Recording
 
 
@@ -48,5 +49,6 @@ def _findings(recording: Recording) -> list[Finding]:
             check_overlap(recording)
         except EvflowDataError as error:
             return [*found, Finding.of(error)]
-        found += agreement(recording)
+        # Where nothing moves, noise agrees with nothing, as it should.
+        found += [] if stands_still(recording) else agreement(recording)
     return sorted(found, key=lambda f: ("error", "warning", "note").index(f.severity))

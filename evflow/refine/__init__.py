@@ -6,19 +6,16 @@
     recorded against simulated Moments --> the summary   fit.py
     recorded events on the path --> each pixel's theta   pixels.py
     recorded events of quiet pixels --> noise rates      noise.py
-    recorded events --> hot and dead pixels              faults.py
 
 A network sees windows; this sees what the recording would look like were the estimate true, and
 moves the estimate until the two agree. Each pixel is compared only after its first event, where
 its memory is known: nothing depends on what happened before the recording began.
 """
 
-from evflow.refine.faults import dead_pixels, fires_alone, hot_pixels
 from evflow.refine.fit import Refined, fused, refine_summary
 from evflow.refine.path import Chunk, make_chunk, plan_chunks
 from evflow.refine.pixels import pixel_posterior
 
 __all__ = [
-    "Chunk", "Refined", "dead_pixels", "fires_alone", "fused", "hot_pixels", "make_chunk",
-    "pixel_posterior", "plan_chunks", "refine_summary",
+    "Chunk", "Refined", "fused", "make_chunk", "pixel_posterior", "plan_chunks", "refine_summary",
 ]

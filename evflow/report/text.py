@@ -20,6 +20,6 @@ def describe(found: CameraEstimate) -> str:
     events = f"from {int(found.n_events.sum()):,} events"
     windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
     lines.append(f"{events} in {windows}; {found.valid.mean():.0%} of the pixels have events of "
-                 "their own" if found.windows else f"{events}, without frames")
+                 "their own" if found.windows else f"{events} of a static scene")
     lines += [f"note: {warning}" for warning in found.warnings]
     return "\n".join(lines)

@@ -5,22 +5,21 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from evflow.refine.path import Chunk
-
 HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
 AROUND = 5  # pixels: side of the neighbourhood that a dead pixel is compared with
 MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, itself included
 DEAD_EVENTS = 12  # median there: e^-12 by chance alone, and room for a high threshold
 
 
-def hot_pixels(chunks: list[Chunk], rate_hz: float) -> np.ndarray:
+def hot_pixels(quiet: np.ndarray, rate_hz: float) -> np.ndarray:
     """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
-    happens in front of them; less than one in a million by chance.
+    happens in front of them; less than one in a million by chance. quiet (2, H, W): events and
+    seconds of such times.
 
     Faults are scattered: where several pixels of a neighbourhood are busy, something moved there
     that the frames do not show, such as a fast turn.
     """
-    events, seconds = np.sum([c.quiet for c in chunks], 0)
+    events, seconds = quiet
     busy = fires_alone(events, rate_hz * seconds)
     company = cv2.boxFilter(busy.astype(np.float32), -1, (AROUND, AROUND), normalize=False,
                             borderType=cv2.BORDER_CONSTANT)
