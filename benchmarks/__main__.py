@@ -14,6 +14,7 @@ import datetime
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -49,7 +50,14 @@ SUBJECTS: dict[str, tuple[Case, ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Time evflow on this machine, beside its limits and beside peers."""
+    """Time evflow on this machine, beside its limits and beside peers: a table on the terminal,
+    JSON lines on the disk. Every case runs in a process of its own, except with --quick. If
+    one failed the exit code is 1.
+
+    Example: evflow bench --only simulator voxels
+
+    Example: evflow bench --quick
+    """
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
     """Subjects: simulator, voxels, io, estimate, train (default: all)."""
@@ -144,9 +152,14 @@ def quantity(value: float) -> str:
     return f"{value:.4g}"
 
 
+def command(arguments: Sequence[str], prog: str) -> None:
+    """What a command line says; prog: the program's name in its help. Leaves with the exit code."""
+    sys.exit(main(tyro.cli(Options, args=arguments, prog=prog)))
+
+
 if __name__ == "__main__":
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # inherited by the cases' processes
     try:
-        sys.exit(main(tyro.cli(Options, description=__doc__)))
+        command(sys.argv[1:], "python -m benchmarks")
     except EvflowDataError as e:
         sys.exit(str(e))

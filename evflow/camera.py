@@ -25,6 +25,8 @@ Array = jax.Array
 
 THETA_MIN = 0.01  # v2e clamps thresholds here; a pixel at the clamp is a hot pixel
 PARAMETERS = ("theta_on", "theta_off", "eta_on", "eta_off")
+EXPECTED = ("Expected the camera.npz of evflow estimate (or Camera.save): maps (H, W) "
+            f"{', '.join(PARAMETERS)}.")
 
 
 @jax.tree_util.register_dataclass
@@ -126,20 +128,15 @@ class Camera:
     def load_with_std(path: str | os.PathLike) -> tuple[Camera, Camera | None]:
         """The maps and their standard deviations, where the file holds an estimate."""
         path = Path(path)
-        if not path.is_file():
-            raise EvflowDataError(
-                "EV016", f"no camera file at {path}.", "Make one: evflow estimate.")
-        with open(path, "rb") as file:
-            if file.read(6) == np.lib.format.MAGIC_PREFIX:
-                raise EvflowDataError("EV008", f"{path} is one array, not an .npz of maps.",
-                                      "Expected a camera.npz written by Camera.save.")
+        _check_kind(path)
         data = load_npz(path)
         missing = [n for n in PARAMETERS if n not in data]
         if missing:
+            recording = " It is a recording:" if {"t", "x", "y", "p"} <= set(data) else ""
             raise EvflowDataError(
-                "EV008", f"{path} holds {sorted(data)} but not {missing}.",
-                "Expected a camera.npz written by evflow estimate or Camera.save.",
-            )
+                "EV008", f"{path} holds {', '.join(sorted(data)[:12])} but not "
+                f"{', '.join(missing)}.{recording}", EXPECTED if not recording else
+                f"make a camera of it, evflow estimate {path} -o cam/, and pass cam/camera.npz.")
         errors = [f"{name}_std" for name in PARAMETERS]
         with naming(path):
             for name in {*PARAMETERS, *errors} & set(data):
@@ -152,6 +149,23 @@ class Camera:
             std = Camera(*(jnp.asarray(data[n], jnp.float32) for n in errors))
             jax.tree.map(_check_std, maps, std)
             return maps, std
+
+
+def _check_kind(path: Path) -> None:
+    """EV016 where there is no file, EV008 where it is no .npz."""
+    inside = path / "camera.npz"
+    if path.is_dir() and inside.is_file():
+        raise EvflowDataError("EV016", f"{path} is a folder.", f"Pass {inside}.")
+    if not path.is_file():
+        raise EvflowDataError("EV016", f"no camera file at {path}"
+                              f"{' (a folder without camera.npz)' if path.is_dir() else ''}.",
+                              "Make one: evflow estimate RECORDING -o cam/.")
+    with open(path, "rb") as file:
+        head = file.read(6)
+    if head == np.lib.format.MAGIC_PREFIX:
+        raise EvflowDataError("EV008", f"{path} is one array (.npy), not a camera.", EXPECTED)
+    if head[:2] != b"PK" and path.suffix.lower() != ".npz":
+        raise EvflowDataError("EV008", f"{path} is no .npz: it begins with {head!r}.", EXPECTED)
 
 
 def _check_std(values: Array, std: Array) -> None:

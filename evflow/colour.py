@@ -1,4 +1,5 @@
-"""Colour frames -> what one pixel sees: luma, or its own colour under a Bayer mosaic.
+"""Colour frames -> what one pixel sees: luma, or its own colour under a Bayer mosaic; and a raw
+mosaic -> luma.
 
 Frames are (H, W, 3) in OpenCV's order B, G, R, of dtype uint8, uint16 or float32, and keep that
 dtype. A pattern names the four corners of the mosaic's cell from the top left, row by row: under
@@ -20,6 +21,11 @@ PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
 COLOURS = ("luma", *PATTERNS)
 
 CELLS = tuple(np.s_[row::2, column::2] for row in (0, 1) for column in (0, 1))
+WEIGHTS = {"r": 0.299, "g": 0.587, "b": 0.114}  # of Rec. 601
+BETWEEN = {  # bilinear interpolation of a colour known at one pixel of a cell, or at two
+    "r": np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], np.float32) / 4,
+    "g": np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], np.float32) / 4}
+BETWEEN["b"] = BETWEEN["r"]
 PLANE_MARGIN = 32  # rows of repeated edge around a plane: more than frames to interpolate move
 
 
@@ -38,13 +44,38 @@ def mosaic(bgr: np.ndarray, pattern: str) -> np.ndarray:
 
     Raises EV002 (not (H, W, 3)), EV003 (dtype), EV020 (pattern).
     """
-    if pattern not in PATTERNS:
-        raise EvflowDataError("EV020", f"pattern={pattern!r}.", f"Choose from {PATTERNS}.")
+    _check_pattern(pattern)
     bgr = _checked(bgr)
     seen = np.empty(bgr.shape[:2], bgr.dtype)
     for cell, letter in zip(CELLS, pattern, strict=True):
         seen[cell] = bgr[..., "bgr".index(letter)][cell]
     return seen
+
+
+def mosaic_luma(seen: np.ndarray, pattern: str) -> np.ndarray:
+    """Rec. 601 luma (H, W) of a mosaic (H, W) at its own resolution, of the same dtype.
+
+    Each colour is interpolated bilinearly: a missing one is the mean of its 2 or 4 nearest pixels;
+    beyond the edges the mosaic is mirrored, which keeps its cells whole.
+    Raises EV002 (not (H, W), or less than a cell), EV003 (dtype), EV020 (pattern).
+    """
+    import cv2
+
+    _check_pattern(pattern)
+    if seen.ndim != 2 or min(seen.shape) < 2:
+        raise EvflowDataError("EV002", f"a mosaic has shape {seen.shape}.", "Expected (H, W).")
+    if seen.dtype not in (np.uint8, np.uint16, np.float32):
+        raise EvflowDataError(
+            "EV003", f"a mosaic is {seen.dtype}.", "Expected uint8, uint16 or float32.")
+    total = np.zeros(seen.shape, np.float32)
+    for letter, weight in WEIGHTS.items():
+        alone = np.zeros(seen.shape, np.float32)
+        for cell, name in zip(CELLS, pattern, strict=True):
+            if name == letter:
+                alone[cell] = seen[cell]
+        kernel = BETWEEN[letter] * np.float32(weight)
+        total += cv2.filter2D(alone, -1, kernel, borderType=cv2.BORDER_REFLECT_101)
+    return total if seen.dtype == np.float32 else np.rint(total).astype(seen.dtype)
 
 
 def as_seen(
@@ -97,6 +128,11 @@ def unstack_planes(stacked: np.ndarray, count: int) -> np.ndarray:
     for cell, plane in zip(CELLS, planes, strict=True):
         frame[cell] = plane
     return frame
+
+
+def _check_pattern(pattern: str) -> None:
+    if pattern not in PATTERNS:
+        raise EvflowDataError("EV020", f"pattern={pattern!r}.", f"Choose from {PATTERNS}.")
 
 
 def _checked(bgr: np.ndarray) -> np.ndarray:

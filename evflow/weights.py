@@ -89,3 +89,12 @@ def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
             return json.loads((file.metadata() or {}).get("card", "{}"))
     except (SafetensorError, ValueError, RecursionError) as e:
         raise EvflowDataError("EV009", f"{path} has no readable model card ({e}).") from e
+
+
+def trained_steps(card: dict[str, Any]) -> dict[str, int]:
+    """Steps of training by part of a model card. Weights of one run have one count, "all"; those
+    put together from several runs have a card a part, and the released ones are such."""
+    if isinstance(card.get("steps"), int):
+        return {"all": card["steps"]}
+    return {part: inner["steps"] for part, inner in card.items()
+            if isinstance(inner, dict) and isinstance(inner.get("steps"), int)}

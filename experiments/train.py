@@ -18,8 +18,9 @@ import dataclasses
 import json
 import math
 import signal
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
@@ -45,11 +46,22 @@ Metrics = dict[str, float]
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train the network on simulated cameras."""
+    """Train the network on simulated cameras; writes checkpoints, metrics.jsonl, and
+    weights.safetensors at the end.
+
+    Ctrl-C saves a checkpoint and stops; the same command goes on. All devices there are share the
+    work, also those of several processes (srun, mpirun, or --coordinator).
+
+    Example: evflow train --preset default --out runs/default --max-seconds 2400
+
+    Example: evflow train --out runs/default --coordinator HOST:PORT --processes 2 --process-id 0
+    """
 
     out: Path
     """Folder of the run."""
     preset: Literal["default", "pixels", "paper", "debug"] = "default"
+    """default: all parts; pixels: those that see pixels one by one, on many small scenes; paper:
+    the paper's network and losses; debug: tiny, to see that it runs."""
     steps: int | None = None
     """Number of steps (default: the preset's)."""
     scenes: int | None = None
@@ -59,6 +71,7 @@ class Options:
     start: str | None = None
     """Weights (a name or a file) whose parts of equal shape are the starting point."""
     seed: int = 0
+    """Of scenes, cameras and the first parameters."""
     max_seconds: float = math.inf
     """Stop after this long, with a checkpoint; the schedule still spans all steps."""
     resume: Literal["auto", "never", "must"] = "auto"
@@ -233,8 +246,13 @@ def lines_until(path: Path, step: int) -> Iterator[str]:
                 yield line
 
 
+def command(arguments: Sequence[str], prog: str) -> None:
+    """What a command line says; prog: the program's name in its help."""
+    main(tyro.cli(Options, args=arguments, prog=prog))
+
+
 if __name__ == "__main__":
     try:
-        main(tyro.cli(Options, description=__doc__))
+        command(sys.argv[1:], "python -m experiments.train")
     except EvflowDataError as e:
         raise SystemExit(str(e)) from None

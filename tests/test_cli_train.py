@@ -49,9 +49,22 @@ def test_help_and_errors_are_the_modules_own(tmp_path: Path) -> None:
     assert shown.returncode == 0
     assert "--quick" in shown.stdout
     wrong = run(tmp_path, "bench", "--only", "nothing")
-    assert wrong.returncode == 1
+    assert wrong.returncode == 2
     assert "EV020" in wrong.stderr
     assert "Traceback" not in wrong.stderr
+
+
+@pytest.mark.parametrize("verb", FORWARDED)
+def test_help_is_of_the_command_and_has_an_example(
+    verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([verb, "--help"])
+    assert caught.value.code == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"usage: evflow {verb} [-h]" in shown
+    assert f"Example: evflow {verb}" in shown
+    assert "python -m" not in shown
 
 
 @pytest.mark.slow

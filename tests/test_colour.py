@@ -11,7 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from videos import code_of
 
-from evflow.colour import COLOURS, PATTERNS, as_seen, luma, mosaic, stack_planes, unstack_planes
+from evflow.colour import (
+    COLOURS,
+    PATTERNS,
+    as_seen,
+    luma,
+    mosaic,
+    mosaic_luma,
+    stack_planes,
+    unstack_planes,
+)
 from evflow.commands.simulate import Simulate
 from evflow.simulator.interpolate import upsample
 
@@ -121,3 +130,25 @@ def test_luma_frames_pass_unchanged_without_interpolation() -> None:
     pairs = [(f[..., 1], t) for f, t in moving_edge(1.0)]
     assert all(a is b for (a, _), (b, _) in zip(as_seen(iter(pairs), "luma"), pairs, strict=True))
     assert list(as_seen(iter([]), "rggb")) == []
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_the_luma_of_a_mosaic(pattern: str, dtype: type) -> None:
+    """Exact of one colour all over, and of ramps but at the edges; close in smooth pictures."""
+    flat = np.broadcast_to(np.array([40, 90, 170], dtype), (6, 8, 3))
+    grey = mosaic_luma(mosaic(flat, pattern), pattern)
+    assert grey.dtype == dtype
+    np.testing.assert_allclose(grey, luma(flat), atol=1)
+    ramp = np.add.outer(3 * np.arange(12), 5 * np.arange(16))[..., None] + [0, 40, 90]
+    grey = mosaic_luma(mosaic(ramp.astype(dtype), pattern), pattern)
+    np.testing.assert_allclose(grey[1:-1, 1:-1], luma(ramp.astype(dtype))[1:-1, 1:-1], atol=1)
+
+
+def test_a_mosaic_of_any_size_but_not_of_any_kind() -> None:
+    grey = np.full((5, 7), 90, np.uint8)
+    np.testing.assert_array_equal(mosaic_luma(grey, "gbrg"), grey)
+    assert code_of(lambda: mosaic_luma(grey, "rgbg")) == "EV020"
+    assert code_of(lambda: mosaic_luma(colours(), "rggb")) == "EV002"
+    assert code_of(lambda: mosaic_luma(grey[:1], "rggb")) == "EV002"
+    assert code_of(lambda: mosaic_luma(grey.astype(np.int64), "rggb")) == "EV003"

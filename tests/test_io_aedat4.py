@@ -110,13 +110,31 @@ def test_aedat4_damage_matters_only_before_stop(
     fake_aedat(monkeypatch, [packet_of(events.slice(T0, T0 + 200_000)), damage])
     error = refused(path)
     assert error.code == "EV009"
-    assert f"at byte {len(AEDAT4) + 12:,} of {len(AEDAT4) + 23:,} bytes" in str(error)
+    assert f"at byte {len(AEDAT4) + 12:,} of {len(AEDAT4) + 23:,}: " in str(error)
     stop = float(error.fix.split("stop_s=")[1].split()[0])
     assert 0.19 < stop <= 0.2
     equal(read_events(path, stop_s=stop), events.slice(T0, int(events.t[0]) + round(stop * 1e6)))
     fake_aedat(monkeypatch, [KeyboardInterrupt()])
     with pytest.raises(KeyboardInterrupt):
         read_recording(path)
+
+
+def test_aedat4_frames_that_come_late_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They lie behind events of a later time, and behind the event at which reading stops."""
+    monkeypatch.setattr("evflow.io.tables.ROWS", 100)
+    path, events = tmp_path / "a.aedat4", make().events
+    path.write_bytes(AEDAT4)
+    parts = [events.slice(T0 + k * 50_000, T0 + (k + 1) * 50_000) for k in range(6)]
+    pixels = make().frames[0]
+    fake_aedat(monkeypatch, [*map(packet_of, parts[:4]), frame_packet(T0 + 40_000, pixels),
+                             packet_of(parts[4]), frame_packet(T0 + 150_000, pixels),
+                             RuntimeError("cut off")])
+    got = read_recording(path, stop_s=0.1)
+    equal(got.events, events.slice(T0, int(events.t[0]) + 100_000))
+    assert (got.frame_times - T0).tolist() == [40_000]
+    assert len(read_recording(path, partial=True).frames) == 2
 
 
 @pytest.mark.parametrize("streams", [

@@ -211,6 +211,14 @@ def test_stacks(tmp_path: Path) -> None:
         assert times == [0, 4000, 8000, 12_000, 16_000]
 
 
+def test_an_npz_whose_frames_claim_less_is_damaged(tmp_path: Path) -> None:
+    """Its checksum lies behind bytes that no frame needs."""
+    path = tmp_path / "a.npz"
+    np.savez(path, frames=np.zeros((4, 48, 64), np.uint8), timestamps=np.arange(4))
+    path.write_bytes(path.read_bytes().replace(b"(4, 48, 64)", b"(4, 48, 44)"))
+    assert code_of(lambda: read(path, time_unit="us")) == "EV009"
+
+
 @pytest.mark.parametrize("name", ["a.npy", "a.npz"])
 def test_cut_off_stacks_say_how_much_is_left(tmp_path: Path, name: str) -> None:
     frames = np.random.default_rng(0).integers(0, 256, (10, 24, 32), np.uint8)

@@ -58,3 +58,25 @@ def test_e2vid_text_and_zips(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("second.txt", text)
     assert refused(path).code == "EV008"
+
+
+def test_whole_seconds_are_no_seconds(tmp_path: Path) -> None:
+    """Microseconds read as seconds are refused, with what they probably are."""
+    rows = "".join(f"{160 + 20_000 * i} {i % 4} 1 1\n" for i in range(60))
+    path = tmp_path / "events.txt"
+    path.write_text("4 4\n" + rows)
+    for hints in ({}, {"time_unit": "s"}):
+        error = refused(path, **hints)
+        assert error.code == "EV023"
+        assert "60 event times are whole seconds, 160 to 1180160" in error.seen
+        assert "--time-unit us" in error.fix
+    assert read_events(path, time_unit="us").t[-1] == 1_180_160
+    path.write_text(rows.replace(" ", ".0 ", 1))
+    assert refused(path, time_unit="s", size=(4, 4)).code == "EV023"
+    assert refused(path, size=(4, 4)).code == "EV003"
+    path.write_text("4 4\n" + "".join(f"{1_643_243_628_737_093 + i} 1 1 1\n" for i in range(60)))
+    error = refused(path, time_unit="s")
+    assert (error.code, "--time-unit us" in error.fix) == ("EV003", True)
+    for few in ("4 4\n1 1 1 1\n2 1 1 1\n", "4 4\n" + "1 1 1 1\n" * 20):
+        path.write_text(few)  # too little to be sure
+        assert len(read_events(path)) > 1

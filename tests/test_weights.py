@@ -10,13 +10,14 @@ import pytest
 from networks import small_params
 
 from evflow.errors import EvflowDataError
-from evflow.weights import load_weights, model_card, save_weights, weights_path
+from evflow.weights import load_weights, model_card, save_weights, trained_steps, weights_path
 
 
 def test_round_trip(tmp_path: Path) -> None:
     path = save_weights(tmp_path / "w.safetensors", small_params(), {"steps": 7})
     jax.tree.map(np.testing.assert_array_equal, load_weights(path), small_params())
     assert model_card(path) == {"steps": 7}
+    assert trained_steps(model_card(path)) == {"all": 7}
 
 
 def test_same_params_same_bytes(tmp_path: Path) -> None:
@@ -44,3 +45,6 @@ def test_shipped_weights_are_small_finite_and_explained() -> None:
         assert card[part]["steps"] > 100
         assert {"config", "seed", "preset", "training_figures", "versions"} <= set(card[part])
     assert card["fusion"]["recordings"] > 100
+    steps = trained_steps(card)
+    assert {"pixels", "summary"} <= set(steps)
+    assert all(count > 0 for count in steps.values())

@@ -20,4 +20,4 @@ class Bench:
     """Those of benchmarks: evflow bench --help."""
 
     def run(self) -> None:
-        run_module("benchmarks", self.options)
+        run_module("benchmarks.__main__", self.options, "evflow bench")

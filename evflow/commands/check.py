@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from evflow.commands.options import Reading
+from evflow.commands.options import Reading, own_first
 from evflow.errors import EvflowDataError
 
 
+@own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Check(Reading):
     """Check a recording: polarity, units, order, alignment, gaps, frames. Exit code 1 on errors.
@@ -19,7 +21,7 @@ class Check(Reading):
     Example: evflow check flight.aedat4
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     json: bool = False
     """Print JSON."""

@@ -11,10 +11,11 @@ from typing import Annotated
 
 import tyro
 
-from evflow.commands.options import Reading, write_json
-from evflow.errors import EvflowDataError
+from evflow.commands.options import Reading, note_idle, own_first, value, write_json
+from evflow.commands.writing import need_absent, need_folder
 
 
+@own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Compare(Reading):
     """Compare a synthetic stream with a real one by rates, pixels, intervals and noise.
@@ -22,15 +23,16 @@ class Compare(Reading):
     Example: evflow compare flight.aedat4 synth.h5 -o comparison/
     """
 
-    real: tyro.conf.Positional[Path]
+    real: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REAL")]
     """The recorded events, of any known format. The reading options hold for both."""
-    synthetic: tyro.conf.Positional[Path]
+    synthetic: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SYNTHETIC")]
     """The events to hold against them, of a sensor of the same size."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Annotated[Path | None, value("FOLDER", "-o")] = None
     """Folder for compare.json and compare.html (which needs matplotlib)."""
     plots: bool = True
     """Write compare.html."""
     overwrite: bool = False
+    """Replace those files where they exist."""
     json: bool = False
     """Print all numbers as JSON."""
 
@@ -41,14 +43,17 @@ class Compare(Reading):
         from evflow.report.streams import write_comparison
         from evflow.report.verdict import describe_streams, judge_streams, worst
 
+        if self.out:
+            need_folder(self.out)
         targets = [] if self.out is None else [self.out / "compare.json"] + (
             [self.out / "compare.html"] if self.plots else [])
         for target in targets:
-            if target.exists() and not self.overwrite:
-                raise EvflowDataError("EV013", f"{target} exists.", "Pass --overwrite.")
+            need_absent(target, self.overwrite)
         if self.out and self.plots:
             plots.require()
-        real, synthetic = (self.read(path).events for path in (self.real, self.synthetic))
+        note_idle(self, "streams are compared by their events alone")
+        real, synthetic = (self.read(path, with_frames=False).events
+                           for path in (self.real, self.synthetic))
         numbers = compare(real, synthetic)
         words = describe_streams(numbers)
         facts = {"real": str(self.real), "synthetic": str(self.synthetic),

@@ -6,13 +6,15 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from evflow.commands.options import Reading
+from evflow.commands.options import Reading, own_first
 from evflow.commands.writing import Format, named, need_absent
 
 
+@own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Convert(Reading):
     """Write a recording of any known format, or a part of it, in another.
@@ -22,14 +24,15 @@ class Convert(Reading):
     Example: evflow convert flight.aedat4 flight.zip --start 1 --stop 3
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
-    out: tyro.conf.Positional[Path]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
     aedat4, none (a folder) evreal."""
     format: Format = "auto"
-    """Format of the output, where it is not what the extension stands for."""
+    """Format of the output, where its extension leaves a choice (event_utils in .h5)."""
     overwrite: bool = False
+    """Replace the output where it exists."""
     json: bool = False
     """Print JSON."""
 
@@ -38,7 +41,7 @@ class Convert(Reading):
         from evflow.io.base import writer_of
         from evflow.types import Recording
 
-        writer = writer_of(self.out, named(self.format))
+        writer = writer_of(self.out, named(self.format, self.out))
         need_absent(self.out, self.overwrite)
         recording = self.read(self.recording)
         notes = list(recording.notes)

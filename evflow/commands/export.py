@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from evflow.commands.writing import need_absent
+from evflow.commands.writing import need_absent, need_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,18 +19,20 @@ class Export:
     Example: evflow export cam/camera.npz --to v2e -o cam/v2e
     """
 
-    camera: tyro.conf.Positional[Path]
+    camera: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAMERA")]
     """camera.npz from evflow estimate."""
     to: Literal["v2e", "esim", "openeb", "iebcs"]
     """The simulator."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for maps.npz, README.txt and the script."""
     overwrite: bool = False
+    """Replace the folder where it holds an export and nothing else."""
 
     def run(self) -> None:
         from evflow.camera import Camera
         from evflow.exports import export_camera, write_export
 
+        need_folder(self.out)
         need_absent(self.out, self.overwrite)
         camera, std = Camera.load_with_std(self.camera)
         export, maps = export_camera(camera, self.to, std)

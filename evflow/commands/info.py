@@ -5,24 +5,25 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from evflow.commands.options import Reading
+from evflow.commands.options import Reading, own_first
 
 if TYPE_CHECKING:
     from evflow.types import Recording
 
 
+@own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(Reading):
-    """What is in a recording.
+    """What is in a recording: events, frames, size, duration, usable windows.
 
     Example: evflow info flight.aedat4
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     json: bool = False
     """Print JSON."""

@@ -1,47 +1,78 @@
-"""Options that several commands share, and how results are written."""
+"""Options that several commands share, how they are told from idle ones, and how results are
+written.
+
+An option of `Reading` that can do nothing, because there are no frames or the command looks at
+none, is named in a note on stderr: the same options go with every command. What contradicts is
+refused, EV020.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
+import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+import tyro
 
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
     from evflow.types import Recording
 
+T = TypeVar("T")
+
+ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # of --frames
+CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer")  # of any frames
+
+
+def value(metavar: str, *aliases: str) -> Any:
+    """Of an option that may be left out: what its value is called in the help."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="", aliases=aliases or None)
+
+
+def own_first(command: type[T]) -> type[T]:
+    """Class decorator: a command's help names its own options before those that it inherits, and
+    those of a near base before those of a far one."""
+    depth = {name: i for i, base in enumerate(command.__mro__)
+             for name in getattr(base, "__dataclass_fields__", ())}
+    fields = command.__dataclass_fields__  # type: ignore[attr-defined]
+    command.__dataclass_fields__ = dict(  # type: ignore[attr-defined]
+        sorted(fields.items(), key=lambda item: depth[item[0]]))
+    return command
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
     """How a recording is read; what a command that reads one inherits."""
 
-    start: float | None = None
+    start: Annotated[float | None, value("SECONDS")] = None
     """Use the recording from here (seconds from its first event)."""
-    stop: float | None = None
+    stop: Annotated[float | None, value("SECONDS")] = None
     """... to here."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of the event times; auto takes the format's own."""
     polarity: Literal["auto", "01", "pm1", "invert"] = "auto"
     """What the file's polarities are; invert swaps ON and OFF."""
-    size: str | None = None
-    """Sensor size WxH (346x260), where the file does not tell it or is wrong."""
+    size: Annotated[str | None, value("WxH")] = None
+    """Sensor size (346x260), where the file does not tell it or is wrong."""
     partial: bool = False
     """Use what lies before the damage of a damaged or cut-off file (not HDF5, npz)."""
     drop_outside: bool = False
     """Leave out events outside the sensor instead of refusing them."""
-    frames: Path | None = None
+    frames: Annotated[Path | None, value("PATH")] = None
     """Frames from elsewhere: a folder of images, a video, a stack (.npy, .npz)."""
-    timestamps: Path | None = None
-    """Their times on the events' clock: one a line, alone, beside the image's name, or begin and
-    end of the exposure."""
+    timestamps: Annotated[Path | None, value("FILE")] = None
+    """Times of --frames on the events' clock: one a line, alone, beside the image's name, or begin
+    and end of the exposure."""
     timestamps_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of those times; auto takes the one that gives a plausible frame rate."""
-    frames_fps: float | None = None
+    frames_fps: Annotated[float | None, value("HZ")] = None
     """Frames per second of --frames, the first at 0 (see --frames-offset-ms)."""
-    full_scale: float | None = None
+    full_scale: Annotated[float | None, value("DN")] = None
     """White of --frames; without it 255, or 65535 in 16-bit images. 12-bit data: 4095."""
     frames_offset_ms: Literal["auto"] | float = 0.0
     """Added to the frame times; auto finds what makes events and frames agree."""
@@ -49,30 +80,44 @@ class Reading:
     """Mirror the frames."""
     response: Literal["linear", "gamma", "srgb"] = "linear"
     """How the frames code light; gamma is 2.2. Thresholds are measured against linear light."""
+    bayer: Annotated[str | None, value("RGGB|BGGR|GRBG|GBRG")] = None
+    """The frames are a raw colour mosaic whose cells begin so: turn it into luma. Not where the
+    events come from behind the same filters: there a pixel's own value is what it sees."""
 
-    def read(self, path: Path) -> Recording:
-        """The recording at `path`, these options obeyed."""
+    def read(self, path: Path, *, with_frames: bool = True) -> Recording:
+        """The recording at `path`, these options obeyed. with_frames: False where the command looks
+        at no frames: then none are read from elsewhere or changed (see `note_idle`)."""
         from evflow import io
-        from evflow.io import adjust
 
         check_finite(self)
+        if self.frames is None and (told := given(self, ELSEWHERE)):
+            raise EvflowDataError(
+                "EV020", f"{told} without --frames: of frames from elsewhere.",
+                "Pass --frames too.")
         recording = io.read_recording(
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
             polarity=self.polarity, size=parse_size(self.size), partial=self.partial,
             drop_outside=self.drop_outside)
+        if with_frames and (self.frames is not None or recording.has_frames):
+            return self._seeing(recording)
+        if with_frames:
+            note_idle(self, f"{path} has no frames")
+        return recording
+
+    def _seeing(self, recording: Recording) -> Recording:
+        """The recording with the frames asked for, put right."""
+        from evflow.io import adjust
+
         offset = 0 if self.frames_offset_ms == "auto" else round(self.frames_offset_ms * 1000)
-        if self.frames is not None:
+        pattern = parse_bayer(self.bayer)
+        if self.frames is None:
+            recording = adjust.shifted(recording, offset)
+            recording = adjust.demosaiced(recording, pattern) if pattern else recording
+        else:
             recording = adjust.with_frames(
                 recording, self.frames, offset_us=offset, fps=self.frames_fps,
                 timestamps=self.timestamps, time_unit=self.timestamps_unit,
-                full_scale=self.full_scale, partial=self.partial)
-        elif self.timestamps or self.frames_fps or self.full_scale:
-            raise EvflowDataError(
-                "EV020", "--timestamps, --frames-fps and --full-scale tell of frames from "
-                "elsewhere.",
-                "Pass --frames too.")
-        else:
-            recording = adjust.shifted(recording, offset)
+                full_scale=self.full_scale, partial=self.partial, bayer=pattern)
         if self.flip_frames != "none":
             recording = adjust.flipped(recording, self.flip_frames)
         recording = adjust.linearised(recording, self.response)
@@ -86,12 +131,37 @@ def _aligned(recording: Recording) -> Recording:
     return adjust.shifted(recording, frames_offset(recording))
 
 
+def given(options: Any, names: Iterable[str]) -> str:
+    """Those of the named options that are not at their default, as they are typed: "--fps, --slow";
+    "" where all are."""
+    defaults = {field.name: field.default for field in dataclasses.fields(options)}
+    return ", ".join(flag(name, no=defaults[name] is True) for name in names
+                     if getattr(options, name) != defaults[name])
+
+
+def note_idle(options: Reading, why: str) -> None:
+    """Say which options of frames do nothing."""
+    if idle := given(options, ("frames", *ELSEWHERE, *CHANGES)):
+        print(f"note: {idle} without effect: {why}.", file=sys.stderr)
+
+
+def flag(name: str, *, no: bool = False) -> str:
+    """An option as it is typed: "--frames-fps"."""
+    return f"--{'no-' if no else ''}{name.replace('_', '-')}"
+
+
+def refuse(options: Any, names: Iterable[str], why: str) -> None:
+    """EV020 where any of the command's own options is given that contradicts the rest."""
+    if wrong := given(options, names):
+        raise EvflowDataError("EV020", f"{wrong}: {why}.", "Leave it out.")
+
+
 def check_finite(options: Any) -> None:
     """EV020 where a number among the options is NaN or infinite."""
     for field in dataclasses.fields(options):
-        value = getattr(options, field.name)
-        if isinstance(value, float) and not math.isfinite(value):
-            raise EvflowDataError("EV020", f"--{field.name.replace('_', '-')} {value}.",
+        number = getattr(options, field.name)
+        if isinstance(number, float) and not math.isfinite(number):
+            raise EvflowDataError("EV020", f"{flag(field.name)} {number}.",
                                   "Give a finite number.")
 
 
@@ -103,6 +173,16 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if not (width.isdecimal() and height.isdecimal()):
         raise EvflowDataError("EV020", f"size {text!r}.", "Give it as WxH: --size 346x260.")
     return int(width), int(height)
+
+
+def parse_bayer(text: str | None) -> str | None:
+    """A pattern of `colour.PATTERNS`, of any case; EV020 on anything else."""
+    from evflow.colour import PATTERNS
+
+    if text is None or text.lower() in PATTERNS:
+        return text and text.lower()
+    raise EvflowDataError("EV020", f"--bayer {text}.",
+                          f"Choose from {', '.join(p.upper() for p in PATTERNS)}.")
 
 
 def write_json(path: Path, facts: dict[str, Any]) -> None:

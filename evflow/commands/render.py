@@ -9,9 +9,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from evflow.commands.options import Reading, check_finite
+from evflow.commands.options import Reading, check_finite, note_idle, own_first, refuse, value
 
 
+@own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(Reading):
     """Show events: a film (.mp4, .gif), or a sheet of one instant (.png). Red: ON. Blue: OFF.
@@ -19,25 +20,26 @@ class Render(Reading):
     Example: evflow render flight.aedat4 -o flight.mp4 --slow 10
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """.mp4, .gif, or .png."""
     fps: float = 30.0
-    """Pictures per second of the film."""
+    """Pictures per second of the film (.mp4, .gif)."""
     window_ms: float = 33.0
     """How long a picture gathers events."""
     slow: float = 1.0
-    """How many times slower than life."""
+    """How many times slower than life (.mp4, .gif)."""
     over_frames: bool = False
-    """Draw the events over the frames nearest in time."""
-    at: float | None = None
+    """Draw the events over the frames nearest in time (a .png shows both as they are, too)."""
+    at: Annotated[float | None, value("SECONDS")] = None
     """Instant of the .png, seconds from the first event; without it the busiest."""
-    scale: int | None = None
+    scale: Annotated[int | None, value("N")] = None
     """Screen pixels per pixel; without it as many as make the film 640 wide."""
     codec: Literal["mpeg4", "vp9"] = "mpeg4"
     """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
     overwrite: bool = False
+    """Replace the output where it exists."""
 
     def run(self) -> None:
         from evflow.progress import bar
@@ -47,8 +49,14 @@ class Render(Reading):
         film = Film(fps=self.fps, window_us=round(1000 * self.window_ms), slow=self.slow,
                     over_frames=self.over_frames, scale=self.scale, codec=self.codec)
         film.check_target(self.out, overwrite=self.overwrite)
-        recording = self.read(self.recording)
-        if self.out.suffix.lower() == ".png":
+        kind = self.out.suffix.lower()
+        refuse(self, {".png": ("fps", "slow", "codec"), ".gif": ("at", "codec"),
+                      ".mp4": ("at",)}[kind], f"nothing that a {kind} has")
+        seen = self.over_frames or kind == ".png"
+        if not seen:
+            note_idle(self, "the film shows no frames without --over-frames")
+        recording = self.read(self.recording, with_frames=seen)
+        if kind == ".png":
             said = write_sheet(self.out, recording, film, at_s=self.at, overwrite=self.overwrite)
         else:
             with bar("rendering") as progress:

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from evflow.commands.options import check_finite, parse_bayer, refuse, value
 from evflow.commands.writing import Format, named
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
-    from evflow.io.frames import Frames
+    from evflow.io.frames import Frames, FrameSource
     from evflow.io.writer import EventWriter
+    from evflow.sensors import SensorModel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,46 +27,64 @@ class Simulate:
 
     Example: evflow simulate ride.mp4 --camera cam/camera.npz -o synth.h5
 
+    Example: evflow simulate flight.aedat4 --camera cam/camera.npz -o again.h5
+
     Example: evflow simulate frames/ --timestamps times.txt --colour rggb -o synth.h5
     """
 
-    video: tyro.conf.Positional[Path]
+    video: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
     """A video file; a folder of images (png, jpg, tif, bmp, pgm; 8 or 16 bits); a stack of frames
-    (.npy, .npz); or a recording, whose frames are used."""
+    (.npy, .npz); or a recording of any known format, whose frames are used at their own times."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
     aedat4, none (a folder) evreal."""
     format: Format = "auto"
-    """Format of the output, where it is not what the extension stands for."""
+    """Format of the output, where its extension leaves a choice (event_utils in .h5)."""
     frames_too: bool = False
     """Write the video's frames beside the events: grey, at their own times."""
-    camera: Path | None = None
+    camera: Annotated[Path | None, value("FILE")] = None
     """camera.npz from evflow estimate; without it the thresholds below, or the sensor's own."""
     draw: bool = False
     """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
     the most likely values are too even."""
     sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
-    """Pixel circuit: v2e's presets and defaults, ESIM, DVS-Voltmeter, the paper's."""
-    theta_on: float | None = None
-    """The same threshold everywhere (natural log); default: the sensor's, with its mismatch."""
-    theta_off: float | None = None
-    eta_on: float | None = None
-    """Noise rate in Hz per pixel, added to the sensor's own (default: none)."""
-    eta_off: float | None = None
-    fps: float | None = None
+    """Pixel circuit. clean, noisy: v2e's presets; v2e: its defaults; esim; dvs346, dvs240:
+    DVS-Voltmeter's; paper: the paper's."""
+    theta_on: Annotated[float | None, value("THETA")] = None
+    """ON threshold of every pixel (natural log); without it the sensor's, with its mismatch."""
+    theta_off: Annotated[float | None, value("THETA")] = None
+    """OFF threshold of every pixel."""
+    eta_on: Annotated[float | None, value("HZ")] = None
+    """Noise events per second and pixel, ON, added to the sensor's own."""
+    eta_off: Annotated[float | None, value("HZ")] = None
+    """The same, OFF."""
+    start: Annotated[float | None, value("SECONDS")] = None
+    """Use the frames from here: seconds from the first, of a recording from its first event."""
+    stop: Annotated[float | None, value("SECONDS")] = None
+    """... to here."""
+    fps: Annotated[float | None, value("HZ")] = None
     """Frames per second: for images without times, or where the video's own are wrong."""
-    timestamps: Path | None = None
+    timestamps: Annotated[Path | None, value("FILE")] = None
     """Times of the frames: one a line, alone or beside the image's name (text, csv, .npy). A
     folder's timestamps.txt or images.txt is found unasked."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of those times; auto takes the one that gives a plausible frame rate."""
+    """Unit of those times, or of a recording's; auto takes the one that gives a plausible frame
+    rate, of a recording its format's own."""
     colour: Literal["luma", "rggb", "bggr", "grbg", "gbrg"] = "luma"
     """What a pixel sees of colour: luma, or its channel under this Bayer mosaic. Frames with one
     channel are taken as the mosaic itself."""
-    full_scale: float | None = None
+    bayer: Annotated[str | None, value("RGGB|BGGR|GRBG|GBRG")] = None
+    """The frames are a raw colour mosaic whose cells begin so: pixels see its luma. (--colour rggb:
+    they see the mosaic itself.)"""
+    full_scale: Annotated[float | None, value("DN")] = None
     """Value of white; without it 255, or 65535 in 16-bit images. 12-bit data: 4095."""
+    response: Literal["linear", "gamma", "srgb"] = "linear"
+    """How the frames code light: videos mostly as srgb, cameras with events linearly. Pixels see
+    light."""
+    flip_frames: Literal["none", "horizontal", "vertical", "both"] = "none"
+    """Mirror the frames."""
     partial: bool = False
-    """Use what can be read of a damaged video."""
+    """Use what can be read of a damaged video or recording."""
     interpolate: bool = True
     """Fill in frames where things move by more than --max-motion-px from frame to frame."""
     max_motion_px: Annotated[float, tyro.conf.arg(aliases=["--max-motion"])] = 1.0
@@ -72,27 +92,25 @@ class Simulate:
     noise_resets_memory: bool = True
     """A noise event stores the present intensity, as in real pixels (v2e's sensors)."""
     seed: int = 0
+    """Of noise, and of what is drawn: the same seed gives the same events."""
     overwrite: bool = False
+    """Replace the output where it exists."""
     json: bool = False
+    """Print JSON."""
 
     def run(self) -> None:
         import jax
 
         from evflow import io
         from evflow.colour import as_seen
-        from evflow.io.source import open_frames
         from evflow.progress import bar
-        from evflow.sensors import known_sensor
         from evflow.simulator import simulate_stream
         from evflow.simulator.interpolate import unzip, upsample
 
-        source = open_frames(
-            self.video, fps=self.fps, timestamps=self.timestamps, colour=self.colour,
-            time_unit=self.time_unit, full_scale=self.full_scale, partial=self.partial)
+        format = named(self.format, self.out)
+        source = self._source()
         camera = _camera(self, source.size)
-        sensor = known_sensor(self.sensor).model
-        if sensor.kind == "v2e":
-            sensor = dataclasses.replace(sensor, noise_resets_memory=self.noise_resets_memory)
+        sensor = self._model()
         count = frames = 0
 
         def shown(done: int, total: int) -> None:
@@ -101,7 +119,7 @@ class Simulate:
             progress(done, total)
 
         with bar("simulating") as progress, io.open_writer(
-                self.out, source.size, named(self.format), overwrite=self.overwrite) as writer:
+                self.out, source.size, format, overwrite=self.overwrite) as writer:
             limit = self.max_motion_px if self.interpolate else 0.0
             video = source.watched(shown)
             if self.frames_too:
@@ -119,6 +137,29 @@ class Simulate:
                  "sensor": self.sensor, "colour": self.colour, "notes": source.notes}
         print(json.dumps(facts) if self.json else
               f"{count:,} events of {frames:,} frames -> {self.out}")
+
+    def _source(self) -> FrameSource:
+        """The frames; EV020 where options contradict each other."""
+        from evflow.io.source import open_frames
+
+        check_finite(self)
+        if not self.interpolate:
+            refuse(self, ("max_motion_px",), "nothing is filled in with --no-interpolate")
+        return open_frames(
+            self.video, fps=self.fps, timestamps=self.timestamps, colour=self.colour,
+            time_unit=self.time_unit, full_scale=self.full_scale, partial=self.partial,
+            bayer=parse_bayer(self.bayer), response=self.response, flip=self.flip_frames,
+            start_s=self.start, stop_s=self.stop)
+
+    def _model(self) -> SensorModel:
+        """The pixels' circuit; EV020 where it has no such choice."""
+        from evflow.sensors import known_sensor
+
+        model = known_sensor(self.sensor).model
+        if model.kind == "v2e":
+            return dataclasses.replace(model, noise_resets_memory=self.noise_resets_memory)
+        refuse(self, ("noise_resets_memory",), f"--sensor {self.sensor} has no such choice")
+        return model
 
 
 def _recorded(video: Frames, colour: str, writer: EventWriter) -> Frames:

@@ -1,9 +1,9 @@
-"""What trains and times evflow lies beside the package, in its source tree: such a command runs a
-module of the tree that this evflow comes from, as `python -m MODULE` would."""
+"""What trains and times evflow lies beside the package, in its source tree: such a command calls a
+module of the tree that this evflow comes from."""
 
 from __future__ import annotations
 
-import runpy
+import importlib
 import sys
 from pathlib import Path
 
@@ -20,18 +20,18 @@ def forwarded(arguments: list[str]) -> list[str]:
     return arguments
 
 
-def run_module(name: str, options: tuple[str, ...]) -> None:
-    """Run module `name` as the program, in this process: signals, terminal and exit code are its
-    own. EV016 where evflow was installed without its source tree."""
+def run_module(name: str, options: tuple[str, ...], prog: str) -> None:
+    """Call `command(options, prog)` of module `name`: signals, terminal and exit code are its own.
+    EV016 where evflow was installed without its source tree."""
     root = Path(evflow.__file__).resolve().parents[1]
     if not ((root / "pyproject.toml").is_file() and (root / name.split(".")[0]).is_dir()):
         raise EvflowDataError(
             "EV016", f"{name} is not in {root}: it belongs to evflow's source tree, not to the "
             "installed package.",
             "Get the source tree, run `pip install -e .` in it, then this command again.")
-    argv, path = sys.argv, sys.path[:]
-    sys.argv, sys.path[:0] = [name, *options], [str(root)]
+    path = sys.path[:]
+    sys.path.insert(0, str(root))
     try:
-        runpy.run_module(name, run_name="__main__", alter_sys=True)
+        importlib.import_module(name).command(options, prog)
     finally:
-        sys.argv, sys.path[:] = argv, path
+        sys.path[:] = path

@@ -20,4 +20,4 @@ class Train:
     """Those of experiments.train: evflow train --help."""
 
     def run(self) -> None:
-        run_module("experiments.train", self.options)
+        run_module("experiments.train", self.options, "evflow train")

@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from evflow.commands.options import Reading, check_finite
-from evflow.commands.writing import need_absent
+from evflow.commands.options import Reading, check_finite, own_first
+from evflow.commands.writing import need_absent, need_suffix
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
     from evflow.types import Recording
 
 
+@own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Voxel(Reading):
     """Voxel grids (Eq. 2) of a recording's windows, for a network or a notebook.
@@ -32,7 +33,7 @@ class Voxel(Reading):
     Example: evflow voxel flight.aedat4 -o voxels.npz --stop 10
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output, .npz (compressed; one grid is in memory at a time)."""
@@ -41,6 +42,7 @@ class Voxel(Reading):
     window_ms: float = 40.0
     """Shortest window where there are frames, the length of every window where there are none."""
     overwrite: bool = False
+    """Replace the output where it exists."""
 
     def run(self) -> None:
         from evflow.files import atomic_write
@@ -51,6 +53,7 @@ class Voxel(Reading):
         if self.bins < 2 or not self.window_ms >= 0.001:
             raise EvflowDataError("EV020", f"--bins {self.bins}, --window-ms {self.window_ms:g}.",
                                   "Need two bins and 0.001 ms at least.")
+        need_suffix(self.out, ".npz")
         need_absent(self.out, self.overwrite)
         recording = self.read(self.recording)
         pairs, starts, lengths, notes = _windows(recording, round(self.window_ms * 1000))

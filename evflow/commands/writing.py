@@ -1,4 +1,5 @@
-"""Options of commands that write a recording."""
+"""Options of commands that write, and what is refused before long work: outputs that exist, and
+names that say something else than what is written."""
 
 from __future__ import annotations
 
@@ -9,10 +10,40 @@ from evflow.errors import EvflowDataError
 
 Format = Literal["auto", "dsec", "e2vid", "event_utils", "evreal", "npz", "aedat4"]
 
+KINDS = {".h5": ("dsec", "event_utils"), ".hdf5": ("dsec", "event_utils")}  # else: the one format
+FILES = frozenset((  # endings that nobody gives a folder
+    ".npz", ".npy", ".json", ".html", ".htm", ".png", ".jpg", ".pdf", ".svg", ".txt", ".csv",
+    ".md", ".zip", ".h5", ".hdf5", ".aedat4", ".mp4", ".gif", ".py", ".yaml"))
 
-def named(format: Format) -> str | None:
-    """The format as `evflow.io` takes it: None for what the extension stands for."""
+
+def named(format: Format, out: Path) -> str | None:
+    """The format as `evflow.io` takes it: None for what the extension stands for. EV020 where the
+    extension stands for another one."""
+    from evflow.io.base import WRITTEN
+
+    suffix = out.suffix.lower()
+    stands_for = KINDS.get(suffix, (WRITTEN[suffix],) if WRITTEN.get(suffix) and suffix else ())
+    if format != "auto" and stands_for and format not in stands_for:
+        endings = [s or "none (a folder)" for s, name in WRITTEN.items()
+                   if format in KINDS.get(s, (name,))]
+        raise EvflowDataError(
+            "EV020", f"--format {format} is not what a name that ends in {suffix} holds.",
+            f"Name the output with {' or '.join(endings)}.")
     return None if format == "auto" else format
+
+
+def need_suffix(out: Path, suffix: str) -> None:
+    """EV020 where a file that is always of one kind is to be named as another."""
+    if out.suffix.lower() != suffix:
+        raise EvflowDataError("EV020", f"{out} does not end in {suffix}, which is what is written.",
+                              f"Name it {out.with_suffix(suffix)}.")
+
+
+def need_folder(out: Path) -> None:
+    """EV020 where the name of a folder to be made is that of a file."""
+    if out.suffix.lower() in FILES and not out.is_dir():
+        raise EvflowDataError("EV020", f"{out} has the name of a file, but a folder is written.",
+                              f"Name a folder: -o {out.with_suffix('')}/.")
 
 
 def need_absent(path: Path, overwrite: bool) -> None:

@@ -27,6 +27,8 @@ LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer cannot tell
 INVERTED = -0.2  # correlation below which polarity is inverted
 AGREES, BETTER = 0.2, 0.1  # least correlation of another reading, and its gain over the present
 UNRELATED = 0.06  # the most of any reading; the least of 26 recordings that agree is .12
+STRONG = 0.3  # mean change of log brightness of a cell's pixels that neither noise nor drift makes
+LEAST_CHANGE, MOST_THETA = 500.0, 10.0  # log units in all; the least of real ones is .4 per event
 SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # that many leave chance .03 at most
 SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # the sweep reaches that far: intervals, at most us
 SWEEP_STEP_US = 5_000
@@ -112,23 +114,19 @@ def frame_steps(recording: Recording) -> Steps | None:
 
 
 def agreement(recording: Recording) -> list[Finding]:
-    """EV021 (polarity inverted), EV024 (clocks not aligned), EV029 (frames mirrored), EV034 (no
-    reading of the frames agrees with the events)."""
+    """EV021 (polarity inverted), EV023 (times stretched), EV024 (clocks not aligned), EV029 (frames
+    mirrored), EV034 (no reading of the frames agrees with the events)."""
     steps = frame_steps(recording)
-    if steps is None or np.isnan(here := steps.correlation()):
+    if steps is None:
         return []
+    if (missing := _missing(steps)) or np.isnan(here := steps.correlation()):
+        return missing
     offsets, r = steps.sweep()
     flips = {flip: steps.correlation(flip=flip) for flip in FLIPS}
     flip = max(flips, key=lambda f: abs(flips[f]))
-    over = f"r={here:+.2f} over {len(steps.bounds)} frame steps"
     if abs(flips[flip]) > AGREES and abs(flips[flip]) > np.nanmax(np.abs(r)) + BETTER:
-        swapped = " and with ON and OFF swapped" if flips[flip] < 0 else ""
-        also = " --polarity invert" if flips[flip] < 0 else ""
-        axis = "both axes" if flip == "both" else f"the {flip} axis"
-        return [Finding(
-            "EV029", "error", f"events and frames agree only with the frames mirrored in {axis}"
-            f"{swapped} (r {here:+.2f} -> {abs(flips[flip]):+.2f}).",
-            f"Pass --flip-frames {flip}{also}.")]
+        return [_mirrored(flip, here, flips[flip])]
+    over = f"r={here:+.2f} over {len(steps.bounds)} frame steps"
     inverted = _inverted(r)
     if inverted:
         offset, best = _peak(offsets, -r)
@@ -154,6 +152,31 @@ def agreement(recording: Recording) -> list[Finding]:
             "Are they of one camera and one time? Coordinates transposed, another time unit "
             "(--time-unit)? Nothing can be measured from them.")]
     return []
+
+
+def _mirrored(flip: str, here: float, best: float) -> Finding:
+    """EV029: r as the recording is, and with its frames mirrored."""
+    swapped = " and with ON and OFF swapped" if best < 0 else ""
+    also = " --polarity invert" if best < 0 else ""
+    axis = "both axes" if flip == "both" else f"the {flip} axis"
+    return Finding(
+        "EV029", "error", f"events and frames agree only with the frames mirrored in {axis}"
+        f"{swapped} (r {here:+.2f} -> {abs(best):+.2f}).", f"Pass --flip-frames {flip}{also}.")
+
+
+def _missing(steps: Steps) -> list[Finding]:
+    """EV023 where frames change by far more than any threshold makes of so few events: a short cut
+    of events whose times are stretched."""
+    change = np.abs(steps.changes[""])
+    shown = float(change[change > STRONG * steps.cell**2].sum())
+    count = sum(len(steps.events.slice(int(t0), int(t1))) for t0, t1 in steps.bounds)
+    if shown < LEAST_CHANGE or count > shown / MOST_THETA:
+        return []
+    return [Finding(
+        "EV023", "warning", f"frames change by {shown:,.0f} log units where they change most, "
+        f"which is as many events at thresholds of 1, but {count:,} events happen meanwhile.",
+        "Event times a thousand times too long? Pass --time-unit ns where they "
+        "were read in us, us where in ms, ms where in s; or frames of another recording.")]
 
 
 def frames_offset(recording: Recording) -> int:

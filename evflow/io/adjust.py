@@ -7,50 +7,42 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from evflow.colour import mosaic_luma
 from evflow.errors import EvflowDataError
+from evflow.io import light
 from evflow.io.source import open_frames
 from evflow.types import Recording
 
+LUMA = ("colour frames", "frames were a colour mosaic")  # notes on frames that are luma already
 MARGIN_US = 1_000_000  # frames that far outside the events are kept: their clock may be off
-FLIPS: dict[str, int | tuple[int, int]] = {"horizontal": 2, "vertical": 1, "both": (1, 2)}  # axes
-GAMMA = 2.2
-
-
-def _gamma(code: np.ndarray) -> np.ndarray:
-    return code ** np.float32(GAMMA)
-
-
-def _srgb(code: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1."""
-    curved = ((code + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
-    return np.where(code <= 0.04045, code / np.float32(12.92), curved)
-
-
-RESPONSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {"gamma": _gamma, "srgb": _srgb}
 
 
 def linearised(recording: Recording, response: str) -> Recording:
-    """The recording with frames proportional to light, float32 DN on 0..255.
-
-    response: what the frames are coded by: "linear" (nothing to do), "gamma" (code = light^(1/2.2))
-    or "srgb" (IEC 61966-2-1). Thresholds are measured against the log of light: of frames with a
-    gamma of 2.2 they come out 2.2 times too small. EV020 on any other response.
-    """
+    """The recording with frames proportional to light, float32 DN on 0..255; response and errors
+    as in `light.linear_light`."""
     if response == "linear":
         return recording
-    if response not in RESPONSES:
-        raise EvflowDataError(
-            "EV020", f"response={response!r}.", f"Choose from linear, {', '.join(RESPONSES)}.")
     frames = np.empty(recording.frames.shape, np.float32)
     for i in range(len(frames)):
-        code = recording.frame_dn(i) * np.float32(1 / 255)
-        frames[i] = np.minimum(RESPONSES[response](code), 1) * np.float32(255)
+        frames[i] = light.linear_light(recording.frame_dn(i), response)
     return _changed(recording, f"frames linearised ({response})", frames=frames)
+
+
+def demosaiced(recording: Recording, pattern: str) -> Recording:
+    """The recording whose frames are a raw mosaic, with their luma in its place, of the same size
+    and dtype. EV020 where they were colour images already; errors of `colour.mosaic_luma`."""
+    if any(note.startswith(LUMA) for note in recording.notes):
+        raise EvflowDataError(
+            "EV020", "the frames are luma of colour images already, and no "
+            f"{pattern.upper()} mosaic.", "Leave out --bayer.")
+    frames = np.empty(recording.frames.shape, recording.frames.dtype)
+    for i, frame in enumerate(recording.frames):
+        frames[i] = mosaic_luma(frame, pattern)
+    return _changed(recording, light.remark(pattern), frames=frames)
 
 
 def shifted(recording: Recording, offset_us: int) -> Recording:
@@ -63,10 +55,11 @@ def shifted(recording: Recording, offset_us: int) -> Recording:
 
 def flipped(recording: Recording, side: str) -> Recording:
     """The recording with its frames mirrored: "horizontal", "vertical" or "both"; EV020."""
-    if side not in FLIPS:
-        raise EvflowDataError("EV020", f"side={side!r}.", f"Choose from {sorted(FLIPS)}.")
+    if side not in light.FLIPS:
+        raise EvflowDataError("EV020", f"side={side!r}.", f"Choose from {sorted(light.FLIPS)}.")
+    axes = tuple(1 + axis for axis in light.FLIPS[side])
     return _changed(recording, f"frames flipped ({side})",
-                    frames=np.flip(recording.frames, FLIPS[side]))
+                    frames=np.flip(recording.frames, axes))
 
 
 def with_frames(
@@ -75,9 +68,9 @@ def with_frames(
     """The recording with the frames of `path` in place of its own: a folder of images, a video, a
     NumPy stack, another recording.
 
-    hints: fps, timestamps, time_unit, full_scale, partial, as in `open_frames`; times are those
-    of the events' clock, after offset_us is added. Frames more than a second away from all events
-    are left out.
+    hints: fps, timestamps, time_unit, full_scale, partial, bayer, as in `open_frames`; times are
+    those of the events' clock, after offset_us is added. Frames more than a second away from all
+    events are left out.
     Raises EV012 (no frame near the events), EV015 (another size), and what `open_frames` raises.
     """
     try:

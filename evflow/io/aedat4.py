@@ -9,25 +9,30 @@ matter.
 
 from __future__ import annotations
 
+import array
+import collections
 import contextlib
 import itertools
 import os
 import struct
+import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
 import numpy as np
 
+from evflow.checks import COLUMNS
 from evflow.errors import EvflowDataError
+from evflow.io import tables
 from evflow.io.compressed import most_bytes
-from evflow.io.frames import stack_frames
+from evflow.io.frames import FrameStack, cut
 from evflow.io.hints import Hints
 from evflow.io.limits import FREE, RATIO
-from evflow.io.stream import Damage
+from evflow.io.stream import Chunk, Damage, gather
 from evflow.types import Events, Recording
 
 NAME = "aedat4"
@@ -47,7 +52,7 @@ def read(path: Path, hints: Hints) -> Recording:
     """Events (N,) and frames (T, H, W) uint8; colour frames become Rec. 709 luma (float32).
 
     Raises EV008 (no event stream, or several), EV009 (damaged), EV010 (no `aedat`), and what
-    `Events` and `Recording` raise.
+    `stream.gather` and `Recording` raise.
     """
     packets_start, table = _check_header(path)
     streams = _decoder(path).id_to_stream()
@@ -58,53 +63,86 @@ def read(path: Path, hints: Hints) -> Recording:
         raise EvflowDataError(
             "EV008", f"{path} holds the streams {{{kinds}}}.",
             "One event stream and at most one frame stream are read: export one camera alone.")
-    events, frames = _decode(path, packets_start, table, hints)
     info = streams[found["events"][0]]
-    x, y, t, p = (np.concatenate([packet[n] for packet in events]) if events else np.zeros(0, int)
-                  for n in ("x", "y", "t", "p"))
-    t, size = hints.microseconds(t, "us"), hints.sensor((info["width"], info["height"]))
-    return hints.crop(_recording(path, hints.events(x, y, t, hints.on(p), size), frames, hints))
-
-
-def _decode(
-    path: Path, packets_start: int, table: int, hints: Hints
-) -> tuple[list[Any], list[Any]]:
-    """The event packets (structured arrays) and the frames (dicts), up to `stop_s` or the end."""
-    events: list[Any] = []
-    frames: list[Any] = []
-    stop, last, byte = np.iinfo(np.int64).max, 0, packets_start
     starts, damage = _packets(path, packets_start, table)
-    try:
-        with _before(path, damage) as sound, warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            decoder = iter(_decoder(sound))
-            end = itertools.repeat(os.path.getsize(sound))
-            for byte in itertools.chain(starts, end):  # noqa: B007 (read on failure)
-                packet = next(decoder, None)
-                if packet is None:
-                    break
-                if len(packet.get("events", ())):
-                    events.append(packet["events"])
-                    last = hints.instant(events[-1]["t"][-1], "us")
-                    if len(events) == 1 and hints.stop_s is not None:
-                        stop = hints.span_us(hints.instant(events[0]["t"][0], "us"))[1]
-                elif "frame" in packet:
-                    frames.append(packet["frame"])
-                if last >= stop + LATE_US:
-                    break
-        hints.remarks.extend(sorted({f"the decoder left something out: {w.message}"
-                                     for w in said}))
-        if damage:
-            raise damage
-    except (KeyboardInterrupt, SystemExit):
-        raise
-    except BaseException as e:  # a Rust panic derives from BaseException
-        if last < stop:
-            byte = e.byte if isinstance(e, Damage) else byte
-            error = _damaged(path, byte, events, len(frames), e)
-            error.__cause__ = e
-            hints.forgive(error, len(events) > 0)
-    return events, frames
+    with _before(path, damage) as sound:
+        reading = _Reading(path, sound, starts, damage, hints)
+        chunks = reading.chunks()
+        events, span = gather(path, chunks, hints, (info["width"], info["height"]))
+        if reading.last >= span[1]:  # frames that are late
+            with contextlib.suppress(Damage):
+                collections.deque(chunks, 0)
+    hints.remarks.extend(sorted(reading.remarks))
+    return reading.beside(events, span)
+
+
+class _Reading:
+    """Packets decoded in turn: events become chunks, frames are put aside. last: time of the last
+    event so far in us."""
+
+    def __init__(
+        self, path: Path, sound: Path, starts: Iterable[int], damage: Damage | None, hints: Hints
+    ) -> None:
+        self.path, self.hints, self.damage = path, hints, damage
+        self.decoder = iter(_decoder(sound))
+        self.places = itertools.chain(starts, itertools.repeat(os.path.getsize(sound)))
+        self.stack, self.times = FrameStack(path), array.array("q")
+        self.last, self.stop = 0, sys.maxsize
+        self.begun = False
+        self.remarks: set[str] = set()
+
+    def chunks(self) -> Iterator[Chunk]:
+        """All events up to `stop_s`, and up to the time when frames from before it have come."""
+        done = 0
+        while found := self._some():
+            x, y, t, p = (np.concatenate([packet[name] for packet in found]) for name in COLUMNS)
+            yield Chunk(x, y, t, p, lambda i, done=done: done + i, "event")  # type: ignore[misc]
+            done += len(t)
+        if self.damage:
+            raise self.damage
+
+    def _some(self) -> list[np.ndarray]:
+        """The next packets of events; none at the end, and where the damage is next."""
+        found: list[np.ndarray] = []
+        count = byte = 0
+        try:
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                while count < tables.ROWS and self.last < self.stop + LATE_US:
+                    byte = next(self.places)
+                    packet = next(self.decoder, None)
+                    if packet is None:
+                        self.decoder = iter(())
+                        break
+                    if len(packet.get("events", ())):
+                        found.append(packet["events"])
+                        count += len(found[-1])
+                        self._at(found[-1]["t"])
+                    elif "frame" in packet:
+                        self.times.append(_mid_exposure(packet["frame"]))
+                        self.stack.append(packet["frame"]["pixels"])
+            self.remarks |= {f"the decoder left something out: {w.message}" for w in said}
+        except (KeyboardInterrupt, SystemExit, EvflowDataError):
+            raise
+        except BaseException as e:  # a Rust panic derives from BaseException
+            self.damage, self.decoder = Damage(byte, str(e)), iter(())
+            self.damage.__cause__ = e
+        return found
+
+    def _at(self, t: np.ndarray) -> None:
+        """Follow the time of events t as far as `stop_s` needs it."""
+        if self.hints.stop_s is not None:
+            self.last = self.hints.instant(t[-1], "us")
+            if not self.begun:
+                self.begun, self.stop = True, self.hints.span_us(self.hints.instant(t[0], "us"))[1]
+
+    def beside(self, events: Events, span: tuple[int, int]) -> Recording:
+        """The recording of these events and the frames in [start, stop) us."""
+        if not self.times:
+            return Recording.of_events(events)
+        times = self.hints.microseconds(np.array(self.times), "us")
+        recording = self.stack.beside(events, times, ("frame times are mid-exposure",))
+        return cut(recording, span)
 
 
 @contextlib.contextmanager
@@ -127,27 +165,12 @@ def _before(path: Path, damage: Damage | None) -> Iterator[Path]:
         yield Path(copy.name)
 
 
-def _damaged(
-    path: Path, byte: int, events: list[Any], n_frames: int, e: BaseException
-) -> EvflowDataError:
-    """EV009 with the byte at which the damaged packet begins and what was read before it."""
-    n = sum(len(packet) for packet in events)
-    us = int(events[-1]["t"][-1]) - int(events[0]["t"][0]) if events else 0
-    until = us // 1000 / 1000  # rounded down: read with this stop_s, the file is sound
-    return EvflowDataError(
-        "EV009", f"{path} is cut off or damaged at byte {byte:,} of {os.path.getsize(path):,} "
-        f"bytes ({e}); {n:,} events up to {until:.3f} s and {n_frames} frames before that are "
-        "sound.",
-        f"Copy it again, or read the sound part: stop_s={until:.3f} (--stop), or --partial."
-        if until else "Copy it again.")
-
-
-def _packets(path: Path, start: int, table: int) -> tuple[list[int], Damage | None]:
+def _packets(path: Path, start: int, table: int) -> tuple[array.array[int], Damage | None]:
     """Where packets begin, each {i32 stream, i32 size, size bytes}, up to the table; and the one
     that claims more than is left, or expands beyond measure: the decoder would take that much
     memory."""
     total = os.path.getsize(path)
-    starts: list[int] = []
+    starts = array.array("q")
     with open(path, "rb") as f:
         while start + 8 <= total and start != table:
             f.seek(start + 4)
@@ -238,18 +261,6 @@ def _decoder(path: Path) -> Any:
     except BaseException as e:
         raise EvflowDataError(
             "EV009", f"{path} cannot be decoded ({e}).", "Copy it again.") from e
-
-
-def _recording(path: Path, events: Events, frames: list[Any], hints: Hints) -> Recording:
-    if not frames:
-        return Recording.of_events(events)
-    pixels, notes = stack_frames([frame["pixels"] for frame in frames], path)
-    try:
-        times = np.array([_mid_exposure(frame) for frame in frames], np.int64)
-    except OverflowError as e:
-        raise EvflowDataError("EV009", f"{path} has frame times beyond int64.") from e
-    times = hints.microseconds(times, "us")
-    return Recording(events, pixels, times, ("frame times are mid-exposure", *notes))
 
 
 def _mid_exposure(frame: dict[str, Any]) -> int:

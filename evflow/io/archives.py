@@ -17,8 +17,10 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.io.limits import check_expansion
+from evflow.io.spool import Spool
 
 MAX_HEADER = 10_000  # bytes, NumPy's own bound
+BLOCK = 1 << 20  # bytes, or values, read at a time
 DAMAGE = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError,
           OSError)  # what zipfile raises on a damaged archive
 
@@ -71,20 +73,73 @@ def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an .npz by key; EV009 where any of them is damaged or pickled."""
+    with members(path) as found:
+        return {name: member.whole() for name, member in found.items()}
+
+
+@contextlib.contextmanager
+def members(path: Path) -> Iterator[dict[str, Member]]:
+    """The arrays of an .npz by key, to be read in the block; EV009 as `unzipped`."""
     with unzipped(path) as archive:
-        return {info.filename.removesuffix(".npy"): load_member(archive, info)
-                for info in archive.infolist()}
+        found = {info.filename.removesuffix(".npy"): Member(archive, info)
+                 for info in archive.infolist()}
+        try:
+            yield found
+        finally:
+            for member in found.values():
+                member.close()
 
 
-def load_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One array of an open .npz; ValueError and what zipfile raises where it is damaged."""
-    if not info.filename.endswith(".npy"):  # skipping it could lose the frames unseen
-        raise ValueError(f"{info.filename} is not an array")
-    with archive.open(info) as f:
-        shape, fortran, dtype = npy_header(f)
-        count = math.prod(shape)
-        if count * dtype.itemsize > info.file_size:
-            raise ValueError(f"{info.filename} is cut off: {dtype} {shape}")
-        data = f.read()  # to its end, where the checksum is compared
-    flat = np.frombuffer(data, dtype, count)
-    return flat.reshape(shape, order="F" if fortran else "C")
+class Member:
+    """An array of an open .npz, read whole or from its beginning on, rows by rows; ValueError and
+    what zipfile raises where it is damaged. Its checksum is compared at its end."""
+
+    def __init__(self, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
+        if not info.filename.endswith(".npy"):  # skipping it could lose the frames unseen
+            raise ValueError(f"{info.filename} is not an array")
+        self._archive, self._info = archive, info
+        self._file: IO[bytes] | None = None  # of some that are read: an open one takes 50 kB
+        with archive.open(info) as f:
+            self.shape, self.fortran, self.dtype = npy_header(f)
+        if math.prod(self.shape) * self.dtype.itemsize > info.file_size:
+            raise ValueError(f"{info.filename} is cut off: {self.dtype} {self.shape}")
+
+    def take(self, count: int) -> np.ndarray:
+        """The next `count` values, (count,), in the order of the file."""
+        return np.frombuffer(self._data().read(count * self.dtype.itemsize), self.dtype, count)
+
+    def finish(self) -> None:
+        """Read what is left of it, for the checksum."""
+        while self._data().read(BLOCK):
+            pass
+        self.close()
+
+    def whole(self) -> np.ndarray:
+        """The array, in memory."""
+        try:
+            flat = self.take(math.prod(self.shape))
+            self.finish()
+        finally:
+            self.close()
+        return flat.reshape(self.shape, order="F" if self.fortran else "C")
+
+    def spooled(self) -> np.ndarray:
+        """The array, in memory or on disk as `Spool` has it."""
+        spool, left = Spool(self.dtype), math.prod(self.shape)
+        while left:
+            spool.append(self.take(min(left, BLOCK)))
+            left -= min(left, BLOCK)
+        self.finish()
+        return spool.array().reshape(self.shape, order="F" if self.fortran else "C")
+
+    def close(self) -> None:
+        """It can be read again, from its beginning on."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _data(self) -> IO[bytes]:
+        if self._file is None:
+            self._file = self._archive.open(self._info)
+            npy_header(self._file)
+        return self._file

@@ -34,6 +34,7 @@ from evflow.io import (
     v2e_text,
 )
 from evflow.io.hints import Hints
+from evflow.io.units import check_seconds
 from evflow.io.write_aedat4 import Aedat4Writer
 from evflow.io.writer import EventWriter, copy
 from evflow.types import Events, Recording
@@ -91,7 +92,7 @@ def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
 
     hints: start_s, stop_s, time_unit, polarity, size, partial, drop_outside (see `Hints`).
     Raises EV008 (unknown format), EV009 (damaged), EV010 (a package is missing), EV016 (not
-    there), EV020 (unknown hint), and what `Events` and `Recording` raise.
+    there), EV020 (unknown hint), EV023 (whole seconds), and what `Events` and `Recording` raise.
     """
     told = Hints.parse(hints)
     path = Path(path)
@@ -99,6 +100,8 @@ def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
     try:
         with naming(path):
             recording = found.read(path, told)
+            events = recording.events
+            check_seconds(events.t, events.size, told.time_unit, found.NAME)
     except MemoryError as e:
         raise EvflowDataError(
             "EV009", f"{path} asks for more memory than there is.",

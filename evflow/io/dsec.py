@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from evflow.errors import EvflowDataError
 from evflow.io import tables
 from evflow.io.hdf5 import DAMAGE, MAGIC, Hdf5Writer, load_h5py, plausible
 from evflow.io.hints import Hints
+from evflow.io.stream import Chunk, gather
 from evflow.types import Events, Recording
 
 NAME = "dsec"
@@ -43,32 +45,22 @@ def sniff(path: Path, head: bytes) -> bool:
 def read(path: Path, hints: Hints) -> Recording:
     """Only the part between start_s and stop_s is read.
 
-    Raises EV008 (a data set is missing), EV009 (damaged), EV010 (h5py or a filter is missing),
-    EV001 (no event in the range), and what `Events` and `Recording` raise.
+    Raises EV008 (a data set is missing), EV009 (damaged), EV010 (h5py or a filter is missing), and
+    what `stream.gather` and `Recording` raise.
     """
-    h5py = load_h5py()
-    try:
-        with h5py.File(path) as f:
-            columns = _columns(path, f)
-            size = DSEC_SIZE
-            if "width" in f.attrs:
-                size = int(f.attrs["width"]), int(f.attrs["height"])
-            offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
-            part, span = _range(columns["t"], offset, hints)
-            x, y, t, p = (columns[name][part] for name in ("x", "y", "t", "p"))
-            t = _shift(hints.microseconds(t, "us"), offset)
-            events = hints.events(x, y, t, hints.on(p), hints.sensor(size))
-            if "frames" not in f:
-                return Recording.of_events(events)
-            frames = tables.dataset(path, f, "frames", (None, None, None))
-            times = hints.microseconds(
-                tables.dataset(path, f, "frame_times", (len(frames),))[:], "us")
-            keep = slice(*np.searchsorted(times, span))
-            return Recording(events, frames[keep], times[keep])
-    except DAMAGE as e:
-        raise EvflowDataError(
-            "EV009", f"{path} is cut off or damaged ({type(e).__name__}: {e}).",
-            "Copy it again; h5ls and h5dump show what is left.") from e
+    with tables.opened(path) as f:
+        columns = _columns(path, f)
+        size = DSEC_SIZE
+        if "width" in f.attrs:
+            size = int(f.attrs["width"]), int(f.attrs["height"])
+        offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
+        events, span = gather(path, _chunks(columns, hints), hints, size, "us", offset)
+        if "frames" not in f:
+            return Recording.of_events(events)
+        frames = tables.dataset(path, f, "frames", (None, None, None))
+        times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
+        return tables.with_frames(path, events, span, hints.microseconds(times, "us"),
+                                  lambda keep: tables.stored_frames(frames, keep), ())
 
 
 class DsecWriter(Hdf5Writer):
@@ -152,25 +144,30 @@ def _scalar(path: Path, f: Any, name: str) -> Any:
     return plausible(path, f[name])[()]
 
 
-def _range(t: Any, offset: int, hints: Hints) -> tuple[slice, np.ndarray]:
-    """Events to read as a slice, and the absolute range (2,) in us; binary search on the file."""
+def _chunks(columns: dict[str, Any], hints: Hints) -> Iterator[Chunk]:
+    """Chunks of the events between start_s and stop_s, found by binary search in the file, and
+    before them the very first event, from which those count."""
+    x, y, t, p = columns.values()
+    first, last = _range(t, hints)
+
+    def rows(part: slice) -> tuple[Any, Any, Any, Any]:
+        return x[part], y[part], t[part], p[part]
+
+    if first > 0:
+        yield from tables.blocks(1, rows)
+    stored = max(tables.stored_rows(column) for column in columns.values())
+    yield from tables.blocks(last, rows, stored, first)
+
+
+def _range(t: Any, hints: Hints) -> tuple[int, int]:
+    """The first event to read, and the first not to."""
     if hints.whole or len(t) == 0:
-        limits = np.iinfo(np.int64)
-        return slice(None), np.array([limits.min, limits.max])
+        return 0, len(t)
 
     def us(value: Any) -> int:
         return hints.instant(value, "us")
 
-    span = hints.span_us(us(t[0]))
-    first, last = (bisect.bisect_left(t, value, key=us) for value in span)
+    first, last = (bisect.bisect_left(t, value, key=us) for value in hints.span_us(us(t[0])))
     if first >= last:
         raise hints.empty(us(t[-1]) - us(t[0]))
-    return slice(first, last), np.clip(np.array(span), -(2**62), 2**62) + offset
-
-
-def _shift(t: np.ndarray, offset: int) -> np.ndarray:
-    """t + offset in int64, or EV009 where that does not fit."""
-    if len(t) and not -(2**63) <= min(offset, int(t.min()) + offset) <= max(
-        offset, int(t.max()) + offset) < 2**63:
-        raise EvflowDataError("EV009", f"t_offset {offset} takes times beyond int64.")
-    return t + np.int64(offset)
+    return first, last

@@ -50,7 +50,7 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events, notes)
         times = hints.microseconds(np.array([_time(path, image) for image in images]), native)
         return tables.with_frames(path, events, span, times,
-                                  lambda keep: [_rgb(image[:]) for image in images[keep]], notes)
+                                  lambda keep: (_rgb(image[:]) for image in images[keep]), notes)
 
 
 def _image(path: Path, group: Any, name: str) -> Any:
@@ -82,6 +82,8 @@ def _size(
     if len(told) < 2 or told.dtype.kind not in "iuf" or not (told[:2] > 0).all():
         return None, ()
     height, width = (int(v) for v in told[:2])
+    if height <= width:  # as sensors are: no event can tell, and two columns need not be read twice
+        return (width, height), ()
     reach = [0, 0]
     for first in range(0, len(columns["xs"]), tables.ROWS):
         for i, name in enumerate(("xs", "ys")):

@@ -14,6 +14,7 @@ from evflow.checks import Size
 from evflow.io import tables
 from evflow.io.arrays import mapped
 from evflow.io.hints import Hints
+from evflow.io.spool import Spool
 from evflow.io.stream import gather
 from evflow.types import Events, Recording
 
@@ -39,6 +40,13 @@ def read(path: Path, hints: Hints) -> Recording:
         SIZES.get(camera or ""), "s" if t.dtype.kind == "f" else "us")
     if camera != "samsung_mono":
         return Recording.of_events(events)
-    turned = Events.unchecked(events.x, events.y, events.t, ~events.p, events.size)
     return Recording.of_events(
-        turned, ("polarity was turned: EVIMO2's Samsung camera stores brighter as 0",))
+        _turned(events), ("polarity was turned: EVIMO2's Samsung camera stores brighter as 0",))
+
+
+def _turned(events: Events) -> Events:
+    """The events with ON and OFF changed, block by block: p may lie on disk."""
+    on = Spool(bool)
+    for first in range(0, len(events), tables.ROWS):
+        on.append(~events.p[first : first + tables.ROWS])
+    return Events.unchecked(events.x, events.y, events.t, on.array(), events.size)

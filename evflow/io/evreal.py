@@ -46,7 +46,7 @@ def read(path: Path, hints: Hints) -> Recording:
     stamps = mapped(path / "images_ts.npy", (len(images),))
     times = hints.microseconds(np.asarray(stamps), _unit(stamps))
     return tables.with_frames(path, events, span, times,
-                              lambda keep: [_rgb(image) for image in images[keep]], ())
+                              lambda keep: map(_rgb, images[keep]), ())
 
 
 def _unit(times: np.ndarray) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,10 @@ import numpy as np
 
 from evflow.colour import COLOURS, luma
 from evflow.errors import EvflowDataError
-from evflow.io.hints import UNITS_US, check_choices, known
+from evflow.io import light
+from evflow.io.hints import UNITS_US, Hints, check_choices, known
+from evflow.io.spool import Spool
+from evflow.types import Events, Recording
 from evflow.types import luma as rec709
 
 Frames = Iterator[tuple[np.ndarray, int]]
@@ -41,6 +44,10 @@ class FrameHints:
     colour: "luma", or a Bayer pattern: then colour frames stay (H, W, 3), for `colour.mosaic`.
     full_scale: DN of white; None = 255 for uint8 and floats, 65535 for uint16.
     partial: use what can be read of a damaged or cut-off file.
+    bayer: pattern of the raw mosaic that the frames are; they become its luma.
+    flip, response: mirror them; undo a gamma (see `light`).
+    start_s, stop_s: frames with start <= time < stop, in seconds from the first; of a recording
+        from its first event.
     """
 
     fps: float | None = None
@@ -49,9 +56,20 @@ class FrameHints:
     colour: str = "luma"
     full_scale: float | None = None
     partial: bool = False
+    bayer: str | None = None
+    flip: str = "none"
+    response: str = "linear"
+    start_s: float | None = None
+    stop_s: float | None = None
 
     def __post_init__(self) -> None:
-        check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS)
+        check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS,
+                      flip=("none", *light.FLIPS), response=light.RESPONSES)
+        Hints(start_s=self.start_s, stop_s=self.stop_s)  # EV020 where they are no range
+        if self.bayer is not None and self.colour != "luma":
+            raise EvflowDataError(
+                "EV020", f"bayer={self.bayer} makes luma of a mosaic, colour={self.colour} wants "
+                "the mosaic itself.", "Give one of them.")
         for name in ("fps", "full_scale"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
@@ -102,7 +120,7 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[str]) -> F
     first: tuple[np.ndarray, np.dtype] | None = None
     last, bright = 0, False
     for image in images:
-        frame, bright = _frame(image, hints, bright)
+        frame, bright = _seen(image, hints, bright)
         depth = image.pixels.dtype
         if first is None:
             first = frame, depth
@@ -123,6 +141,15 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[str]) -> F
                 "All frames must have one bit depth and number of channels.")
         last = image.time_us
         yield frame, last
+
+
+def _seen(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, bool]:
+    """The frame as light, and `bright` as `_frame` has it."""
+    if hints.bayer is not None:
+        image = image._replace(pixels=light.luma_of_mosaic(image.pixels, hints.bayer, image.where))
+    frame, bright = _frame(image, hints, bright)
+    frame = light.linear_light(frame, hints.response)
+    return frame if hints.flip == "none" else np.flip(frame, light.FLIPS[hints.flip]), bright
 
 
 def _frame(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, bool]:
@@ -161,7 +188,11 @@ def _frame(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, b
 
 def _remarks(image: Image, frame: np.ndarray, hints: FrameHints) -> list[str]:
     """What the user should know about the first frame."""
-    notes = []
+    notes = [] if hints.bayer is None else [light.remark(hints.bayer)]
+    if hints.response != "linear":
+        notes.append(f"frames linearised ({hints.response})")
+    if hints.flip != "none":
+        notes.append(f"frames flipped ({hints.flip})")
     if hints.colour != "luma" and frame.ndim == 2:
         notes.append(f"frames have one channel: taken as a {hints.colour} mosaic as they are.")
     peak = int(image.pixels.max()) if image.pixels.dtype == np.uint16 else 0
@@ -182,18 +213,48 @@ def existing(path: str | os.PathLike) -> Path:
     return path
 
 
-def stack_frames(
-    images: Sequence[np.ndarray], where: object
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Images (H, W) or (H, W, 3) RGB -> frames (T, H, W), and a note where colour was converted.
+class FrameStack:
+    """Images (H, W) or (H, W, 3) RGB that come one by one, as the frames of a recording: colour
+    becomes luma. Kept as `Spool` does it. where: names their file in messages."""
 
-    Raises EV015 where the images differ in shape; `where` names their file in the message.
-    """
-    shapes = sorted({image.shape for image in images})
-    if len(shapes) > 1:
-        raise EvflowDataError(
-            "EV015", f"{where} has frames of shapes {shapes}.", "Use those of one sensor.")
-    frames = np.stack(images) if images else np.zeros((0, 0, 0), np.uint8)
-    if frames.ndim == 3:
-        return frames, ()
-    return rec709(frames[..., :3]), ("colour frames were converted to Rec. 709 luma",)
+    def __init__(self, where: object) -> None:
+        self.where, self.count = where, 0
+        self._first: np.ndarray | None = None  # as it came
+        self._spool: Spool | None = None
+
+    def append(self, image: np.ndarray) -> None:
+        """Raises EV002 (no image), EV003 and EV015 (dtype or shape change), EV019 (disk full)."""
+        if self._first is None:
+            if image.ndim != 2 and not (image.ndim == 3 and image.shape[-1] in (3, 4)):
+                raise EvflowDataError(
+                    "EV002", f"{self.where} has a frame of shape {image.shape}.",
+                    "Expected (H, W) or (H, W, 3).")
+            self._first = image
+        if image.shape != self._first.shape:
+            raise EvflowDataError(
+                "EV015", f"{self.where} has frames of shapes {self._first.shape} and "
+                f"{image.shape}.", "Use those of one sensor.")
+        if image.dtype != self._first.dtype:
+            raise EvflowDataError(
+                "EV003", f"{self.where} has frames of {self._first.dtype} and {image.dtype}.",
+                "Use those of one bit depth.")
+        grey = image if image.ndim == 2 else rec709(image[..., :3])
+        self._spool = self._spool or Spool(grey.dtype)
+        self._spool.append(grey.ravel())
+        self.count += 1
+
+    def beside(self, events: Events, times: np.ndarray, notes: tuple[str, ...]) -> Recording:
+        """The recording of these events and all frames, at `times` (T,); raises what it raises."""
+        if self._first is None or self._spool is None:
+            return Recording.of_events(events, notes)
+        frames = self._spool.array().reshape(self.count, *self._first.shape[:2])
+        if self._first.ndim == 3:
+            notes = (*notes, "colour frames were converted to Rec. 709 luma")
+        return Recording(events, frames, times, notes)
+
+
+def cut(recording: Recording, span: tuple[int, int]) -> Recording:
+    """The recording with those frames alone that lie in [start, stop) us."""
+    keep = slice(*np.searchsorted(recording.frame_times, np.array(span)))
+    return dataclasses.replace(
+        recording, frames=recording.frames[keep], frame_times=recording.frame_times[keep])

@@ -1,7 +1,7 @@
 """What a user may tell a reader, and how every reader obeys it.
 
-A reader parses its file, passes raw columns through `microseconds`, `on` and `sensor`, and its
-result through `crop`; so units, polarity, size and time range mean the same for every format.
+`stream.gather` passes what a reader parses through `microseconds`, `on`, `sensor` and `span_us`;
+so units, polarity, size and time range mean the same for every format.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from evflow.checks import Size, check_polarity, check_size
 from evflow.errors import EvflowDataError
-from evflow.types import Events, Recording
 
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 POLARITIES = ("auto", "01", "pm1", "invert")
@@ -94,13 +93,22 @@ class Hints:
             + (f" (events reach x={reach[0]}, y={reach[1]})." if reach else "."),
             "Pass size=(width, height), --size WxH.")
 
-    def microseconds(self, t: np.ndarray, native: str) -> np.ndarray:
-        """Times of any dtype in `time_unit` (auto: `native`) as int64 us; EV003, EV007.
+    def microseconds(self, t: np.ndarray, native: str, offset_us: int = 0) -> np.ndarray:
+        """Times of any dtype in `time_unit` (auto: `native`) as int64 us, offset_us added.
 
         Integers stay exact; floats and ns are rounded to the nearest microsecond.
+        Raises EV003, EV007, EV009 (the offset takes them beyond int64).
         """
         if t.size == 0:
             return np.zeros(0, np.int64)
+        us = self._microseconds(t, native)
+        if offset_us == 0:
+            return us
+        if not all(-(2**63) <= int(end) + offset_us < 2**63 for end in (us.min(), us.max())):
+            raise EvflowDataError("EV009", f"an offset of {offset_us} us takes times beyond int64.")
+        return us + np.int64(offset_us)
+
+    def _microseconds(self, t: np.ndarray, native: str) -> np.ndarray:
         unit = native if self.time_unit == "auto" else self.time_unit
         if t.dtype.kind == "f":
             if self.time_unit == "auto" and native != "s":
@@ -119,7 +127,9 @@ class Hints:
         if max(abs(int(t.min())), abs(int(t.max()))) * max(UNITS_US[unit], 1) >= 2**63:
             raise _too_late(t, unit)
         whole = t.astype(np.int64, copy=False)
-        return (whole + 500) // 1000 if unit == "ns" else whole * np.int64(UNITS_US[unit])
+        if unit == "ns":
+            return (whole + 500) // 1000
+        return whole if unit == "us" else whole * np.int64(UNITS_US[unit])
 
     def instant(self, t: Any, native: str) -> int:
         """One time as `microseconds` has it."""
@@ -137,17 +147,6 @@ class Hints:
         on = check_polarity(p)
         return ~on if self.polarity == "invert" else on
 
-    def events(
-        self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, size: Size
-    ) -> Events:
-        """`Events` of columns (N,), those outside `size` left out where that was asked for."""
-        if self.drop_outside and len(x):
-            inside = within(x, y, size)
-            if not inside.all():
-                self.remarks.append(dropped(int((~inside).sum()), len(x), size))
-                x, y, t, p = (column[inside] for column in (x, y, t, p))
-        return Events(x, y, t, p, size)
-
     def forgive(self, error: EvflowDataError, sound: bool) -> None:
         """Raise the error, unless what is sound before the damage was asked for and is some."""
         if not (self.partial and sound and error.code in ("EV004", "EV009")):
@@ -164,19 +163,6 @@ class Hints:
     @property
     def whole(self) -> bool:
         return self.start_s is None and self.stop_s is None
-
-    def crop(self, recording: Recording) -> Recording:
-        """The part between start_s and stop_s; EV001 where it holds no event."""
-        events = recording.events
-        if self.whole or len(events) == 0:
-            return recording
-        start, stop = self.span_us(int(events.t[0]))
-        part = events.slice(start, stop)
-        if len(part) == 0:
-            raise self.empty(events.duration_us)
-        keep = slice(*np.searchsorted(recording.frame_times, np.array([start, stop])))
-        return Recording(
-            part, recording.frames[keep], recording.frame_times[keep], recording.notes)
 
     def empty(self, duration_us: int) -> EvflowDataError:
         """EV001 for a time range without events in a recording of that duration."""
@@ -198,6 +184,10 @@ def dropped(count: int, total: int, size: Size) -> str:
 
 
 def _too_late(t: np.ndarray, unit: str) -> EvflowDataError:
+    """The unit that makes them times since 1970 is named, if there is one: 2001 to 2099."""
+    last = float(t.max())
+    since = [u for u, us in UNITS_US.items() if 1e9 < 1e-6 * us * last < 4.1e9]
     return EvflowDataError(
-        "EV003", f"times span {t.min()}..{t.max()} {unit}, more than int64 microseconds hold.",
-        "Pass the right time_unit (--time-unit ns).")
+        "EV003", f"times span {t.min():.0f}..{last:.0f} {unit}, more than int64 microseconds hold"
+        f"{f'; in {since[0]} they are times since 1970' if since else ''}.",
+        f"Pass the right time_unit (--time-unit {since[0] if since else 'us, or ns'}).")

@@ -86,7 +86,7 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
     if not names:
         return Recording.of_events(events)
     return tables.with_frames(
-        path, events, span, times, lambda keep: [_image(root, n) for n in names[keep]],
+        path, events, span, times, lambda keep: (_image(root, n) for n in names[keep]),
         ("frame times are those of images.txt",))
 
 

@@ -53,4 +53,4 @@ def read(path: Path, hints: Hints) -> Recording:
         frames = tables.dataset(path, camera, "image_raw", (None, None, None))
         times = tables.dataset(path, camera, "image_raw_ts", (len(frames),))[:]
         return tables.with_frames(path, events, span, hints.microseconds(times, "s"),
-                                  lambda keep: frames[keep], notes)
+                                  lambda keep: tables.stored_frames(frames, keep), notes)

@@ -1,7 +1,8 @@
 """evflow's own .npz: t (int64 us), x, y, p, size = (width, height); frames and frame_times beside
 them where there are any. `wh` is read as another name of `size`. Pickles are never loaded.
 
-Members are checked against the bytes that the archive really holds before memory is taken.
+Members are checked against the bytes that the archive really holds before memory is taken, and
+columns are decompressed side by side, block by block.
 """
 
 from __future__ import annotations
@@ -14,10 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from evflow.checks import COLUMNS, Size, check_columns
 from evflow.errors import EvflowDataError
-from evflow.io.archives import DAMAGE, load_npz
+from evflow.io import tables
+from evflow.io.archives import DAMAGE, Member, members
 from evflow.io.arrays import GrowingArray
+from evflow.io.frames import cut
 from evflow.io.hints import Hints
+from evflow.io.stream import gather
 from evflow.io.writer import EventWriter
 from evflow.types import Events, Recording
 
@@ -36,25 +41,50 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV008 (a column is missing), EV009 (damaged), and what `Events` raises."""
-    arrays = load_npz(path)
-    missing = [name for name in ("t", "x", "y", "p") if name not in arrays]
-    if missing:
-        raise EvflowDataError(
-            "EV008", f"{path} holds {sorted(arrays)} but not {missing}.",
-            "Expected the keys t, x, y, p, size, and optionally frames, frame_times.")
-    stored = arrays.get("size", arrays.get("wh"))
-    x, y = arrays["x"], arrays["y"]
-    reach = (int(x.max()), int(y.max())) if x.dtype.kind in "iu" and x.size and y.size else None
-    size = hints.sensor(None if stored is None else tuple(stored.ravel().tolist()), reach=reach)
-    events = hints.events(
-        x, y, hints.microseconds(arrays["t"], "us"), hints.on(arrays["p"]), size)
-    if "frames" not in arrays:
-        return hints.crop(Recording.of_events(events))
-    if "frame_times" not in arrays:
-        raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
-    times = hints.microseconds(arrays["frame_times"], "us")
-    return hints.crop(Recording(events, arrays["frames"], times))
+    """Events are read to the end also where stop_s comes before it: checksums are compared there.
+
+    Raises EV002 (shapes), EV008 (a column is missing), EV009 (damaged), and what `stream.gather`
+    and `Recording` raise.
+    """
+    with members(path) as found:
+        missing = [name for name in ("t", "x", "y", "p") if name not in found]
+        if missing:
+            raise EvflowDataError(
+                "EV008", f"{path} holds {sorted(found)} but not {missing}.",
+                "Expected the keys t, x, y, p, size, and optionally frames, frame_times.")
+        stored = found.get("size", found.get("wh"))
+        size: Any = None if stored is None else tuple(stored.whole().ravel().tolist())
+        events, span = _events(path, [found[name] for name in COLUMNS], hints, size)
+        if "frames" not in found:
+            return Recording.of_events(events)
+        if "frame_times" not in found:
+            raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
+        times = hints.microseconds(found["frame_times"].whole(), "us")
+        return cut(Recording(events, found["frames"].spooled(), times), span)
+
+
+def _events(
+    path: Path, columns: list[Member], hints: Hints, size: Size | None
+) -> tuple[Events, tuple[int, int]]:
+    """What `gather` makes of the columns; damage is told before what it makes of them."""
+    check_columns(*(np.broadcast_to(np.int8(0), column.shape) for column in columns))
+
+    def rows(part: slice) -> Any:
+        return tuple(column.take(part.stop - part.start) for column in columns)
+
+    chunks = tables.blocks(columns[0].shape[0], rows)
+    try:
+        gathered = gather(path, chunks, hints, None if size is None else hints.sensor(size))
+    except EvflowDataError:
+        _finish(columns)
+        raise
+    _finish(columns)
+    return gathered
+
+
+def _finish(columns: list[Member]) -> None:
+    for column in columns:
+        column.finish()
 
 
 class NpzWriter(EventWriter):

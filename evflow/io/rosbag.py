@@ -21,7 +21,8 @@ import numpy as np
 
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
-from evflow.io import evt3, stream, tables
+from evflow.io import evt3, stream
+from evflow.io.frames import FrameStack
 from evflow.io.hints import Hints
 from evflow.io.limits import RATIO, check_expansion
 from evflow.io.messages import EVENT_TYPES, IMAGE, Message, Packet
@@ -215,7 +216,7 @@ class _Bag:
     def with_images(
         self, topic: str, events: Any, span: tuple[int, int], hints: Hints, notes: tuple[str, ...]
     ) -> Recording:
-        times, images = [], []
+        times, images = [], FrameStack(self.path)
         try:
             for message in self.messages(topic):
                 stamp = hints.instant(message.stamp_ns(), "ns")
@@ -224,8 +225,8 @@ class _Bag:
                     images.append(message.image())
         except Damage as e:
             raise self._wrong(topic, e) from e
-        return tables.with_frames(
-            self.path, events, span, np.array(times, np.int64), lambda keep: images[keep],
+        return images.beside(
+            events, np.array(times, np.int64),
             (*notes, f"frame times are the header times of {topic}"))
 
 

@@ -3,6 +3,7 @@ stack, or a recording with frames."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,9 +19,10 @@ from evflow.io.stacks import is_stack, open_stack
 def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
     """The frames of anything, in bounded memory (a recording's are read whole).
 
-    hints: fps, timestamps, time_unit, colour, full_scale, partial (see `FrameHints`).
-    Raises EV016 (not there), EV008 (nothing that has frames), EV011 (a recording without
-    frames), EV020 (unknown hint; no times), and what the readers raise.
+    hints: those of `FrameHints`.
+    Raises EV001 (none between start_s and stop_s), EV008 (nothing that has frames), EV011 (a
+    recording without frames), EV016 (not there), EV020 (unknown hint; no times), and what the
+    readers raise.
     """
     told, path = FrameHints.parse(hints), existing(path)
     with naming(path):
@@ -66,12 +68,13 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
         raise EvflowDataError(
             "EV020", f"{path} is a recording, whose frames have their own times.",
             "Leave out --fps and --timestamps, or pass its images alone.")
-    recording = read_recording(path, time_unit=told.time_unit)
+    recording = read_recording(path, time_unit=told.time_unit, partial=told.partial,
+                               start_s=told.start_s, stop_s=told.stop_s)
     if not recording.has_frames:
         raise EvflowDataError("EV011", f"{path} has events but no frames.",
                               "Simulate a recording with frames, or a video.")
     white = told.full_scale or recording.full_scale
-    told = FrameHints(colour=told.colour, full_scale=white)
+    told = dataclasses.replace(told, full_scale=white, start_s=None, stop_s=None)
 
     def images() -> Iterator[Image]:
         for i, t in enumerate(recording.frame_times.tolist()):
@@ -81,9 +84,29 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
                    list(recording.notes))
 
 
+def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:
+    """The images from start_s to stop_s after the first; EV001 where there is none."""
+    start, stop = (None if s is None else 1e6 * s for s in (told.start_s, told.stop_s))
+    first = last = None
+    count = 0
+    for image in images:
+        last = image.time_us
+        first = last if first is None else first
+        if stop is not None and last - first >= stop:
+            break
+        if start is None or last - first >= start:
+            count += 1
+            yield image
+    if not count and first is not None and last is not None:
+        raise EvflowDataError(
+            "EV001", f"no frame between {told.start_s or 0:g} s and "
+            f"{'the end' if told.stop_s is None else f'{told.stop_s:g} s'} from the first.",
+            f"The frames read cover 0 to {(last - first) / 1e6:.3f} s.")
+
+
 def _source(size: tuple[int, int], count: int, images: Any, told: FrameHints,
             notes: list[str]) -> FrameSource:
     def frames() -> Frames:
-        return converted(images(), told, notes)
+        return converted(_between(images(), told), told, notes)
 
     return FrameSource(size, count, frames, notes)

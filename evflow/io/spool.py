@@ -16,27 +16,41 @@ import numpy as np
 from evflow.errors import EvflowDataError
 
 LIMIT = 1 << 29  # bytes of a column in memory: 67 million int64 times
+JOINED = 1 << 25  # bytes of parts; malloc gives smaller arrays memory that is warm
 
 
 class Spool:
-    """Parts (n,) of one dtype, joined by `array`."""
+    """Parts (n,) of one dtype, joined by `array`. Memory: the rows below the limit, an eighth of
+    them that is not filled, and `JOINED` bytes of parts."""
 
     def __init__(self, dtype: Any, limit: int | None = None) -> None:
         self.dtype, self.rows = np.dtype(dtype), 0
         self.limit = LIMIT if limit is None else limit
-        self._parts: list[np.ndarray] = []
+        self._memory, self._filled = np.empty(0, self.dtype), 0
+        self._parts: list[np.ndarray] = []  # rows behind those of _memory or _file
         self._file: IO[bytes] | None = None
 
     def append(self, part: np.ndarray) -> None:
-        """Add a part, which is kept as it is while all fits into memory; EV019 where the disk
-        is full."""
-        part = part.astype(self.dtype, copy=False)
+        """Add a part, cast to the dtype, copied if it is a view; EV019 where the disk is full."""
+        self._parts.append(part.astype(self.dtype, copy=part.base is not None))
         self.rows += len(part)
-        self._parts.append(part)
         if self._file is None and self.rows * self.dtype.itemsize > self.limit:
             self._file = tempfile.TemporaryFile(prefix="evflow-")  # noqa: SIM115 (mapped later)
+            self._parts.insert(0, self._memory[: self._filled])
+            self._memory = np.empty(0, self.dtype)
         if self._file is not None:
             self._write(self._file)
+        elif (self.rows - self._filled) * self.dtype.itemsize > JOINED:
+            self._join()
+
+    def _join(self) -> None:
+        """Move the parts behind the rows in memory, which grow by realloc: it moves large arrays
+        without a copy, so that nothing is there twice."""
+        if self.rows > len(self._memory):
+            self._memory.resize(max(self.rows, len(self._memory) * 9 // 8), refcheck=False)
+        parts, self._parts = self._parts, []
+        np.concatenate(parts, out=self._memory[self._filled : self.rows])
+        self._filled = self.rows
 
     def _write(self, file: IO[bytes]) -> None:
         parts, self._parts = self._parts, []
@@ -55,8 +69,14 @@ class Spool:
 
     def array(self) -> np.ndarray:
         """All rows: one array in memory, or a map of the file. The spool is empty afterwards."""
-        parts, self._parts = self._parts, []
         if self._file is not None:
             with self._file as file:  # the map outlives it
                 return np.memmap(file, self.dtype, "r+", shape=(self.rows,))
-        return np.concatenate(parts) if parts else np.zeros(0, self.dtype)
+        if self._parts and not self._filled:
+            parts, self._parts = self._parts, []
+            return np.concatenate(parts)
+        if self._parts:
+            self._join()
+        memory, self._memory = self._memory, np.empty(0, self.dtype)
+        memory.resize(self.rows, refcheck=False)
+        return memory

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.archives import DAMAGE, is_zip, load_member, npy_header, unzipped
+from evflow.io.archives import BLOCK, DAMAGE, Member, is_zip, npy_header, unzipped
 from evflow.io.frames import FrameHints, Image
 from evflow.io.limits import check_expansion
 from evflow.io.times import read_times, to_us
@@ -81,6 +81,8 @@ class Stack:
                     data = f.read(count * self.dtype.itemsize)
                     yield np.frombuffer(data, self.dtype, count).reshape(self.shape[1:])
                     done += 1
+                while f.read(BLOCK):  # a damaged header may claim less: the checksum is at the end
+                    pass
         except Exception as e:  # zip, zlib, lzma, ValueError: half a dozen kinds
             if not (partial and done):
                 raise cut_off(self.path, done, self.shape[0], str(e)) from e
@@ -137,7 +139,7 @@ def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
         clock = next((name for name in TIMES if name in names), None)
         times = None
         if clock is not None:
-            times = load_member(archive, archive.getinfo(clock + ".npy"))
+            times = Member(archive, archive.getinfo(clock + ".npy")).whole()
     if fortran and len(shape) > 1:
         raise EvflowDataError(
             "EV009", f"{path} holds {member} in Fortran order, whose frames are not together.",

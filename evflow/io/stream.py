@@ -3,9 +3,8 @@
 A decoder yields `Chunk`s and raises `Damage` where the bytes stop making sense; `gather` makes
 `Events` of them. It keeps what lies between start_s and stop_s alone, reads no further than
 stop_s, and names the place of the first event that cannot be right; damage behind stop_s does not
-matter. Memory: the columns kept, 13 bytes per event, one of them twice while it is joined, or
-what `spool` keeps of them, and the temporaries of one chunk. A file of F bytes holds F/4 events at
-most, of EVT3 6 F.
+matter. Memory: the temporaries of a chunk, and of the columns kept, 13 bytes per event, what
+`spool` keeps there.
 """
 
 from __future__ import annotations
@@ -126,15 +125,17 @@ def collect(
 
 
 def gather(
-    path: Path, chunks: Iterable[Chunk], hints: Hints, size: Size | None, native: str = "us"
+    path: Path, chunks: Iterable[Chunk], hints: Hints, size: Size | None, native: str = "us",
+    offset_us: int = 0,
 ) -> tuple[Events, tuple[int, int]]:
     """The events that `hints` ask for, and the range [start, stop) in us that they ask for.
 
     size: what the file says of its sensor, None where it says nothing. native: unit of t.
+    offset_us: added to t.
     Raises EV001 (no event in the range), EV003 and EV007 (not whole), EV004 (order), EV005
     (outside the sensor), EV006 (polarity), EV009 (damage), EV015 (size unknown).
     """
-    gathered = _Gathered(path, hints, hints.size or size, native)
+    gathered = _Gathered(path, hints, hints.size or size, native, offset_us)
     try:
         for chunk in chunks:
             if len(chunk.t) and gathered.add(chunk):
@@ -151,8 +152,11 @@ def gather(
 class _Gathered:
     """The events kept so far. first, last: times of all events seen, in us."""
 
-    def __init__(self, path: Path, hints: Hints, size: Size | None, native: str) -> None:
-        self.path, self.hints, self.size, self.native = path, hints, size, native
+    def __init__(
+        self, path: Path, hints: Hints, size: Size | None, native: str, offset: int
+    ) -> None:
+        self.path, self.hints, self.size = path, hints, size
+        self.native, self.offset = native, offset
         self.columns = {name: Spool(KINDS[name]) for name in COLUMNS}
         self.signs: set[int] = set()  # values of p kept, where they are not bool
         self.seen = self.kept = self.first = self.last = self.outside = 0
@@ -163,7 +167,7 @@ class _Gathered:
         """Take what lies in the range; True where the rest of the file lies behind it."""
         if chunk.t.dtype.kind == "f" and not (told := np.abs(chunk.t) < 2.0**63).all():
             raise self._odd(chunk, "t", int(np.argmin(told)))
-        t = self.hints.microseconds(chunk.t, self.native)
+        t = self.hints.microseconds(chunk.t, self.native, self.offset)
         if not self.seen:
             self.first = self.last = int(t[0])
             self.start, self.stop = self.hints.span_us(self.first)
@@ -227,7 +231,7 @@ class _Gathered:
         if back.any():
             first = min(first, int(np.argmax(back)) + 1)
         for a, limit in zip((chunk.x, chunk.y), self.size or (1 << 16, 1 << 16), strict=True):
-            if a.max() >= limit or a.min() < 0:
+            if a.max() >= limit or (a.dtype.kind != "u" and a.min() < 0):
                 first = min(first, int(np.argmax((a >= limit) | (a < 0))))
         return first
 
@@ -265,9 +269,7 @@ class _Gathered:
             if chunk.p.dtype != bool:
                 self.signs.update(v for v in (-1, 0, 1) if (chunk.p[a:b] == v).any())
             for name, column in zip(COLUMNS, (chunk.x, chunk.y, t, chunk.p > 0), strict=True):
-                # copied where it is a part or a view, which would keep the whole chunk alive
-                own = column.base is None and b - a == len(column)
-                self.columns[name].append(column[a:b].astype(KINDS[name], copy=not own))
+                self.columns[name].append(column[a:b])
 
     def so_far(self) -> str:
         span = (self.last - self.first) // 1000 / 1000

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from evflow.checks import Size, check_times
 from evflow.errors import EvflowDataError
-from evflow.io.frames import stack_frames
+from evflow.io.frames import FrameStack
 from evflow.io.hdf5 import DAMAGE, MAGIC, MAX_RATIO, load_h5py, need_filters, plausible
 from evflow.io.stream import Chunk
 from evflow.types import Events, Recording
@@ -75,13 +75,19 @@ def blocks(
     n: int,
     rows: Callable[[slice], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
     stored: int = 1,
+    begin: int = 0,
 ) -> Iterator[Chunk]:
-    """Chunks of n events; rows(slice) gives their x, y, t, p. stored: rows of a block of HDF5,
-    which is decoded as a whole: whole ones are read, each once."""
-    step = max(ROWS // stored, 1) * stored
-    for first in range(0, n, step):
-        yield Chunk(*rows(slice(first, min(first + step, n))),
-                    lambda i, first=first: first + i, "event")  # type: ignore[misc]
+    """Chunks of the events begin to n; rows(slice) gives their x, y, t, p. stored: rows of a block
+    of HDF5, which is decoded as a whole: whole ones are read, each once."""
+    for part in aligned(begin, n, max(ROWS // stored, 1) * stored):
+        yield Chunk(*rows(part), lambda i, first=part.start: first + i,  # type: ignore[misc]
+                    "event")
+
+
+def aligned(begin: int, end: int, step: int) -> Iterator[slice]:
+    """Slices that cover [begin, end) and meet at multiples of step."""
+    for first in range(begin - begin % step, end, step):
+        yield slice(max(first, begin), min(first + step, end))
 
 
 def stored_rows(data: Any) -> int:
@@ -103,16 +109,23 @@ def with_frames(
     events: Events,
     span: tuple[int, int],
     times: np.ndarray,
-    images: Callable[[slice], Sequence[np.ndarray] | np.ndarray],
+    images: Callable[[slice], Iterable[np.ndarray]],
     notes: tuple[str, ...],
 ) -> Recording:
     """The recording with those frames whose times (T,) int64 us lie in [start, stop)."""
     times = check_times(times, f"{path}: frame times", strict=True)
     keep = slice(*(int(i) for i in np.searchsorted(times, np.array(span))))
-    if keep.start >= keep.stop:
-        return Recording.of_events(events, notes)
-    frames, more = stack_frames(list(images(keep)), path)
-    return Recording(events, frames, times[keep], (*notes, *more))
+    stack = FrameStack(path)
+    if keep.start < keep.stop:
+        for image in images(keep):
+            stack.append(image)
+    return stack.beside(events, times[keep], notes)
+
+
+def stored_frames(data: Any, keep: slice) -> Iterator[np.ndarray]:
+    """Frames of an HDF5 data set one by one, each stored block decoded once."""
+    for part in aligned(keep.start, keep.stop, stored_rows(data)):
+        yield from data[part]
 
 
 def frame_size(data: Any) -> Size | None:

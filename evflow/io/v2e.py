@@ -43,4 +43,4 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events)
         times = tables.dataset(path, f, "frame_ts", (len(frames),))[:]
         return tables.with_frames(path, events, span, hints.microseconds(times, "us"),
-                                  lambda keep: frames[keep], ())
+                                  lambda keep: tables.stored_frames(frames, keep), ())

@@ -57,6 +57,7 @@ def histogram(values: np.ndarray, summary: float, colour: Any, unit: str) -> byt
         if np.isfinite(summary) and low <= summary <= high:
             axis.axvline(summary, color=INK, lw=1.2, ls=(0, (2, 2)))
         axis.set_xlabel(unit)
+        axis.locator_params(axis="x", nbins=5)
         axis.set_yticks([])
         axis.spines["left"].set_visible(False)
 
@@ -84,6 +85,7 @@ def on_against_off(on: np.ndarray, off: np.ndarray, symbol: str, unit: str) -> b
         ends = [min(s[0] for s in spans), max(s[1] for s in spans)]
         axis.plot(ends, ends, color="#5d6673", lw=0.8, ls=(0, (4, 3)))
         axis.plot(np.median(on), np.median(off), "+", color=ON_COLOUR, ms=11, mew=1.8)
+        axis.locator_params(nbins=5)  # of four digits: noise rates differ in the third
         axis.set(xlim=spans[0], ylim=spans[1], xlabel=f"{symbol} ON [{unit}]",
                  ylabel=f"{symbol} OFF [{unit}]")
 

@@ -1,0 +1,69 @@
+"""Times that are a thousand times too long or too short: found where something tells for certain,
+and nowhere else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evflow import Events, Recording, check
+
+SIZE = (64, 48)
+MS = 1000
+
+
+def watched(count: int, span_us: int, *, step_us: int = 1) -> Recording:
+    """A texture that moves fast beneath frames every 40 ms, and `count` events at random, at
+    multiples of step_us."""
+    rng = np.random.default_rng(count)
+    times = 20 * MS + 40 * MS * np.arange(13)
+    texture = rng.integers(30, 230, (48, 200)).astype(np.uint8)
+    frames = np.stack([texture[:, 5 * i : 5 * i + 64] for i in range(len(times))])
+    t = step_us * np.sort(rng.integers(0, span_us // step_us, count))
+    events = Events(rng.integers(0, 64, count), rng.integers(0, 48, count), t,
+                    rng.integers(0, 2, count), SIZE)
+    return Recording(events, frames, times)
+
+
+def findings(recording: Recording) -> list[tuple[str, str]]:
+    """Severity and words of what is said of the unit."""
+    return [(f.severity, str(f)) for f in check(recording).findings if f.code == "EV023"]
+
+
+@pytest.mark.parametrize("power", [3, 6])
+def test_frames_tell_of_times_too_long(power: int) -> None:
+    ((severity, words),) = findings(watched(20_000, 500 * MS * 10**power))
+    assert severity == "error"
+    assert ("ms where they were read in s" if power == 3 else "us read as s") in words
+
+
+def test_frames_tell_of_a_short_cut_of_times_too_long() -> None:
+    """The cut hides how long all events take, not that they are too few for the frames."""
+    ((severity, words),) = findings(watched(60, 540 * MS))
+    assert severity == "warning"
+    assert "but 5" in words
+    assert "--time-unit ns" in words
+    assert not findings(watched(20_000, 540 * MS))
+    still = watched(60, 540 * MS)
+    assert not findings(Recording(still.events, still.frames[:1].repeat(13, 0), still.frame_times))
+
+
+def test_without_frames_few_events_on_ticks_are_doubted() -> None:
+    def bare(*args: int, **kwargs: int) -> Recording:
+        return Recording.of_events(watched(*args, **kwargs).events)
+
+    ((severity, words),) = findings(bare(20_000, 500_000 * MS, step_us=1000))
+    assert severity == "warning"
+    assert "steps of 1 ms of a simulator" in words
+    assert not findings(bare(20_000, 500_000 * MS))  # few, but not on ticks
+    assert not findings(bare(20_000, 5_000 * MS, step_us=1000))  # on ticks, but a usual rate
+
+
+def test_more_events_than_a_link_carries() -> None:
+    """In a flash every pixel may fire a few times at once; none goes on like that."""
+    pixels = SIZE[0] * SIZE[1]
+    flash = watched(4 * pixels, 2 * MS)
+    assert not findings(Recording.of_events(flash.events))
+    ((severity, words),) = findings(Recording.of_events(watched(30 * pixels, 12 * MS).events))
+    assert severity == "error"
+    assert "--time-unit ms" in words
