@@ -4,7 +4,9 @@ way to stop."""
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -26,7 +28,8 @@ def bar(title: str) -> Iterator[Callable[[int, int], None]]:
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
     """SIGTERM, as schedulers send it, ends the block as Ctrl-C does: through every `finally`, so
-    that nothing half-written is left."""
+    that nothing half-written is left. A signal that comes while Python collects garbage, where
+    exceptions are ignored, comes again."""
     if threading.current_thread() is not threading.main_thread():
         yield  # handlers belong to the main thread
         return
@@ -34,8 +37,20 @@ def stoppable() -> Iterator[None]:
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, stop)
+    def ignored(lost: Any) -> None:
+        if isinstance(lost.exc_value, KeyboardInterrupt):
+            again.append(threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)))
+            again[-1].start()
+        else:
+            hook(lost)
+
+    again: list[threading.Timer] = []
+    before, hook = signal.signal(signal.SIGTERM, stop), sys.unraisablehook
+    sys.unraisablehook = ignored
     try:
         yield
     finally:
+        for timer in again:
+            timer.cancel()
+        sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)

@@ -230,7 +230,7 @@ def _warnings(
     ):
         if mask.any():
             y, x = np.argwhere(mask)[0]
-            found.append(f"{mask.sum()} {name} pixels, the first at x={x}, y={y}: {what}")
+            found.append(f"{name} pixels ({mask.sum()}, the first at x={x}, y={y}): {what}")
     low, high = PRESETS["default"].prior.theta
     for name, events in (("on", stats.events_on), ("off", stats.events_off)):
         theta = float(getattr(summary, f"theta_{name}"))
