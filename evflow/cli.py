@@ -17,7 +17,9 @@ from evflow.commands.compare import Compare
 from evflow.commands.convert import Convert
 from evflow.commands.estimate import Estimate
 from evflow.commands.export import Export
+from evflow.commands.flow import Flow
 from evflow.commands.info import Info
+from evflow.commands.reconstruct import Reconstruct
 from evflow.commands.render import Render
 from evflow.commands.simulate import Simulate
 from evflow.commands.source_tree import forwarded
@@ -35,6 +37,8 @@ Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these ann
     Annotated[Estimate, tyro.conf.subcommand("estimate")],
     Annotated[Compare, tyro.conf.subcommand("compare")],
     Annotated[Render, tyro.conf.subcommand("render")],
+    Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")],
+    Annotated[Flow, tyro.conf.subcommand("flow")],
     Annotated[Simulate, tyro.conf.subcommand("simulate")],
     Annotated[Convert, tyro.conf.subcommand("convert")],
     Annotated[Voxel, tyro.conf.subcommand("voxel")],

@@ -11,9 +11,7 @@ Ctrl-C (or SIGTERM) saves a checkpoint and stops; the same command goes on, bit 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import time
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,18 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from evflow.baselines.eventgan import GANS, GanConfig, GanState, generate, init_state, run_step
-from evflow.checkpoint import Checkpoints
+from evflow.baselines.eventgan import GANS, GanConfig, generate, init_state, run_step
 from evflow.config import as_dict
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
 from evflow.intensity import lin_log_inverse
 from evflow.progress import bar
-from evflow.scenes import TextureBank, make_bank
+from evflow.scenes import make_bank
 from evflow.weights import save_weights
 from experiments import generate as inverse
 from experiments.common import provenance, write_result
-from experiments.train import goes_on, lines_until, stop_requests
+from experiments.loop import train
 
 HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
 COLUMNS = ("on", "off", "empty", "correlation", "two simulations", "relative")
@@ -64,12 +60,8 @@ def main(options: Options) -> dict[str, Any]:
     config = dataclasses.replace(GANS[options.preset], seed=options.seed)
     if options.steps is not None:
         config = dataclasses.replace(config, steps=options.steps)
-    state = init_state(config)
-    with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
-        if goes_on(checkpoints, config, options) and checkpoints.latest is not None:
-            state = checkpoints.restore(state)
-        bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.data.textures)
-        state = run(state, bank, config, options, checkpoints, requests)
+    bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.data.textures)
+    state = train(lambda state: run_step(state, bank, config), init_state(config), config, options)
     params = state.params["generator"]
     result = measure(params, config, options.scenes) | {"steps": int(state.step)}
     card = {"preset": options.preset, "steps": int(state.step), "seed": config.seed,
@@ -80,31 +72,6 @@ def main(options: Options) -> dict[str, Any]:
     print(text)
     (options.out / "eventgan.md").write_text(text + "\n")
     return result
-
-
-def run(
-    state: GanState, bank: TextureBank, config: GanConfig, options: Options,
-    checkpoints: Checkpoints, requests: list[int],
-) -> GanState:
-    """Steps until the end, the time limit or a signal; the last step is saved."""
-    started, step = time.monotonic(), int(state.step)
-    path = options.out / "metrics.jsonl"
-    kept = "".join(f"{line}\n" for line in lines_until(path, step))
-    with atomic_write(path, overwrite=True) as temporary:
-        temporary.write_text(kept)
-    with bar("training") as progress, path.open("a", buffering=1) as log:
-        while (step < config.steps and not requests
-               and time.monotonic() - started < options.max_seconds):
-            state, metrics = run_step(state, bank, config)
-            step += 1
-            values = {k: float(v) for k, v in jax.device_get(metrics).items()}
-            seconds = time.monotonic() - started
-            log.write(json.dumps({"step": step, "time": seconds, **values}) + "\n")
-            progress(step, config.steps)
-            if step % options.save_every == 0:
-                checkpoints.save(step, state)
-    checkpoints.save(step, state)
-    return state
 
 
 def measure(params: dict[str, Any], config: GanConfig, scenes: int) -> dict[str, Any]:

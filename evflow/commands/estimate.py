@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from evflow.commands.options import Reading, check_finite, write_json
+from evflow.commands.options import Reading, check_finite, own_first, refuse, write_json
+from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ FILES = ("camera.npz", "camera.json", "maps.png", "histograms.png", "report.html
 SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate warns of these itself
 
 
+@own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Estimate(Reading):
     """Measure a camera: per-pixel thresholds and noise rates, from events and frames.
@@ -31,18 +33,23 @@ class Estimate(Reading):
     Example: evflow estimate screen.aedat4 -o bench/ --protocol step
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """A recording with frames; of a static scene without frames the noise alone is measured."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for camera.npz, camera.json, the pictures and report.html."""
     protocol: Literal["motion", "step", "static"] = "motion"
-    """How it was recorded: motion of any kind; step, a screen that fills the view and steps
-    between levels of light (thresholds are the change per event); static, a scene at rest, all of
+    """How it was recorded. motion: of any kind; step: a screen that fills the view and steps
+    between levels of light (thresholds are the change per event); static: a scene at rest, all of
     whose events are noise."""
     weights: str = "default"
     """Name of released weights, or a .safetensors path."""
     window_ms: float = 40.0
     """Shortest window; windows run from frame to frame."""
+    reconstruct: bool = False
+    """For a recording without frames: make them from the events (see evflow reconstruct). Their
+    contrast is a network's guess, and the thresholds are no better than that."""
+    reconstruct_weights: str = "e2vid-small"
+    """Of that network: a released name, a .safetensors path, or a published checkpoint."""
     plots: bool = True
     """Write maps and histograms as PNG (needs matplotlib)."""
     report: bool = True
@@ -51,6 +58,7 @@ class Estimate(Reading):
     checks: bool = True
     """Stop where `evflow check` finds errors."""
     overwrite: bool = False
+    """Replace those files where they exist."""
     json: bool = False
     """Print the summary as JSON."""
 
@@ -61,14 +69,18 @@ class Estimate(Reading):
 
         check_finite(self)
         moving = self.protocol == "motion"
-        if not moving and (self.weights != "default" or self.window_ms != 40.0):
-            raise EvflowDataError("EV020", f"--weights and --window-ms with --protocol "
-                                  f"{self.protocol}.", "They belong to protocol motion.")
+        need_folder(self.out)
+        if not moving:
+            refuse(self, ("weights", "window_ms", "reconstruct"),
+                   "of use with --protocol motion only")
+        if not self.reconstruct:
+            refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
         if self.plots or (self.report and moving):
             plots.require()
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording = self.read(self.recording)
             doubts = self._checked(recording)
+            recording = self._reconstructed(recording) if self.reconstruct else recording
             found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
             found = dataclasses.replace(found, warnings=(*doubts, *found.warnings))
             found.save(out / "camera.npz")
@@ -95,17 +107,33 @@ class Estimate(Reading):
             print(f"warning: {doubt}", file=sys.stderr)
         return doubts
 
+    def _reconstructed(self, recording: Recording) -> Recording:
+        """The recording with frames made from its events; EV020 where it has frames."""
+        from evflow.downstream.video import with_reconstructed_frames
+        from evflow.progress import bar
+
+        if recording.has_frames:
+            raise EvflowDataError("EV020", f"--reconstruct, but {self.recording} has frames.",
+                                  "Leave it out: they measure what a network would guess.")
+        with bar("reconstructing") as progress:
+            return with_reconstructed_frames(
+                recording, self.reconstruct_weights, progress=progress)
+
     def _estimated(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
         from evflow.progress import bar
         from evflow.recording import estimate_camera
-        from evflow.weights import load_weights, model_card
+        from evflow.weights import load_weights, model_card, trained_steps
 
         params = load_weights(self.weights)
         with bar("estimating") as progress:
             found = estimate_camera(
                 recording, params, min_window_us=round(self.window_ms * 1000), progress=progress)
+        if self.reconstruct:
+            from evflow.downstream.video import doubted
+
+            found = doubted(found)
         return found, {"weights": self.weights,
-                       "weights_steps": model_card(self.weights).get("steps")}
+                       "weights_steps": trained_steps(model_card(self.weights))}
 
     def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
         from evflow.baselines.calibration import calibrate_step

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from evflow.camera import Camera, CameraPrior, sample_nominal, sample_pixels
 from evflow.dataset.motion import optical_flow
+from evflow.downstream.prior import WidePrior
 from evflow.downstream.tensor import BINS, signed
 from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
@@ -44,7 +45,7 @@ class SequenceConfig:
     crop: int = 48
     window_s: float = 0.03
     bins: int = BINS
-    prior: CameraPrior = CameraPrior()
+    prior: CameraPrior | WidePrior = CameraPrior()
     model: SensorModel = SensorModel(eta_intensity=True)
     scene: SceneConfig = SceneConfig(contrast=(0.3, 1.0), static_fraction=0.0)
     pause: float = 0.05
@@ -87,7 +88,8 @@ class Sequences:
 def sample_sequences(
     key: Array, bank: TextureBank, config: SequenceConfig, camera: Camera | None = None
 ) -> Sequences:
-    """A batch. camera: maps of at least crop x crop pixels; None draws cameras from the prior."""
+    """A batch. camera: maps (H, W) of at least crop x crop pixels, or those of K cameras
+    (K, H, W), of which each sequence has one; None draws cameras from the prior."""
     if camera is not None and min(camera.shape[-2:]) < config.crop:
         raise EvflowDataError("EV015", f"the camera has {camera.shape} pixels, the crop "
                               f"{config.crop}.", "Choose a smaller crop.")
@@ -104,12 +106,8 @@ def _sequence(
     scene = sample_scene(k_scene, bank, config.scene, shape)
     clock = scene_clock(k_pause, config)
     frames = render(scene, clock, shape)
-    if camera is None:
-        light = noise_factor(jnp.mean(normalised_intensity(frames[0])))
-        nominal = sample_nominal(k_camera, (), config.prior, light)
-        seen = sample_pixels(k_camera, nominal, shape, config.prior.eta_spread)
-    else:
-        seen = _crop(k_camera, camera, shape)
+    seen = (_draw(k_camera, config.prior, frames[0]) if camera is None
+            else _crop(k_camera, camera, shape))
     tensors = add_noise(k_noise, _simulate(k_sim, frames, seen, config), config)
     edges = clock[::config.steps_per_window]
     flow, back, visible = _flows(scene, edges, shape)
@@ -131,13 +129,26 @@ def scene_clock(key: Array, config: SequenceConfig) -> Array:
     return steps.astype(jnp.float32) * (config.window_s / config.steps_per_window)
 
 
+def _draw(key: Array, prior: CameraPrior | WidePrior, frame: Array) -> Camera:
+    """A camera of the prior that looks at the frame (H, W), by whose light its noise may go."""
+    height, width = frame.shape
+    if isinstance(prior, WidePrior):
+        return prior.sample(key, (height, width))
+    light = noise_factor(jnp.mean(normalised_intensity(frame)))
+    nominal = sample_nominal(key, (), prior, light)
+    return sample_pixels(key, nominal, (height, width), prior.eta_spread)
+
+
 def _crop(key: Array, camera: Camera, shape: tuple[int, int]) -> Camera:
-    """A random part of a camera's maps."""
+    """A random part of a camera's maps, or of one of several cameras'."""
     k_row, k_column = jax.random.split(key)
-    rows, columns = camera.shape[-2:]
-    start = (jax.random.randint(k_row, (), 0, rows - shape[0] + 1),
-             jax.random.randint(k_column, (), 0, columns - shape[1] + 1))
-    return jax.tree.map(lambda m: jax.lax.dynamic_slice(m, start, shape), camera)
+    *several, rows, columns = camera.shape
+    start = [jax.random.randint(k_row, (), 0, rows - shape[0] + 1),
+             jax.random.randint(k_column, (), 0, columns - shape[1] + 1)]
+    if several:
+        start.insert(0, jax.random.randint(jax.random.fold_in(key, 2), (), 0, several[0]))
+    size = (*(1 for _ in several), *shape)
+    return jax.tree.map(lambda m: jax.lax.dynamic_slice(m, start, size).reshape(shape), camera)
 
 
 def _simulate(key: Array, frames: Array, camera: Camera, config: SequenceConfig) -> Array:

@@ -8,6 +8,7 @@ and FireNet+ (S2R) raw, which keeps the scale of the camera's thresholds in it.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +72,33 @@ def _step(
     return network.apply(params, normalise(tensor) if normalised else tensor, state)
 
 
+def reconstructions(
+    network: Network, params: Params, events: Events, frame_times_us: np.ndarray, *,
+    normalised: bool = False,
+) -> Iterator[np.ndarray]:
+    """What `reconstruct` stacks, one at a time: images (H, W), or flow (2, H, W).
+
+    Raises, before the first, what `reconstruct` raises.
+    """
+    times = np.asarray(frame_times_us, np.int64)
+    if not times.size:
+        raise EvflowDataError("EV001", "frame_times_us is empty.")
+    if np.any(np.diff(times) < 0):
+        raise EvflowDataError("EV004", "frame_times_us falls.", "Pass them in order.")
+
+    def images() -> Iterator[np.ndarray]:
+        width, height = events.size
+        state = network.start((height, width))
+        for window in windows_between(events.t, times):
+            part = Events.unchecked(events.x[window], events.y[window], events.t[window],
+                                    events.p[window], events.size)
+            tensor = event_tensor(part, network.bins)
+            image, state = _step(network, params, tensor, state, normalised)
+            yield np.asarray(image)
+
+    return images()
+
+
 def reconstruct(
     network: Network, params: Params, events: Events, frame_times_us: np.ndarray, *,
     normalised: bool = False,
@@ -81,16 +109,5 @@ def reconstruct(
     normalised: True for E2VID and FireNet, False for E2VID+, FireNet+ and EV-FlowNet.
     Raises EV001 without frame times, EV004 where they fall.
     """
-    times = np.asarray(frame_times_us, np.int64)
-    if not times.size:
-        raise EvflowDataError("EV001", "frame_times_us is empty.")
-    if np.any(np.diff(times) < 0):
-        raise EvflowDataError("EV004", "frame_times_us falls.", "Pass them in order.")
-    width, height = events.size
-    state, images = network.start((height, width)), []
-    for window in windows_between(events.t, times):
-        part = Events.unchecked(events.x[window], events.y[window], events.t[window],
-                                events.p[window], events.size)
-        image, state = _step(network, params, event_tensor(part, network.bins), state, normalised)
-        images.append(np.asarray(image))
-    return np.stack(images)
+    return np.stack(list(reconstructions(
+        network, params, events, frame_times_us, normalised=normalised)))

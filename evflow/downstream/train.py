@@ -86,12 +86,14 @@ def init_state(
 
 
 def make_step(
-    network: Network, config: LearningConfig, tx: optax.GradientTransformation
+    network: Network, config: LearningConfig, tx: optax.GradientTransformation,
+    sample: Callable[..., Sequences] = sample_sequences,
 ) -> Callable[..., tuple[LearningState, dict[str, Array]]]:
     """step(state, bank, camera=None, lpips_params=None) -> (state, metrics), pure; jit it.
 
-    camera: maps of the camera to train for, None for cameras of the prior; lpips_params: of
-    `load_lpips`, None for L1 + SSIM. metrics: "loss" and its parts.
+    camera: maps of the camera or cameras to train for, None for cameras of the prior;
+    lpips_params: of `load_lpips`, None for L1 + SSIM; sample(key, bank, config.data, camera): a
+    batch. metrics: "loss" and its parts.
     Raises EV020 where network and data differ in their bins.
     """
     if network.bins != config.data.bins:
@@ -103,7 +105,7 @@ def make_step(
         lpips_params: Params | None = None,
     ) -> tuple[LearningState, dict[str, Array]]:
         key = jax.random.fold_in(state.key, state.step)
-        sequences = sample_sequences(key, bank, config.data, camera)
+        sequences = sample(key, bank, config.data, camera)
 
         def loss(params: Params) -> tuple[Array, dict[str, Array]]:
             return sequence_loss(network, params, sequences, config, lpips_params)

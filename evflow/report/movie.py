@@ -1,7 +1,6 @@
 """Events as a film or a sheet: red ON, blue OFF, over white or over the recording's frames.
 
-Needs OpenCV and Pillow alone. A film is written beside its place, opened again, and only moved
-there if all its pictures can be read.
+Needs OpenCV and Pillow alone.
 """
 
 from __future__ import annotations
@@ -9,12 +8,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
-import cv2
 import numpy as np
 from PIL import Image
 
@@ -23,13 +19,10 @@ from evflow.files import atomic_write
 from evflow.recording import Progress
 from evflow.report.plots import event_image
 from evflow.report.resimulate import busiest_instant
+from evflow.report.video import CODECS, FPS, Codec, enlarged, write_video
 from evflow.types import Recording
 
-FOURCC = {"mpeg4": "mp4v", "vp9": "vp09"}  # H.264 is in no free build of OpenCV
 SUFFIXES = (".mp4", ".gif", ".png")
-WIDTH = 640  # screen pixels that a small sensor is enlarged to
-GIF_TICK_S = 0.01  # GIF counts time in hundredths of a second
-GIF_FRAMES = 600  # a GIF is held in memory and grows large: more are refused
 GAP = 8  # pixels between the pictures of a sheet
 
 
@@ -46,17 +39,17 @@ class Film:
     slow: float = 1.0
     over_frames: bool = False
     scale: int | None = None
-    codec: Literal["mpeg4", "vp9"] = "mpeg4"
+    codec: Codec = "mpeg4"
 
     def __post_init__(self) -> None:
-        for name, low, high in (("fps", 0.1, 240.0), ("window_us", 1, 10**9),
+        for name, low, high in (("fps", *FPS), ("window_us", 1, 10**9),
                                 ("slow", 1e-3, 1e6), ("scale", 1, 32)):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise EvflowDataError(
                     "EV020", f"{name}={value}.", f"Give a value from {low:g} to {high:g}.")
-        if self.codec not in FOURCC:
-            raise EvflowDataError("EV020", f"codec={self.codec!r}.", f"Choose {tuple(FOURCC)}.")
+        if self.codec not in CODECS:
+            raise EvflowDataError("EV020", f"codec={self.codec!r}.", f"Choose {CODECS}.")
 
     @property
     def step_us(self) -> float:
@@ -85,13 +78,8 @@ def write_film(
     film.check_target(path, overwrite=overwrite)
     _check(recording, film)
     count = max(1, math.ceil(recording.events.duration_us / film.step_us))
-    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
-    with atomic_write(path, overwrite=overwrite) as temporary, \
-            tempfile.TemporaryDirectory(dir=temporary.parent, prefix=".render") as folder:
-        made = Path(folder) / f"film{path.suffix.lower()}"
-        said = write(made, _pictures(recording, film, count, progress), film, count)
-        os.replace(made, temporary)
-    return f"{count} pictures, {count / film.fps:.1f} s, {said}"
+    return write_video(path, _pictures(recording, film, count, progress), count, fps=film.fps,
+                       codec=film.codec, overwrite=overwrite)
 
 
 def write_sheet(
@@ -119,7 +107,7 @@ def write_sheet(
     if recording.has_frames:
         frame = _frame(recording, middle, _white(recording))
         parts = [np.repeat(frame, 3, -1), shown, _over(frame, shown)]
-    parts = [_enlarged(part, film.scale) for part in parts]
+    parts = [enlarged(part, film.scale) for part in parts]
     gap = np.full((parts[0].shape[0], GAP, 3), 255, np.uint8)
     sheet = np.concatenate([piece for part in parts for piece in (part, gap)][:-1], 1)
     with atomic_write(path, overwrite=overwrite) as temporary:
@@ -148,7 +136,7 @@ def _pictures(
         shown = event_image(recording.events, begin, begin + film.window_us)
         if film.over_frames:
             shown = _over(_frame(recording, middle, white), shown)
-        yield _enlarged(shown, film.scale)
+        yield enlarged(shown, film.scale)
         if progress:
             progress(i + 1, count)
 
@@ -169,49 +157,3 @@ def _over(frame: np.ndarray, shown: np.ndarray) -> np.ndarray:
     """An event image on a frame: where there are no events, the frame shows."""
     strength = np.minimum(1.0, 1.5 * (1.0 - shown.min(-1, keepdims=True)))
     return (1 - strength) * frame + strength * shown
-
-
-def _enlarged(image: np.ndarray, scale: int | None) -> np.ndarray:
-    """(H, W, 3) floats as uint8, each pixel scale x scale, the sides even: codecs store colour at
-    half the resolution."""
-    scale = scale or max(1, round(WIDTH / image.shape[1]))
-    pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8).repeat(scale, 0).repeat(scale, 1)
-    height, width = pixels.shape[:2]
-    return np.pad(pixels, [(0, height % 2), (0, width % 2), (0, 0)], mode="edge")
-
-
-def _write_mp4(path: Path, pictures: Iterator[np.ndarray], film: Film, count: int) -> str:
-    first = next(pictures)
-    size = (first.shape[1], first.shape[0])
-    fourcc = cv2.VideoWriter.fourcc(*FOURCC[film.codec])
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, film.fps, size)
-    if not writer.isOpened():
-        raise EvflowDataError("EV019", f"OpenCV {cv2.__version__} does not write {film.codec}.",
-                              "Try the other codec, or write a .gif.")
-    try:
-        writer.write(first[..., ::-1])
-        for picture in pictures:
-            writer.write(picture[..., ::-1])
-    finally:
-        writer.release()
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    readable = 0
-    while capture.grab():
-        readable += 1
-    capture.release()
-    if readable != count:
-        raise EvflowDataError("EV019", f"{readable} of {count} pictures can be read again.",
-                              "Is the disk full? Nothing was kept.")
-    return f"{size[0]}x{size[1]}, {film.codec}"
-
-
-def _write_gif(path: Path, pictures: Iterator[np.ndarray], film: Film, count: int) -> str:
-    if count > GIF_FRAMES:
-        raise EvflowDataError("EV020", f"the GIF would have {count:,} pictures.",
-                              f"At most {GIF_FRAMES}: show less (--start, --stop), or .mp4.")
-    images = [Image.fromarray(p).quantize(64, dither=Image.Dither.NONE) for p in pictures]
-    ticks = max(2, round(1 / (film.fps * GIF_TICK_S)))  # faster ones are slowed down by browsers
-    images[0].save(path, save_all=True, append_images=images[1:], loop=0, optimize=False,
-                   duration=1000 * ticks * GIF_TICK_S)
-    width, height = images[0].size
-    return f"{width}x{height}, shown at {1 / (ticks * GIF_TICK_S):.0f} fps"

@@ -1,0 +1,148 @@
+"""`evflow flow`: the optical flow of a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from evflow.commands.options import check_finite, note_idle, own_first, refuse, value
+from evflow.commands.windows import Windowed, lasting
+from evflow.commands.writing import need_absent
+from evflow.errors import EvflowDataError
+
+if TYPE_CHECKING:
+    from evflow.downstream.flow import FlowTruth
+    from evflow.types import Recording
+
+
+@own_first
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Flow(Windowed):
+    """Show the optical flow, by EV-FlowNet: the hue says where to, the saturation how fast, where
+    there are events; and measure how much it sharpens them (FWL; above 1 is better than none).
+
+    Example: evflow flow flight.aedat4 -o flow.mp4
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder of any known format."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """.mp4, .avi or .gif."""
+    weights: str = "evflownet-small"
+    """Name of released weights, a .safetensors path, or a published checkpoint (.pth.tar)."""
+    truth: Annotated[Path | None, value("FILE")] = None
+    """True flow, .npz: flow (T, 2, H, W) = (x, y) px over each window, edges_us (T + 1,) of the
+    windows, which replace --sync, and valid (T, H, W) where not all of it is."""
+    full_px: Annotated[float | None, value("PX")] = None
+    """Motion in a window that has full colour; without it that which 1 % of the pixels exceed."""
+    fps: Annotated[float | None, value("HZ")] = None
+    """Pictures per second; without it the film lasts as long as the recording."""
+    scale: Annotated[int | None, value("N")] = None
+    """Screen pixels per pixel; without it as many as make the film 640 wide."""
+    codec: Literal["mpeg4", "vp9"] = "mpeg4"
+    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
+    overwrite: bool = False
+    """Replace the output where it exists."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> None:
+        from evflow.downstream.flow import FlowScores, flow_of, full_motion, window_flows
+        from evflow.downstream.released import load_network
+        from evflow.progress import bar
+
+        check_finite(self)
+        self._check()
+        trained = flow_of(load_network(self.weights))
+        recording, edges, truth = self._read()
+        full_px = full_motion(trained, recording.events, edges) if self.full_px is None else (
+            self.full_px)
+        scores = FlowScores(recording.events, edges, truth)
+        with bar("flow") as progress:
+            flows = window_flows(trained, recording.events, edges)
+            said = self._film(_watched(flows, scores, len(edges) - 1, progress), recording, edges,
+                              full_px)
+        result = scores.result()
+        facts = {"out": str(self.out), "weights": self.weights, "full_px": full_px,
+                 "scores": result, "notes": list(recording.notes)}
+        for note in recording.notes:
+            print(f"note: {note}", file=sys.stderr)
+        print(json.dumps(facts) if self.json else "\n".join(
+            (f"{said}, full colour at {full_px:.1f} px a window -> {self.out}",
+             *_described(result))))
+
+    def _check(self) -> None:
+        """EV013, EV020 before any long work."""
+        from evflow.report.video import SUFFIXES
+
+        kind = self.out.suffix.lower()
+        if kind not in SUFFIXES:
+            raise EvflowDataError("EV020", f"{self.out.name} is none of {', '.join(SUFFIXES)}.",
+                                  "The ending says what is made.")
+        if kind != ".mp4":
+            refuse(self, ("codec",), f"nothing that a {kind} has")
+        if self.truth is not None:
+            refuse(self, ("sync", "window_events", "window_ms"), "the windows are those of --truth")
+        if self.full_px is not None and self.full_px <= 0:
+            raise EvflowDataError("EV020", f"--full-px {self.full_px}.", "It must be > 0.")
+        need_absent(self.out, self.overwrite)
+
+    def _read(self) -> tuple[Recording, np.ndarray, FlowTruth | None]:
+        """The recording, the edges (T + 1,) of the windows, and the true flow if there is one."""
+        from evflow.downstream.flow import load_truth
+        from evflow.downstream.sync import window_edges
+
+        seen = self.sync in ("auto", "frames") and self.truth is None
+        if not seen:
+            note_idle(self, "the frames are not looked at")
+        recording = self.read(self.recording, with_frames=seen)
+        if self.truth is not None:
+            truth = load_truth(self.truth, recording.events.size)
+            return recording, truth.edges_us, truth
+        return recording, window_edges(recording, self.times(recording)), None
+
+    def _film(
+        self, flows: Iterator[np.ndarray], recording: Recording, edges: np.ndarray, full_px: float
+    ) -> str:
+        from evflow.report.flow import flow_image
+        from evflow.report.video import enlarged, write_video
+
+        def pictures() -> Iterator[np.ndarray]:
+            for i, flow in enumerate(flows):
+                events = recording.events.slice(int(edges[i]), int(edges[i + 1]))
+                yield enlarged(flow_image(flow, events, full_px), self.scale)
+
+        count = len(edges) - 1
+        fps = lasting(count, int(edges[-1] - edges[0])) if self.fps is None else self.fps
+        return write_video(self.out, pictures(), count, fps=fps, codec=self.codec,
+                           overwrite=self.overwrite)
+
+
+def _watched(
+    flows: Iterator[np.ndarray], scores: Any, count: int, progress: Any
+) -> Iterator[np.ndarray]:
+    """The flows on their way, each scored."""
+    for i, flow in enumerate(flows):
+        scores.add(flow)
+        yield flow
+        progress(i + 1, count)
+
+
+def _described(result: dict[str, Any]) -> list[str]:
+    """The scores as a line for people."""
+    names = {"fwl": "FWL", "rsat": "RSAT", "aee": "AEE [px]", "outlier_percent": "outliers [%]",
+             "fwl_truth": "FWL of the truth"}
+    numbers = [f"{said} {result[name]:.3f}" for name, said in names.items()
+               if result.get(name) is not None]
+    if not numbers:
+        return []
+    how = ", ".join(f"{k} {v}" for k, v in result["convention"].items())
+    return [f"{', '.join(numbers)} over {result['windows']} windows of "
+            f"{result['window_ms']:.1f} ms ({how})"]

@@ -1,0 +1,143 @@
+"""`evflow reconstruct`: events as video."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from evflow.commands.options import check_finite, own_first, refuse, value
+from evflow.commands.windows import Windowed, lasting
+from evflow.commands.writing import need_absent
+from evflow.errors import EvflowDataError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from evflow.downstream.video import FrameScores
+    from evflow.types import Recording
+
+
+@own_first
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reconstruct(Windowed):
+    """Turn events into video, by E2VID or FireNet. Where the recording has frames the images are
+    made at their times and scored against them.
+
+    Example: evflow reconstruct flight.aedat4 -o flight.mp4
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """File or folder of any known format."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """.mp4, .avi or .gif; or a folder for .png images with timestamps.txt, as --frames of other
+    commands reads it."""
+    weights: str = "e2vid-small"
+    """Name of released weights, a .safetensors path, or a published checkpoint (.pth.tar)."""
+    protocol: Literal["evreal", "etnet", "global"] = "evreal"
+    """How images are scored: which SSIM, clipped or not."""
+    fps: Annotated[float | None, value("HZ")] = None
+    """Pictures per second of the film; without it, it lasts as long as the recording."""
+    scale: Annotated[int | None, value("N")] = None
+    """Screen pixels per pixel of the film; without it as many as make it 640 wide."""
+    codec: Literal["mpeg4", "vp9"] = "mpeg4"
+    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
+    overwrite: bool = False
+    """Replace the output where it exists."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> None:
+        from evflow.downstream.released import load_network
+        from evflow.downstream.tensor import reconstructions
+        from evflow.downstream.video import images_of
+        from evflow.progress import bar
+
+        check_finite(self)
+        kind = self._kind()
+        need_absent(self.out, self.overwrite)
+        trained = images_of(load_network(self.weights))
+        recording = self.read(self.recording)
+        times = self.times(recording)
+        scores = self._scores() if times is recording.frame_times else None
+        with bar("reconstructing") as progress:
+            images = reconstructions(
+                trained.network, trained.params, recording.events, times, **trained.how)
+            seen = _watched(images, recording, scores, len(times), progress)
+            said = (self._folder(seen, times) if kind == "" else
+                    self._film(seen, times, recording))
+        result = scores.result() if scores else None
+        facts = {"out": str(self.out), "weights": self.weights, "images": len(times),
+                 "scores": result, "notes": list(recording.notes)}
+        for note in recording.notes:
+            print(f"note: {note}", file=sys.stderr)
+        print(json.dumps(facts) if self.json else "\n".join(
+            (f"{said} -> {self.out}", *_described(result))))
+
+    def _kind(self) -> str:
+        """The suffix of a film, "" for a folder; EV020 for anything else."""
+        from evflow.report.video import SUFFIXES
+
+        kind = self.out.suffix.lower()
+        if kind not in ("", *SUFFIXES):
+            raise EvflowDataError("EV020", f"{self.out.name} is none of {', '.join(SUFFIXES)}, and "
+                                  "a folder has no such ending.", "The ending says what is made.")
+        refuse(self, {"": ("fps", "scale", "codec"), ".mp4": ()}.get(kind, ("codec",)),
+               f"nothing that a {kind or 'folder of images'} has")
+        return kind
+
+    def _scores(self) -> FrameScores:
+        """By the protocol, with LPIPS where its weights are installed."""
+        from evflow.downstream.video import FrameScores
+        from evflow.metrics.image_scores import PROTOCOLS
+        from evflow.metrics.lpips import load_lpips
+
+        try:
+            weights = load_lpips()
+        except EvflowDataError:
+            weights = None
+        return FrameScores(PROTOCOLS[self.protocol], weights)
+
+    def _film(self, images: Iterator[np.ndarray], times: np.ndarray, recording: Recording) -> str:
+        from evflow.report.video import enlarged, write_video
+
+        pictures = (enlarged(image[..., None].repeat(3, -1), self.scale) for image in images)
+        start = min(int(recording.events.t[0]), int(times[0]))
+        fps = lasting(len(times), int(times[-1]) - start) if self.fps is None else self.fps
+        return write_video(self.out, pictures, len(times), fps=fps, codec=self.codec,
+                           overwrite=self.overwrite)
+
+    def _folder(self, images: Iterator[np.ndarray], times: np.ndarray) -> str:
+        from evflow.report.video import write_images
+
+        return write_images(self.out, images, times, overwrite=self.overwrite)
+
+
+def _watched(
+    images: Iterator[np.ndarray], recording: Recording, scores: FrameScores | None, count: int,
+    progress: Any,
+) -> Iterator[np.ndarray]:
+    """The images on their way, each scored against its frame."""
+    for i, image in enumerate(images):
+        if scores:
+            scores.add(image, recording.frame_dn(i))
+        yield image
+        progress(i + 1, count)
+
+
+def _described(result: dict[str, Any] | None) -> list[str]:
+    """The scores as a line for people."""
+    if result is None:
+        return []
+    numbers = [f"{name} {result[name]:.4f}" for name in ("mse", "ssim", "lpips")
+               if result.get(name) is not None]
+    return [f"against {result['frames']} frames: {', '.join(numbers)} "
+            f"(SSIM {result['protocol']['ssim']}, mean over frames, "
+            f"{'clipped' if result['protocol']['clip'] else 'not clipped'}"
+            + (f", LPIPS {result['lpips_net']}" if result["lpips_net"] else "")
+            + f"; the first {result['warm_up']} left out)"]

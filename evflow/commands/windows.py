@@ -1,0 +1,44 @@
+"""Options of commands that run a network over a recording, window by window."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from evflow.commands.options import Reading, refuse, value
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from evflow.types import Recording
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Windowed(Reading):
+    """How a recording is read and cut into windows; what a command that does both inherits."""
+
+    sync: Literal["auto", "frames", "events", "ms"] = "auto"
+    """Where windows end: at the recording's frames, after --window-events, or every --window-ms.
+    auto: frames where there are any, else ms."""
+    window_events: Annotated[int | None, value("N")] = None
+    """Events a window (--sync events); without it .35 a pixel."""
+    window_ms: float = 33.0
+    """Length of a window (--sync ms, and auto without frames)."""
+
+    def times(self, recording: Recording) -> np.ndarray:
+        """The ends (T,) of the windows; EV020 where options contradict each other."""
+        from evflow.downstream.sync import sync_times
+
+        idle = {"frames": ("window_events", "window_ms"), "events": ("window_ms",),
+                "ms": ("window_events",), "auto": ("window_events",)}[self.sync]
+        refuse(self, idle, f"of no use with --sync {self.sync}")
+        return sync_times(recording, self.sync, count=self.window_events,
+                          window_us=round(1000 * self.window_ms))
+
+
+def lasting(pictures: int, duration_us: int) -> float:
+    """Pictures per second of a film that lasts as long as what it shows, within what players can
+    do."""
+    from evflow.report.video import FPS
+
+    return float(min(max(1e6 * pictures / max(duration_us, 1), FPS[0]), FPS[1]))

@@ -1,0 +1,95 @@
+"""Event networks in files of our own: parameters, and in the model card what they belong to.
+
+    trained = load_network("e2vid-small")          # released; or a .safetensors file of a training,
+    trained = load_network("E2VID_plus.pth.tar")   # or a published checkpoint
+    images = reconstruct(trained.network, trained.params, events, times, **trained.how)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from evflow.downstream.e2vid import E2VID
+from evflow.downstream.network import Network, Params
+from evflow.downstream.presets import KINDS
+from evflow.downstream.published import load_published
+from evflow.errors import EvflowDataError
+from evflow.weights import load_weights, model_card, save_weights, weights_path
+
+PUBLISHED = (".pth", ".pt", ".tar")
+RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: network
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A network with its params. normalised: whether its event tensors are; card: who made it of
+    what, empty for a published checkpoint."""
+
+    network: Network
+    params: Params
+    normalised: bool
+    card: dict[str, Any]
+
+    @property
+    def how(self) -> dict[str, bool]:
+        """The options that `reconstruct` needs."""
+        return {"normalised": self.normalised}
+
+
+def save_network(
+    path: str | os.PathLike, network: Network, params: Params, card: dict[str, Any], *,
+    normalised: bool = False, overwrite: bool = False,
+) -> Path:
+    """Write a network as .safetensors; card: any JSON-ready dict that says how it was made."""
+    kind = next(name for name, cls in KINDS.items() if type(network) is cls)
+    card = card | {"network": kind, "structure": dataclasses.asdict(network),
+                   "normalised": normalised}
+    return save_weights(path, params, card, overwrite=overwrite)
+
+
+def load_network(name_or_path: str | os.PathLike) -> Trained:
+    """A released network by name, one of `save_network`, or a published checkpoint by path.
+
+    Raises EV016 (no such file), EV009 (damaged), EV018 (the file is of something else).
+    """
+    path = Path(name_or_path)
+    if path.suffix in PUBLISHED:
+        network, params = load_published(path)
+        # E2VID of 2019 has batch norm and normalised tensors; E2VID+ and FireNet+ have neither.
+        return Trained(network, params, isinstance(network, E2VID) and network.norm == "batch", {})
+    file = _file(name_or_path)
+    card = model_card(file)
+    kind = KINDS.get(str(card.get("network")))
+    if kind is None:
+        raise EvflowDataError("EV018", f"{file} holds no event network.",
+                              f"Its model card should name one of {list(KINDS)}.")
+    try:
+        network = kind(**card["structure"])
+    except (KeyError, TypeError) as e:
+        raise EvflowDataError("EV009", f"{file}: its model card does not describe a network "
+                              f"({e}).") from e
+    params = load_weights(file)
+    expected = jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16)))
+    if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
+        raise EvflowDataError("EV018", f"{file}: the parameters are not those of {network}.")
+    return Trained(network, params, bool(card.get("normalised")), card)
+
+
+def _file(name_or_path: str | os.PathLike) -> Path:
+    """Where the weights are; EV016 that says how to come by released ones that are missing."""
+    kind = RELEASED.get(str(name_or_path))
+    try:
+        return weights_path(name_or_path)
+    except EvflowDataError as e:
+        if kind is None:
+            raise
+        raise EvflowDataError(
+            "EV016", f"the weights {name_or_path} are not in this installation.",
+            f"Pass the path of others, or make them: python -m experiments.train_network "
+            f"--network {kind} --out runs/{kind}") from e

@@ -1,0 +1,57 @@
+"""When a network looks at a stream of events: at the frames, after every so many events, or at
+equal intervals."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.types import Recording
+
+Sync = Literal["auto", "frames", "events", "ms"]
+
+PER_PIXEL = 0.35  # events a pixel in a window, what E2VID was published with
+WINDOW_US = 33_000
+
+
+def sync_times(
+    recording: Recording, sync: Sync = "auto", *, count: int | None = None,
+    window_us: int = WINDOW_US,
+) -> np.ndarray:
+    """Rising instants (T,) int64 us, each the end of a window: of the frames; of every `count`
+    events (default: .35 a pixel); or of every window_us from the first event on. What is left at
+    the end and fills no window is left out, but one window there always is.
+
+    auto: the frames, where there are two or more, else equal intervals.
+    Raises EV001 (no events), EV011 (no frames to follow), EV020.
+    """
+    t = recording.events.t
+    if not len(t):
+        raise EvflowDataError("EV001", "the recording has no events.")
+    if sync == "auto":
+        sync = "frames" if len(recording.frames) > 1 else "ms"
+    if sync == "frames":
+        if not recording.has_frames:
+            raise EvflowDataError("EV011", "the recording has no frames to follow.",
+                                  "Choose windows of equal length or count.")
+        return recording.frame_times
+    if sync == "events":
+        width, height = recording.events.size
+        count = max(1, round(PER_PIXEL * width * height)) if count is None else count
+        if count < 1:
+            raise EvflowDataError("EV020", f"{count} events a window.", "Give one or more.")
+        # Two windows can end within one microsecond: they are one.
+        return np.unique(t[count - 1::count] if count <= len(t) else t[-1:])
+    if window_us < 1:
+        raise EvflowDataError("EV020", f"windows of {window_us} us.", "Give 1 us or more.")
+    windows = max(1, int(t[-1] - t[0]) // window_us)
+    return t[0] + window_us * np.arange(1, windows + 1)
+
+
+def window_edges(recording: Recording, times: np.ndarray) -> np.ndarray:
+    """The edges (T + 1,) int64 of the windows that end at times (T,): the first begins with the
+    first event; a time that is not after it ends no window."""
+    start = recording.events.t[0]
+    return np.concatenate([[start], times[times > start]])

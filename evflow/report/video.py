@@ -1,0 +1,125 @@
+"""Pictures -> a film: .mp4 and .avi by OpenCV, .gif by Pillow; or a folder of images with times.
+
+A film is written beside its place, opened again, and only moved there if all its pictures can be
+read.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+from evflow.folders import atomic_folder
+
+Codec = Literal["mpeg4", "vp9"]
+
+FOURCC = {"mpeg4": "mp4v", "vp9": "vp09", "mjpeg": "MJPG"}  # H.264 is in no free build of OpenCV
+CODECS: tuple[Codec, ...] = ("mpeg4", "vp9")
+SUFFIXES = (".mp4", ".avi", ".gif")
+TIMES = "timestamps.txt"
+FPS = (0.1, 240.0)
+WIDTH = 640  # screen pixels that a small sensor is enlarged to
+GIF_TICK_S = 0.01  # GIF counts time in hundredths of a second
+GIF_FRAMES = 600  # a GIF is held in memory and grows large: more are refused
+
+
+def write_video(
+    path: str | os.PathLike, pictures: Iterator[np.ndarray], count: int, *, fps: float,
+    codec: Codec = "mpeg4", overwrite: bool = False,
+) -> str:
+    """Write `count` pictures (H, W, 3) uint8 RGB of one even size; returns what was written, in
+    words. codec: of .mp4; an .avi is motion JPEG.
+
+    Raises EV013, EV019 (OpenCV cannot write it, or not all can be read again), EV020.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if not FPS[0] <= fps <= FPS[1]:
+        raise EvflowDataError("EV020", f"fps={fps}.", f"Give a value from {FPS[0]} to {FPS[1]:g}.")
+    with atomic_write(path, overwrite=overwrite) as temporary, \
+            tempfile.TemporaryDirectory(dir=temporary.parent, prefix=".render") as folder:
+        made = Path(folder) / f"film{kind}"
+        if kind == ".gif":
+            said = _write_gif(made, pictures, count, fps)
+        else:
+            said = _write_film(made, pictures, count, fps, "mjpeg" if kind == ".avi" else codec)
+        os.replace(made, temporary)
+    return f"{count} pictures, {count / fps:.1f} s, {said}"
+
+
+def write_images(
+    folder: str | os.PathLike, images: Iterator[np.ndarray], times_us: np.ndarray, *,
+    overwrite: bool = False,
+) -> str:
+    """Write grey images (H, W) on 0..1 as 8-bit .png, with their times (T,) in timestamps.txt, as
+    readers of image folders take them; returns what was written, in words.
+
+    Raises EV013 (the folder exists, or holds other things), EV019.
+    """
+    folder = Path(folder)
+    before = len(list(folder.iterdir())) if folder.is_dir() else 0
+    names = [f"frame_{i:08d}.png" for i in range(max(len(times_us), before))]
+    with atomic_folder(folder, names=(TIMES, *names), overwrite=overwrite) as temporary:
+        for name, image in zip(names, images, strict=False):
+            pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+            Image.fromarray(pixels).save(temporary / name)
+        lines = (f"{time} {name}\n" for time, name in zip(times_us, names, strict=False))
+        (temporary / TIMES).write_text("# timestamp_us image\n" + "".join(lines))
+    return f"{len(times_us)} images"
+
+
+def enlarged(image: np.ndarray, scale: int | None = None) -> np.ndarray:
+    """(H, W, 3) floats 0..1 as uint8, each pixel scale x scale (None: as many as make it 640
+    wide), the sides even: codecs store colour at half the resolution."""
+    scale = scale or max(1, round(WIDTH / image.shape[1]))
+    pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8).repeat(scale, 0).repeat(scale, 1)
+    height, width = pixels.shape[:2]
+    return np.pad(pixels, [(0, height % 2), (0, width % 2), (0, 0)], mode="edge")
+
+
+def _write_film(
+    path: Path, pictures: Iterator[np.ndarray], count: int, fps: float, codec: str
+) -> str:
+    first = next(pictures)
+    size = (first.shape[1], first.shape[0])
+    writer = cv2.VideoWriter(
+        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*FOURCC[codec]), fps, size)
+    if not writer.isOpened():
+        raise EvflowDataError("EV019", f"OpenCV {cv2.__version__} does not write {codec}.",
+                              "Try the other codec, or write a .gif.")
+    try:
+        writer.write(first[..., ::-1])
+        for picture in pictures:
+            writer.write(picture[..., ::-1])
+    finally:
+        writer.release()
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    readable = 0
+    while capture.grab():
+        readable += 1
+    capture.release()
+    if readable != count:
+        raise EvflowDataError("EV019", f"{readable} of {count} pictures can be read again.",
+                              "Is the disk full? Nothing was kept.")
+    return f"{size[0]}x{size[1]}, {codec}"
+
+
+def _write_gif(path: Path, pictures: Iterator[np.ndarray], count: int, fps: float) -> str:
+    if count > GIF_FRAMES:
+        raise EvflowDataError("EV020", f"the GIF would have {count:,} pictures.",
+                              f"At most {GIF_FRAMES}: show less (--start, --stop), or .mp4.")
+    images = [Image.fromarray(p).quantize(64, dither=Image.Dither.NONE) for p in pictures]
+    ticks = max(2, round(1 / (fps * GIF_TICK_S)))  # faster ones are slowed down by browsers
+    images[0].save(path, save_all=True, append_images=images[1:], loop=0, optimize=False,
+                   duration=1000 * ticks * GIF_TICK_S)
+    width, height = images[0].size
+    return f"{width}x{height}, shown at {1 / (ticks * GIF_TICK_S):.0f} fps"

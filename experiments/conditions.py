@@ -1,0 +1,177 @@
+"""What networks are trained on: the cameras of each condition of `experiments.see_better`.
+
+Every condition gives maps of the same number K of cameras and of one size, so that one compiled
+training step serves them all: drawn ones, the target's own K times, or K draws from an estimate
+and its errors.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow import Recording, estimate_camera, load_weights
+from evflow.baselines import SYSTEMS
+from evflow.baselines.lgan import Lgan
+from evflow.camera import Camera, Summary, sample_pixels
+from evflow.downstream.prior import WidePrior
+from evflow.errors import EvflowDataError
+from evflow.weights import weights_path
+from experiments.targets import Target
+
+Array = jax.Array
+Shape = tuple[int, int]
+
+DEFAULT, WIDE, OURS, ORACLE, EVENTGAN = "default", "wide", "evflow", "oracle", "eventgan"
+FREE = (DEFAULT, WIDE, EVENTGAN)  # that do not depend on the target
+DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
+COMPARED = SYSTEMS | {"lgan": Lgan()}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Condition:
+    """label: its name in the tables; name: of the run, one for each thing that is trained;
+    targets: what it is tested on; make: maps of K cameras (K, H, W), or None where the events
+    come from EventGAN; source: of the file that it rests on, so that another is not taken for
+    it."""
+
+    label: str
+    name: str
+    targets: tuple[Target, ...]
+    make: Callable[[], Camera | None]
+    source: str = ""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Workshop:
+    """What conditions are made of. record: a target's recording; count: K; folder: where
+    estimates are kept; params: of evflow's estimator."""
+
+    shape: Shape
+    count: int
+    folder: Path
+    record: Callable[[Target], Recording]
+    params: Any
+
+    def default(self) -> Camera:
+        """Thresholds .2 with v2e's mismatch, no noise."""
+        theta, none = jnp.full(self.count, DEFAULT_THETA), jnp.zeros(self.count)
+        sigma = jnp.full(self.count, DEFAULT_MISMATCH)
+        return sample_pixels(jax.random.key(1), Summary(theta, theta, none, none, sigma, sigma),
+                             self.shape)
+
+    def wide(self) -> Camera:
+        """Cameras of the prior that serves unknown ones."""
+        keys = jax.random.split(jax.random.key(2), self.count)
+        return jax.vmap(lambda key: WidePrior().sample(key, self.shape))(keys)
+
+    def same(self, camera: Camera) -> Camera:
+        """One camera, K times."""
+        return jax.tree.map(
+            lambda m: jnp.broadcast_to(m, (self.count, *self.shape)), self.fitted(camera))
+
+    def fitted(self, camera: Camera) -> Camera:
+        """Maps of this size: repeated or cut."""
+        def fit(m: Array) -> Array:
+            wanted = [-(-n // have) for n, have in zip(self.shape, m.shape, strict=True)]
+            return jnp.tile(m, wanted)[:self.shape[0], :self.shape[1]]
+
+        return jax.tree.map(fit, camera)
+
+    def stored(self, path: Path) -> Camera:
+        """Draws from the estimate in a file, or the maps in it."""
+        camera, std = Camera.load_with_std(path)
+        if std is None:
+            return self.same(camera)
+        whole, error = self.fitted(camera), self.fitted(std)
+        keys = jax.random.split(jax.random.key(3), self.count)
+        return jax.vmap(lambda key: whole.drawn(key, error))(keys)
+
+    def estimated(self, target: Target, name: str = OURS, params: Any = None) -> Camera:
+        """The target as `estimate_camera` sees its recording. params: of an estimator that is
+        taken as it is, without refinement, which would make up for its faults."""
+        path = self.folder / f"{target.name} {name}.npz"
+        if not path.is_file():
+            found = estimate_camera(self.record(target), self.params if params is None else params,
+                                    refine="auto" if params is None else "off")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            found.save(path)
+        return self.stored(path)
+
+    def compared(self, target: Target, name: str) -> Camera:
+        """The target as a compared system sees its recording."""
+        path = self.folder / f"{target.name} {name}.npz"
+        if not path.is_file():
+            fitted = COMPARED[name].fit(self.record(target))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fitted.camera.save(path)
+        return self.stored(path)
+
+
+def conditions(
+    shop: Workshop, targets: Sequence[Target], names: Sequence[str],
+    estimators: dict[str, Path], cameras: dict[str, Path],
+) -> list[Condition]:
+    """Of the names (`default`, `wide`, `evflow`, `oracle`, `eventgan`, or a compared system), of
+    estimators' weights, and of camera files; raises EV020 for an unknown name or one used twice.
+    """
+    twice = [n for n in (*estimators, *cameras) if n in {*names, *(estimators.keys() & cameras)}]
+    if twice:
+        raise EvflowDataError("EV020", f"two conditions are called {twice}.", "Rename one.")
+    free: dict[str, Callable[[], Camera | None]] = {
+        DEFAULT: shop.default, WIDE: shop.wide, EVENTGAN: lambda: None}
+    found = []
+    for name in names:
+        if name in FREE:
+            found.append(Condition(name, name, tuple(targets), free[name]))
+        elif name == ORACLE:
+            by_camera = {t.camera_name: t for t in targets}
+            found += [_oracle(shop, targets, t) for t in by_camera.values()]
+        elif name == OURS:
+            found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.estimated, t))
+                      for t in targets]
+        elif name in COMPARED:
+            found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.compared, t, name))
+                      for t in targets]
+        else:
+            raise EvflowDataError("EV020", f"condition {name!r}.", "Choose of "
+                                  f"{[*FREE, OURS, ORACLE, *COMPARED]}.")
+    for name, path in estimators.items():
+        params = load_weights(path)
+        found += [Condition(name, f"{t.name} {name}", (t,),
+                            _bound(shop.estimated, t, name, params), digest(weights_path(path)))
+                  for t in targets]
+    return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path))
+                    for name, path in cameras.items()]
+
+
+def _oracle(shop: Workshop, targets: Sequence[Target], one: Target) -> Condition:
+    """True maps, which targets of one camera share."""
+    alike = tuple(t for t in targets if t.camera_name == one.camera_name)
+    return Condition(ORACLE, f"{one.camera_name} {ORACLE}", alike, _bound(shop.same, one.camera))
+
+
+def _bound(make: Callable[..., Camera], *arguments: Any) -> Callable[[], Camera | None]:
+    return lambda: make(*arguments)
+
+
+def digest(path: Path) -> str:
+    """Of a file's content; EV016 without the file."""
+    if not path.is_file():
+        raise EvflowDataError("EV016", f"no file at {path}.")
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def told(camera: Camera) -> dict[str, float]:
+    """Medians over all cameras and pixels, and the thresholds' spread within a camera."""
+    medians = {k: float(np.median(v)) for k, v in dataclasses.asdict(camera).items()}
+    spread = {f"sigma_{p}": float(np.median(np.std(getattr(camera, f"theta_{p}"), (-2, -1))))
+              for p in ("on", "off")}
+    return medians | spread

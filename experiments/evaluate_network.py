@@ -1,0 +1,269 @@
+"""Evaluate networks that turn events into video or flow.
+
+    python -m experiments.evaluate_network --weights e2vid-small
+    python -m experiments.evaluate_network --weights E2VID_plus.pth.tar --data ijrr/* \\
+        --protocol etnet --aggregate sequences --warmup-s 0
+    python -m experiments.evaluate_network --weights evflownet-small
+
+Weights: released names, .safetensors files, published checkpoints. --data takes recordings of any
+format: IJRR, MVSEC, HQF, EVIMO2v2, EVREAL. The cuts are those of `experiments.recorded.CUTS`, by
+the sequence's name. Without --data: synthetic cameras behind three circuits that no training
+simulates (`experiments.targets`), and, where the environment variable EVFLOW_DATA names a folder
+with them, two real recordings and two slices of rotations, whose flow the gyroscope tells.
+
+Images are scored linear and in the log domain, log(1 + 255 I) / log 256; flow of real recordings by
+FWL. Writes evaluate_network.json, .md and .png.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from evflow.config import as_dict
+from evflow.downstream import EVFlowNet, event_tensor, reconstruct
+from evflow.downstream.released import Trained, load_network
+from evflow.downstream.simulated import SequenceConfig
+from evflow.errors import EvflowDataError
+from evflow.metrics import PROTOCOLS, FwlConvention, fwl, load_lpips, score_flow, score_images
+from evflow.report import plots
+from experiments import held_out, targets
+from experiments.common import write_result
+from experiments.recorded import Part, Rotation, equalised, read_part, read_rotation, stretched
+
+REAL = ("newton_cradle_davis346.aedat4", "ijrr_slider_depth")
+ROTATIONS = ("ijrr_boxes_rotation", "ijrr_dynamic_rotation")
+SKIPPED, WINDOWS = 6, 20  # of synthetic clips
+SHOWN = 4  # frames of a sequence in the picture
+# E2VID+ by others, conventions of `etnet`: MSE, SSIM, LPIPS; to check a run of its weights by.
+E2VID_PLUS = {
+    "slider_depth": (.0458, .6008, .2383), "shapes_6dof": (.0910, .7553, .1850),
+    "dynamic_6dof": (.1299, .3015, .3423), "boxes_6dof": (.0373, .6248, .2362),
+    "calibration": (.0291, .6550, .1829), "office_zigzag": (.0412, .4887, .2576),
+    "poster_6dof": (.0698, .4624, .2233)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Score networks on recordings, or on synthetic cameras."""
+
+    weights: tuple[str, ...] = ("e2vid-small",)
+    """Names or paths."""
+    data: tuple[Path, ...] = ()
+    """Recordings; without them synthetic cameras, and what EVFLOW_DATA has."""
+    out: Path = Path("out/evaluate_network")
+    protocol: Literal["evreal", "etnet", "global"] = "evreal"
+    """How images are scored: which SSIM, clipped or not."""
+    aggregate: Literal["frames", "sequences"] = "frames"
+    """Mean over all frames, or over the means of sequences."""
+    warmup_s: float = 10.0
+    """Seconds before the cut from which networks run (EVREAL: 10; ET-Net and S2R: 0)."""
+    histeq: Literal["none", "global", "local", "clahe"] = "none"
+    """Equalise the histograms of images and frames."""
+    robust: bool = False
+    """Stretch images between their percentiles 1 and 99, as EVREAL does for E2VID."""
+    whole: bool = False
+    """Without cuts."""
+    window_ms: float = 33.0
+    """Of recordings without frames."""
+    scenes: int = 12
+    """Synthetic clips of each camera."""
+    side: int = 64
+    """Their height and width in pixels."""
+
+
+def parts(options: Options) -> list[Part]:
+    """The real recordings asked for, or at hand; what cannot be read is said and left out."""
+    cut, found = not options.whole, []
+    at_hand = os.environ.get("EVFLOW_DATA")
+    paths = list(options.data)
+    if not paths and at_hand:
+        # Shorter than their cuts: slices of sequences.
+        cut = False
+        paths = [p for name in REAL if (p := Path(at_hand) / "data/recordings" / name).exists()]
+    for path in paths:
+        try:
+            found.append(read_part(path, options.warmup_s, options.window_ms, cut))
+        except EvflowDataError as error:
+            if options.data and len(paths) == 1:
+                raise
+            print(f"{path} left out: {error}")
+    return found
+
+
+def rotations() -> dict[str, Rotation]:
+    """Slices of rotations under EVFLOW_DATA."""
+    folder = Path(os.environ.get("EVFLOW_DATA", "")) / "data/recordings"
+    return {name: read_rotation(folder / name) for name in ROTATIONS
+            if os.environ.get("EVFLOW_DATA") and (folder / name / "extra.npz").is_file()}
+
+
+def images_of(trained: Trained, part: Part, options: Options) -> tuple[np.ndarray, np.ndarray]:
+    """Images and frames (T, H, W) that count, as they are scored."""
+    if part.frames is None:
+        raise EvflowDataError("EV011", f"{part.name} has no frames of this camera.",
+                              "Score flow on it: FWL needs events alone.")
+    made = reconstruct(trained.network, trained.params, part.events, part.edges_us[1:],
+                       **trained.how)[part.warmup:]
+    made = stretched(made) if options.robust else made
+    return (equalised(made, options.histeq),
+            equalised(part.frames[part.warmup:], options.histeq))
+
+
+def real_video(
+    trained: Trained, found: list[Part], options: Options, lpips: Any
+) -> tuple[dict[str, Any], dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Scores linear and in the log domain, and the images behind them."""
+    pairs = {}
+    for part in found:
+        try:
+            pairs[part.name] = images_of(trained, part, options)
+        except EvflowDataError as error:
+            print(f"{part.name} left out: {error}")
+    if not pairs:
+        return {}, pairs
+    protocol = dataclasses.replace(PROTOCOLS[options.protocol], aggregate=options.aggregate)
+    linear = score_images(pairs, protocol, lpips)
+    log = score_images(pairs, dataclasses.replace(protocol, domain="log"))
+    for row, same in ((linear, log), *((linear["sequences"][n], log["sequences"][n])
+                                       for n in pairs)):
+        row["log_mse"] = same["mse"]
+    return linear, pairs
+
+
+def real_flow(trained: Trained, found: list[Part], slices: dict[str, Rotation]) -> dict[str, Any]:
+    """FWL of recordings window by window, and of rotations beside the gyroscope's flow."""
+    rows: dict[str, Any] = {}
+    for part in found:
+        flows = reconstruct(trained.network, trained.params, part.events, part.edges_us[1:],
+                            **trained.how)
+        rows[part.name] = score_flow(
+            part.events, part.edges_us[part.warmup:], flows[part.warmup:])
+    how = FwlConvention(reference="first")
+    for name, one in slices.items():
+        tensor = jnp.asarray(event_tensor(one.events, trained.network.bins))
+        flow = np.asarray(trained.network.apply(trained.params, tensor)[0])
+        columns = (*one.xy.T, one.t, one.p, np.ones(len(one.t), np.float32))
+        rows[name] = {"fwl": float(fwl(*columns, flow, how)), "convention": how.as_dict(),
+                      "fwl_truth": float(fwl(*columns, one.flow, how)),
+                      "events_per_window": float(len(one.t))}
+    return rows
+
+
+class Synthetic:
+    """Clips of the target cameras, made once."""
+
+    def __init__(self, options: Options) -> None:
+        bank = targets.held_out_bank(48, photos=False)
+        shape = (options.side, options.side)
+        seen = [targets.target(camera, circuit, shape)
+                for camera in targets.CAMERAS for circuit in targets.CIRCUITS]
+        self.clips = {t.name: held_out.gather(targets.clips(
+            t, bank, SequenceConfig(scene=targets.SCENES), options.scenes, WINDOWS))
+            for t in seen}
+
+    def scores(self, trained: Trained, lpips: Any) -> dict[str, dict[str, float]]:
+        """Means over clips, of every camera."""
+        rows = {}
+        for name, clips in self.clips.items():
+            made = held_out.outputs(
+                trained.network, trained.params, clips.tensors, trained.normalised)
+            found = (held_out.flow_scores(made, clips, SKIPPED)
+                     if isinstance(trained.network, EVFlowNet)
+                     else held_out.video_scores(made, clips, SKIPPED, lpips))
+            rows[name] = {k: float(np.nanmean(v)) for k, v in found.items()}
+        return rows
+
+
+def main(options: Options) -> dict[str, Any]:
+    plots.require()
+    networks = {name: load_network(name) for name in options.weights}
+    try:
+        lpips = load_lpips()
+    except EvflowDataError as error:
+        print(f"without LPIPS: {error}")
+        lpips = None
+    found, slices = parts(options), {} if options.data else rotations()
+    synthetic = None if options.data else Synthetic(options)
+    result: dict[str, Any] = {}
+    shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for name, trained in networks.items():
+        row: dict[str, Any] = {"synthetic": synthetic.scores(trained, lpips) if synthetic else {}}
+        if isinstance(trained.network, EVFlowNet):
+            row["flow"] = real_flow(trained, found, slices)
+        else:
+            row["video"], pairs = real_video(trained, found, options, lpips)
+            shown |= {f"{part}, {Path(name).stem}": pair for part, pair in pairs.items()}
+        result[name] = row
+    text = report(result, options)
+    print(text)
+    write_result(options.out / "evaluate_network.json", result, as_dict(options))
+    (options.out / "evaluate_network.md").write_text(text + "\n")
+    if shown:
+        picture(shown, options.out / "evaluate_network.png")
+    return result
+
+
+def report(result: dict[str, Any], options: Options) -> str:
+    """Markdown: real video, real flow, synthetic cameras."""
+    lines = [f"SSIM preset {options.protocol}, mean over {options.aggregate}, warm-up "
+             f"{options.warmup_s:g} s, histeq {options.histeq}."]
+    video = [(name, where, r) for name, row in result.items() if row.get("video")
+             for where, r in (("mean", row["video"]), *row["video"]["sequences"].items())]
+    if video:
+        kinds = [k for k in ("mse", "ssim", "lpips", "psnr", "log_mse") if k in video[0][2]]
+        header = ("weights", "sequence", "frames", *kinds, "E2VID+ by others (etnet)")
+        lines += ["", _row(*header), _row(*["---"] * len(header))]
+        lines += [_row(name, where, r["frames"], *(_cell(r[k]) for k in kinds),
+                       "/".join(f"{v:.4f}" for v in E2VID_PLUS.get(where, ())))
+                  for name, where, r in video]
+    flow = [(name, where, r) for name, row in result.items()
+            for where, r in row.get("flow", {}).items()]
+    if flow:
+        lines += ["", _row("weights", "sequence", "FWL", "FWL of the reference", "events a window"),
+                  _row(*["---"] * 5)]
+        lines += [_row(name, where, _cell(r["fwl"]), _cell(r.get("fwl_truth")),
+                       f"{r['events_per_window']:.0f}") for name, where, r in flow]
+    for name, row in result.items():
+        if row["synthetic"]:
+            kinds = list(next(iter(row["synthetic"].values())))
+            lines += ["", _row(name, *kinds), _row(*["---"] * (1 + len(kinds)))]
+            lines += [_row(camera, *(_cell(r[k]) for k in kinds))
+                      for camera, r in row["synthetic"].items()]
+    return "\n".join(lines)
+
+
+def _row(*cells: Any) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
+
+
+def picture(shown: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:
+    """Frames above what was made of the events before them."""
+    figure = plots.new_figure(2.6 * SHOWN, 4.0 * len(shown))
+    axes = figure.subplots(2 * len(shown), SHOWN, squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for i, (name, (images, frames)) in enumerate(shown.items()):
+        at = np.unique(np.linspace(0, len(frames) - 1, SHOWN).round().astype(int))
+        for line, stack, title in ((2 * i, frames, "frames"), (2 * i + 1, images, name)):
+            axes[line, 0].set_title(title, loc="left", fontsize=9)
+            for axis, k in zip(axes[line], at, strict=False):
+                axis.imshow(stack[k], cmap="gray", vmin=0, vmax=1)
+    plots.save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options, description=__doc__))
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None

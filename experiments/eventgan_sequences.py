@@ -1,0 +1,42 @@
+"""Training sequences whose events EventGAN makes from their frames: it knows no camera."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.baselines.eventgan import generate
+from evflow.downstream.simulated import SequenceConfig, Sequences, add_noise, sample_sequences
+from evflow.downstream.tensor import signed
+from evflow.scenes import TextureBank
+
+Array = jax.Array
+
+
+def sample(
+    key: Array, bank: TextureBank, config: SequenceConfig, generator: dict[str, Any]
+) -> Sequences:
+    """The scenes of `sample_sequences` for this key, with the generator's events: of each window
+    from the frame before it to its own; of the first window, whose frame before is not kept, none.
+    """
+    sequences = sample_sequences(key, bank, config)
+    dn = 255.0 * sequences.frames
+    before = jnp.concatenate([dn[:1], dn[:-1]])
+    events = signed(generate(generator, before, dn))
+    weights = jnp.asarray(rebinning(events.shape[-1], config.bins), events.dtype)
+    tensors = jnp.einsum("...b,bc->...c", events, weights)
+    tensors = tensors.at[0].set(0.0)
+    keys = jax.random.split(jax.random.fold_in(key, 1), config.sequences)
+    noisy = jax.vmap(lambda k, t: add_noise(k, t, config), (0, 1), 1)(keys, tensors)
+    return dataclasses.replace(sequences, tensors=noisy)
+
+
+def rebinning(bins: int, fewer: int) -> np.ndarray:
+    """(bins, fewer): how the events of a bin are shared out to the bins around its time; each
+    gives all it has."""
+    places = np.arange(bins) * ((fewer - 1) / (bins - 1))
+    return np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(fewer)))

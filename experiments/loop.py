@@ -1,0 +1,70 @@
+"""The loop of the small trainings: steps, metrics.jsonl and checkpoints, until the last step, the
+time limit or a signal. One process; `experiments.train` has the loop for many."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeVar
+
+import jax
+
+from evflow.checkpoint import Checkpoints
+from evflow.errors import EvflowDataError
+from evflow.files import atomic_write
+from evflow.progress import bar
+from experiments.train import goes_on, lines_until, stop_requests
+
+State = TypeVar("State")
+Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
+
+
+class Options(Protocol):
+    """What the loop reads of a command's options."""
+
+    out: Path
+    max_seconds: float
+    resume: Literal["auto", "never", "must"]
+    save_every: int
+
+
+def train(advance: Advance, fresh: State, config: Any, options: Options) -> State:
+    """The state after config.steps calls of `advance`, from `fresh` or the run in options.out.
+
+    config: a dataclass that says what the run is; one in the folder must be the same. The state
+    has `step`; every one is logged, and the last is saved, also where time or a signal ends it.
+    """
+    if options.resume == "must" and not options.out.is_dir():  # before a folder is made
+        raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
+                              "Check --out, or pass --resume auto.")
+    with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
+        state = fresh
+        if goes_on(checkpoints, config, options) and checkpoints.latest is not None:
+            state = checkpoints.restore(state)
+        return _run(advance, state, config.steps, options, checkpoints, requests)
+
+
+def _run(
+    advance: Advance, state: State, steps: int, options: Options, checkpoints: Checkpoints,
+    requests: list[int],
+) -> State:
+    started, step = time.monotonic(), int(state.step)
+    path = options.out / "metrics.jsonl"
+    kept = "".join(f"{line}\n" for line in lines_until(path, step))
+    with atomic_write(path, overwrite=True) as temporary:
+        temporary.write_text(kept)
+    with bar("training") as progress, path.open("a", buffering=1) as log:
+        while (step < steps and not requests
+               and time.monotonic() - started < options.max_seconds):
+            state, metrics = advance(state)
+            step += 1
+            values = {k: float(v) for k, v in jax.device_get(metrics).items()}
+            seconds = time.monotonic() - started
+            log.write(json.dumps({"step": step, "time": seconds, **values}) + "\n")
+            progress(step, steps)
+            if step % options.save_every == 0:
+                checkpoints.save(step, state)
+    checkpoints.save(step, state)
+    return state

@@ -1,0 +1,198 @@
+"""Do networks see better that were trained on events of the camera they will use (paper, Tables V,
+VI, VII and IX)?
+
+    python -m experiments.see_better --preset small
+    python -m experiments.see_better --preset small --task flow --out out/flow_better
+    python -m experiments.see_better --preset full --max-seconds 25000
+
+The same network is trained for each condition: default parameters, wide randomisation, evflow's
+estimate of the target camera from a 2 s recording of it, and the target's true maps (oracle); in
+`full` also what the compared systems estimate, and EventGAN's voxels. Seeds are paired: scenes,
+initial parameters and batches are the same for all conditions of a seed, only the camera differs.
+Events for training come from one sensor model, those of the targets from others
+(`experiments.targets`). Images are scored in the later windows of held-out scenes, clipped to
+[0, 1]: SSIM (preset evreal), MSE, PSNR, LPIPS where its weights are installed, and MSE of
+log(1 + 255 I) / log 256; flow by its error at pixels with events, and FWL (votes
+rounded to the nearest pixel) beside that of the true flow.
+
+A finished training stays in --out with its scores: the same command goes on with what is missing.
+Tables VII and IX: weights of ablated estimators as --estimators "8 steps=PATH" ...; any camera
+file is a condition by --cameras NAME=PATH. Writes see_better.json, .md, .png and _clips.png.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from evflow.config import as_dict
+from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet
+from evflow.downstream.simulated import SequenceConfig
+from evflow.downstream.train import LearningConfig
+from evflow.errors import EvflowDataError
+from evflow.progress import stoppable
+from evflow.report import plots
+from experiments import gains
+from experiments.common import provenance, write_result
+from experiments.conditions import EVENTGAN
+from experiments.targets import CAMERAS, SCENES
+from experiments.trainings import FOUR, Setting, Trainings
+
+Task = Literal["video", "flow"]
+Preset = Literal["debug", "small", "full"]
+ALL = (*FOUR, "s2r", "jaer", "ecc median", "match", "lgan", EVENTGAN)
+
+
+def preset_of(task: Task, preset: Preset) -> Setting:
+    data = SequenceConfig(scene=SCENES)
+    if preset == "debug":
+        data = dataclasses.replace(data, sequences=2, windows=4, steps_per_window=2, crop=16)
+        learning = LearningConfig(data, steps=6, warmup=2, skip=1)
+        network = E2VID(base=4, encoders=1, blocks=0) if task == "video" else EVFlowNet(base=4)
+        return Setting(network, learning, seeds=2, shape=(32, 32), textures=8, drawn=8,
+                       seconds=0.5, scenes=2, windows=8, skipped=3)
+    if preset == "small":  # 20 trainings of 220 steps of .6 s take 44 minutes on two cores
+        if task == "video":
+            return Setting(E2VID_SMALL, LearningConfig(data, steps=220))
+        data = dataclasses.replace(data, windows=4, sequences=16)
+        return Setting(EVFlowNet(base=8), LearningConfig(data, steps=500, rate=2e-3))
+    large = dataclasses.replace(data, sequences=4, windows=40, crop=128)
+    setting = Setting(
+        E2VID_PLUS, LearningConfig(large, steps=5000, warmup=200, rate=3e-4), ALL, tuple(CAMERAS),
+        shape=(180, 240), textures=512, drawn=64, windows=40, skipped=10, perceptual=True)
+    if task == "video":
+        return setting
+    large = dataclasses.replace(large, windows=4, sequences=16)
+    return dataclasses.replace(setting, network=EVFlowNet(), learning=LearningConfig(
+        large, steps=5000, warmup=200, rate=2e-4))
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train networks for a camera, and test them on it."""
+
+    out: Path = Path("out/see_better")
+    """Folder of the results, the trained networks and the estimates."""
+    task: Task = "video"
+    preset: Preset = "debug"
+    seeds: int | None = None
+    """Paired trainings of every condition (default: the preset's)."""
+    steps: int | None = None
+    """Steps of each training (default: the preset's)."""
+    names: tuple[str, ...] = ()
+    """Conditions (default: the preset's)."""
+    targets: tuple[Literal["high", "low", "middle"], ...] = ()
+    """Target cameras (default: the preset's)."""
+    circuits: tuple[Literal["noisy", "voltmeter", "esim"], ...] = ()
+    """Their circuits (default: noisy)."""
+    normalised: bool = False
+    """Event tensors of deviation 1, which hide the scale of thresholds."""
+    cameras: tuple[str, ...] = ()
+    """More conditions, NAME=camera.npz, tested on all targets."""
+    estimators: tuple[str, ...] = ()
+    """More conditions, NAME=weights.safetensors of estimators, without refinement."""
+    weights: str = "default"
+    """Of evflow's estimator."""
+    eventgan: Path | None = None
+    """EventGAN's generator.safetensors; the condition is left out without it."""
+    max_seconds: float = math.inf
+    """Begin no other training after this long."""
+
+
+def chosen(options: Options) -> Setting:
+    """The preset with what the options change."""
+    setting = preset_of(options.task, options.preset)
+    learning = dataclasses.replace(setting.learning, normalised=options.normalised)
+    if options.steps is not None:
+        learning = dataclasses.replace(learning, steps=options.steps)
+    given: dict[str, Any] = {"names": options.names, "cameras": options.targets,
+                             "circuits": options.circuits, "seeds": options.seeds}
+    setting = dataclasses.replace(
+        setting, learning=learning, **{k: v for k, v in given.items() if v})
+    if options.eventgan is None:
+        names = tuple(n for n in setting.names if n != EVENTGAN)
+        setting = dataclasses.replace(setting, names=names)
+    return setting
+
+
+def same_setting(out: Path, shared: dict[str, Any], setting: Setting) -> None:
+    """Write down what the runs in `out` share; EV013 where they were made by another setting."""
+    # What may grow from one command to the next: everything is trained and scored by itself.
+    free = ("names", "cameras", "circuits", "seeds")
+    wanted = shared | {k: v for k, v in as_dict(setting).items() if k not in free}
+    wanted = json.loads(json.dumps(wanted))
+    path = out / "setting.json"
+    if path.is_file():
+        before = json.loads(path.read_text())["config"]
+        if before != wanted:
+            differ = [k for k in wanted if before.get(k) != wanted[k]]
+            raise EvflowDataError("EV013", f"{out} holds runs of another setting ({differ}).",
+                                  "Choose another --out.")
+        return
+    write_result(path, {}, wanted)
+
+
+def files(given: tuple[str, ...]) -> dict[str, Path]:
+    """NAME=PATH by name; EV020 for anything else."""
+    found: dict[str, Path] = {}
+    for entry in given:
+        name, _, path = entry.partition("=")
+        if not name or not path or name in found:
+            raise EvflowDataError("EV020", f"{entry!r}.", "Give NAME=PATH, each name once.")
+        found[name] = Path(path)
+    return found
+
+
+def heading(options: Options, setting: Setting) -> str:
+    """What was trained how, on what."""
+    learning, made = setting.learning, provenance()
+    data = learning.data
+    return (f"# {options.task}, preset {options.preset}\n\n"
+            f"{type(setting.network).__name__} of base {setting.network.base}, {setting.seeds} "
+            f"seeds, {learning.steps} steps of {data.sequences} sequences of {data.windows} windows"
+            f" of {1e3 * data.window_s:g} ms at {data.crop} px; {setting.scenes} held-out clips. "
+            f"evflow {made['evflow']}, jax {made['versions']['jax']}, "
+            f"{made['machine']['device']}, {made['machine']['cpus']} CPUs.")
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Train and test what is missing; returns the tables' figures of all there is."""
+    plots.require()
+    began, setting = time.monotonic(), chosen(options)
+    same_setting(options.out, {"task": options.task, "weights": options.weights}, setting)
+    runs = Trainings(setting, options.out, options.weights, options.eventgan)
+    conditions = runs.conditions(files(options.estimators), files(options.cameras))
+    left = setting.seeds * len(conditions)
+    for seed in range(setting.seeds):
+        for condition in conditions:
+            if time.monotonic() - began > options.max_seconds and not runs.done(condition, seed):
+                continue
+            runs.complete(condition, seed)
+            left -= 1
+    scores = runs.scores(conditions)
+    result = {target: gains.compared(of_target) for target, of_target in scores.items()}
+    text = "\n\n".join((heading(options, setting), gains.report(
+        result, options.task, runs.told(conditions), left)))
+    print(text)
+    write_result(options.out / "see_better.json", {"targets": result, "missing": left},
+                 as_dict(options) | {"setting": as_dict(setting)})
+    (options.out / "see_better.md").write_text(text + "\n")
+    gains.picture(result, options.out / "see_better.png")
+    if options.task == "video":
+        gains.examples(runs.examples(conditions, runs.targets[0]),
+                       options.out / "see_better_clips.png")
+    return result
+
+
+if __name__ == "__main__":
+    try:
+        with stoppable():
+            main(tyro.cli(Options, description=__doc__))
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None

