@@ -19,7 +19,6 @@ import numpy as np
 
 from evflow import Recording, estimate_camera, load_weights
 from evflow.baselines import SYSTEMS
-from evflow.baselines.lgan import Lgan
 from evflow.camera import Camera, Summary, sample_pixels
 from evflow.downstream.prior import WidePrior
 from evflow.errors import EvflowDataError
@@ -32,7 +31,6 @@ Shape = tuple[int, int]
 DEFAULT, WIDE, OURS, ORACLE, EVENTGAN = "default", "wide", "evflow", "oracle", "eventgan"
 FREE = (DEFAULT, WIDE, EVENTGAN)  # that do not depend on the target
 DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
-COMPARED = SYSTEMS | {"lgan": Lgan()}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,7 +107,7 @@ class Workshop:
         """The target as a compared system sees its recording."""
         path = self.folder / f"{target.name} {name}.npz"
         if not path.is_file():
-            fitted = COMPARED[name].fit(self.record(target))
+            fitted = SYSTEMS[name].fit(self.record(target))
             path.parent.mkdir(parents=True, exist_ok=True)
             fitted.camera.save(path)
         return self.stored(path)
@@ -137,12 +135,12 @@ def conditions(
         elif name == OURS:
             found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.estimated, t))
                       for t in targets]
-        elif name in COMPARED:
+        elif name in SYSTEMS:
             found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.compared, t, name))
                       for t in targets]
         else:
             raise EvflowDataError("EV020", f"condition {name!r}.", "Choose of "
-                                  f"{[*FREE, OURS, ORACLE, *COMPARED]}.")
+                                  f"{[*FREE, OURS, ORACLE, *SYSTEMS]}.")
     for name, path in estimators.items():
         params = load_weights(path)
         found += [Condition(name, f"{t.name} {name}", (t,),

@@ -92,7 +92,7 @@ def collect(options: Options) -> Rows:
             found.append(made)
         if options.rows and (i % 50 == 0 or i == options.recordings):
             with atomic_write(options.rows, overwrite=True) as t, open(t, "wb") as f:
-                np.savez(f, next=i, **stack(found))
+                np.savez(f, allow_pickle=False, next=i, **stack(found))
     return stack(found)
 
 
@@ -157,7 +157,7 @@ def figures_of(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
         used = rows["signal"][:, i % 2] >= 200
 
         def value(y: np.ndarray, name: str = name) -> np.ndarray:
-            return np.asarray(getattr(squash(y[:, :4]), name))
+            return np.asarray(getattr(squash(jnp.asarray(y[:, :4])), name))
 
         for label, guess in (("network", rows["network"]), ("steps", rows["y"]), ("fused", y)):
             error = np.abs(value(guess) - value(rows["true"]))[used]

@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import jax
 
@@ -15,19 +15,30 @@ from evflow.checkpoint import Checkpoints
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
 from evflow.progress import bar
-from experiments.train import goes_on, lines_until, stop_requests
+from experiments.train import Resume, goes_on, lines_until, stop_requests
 
-State = TypeVar("State")
+State = TypeVar("State", bound="Counted")
 Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
+
+
+class Counted(Protocol):
+    """A state knows how many steps it is."""
+
+    @property
+    def step(self) -> jax.Array: ...
 
 
 class Options(Protocol):
     """What the loop reads of a command's options."""
 
-    out: Path
-    max_seconds: float
-    resume: Literal["auto", "never", "must"]
-    save_every: int
+    @property
+    def out(self) -> Path: ...
+    @property
+    def max_seconds(self) -> float: ...
+    @property
+    def resume(self) -> Resume: ...
+    @property
+    def save_every(self) -> int: ...
 
 
 def train(advance: Advance, fresh: State, config: Any, options: Options) -> State:
@@ -41,7 +52,8 @@ def train(advance: Advance, fresh: State, config: Any, options: Options) -> Stat
                               "Check --out, or pass --resume auto.")
     with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
         state = fresh
-        if goes_on(checkpoints, config, options) and checkpoints.latest is not None:
+        resumed = goes_on(checkpoints, config, options.out, options.resume)
+        if resumed and checkpoints.latest is not None:
             state = checkpoints.restore(state)
         return _run(advance, state, config.steps, options, checkpoints, requests)
 

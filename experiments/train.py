@@ -40,6 +40,8 @@ from evflow.train import TrainState, init_state, make_run_step, optimiser
 from evflow.weights import load_weights, save_weights
 from experiments.common import provenance
 
+Resume = Literal["auto", "never", "must"]
+
 RECENT = 100  # steps whose mean metrics are a run's figures
 Metrics = dict[str, float]
 
@@ -74,7 +76,7 @@ class Options:
     """Of scenes, cameras and the first parameters."""
     max_seconds: float = math.inf
     """Stop after this long, with a checkpoint; the schedule still spans all steps."""
-    resume: Literal["auto", "never", "must"] = "auto"
+    resume: Resume = "auto"
     """Go on with the run in --out: if there is one (its configuration must be this one), never
     (there must be none), or always (there must be one)."""
     save_every: int = 200
@@ -97,7 +99,7 @@ def main(options: Options) -> Metrics:
                               "Check --out, or pass --resume auto.")
     tx = optimiser(config)
     with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
-        resumed = goes_on(checkpoints, config, options)
+        resumed = goes_on(checkpoints, config, options.out, options.resume)
         bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures)
         name = "paper" if options.preset == "paper" else "default"
         state = init_state(config, tx, bank, name)
@@ -132,12 +134,12 @@ def configuration(options: Options, devices: int) -> TrainConfig:
     return config
 
 
-def goes_on(checkpoints: Checkpoints, config: TrainConfig, options: Options) -> bool:
+def goes_on(checkpoints: Checkpoints, config: Any, out: Path, resume: Resume) -> bool:
     """Whether the run in the folder is continued; else the folder is made this run's."""
-    if options.resume == "never" and checkpoints.latest is not None:
-        raise EvflowDataError("EV013", f"{options.out} already holds a run.",
+    if resume == "never" and checkpoints.latest is not None:
+        raise EvflowDataError("EV013", f"{out} already holds a run.",
                               "Pass --resume auto to go on with it, or another --out.")
-    if options.resume == "must" or checkpoints.latest is not None:
+    if resume == "must" or checkpoints.latest is not None:
         checkpoints.check_config(as_dict(config))
         return True
     if distributed.is_main():
@@ -185,7 +187,7 @@ def stop_requests() -> Iterator[list[int]]:
 
     def ask(number: int, _: FrameType | None) -> None:
         requests.append(number)
-        signal.signal(number, before[number])
+        signal.signal(number, before[signal.Signals(number)])
 
     before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
     try:

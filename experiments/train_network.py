@@ -5,8 +5,9 @@
 
 Writes checkpoints, metrics.jsonl and at the end NETWORK.safetensors, whose model card has seed,
 data, steps and figures, and NETWORK.json. Cameras are drawn from a wide prior, or --camera is the
-measured one to train for. Ctrl-C (or SIGTERM) saves a checkpoint and stops; the same command goes
-on, bit for bit.
+measured one to train for; --recordings trains on real events and frames instead (EV-FlowNet with
+--preset original, which needs no true flow: Table VI, "RE"). Ctrl-C (or SIGTERM) saves a checkpoint
+and stops; the same command goes on, bit for bit.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from evflow import read_recording
 from evflow.camera import Camera
 from evflow.config import as_dict
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, run
 from evflow.downstream.presets import training
+from evflow.downstream.recorded import recorded_bank, sample_recorded
 from evflow.downstream.released import save_network
 from evflow.downstream.simulated import Sequences, sample_sequences
 from evflow.downstream.tensor import normalise
@@ -52,7 +55,7 @@ class Options:
     out: Path
     """Folder of the run."""
     network: Literal["e2vid", "firenet", "evflownet"] = "e2vid"
-    preset: Literal["small", "debug", "published"] = "small"
+    preset: Literal["small", "debug", "published", "original"] = "small"
     steps: int | None = None
     """Number of steps, over which the rate falls (default: the preset's)."""
     rate: float | None = None
@@ -65,6 +68,8 @@ class Options:
     of its alexnet.ckpt (default: L1 + SSIM)."""
     camera: Path | None = None
     """camera.npz of the camera to train for (default: cameras of a wide prior)."""
+    recordings: tuple[Path, ...] = ()
+    """Recordings of one sensor, with frames, to train on in place of simulated sequences."""
     max_seconds: float = math.inf
     """Stop after this long, with a checkpoint; the schedule still spans all steps."""
     resume: Literal["auto", "never", "must"] = "auto"
@@ -83,6 +88,7 @@ class Run:
     learning: LearningConfig
     lpips: str | None
     camera: str | None
+    recordings: tuple[str, ...] = ()
 
     @property
     def steps(self) -> int:
@@ -96,15 +102,16 @@ def main(options: Options) -> dict[str, Any]:
     camera = None if options.camera is None else Camera.load(options.camera)
     loss_weights = None if options.lpips is None else load_lpips(
         path=None if options.lpips == "auto" else options.lpips)
-    bank = make_bank(jax.random.fold_in(jax.random.key(learning.seed), 7))
+    bank, sample = source(options.recordings, learning)
     tx = optimiser(learning)
-    step = jax.jit(make_step(network, learning, tx))
+    step = jax.jit(make_step(network, learning, tx, sample))
     state = train(lambda state: step(state, bank, camera, loss_weights),
                   init_state(network, learning, tx), config, options)
     result = measure(network, state.params, learning, camera, options.batches)
     result = {"steps": int(state.step)} | result
     card = {"preset": options.preset, "steps": int(state.step), "seed": learning.seed,
-            "data": "procedural textures and scikit-image's photographs, simulated",
+            "data": ", ".join(config.recordings)
+            or "procedural textures and scikit-image's photographs, simulated",
             "held_out": result, "config": as_dict(config), **provenance()}
     save_network(options.out / f"{options.network}.safetensors", network, state.params, card,
                  normalised=learning.normalised, overwrite=True)
@@ -113,12 +120,28 @@ def main(options: Options) -> dict[str, Any]:
     return result
 
 
+def source(recordings: tuple[Path, ...], learning: LearningConfig) -> tuple[Any, Any]:
+    """What the steps draw from, and how."""
+    if recordings:
+        read = [read_recording(path) for path in recordings]
+        return recorded_bank(read, learning.data), sample_recorded
+    return make_bank(jax.random.fold_in(jax.random.key(learning.seed), 7)), sample_sequences
+
+
 def configuration(options: Options) -> Run:
+    """The run of these options; EV020 where they contradict each other."""
     network, learning = training(options.network, options.preset)
     changes = {k: v for k in ("steps", "rate") if (v := getattr(options, k)) is not None}
     learning = dataclasses.replace(
         learning, seed=options.seed, normalised=options.normalised, **changes)
-    return Run(network, learning, options.lpips, options.camera and str(options.camera))
+    if options.recordings and isinstance(network, EVFlowNet) and network.scales == 1:
+        raise EvflowDataError("EV020", "recordings have no true flow for this form of EV-FlowNet.",
+                              "Pass --preset original, which learns from their frames.")
+    if options.recordings and options.camera:
+        raise EvflowDataError("EV020", "--camera with --recordings, which have their own.",
+                              "Leave one out.")
+    camera = None if options.camera is None else str(options.camera)
+    return Run(network, learning, options.lpips, camera, tuple(map(str, options.recordings)))
 
 
 def measure(
@@ -164,7 +187,7 @@ def _flow_figures(
     flow, _ = network.apply(params, tensors)
     # The noise put on the tensors is no event: most of it is below half of one.
     events = jnp.abs(sequences.tensors).sum(-1) > 1.0
-    rows = {}
+    rows: dict[str, Array] = {}
     for name, guess in (("", flow), ("none_", jnp.zeros_like(flow))):
         error, beyond = aee(guess, sequences.flow, events)
         rows |= {f"{name}aee": jnp.nanmean(error), f"{name}outlier_percent": jnp.nanmean(beyond)}

@@ -12,6 +12,7 @@ import pytest
 
 from evflow.camera import Camera
 from evflow.downstream import E2VID, EVFlowNet, losses
+from evflow.downstream.recorded import recorded_bank, sample_recorded
 from evflow.downstream.simulated import (
     SequenceConfig,
     Sequences,
@@ -23,6 +24,7 @@ from evflow.downstream.train import LearningConfig, init_state, make_step, optim
 from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank, make_bank
 from evflow.sensors import SensorModel
+from evflow.types import Events, Recording
 
 DATA = SequenceConfig(sequences=4, windows=4, steps_per_window=4, crop=16, noise=0.0,
                       hot_pixels=0.0, model=SensorModel())
@@ -114,6 +116,73 @@ def test_the_truth_costs_nothing_and_flicker_does() -> None:
     assert float(losses.flow_l1(s.flow + 0.5, s.flow)) == pytest.approx(0.5, rel=1e-5)
 
 
+def test_the_true_flow_explains_the_frames_best() -> None:
+    """Photometric loss of constant flows on an image that moves by 2 px in x, 1 in y."""
+    rng = np.random.default_rng(0)
+    texture = jax.image.resize(jnp.asarray(rng.uniform(size=(1, 16, 16))), (1, 64, 64), "cubic")
+    before, after = texture[:, 8:40, 8:40], texture[:, 7:39, 6:38]
+
+    def loss(x: float, y: float) -> float:
+        full = jnp.broadcast_to(jnp.array([x, y]).reshape(1, 2, 1, 1), (1, 2, 32, 32))
+        return float(losses.photometric((full[..., ::2, ::2], full), before, after))
+
+    true = loss(2.0, 1.0)
+    assert true < min(loss(*other) for other in ((0, 0), (-2, -1), (1, 1), (2, 2), (3, 1)))
+    rough = jnp.asarray(rng.normal(size=(1, 2, 32, 32)), jnp.float32)
+    same = jnp.zeros_like(before)
+    assert float(losses.photometric((rough,), same, same)) > 0.2  # by its roughness alone
+
+
+@pytest.mark.slow
+def test_four_scales_learn_without_true_flow() -> None:
+    config = LearningConfig(data=DATA, steps=12, warmup=2, rate=3e-3, skip=1)
+    network = EVFlowNet(base=2, scales=4)
+    tx = optimiser(config)
+    step = jax.jit(make_step(network, config, tx))
+    start = init_state(network, config, tx)
+    state, history = start, []
+    for _ in range(12):
+        state, metrics = step(dataclasses.replace(state, step=start.step), bank())
+        history.append(float(metrics["loss"]))
+    assert history[-1] < 0.95 * history[0]
+
+
+def recorded(intervals: int, size: tuple[int, int] = (40, 24), seed: int = 0) -> Recording:
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, 30_000 * intervals, 3000))
+    events = Events(rng.integers(0, size[0], 3000), rng.integers(0, size[1], 3000), t,
+                    rng.integers(0, 2, 3000), size)
+    frames = rng.integers(20, 200, (intervals + 1, size[1], size[0])).astype(np.uint8)
+    return Recording(events, frames, 30_000 * np.arange(intervals + 1))
+
+
+def test_recordings_give_sequences_of_their_own_events() -> None:
+    recording = recorded(11)
+    found = recorded_bank([recording], DATA)
+    assert found.tensors.shape == (2, 4, 24, 40, 5)  # the third run is one interval short
+    inside = recording.events.slice(30_000 * 4, 30_000 * 5)
+    sign = np.where(inside.p, 1.0, -1.0)
+    counts = np.zeros((24, 40))
+    np.add.at(counts, (inside.y, inside.x), sign)
+    np.testing.assert_allclose(found.tensors[1, 0].sum(-1), counts, atol=1e-5)
+    np.testing.assert_allclose(found.frames[1, 0], recording.frames[5] / 255, rtol=1e-6)
+    s = jax.jit(sample_recorded, static_argnames="config")(jax.random.key(0), found, DATA)
+    assert s.tensors.shape == (4, 4, 16, 16, 5)
+    crops = {np.asarray(found.frames[n, 0, y:y + 16, x:x + 16]).tobytes()
+             for n in range(2) for y in range(9) for x in range(25)}
+    assert all(np.asarray(frame).tobytes() in crops for frame in s.frames[0])
+    assert recorded_bank([recording], DATA, most_bytes=1).frames.shape[0] == 1
+
+
+def test_recordings_that_cannot_train_are_refused() -> None:
+    with pytest.raises(EvflowDataError, match=r"EV015.*\(40, 24\)"):
+        recorded_bank([recorded(8), recorded(8, (32, 24))], DATA)
+    with pytest.raises(EvflowDataError, match=r"EV015.*crops of 16"):
+        recorded_bank([recorded(8, (40, 12))], DATA)
+    with pytest.raises(EvflowDataError, match="EV017"):
+        recorded_bank([recorded(3)], DATA)
+
+
 def test_warp_is_bilinear() -> None:
     image = jnp.arange(12.0).reshape(1, 3, 4)
     back = jnp.stack([jnp.full((3, 4), 0.5), jnp.full((3, 4), 1.0)])[None]
@@ -146,6 +215,8 @@ def test_steps_learn_a_batch_and_repeat_themselves(network) -> None:
     lambda: SequenceConfig(windows=1), lambda: SequenceConfig(pause=2.0),
     lambda: SequenceConfig(window_s=0.0), lambda: LearningConfig(rate=-1.0),
     lambda: LearningConfig(data=DATA, skip=3),
+    lambda: make_step(EVFlowNet(base=2, scales=4), LearningConfig(SequenceConfig(crop=24)),
+                      optimiser(LearningConfig())),
     lambda: make_step(E2VID(bins=4), LearningConfig(), optimiser(LearningConfig()))])
 def test_impossible_options_are_refused(make) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):

@@ -5,6 +5,8 @@ Every loss is a scalar of sequences with time first; pure and differentiable.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax.scipy.ndimage import map_coordinates
@@ -15,6 +17,8 @@ from evflow.metrics.lpips import Params, lpips
 Array = jax.Array
 
 OCCLUSION = 50.0  # of exp(-50 (I1 - W(I0))^2): frames that differ by .14 count e^-1
+CHARBONNIER, SMOOTHNESS = 0.45, 0.5  # EV-FlowNet's exponent, and weight of smoothness
+INSIDE = 0.99  # of a point's four neighbours: what was seen in the image
 
 
 def reconstruction(images: Array, frames: Array, lpips_params: Params | None = None) -> Array:
@@ -56,3 +60,33 @@ def warp(images: Array, back: Array) -> Array:
 def flow_l1(flow: Array, truth: Array) -> Array:
     """Mean absolute error of flows (T, B, 2, H, W), px."""
     return jnp.mean(jnp.abs(flow - truth))
+
+
+def photometric(flows: Sequence[Array], before: Array, after: Array) -> Array:
+    """Loss of flow without a true one, from the frames at a window's ends (EV-FlowNet, Zhu et al.,
+    RSS 2018, Eqs. 3-5), summed over scales: `after` read where the flow points should be `before`,
+    both (..., H, W) on [0, 1], and neighbours should move alike.
+
+    flows: one (..., 2, h, w) per scale, px of the full resolution. Points that leave the image do
+    not count.
+    """
+    total = jnp.zeros((), before.dtype)
+    for flow in flows:
+        shape = (*before.shape[:-2], *flow.shape[-2:])
+        first, second = (jax.image.resize(frame, shape, "linear") for frame in (before, after))
+        local = flow * (flow.shape[-1] / before.shape[-1])
+        seen = warp(jnp.ones_like(second), local) > INSIDE
+        total += jnp.mean(seen * _charbonnier(warp(second, local) - first))
+        total += SMOOTHNESS * _roughness(flow)
+    return total
+
+
+def _charbonnier(x: Array) -> Array:
+    return (x**2 + 1e-6) ** CHARBONNIER
+
+
+def _roughness(flow: Array) -> Array:
+    """Mean difference of neighbours: below, beside and along both diagonals."""
+    pairs = ((flow[..., 1:, :], flow[..., :-1, :]), (flow[..., 1:], flow[..., :-1]),
+             (flow[..., 1:, 1:], flow[..., :-1, :-1]), (flow[..., 1:, :-1], flow[..., :-1, 1:]))
+    return sum((jnp.mean(_charbonnier(a - b)) for a, b in pairs), jnp.zeros(())) / len(pairs)

@@ -99,6 +99,9 @@ def make_step(
     if network.bins != config.data.bins:
         raise EvflowDataError("EV020", f"the network has {network.bins} bins, the data "
                               f"{config.data.bins}.", "Give both the same.")
+    if config.data.crop % network.stride and isinstance(network, EVFlowNet) and network.scales > 1:
+        raise EvflowDataError("EV020", f"crop={config.data.crop} with four scales of flow.",
+                              f"Choose a multiple of {network.stride}.")
 
     def step(
         state: LearningState, bank: TextureBank, camera: Camera | None = None,
@@ -123,18 +126,25 @@ def sequence_loss(
     network: Network, params: Params, sequences: Sequences, config: LearningConfig,
     lpips_params: Params | None = None,
 ) -> tuple[Array, dict[str, Array]]:
-    """The loss of a network on sequences, and its parts: L1 of the flow for EV-FlowNet, else
-    reconstruction and temporal consistency."""
+    """The loss of a network on sequences, and its parts: of EV-FlowNet L1 of the flow, or the
+    photometric loss where it has four scales; else reconstruction and temporal consistency."""
     tensors = sequences.tensors
     tensors = normalise(tensors) if config.normalised else tensors
     if isinstance(network, EVFlowNet):
-        # Without memory the windows are one batch.
-        flow, _ = network.apply(params, tensors)
-        l1 = losses.flow_l1(flow, sequences.flow)
-        return l1, {"loss": l1}
+        loss = _flow_loss(network, params, tensors, sequences)
+        return loss, {"loss": loss}
     images, _ = run(network, params, tensors, train=True)
     seen = losses.reconstruction(images, sequences.frames, lpips_params)
     steady = losses.temporal(
         images, sequences.frames, sequences.back, sequences.visible, config.skip)
     total = seen + config.temporal * steady
     return total, {"loss": total, "reconstruction": seen, "temporal": steady}
+
+
+def _flow_loss(network: EVFlowNet, params: Params, tensors: Array, sequences: Sequences) -> Array:
+    """Without memory the windows are one batch; the first has no frame at its start."""
+    if network.scales == 1:
+        flow, _ = network.apply(params, tensors)
+        return losses.flow_l1(flow, sequences.flow)
+    flows = network.pyramid(params, tensors[1:])
+    return losses.photometric(flows, sequences.frames[:-1], sequences.frames[1:])
