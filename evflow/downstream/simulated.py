@@ -182,8 +182,11 @@ def add_noise(key: Array, tensors: Array, config: SequenceConfig) -> Array:
 
 def _flows(scene: Scene, edges: Array, shape: tuple[int, int]) -> tuple[Array, Array, Array]:
     """Flow of every window forward and back, and what of its end was visible at its start."""
-    def window(start: Array, stop: Array) -> tuple[Array, Array, Array]:
-        there, _ = optical_flow(scene, start, stop, shape)
-        return there, *optical_flow(scene, stop, start, shape)
+    def window(ends: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        there, _ = optical_flow(scene, *ends, shape)
+        return there, *optical_flow(scene, *ends[::-1], shape)
 
-    return jax.vmap(window)(edges[:-1], edges[1:])
+    # A loop, whose results are kept: under vmap XLA works the flow out again wherever the loss
+    # reads it, and a training step takes twice as long.
+    flows: tuple[Array, Array, Array] = jax.lax.map(window, (edges[:-1], edges[1:]))
+    return flows
