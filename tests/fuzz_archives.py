@@ -111,6 +111,19 @@ def text_bomb(folder: Path, case: tuple[str, bytes]) -> Sample:
     return sample(deflated(folder / "a.zip", members), size=(9, 9))
 
 
+@hostile
+def zip_that_claims_a_long_member(folder: Path) -> Sample:
+    """Packed into more bytes than the file has."""
+    path = folder / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("events.txt", "0.1 1 1 1\n" * 9)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"PK\1\2") + 20
+    data[at:at + 4] = (1 << 30).to_bytes(4, "little")
+    path.write_bytes(data)
+    return sample(path, size=(9, 9))
+
+
 @each(up="../../events.txt", rooted="/etc/events.txt", twice="a/events.txt b/events.txt")
 def zip_names(folder: Path, case: str) -> Sample:
     with zipfile.ZipFile(folder / "a.zip", "w") as archive:

@@ -40,8 +40,12 @@ def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.Zip
     streamed: members that are read piece by piece, and so may be of any size."""
     try:
         with zipfile.ZipFile(path) as archive:
-            sizes = [info.file_size for info in archive.infolist() if info.filename not in streamed]
-            check_expansion(sum(sizes), os.path.getsize(path), path)
+            found, there = archive.infolist(), os.path.getsize(path)
+            if (most := max((info.compress_size for info in found), default=0)) > there:
+                # zipfile would ask for memory for all of them
+                raise ValueError(f"a member of {most} bytes in a file of {there}")
+            sizes = [info.file_size for info in found if info.filename not in streamed]
+            check_expansion(sum(sizes), there, path)
             yield archive
     except DAMAGE as e:
         raise EvflowDataError(
