@@ -53,6 +53,8 @@ class Reconstruct(Windowed):
     """Print JSON."""
 
     def run(self) -> None:
+        import numpy as np
+
         from evflow.downstream.released import load_network
         from evflow.downstream.tensor import reconstructions
         from evflow.downstream.video import images_of
@@ -64,13 +66,15 @@ class Reconstruct(Windowed):
         trained = images_of(load_network(self.weights))
         recording = self.read(self.recording)
         times = self.times(recording)
-        scores = self._scores() if times is recording.frame_times else None
+        # Without events nothing is to be seen: only frames amid them are scored.
+        seen = np.searchsorted(times, recording.events.t[-1], "right")
+        scores = self._scores(int(seen)) if times is recording.frame_times else None
         with bar("reconstructing") as progress:
             images = reconstructions(
                 trained.network, trained.params, recording.events, times, **trained.how)
-            seen = _watched(images, recording, scores, len(times), progress)
-            said = (self._folder(seen, times) if kind == "" else
-                    self._film(seen, times, recording))
+            images = _watched(images, recording, scores, int(seen), len(times), progress)
+            said = (self._folder(images, times) if kind == "" else
+                    self._film(images, times, recording))
         result = scores.result() if scores else None
         facts = {"out": str(self.out), "weights": self.weights, "images": len(times),
                  "scores": result, "notes": list(recording.notes)}
@@ -91,9 +95,9 @@ class Reconstruct(Windowed):
                f"nothing that a {kind or 'folder of images'} has")
         return kind
 
-    def _scores(self) -> FrameScores:
-        """By the protocol, with LPIPS where its weights are installed."""
-        from evflow.downstream.video import FrameScores
+    def _scores(self, frames: int) -> FrameScores:
+        """Of so many frames by the protocol, with LPIPS where its weights are installed."""
+        from evflow.downstream.video import WARM_UP, FrameScores
         from evflow.metrics.image_scores import PROTOCOLS
         from evflow.metrics.lpips import load_lpips
 
@@ -101,7 +105,7 @@ class Reconstruct(Windowed):
             weights = load_lpips()
         except EvflowDataError:
             weights = None
-        return FrameScores(PROTOCOLS[self.protocol], weights)
+        return FrameScores(PROTOCOLS[self.protocol], weights, min(WARM_UP, frames // 2))
 
     def _film(self, images: Iterator[np.ndarray], times: np.ndarray, recording: Recording) -> str:
         from evflow.report.video import enlarged, write_video
@@ -119,12 +123,12 @@ class Reconstruct(Windowed):
 
 
 def _watched(
-    images: Iterator[np.ndarray], recording: Recording, scores: FrameScores | None, count: int,
-    progress: Any,
+    images: Iterator[np.ndarray], recording: Recording, scores: FrameScores | None, scored: int,
+    count: int, progress: Any,
 ) -> Iterator[np.ndarray]:
-    """The images on their way, each scored against its frame."""
+    """The images on their way, the first `scored` of `count` scored against their frames."""
     for i, image in enumerate(images):
-        if scores:
+        if scores and i < scored:
             scores.add(image, recording.frame_dn(i))
         yield image
         progress(i + 1, count)
