@@ -22,7 +22,7 @@ from evflow.types import Recording
 
 FRAME_US = 30_000  # windows that the released networks were trained on
 WARM_UP = 5  # images until a network's memory holds the scene: .15 s
-# Of log(theta / truth): .70 on hidden cameras (a constant: .37), 1.1 on a Newton's cradle.
+# Of log(theta / truth): .65 on hidden cameras (a constant: .39), 1.2 on a Newton's cradle.
 GUESS_ERROR = 1.0
 GUESSED = (
     "the frames were made from the events by a network: their contrast is its guess, not measured "
