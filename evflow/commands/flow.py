@@ -31,7 +31,7 @@ class Flow(Windowed):
     Example: evflow flow flight.aedat4 -o flow.mp4
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """.mp4, .avi or .gif."""

@@ -32,7 +32,7 @@ class Reconstruct(Windowed):
     Example: evflow reconstruct flight.aedat4 -o flight.mp4
     """
 
-    recording: tyro.conf.Positional[Path]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """.mp4, .avi or .gif; or a folder for .png images with timestamps.txt, as --frames of other
