@@ -3,7 +3,7 @@
     python -m experiments.evaluate_network --weights e2vid-small
     python -m experiments.evaluate_network --weights E2VID_plus.pth.tar --data ijrr/* \\
         --protocol etnet --aggregate sequences --warmup-s 0
-    python -m experiments.evaluate_network --weights evflownet-small
+    python -m experiments.evaluate_network --weights runs/flow/evflownet.safetensors
 
 Weights: released names, .safetensors files, published checkpoints. --data takes recordings of any
 format: IJRR, MVSEC, HQF, EVIMO2v2, EVREAL. The cuts are those of `experiments.recorded.CUTS`, by

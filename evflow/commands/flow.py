@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -28,30 +28,21 @@ class Flow(Windowed):
     """Show the optical flow, by EV-FlowNet: the hue says where to, the saturation how fast, where
     there are events; and measure how much it sharpens them (FWL; above 1 is better than none).
 
-    Example: evflow flow flight.aedat4 -o flow.mp4
+    Example: evflow flow flight.aedat4 -o flow.mp4 --weights runs/flow/evflownet.safetensors
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """.mp4, .avi or .gif."""
-    weights: str = "evflownet-small"
-    """Name of released weights, a .safetensors path, or a published checkpoint (.pth.tar)."""
+    weights: str
+    """A .safetensors path, as `python -m experiments.train_network --network evflownet` makes it,
+    or a published checkpoint (.pth.tar). None are released yet."""
     truth: Annotated[Path | None, value("FILE")] = None
     """True flow, .npz: flow (T, 2, H, W) = (x, y) px over each window, edges_us (T + 1,) of the
     windows, which replace --sync, and valid (T, H, W) where not all of it is."""
     full_px: Annotated[float | None, value("PX")] = None
     """Motion in a window that has full colour; without it that which 1 % of the pixels exceed."""
-    fps: Annotated[float | None, value("HZ")] = None
-    """Pictures per second; without it the film lasts as long as the recording."""
-    scale: Annotated[int | None, value("N")] = None
-    """Screen pixels per pixel; without it as many as make the film 640 wide."""
-    codec: Literal["mpeg4", "vp9"] = "mpeg4"
-    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
-    overwrite: bool = False
-    """Replace the output where it exists."""
-    json: bool = False
-    """Print JSON."""
 
     def run(self) -> None:
         from evflow.downstream.flow import FlowScores, flow_of, full_motion, window_flows

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from evflow.commands.options import check_finite, own_first, refuse, value
+from evflow.commands.options import check_finite, own_first, refuse
 from evflow.commands.windows import Windowed, lasting
 from evflow.commands.writing import need_absent
 from evflow.errors import EvflowDataError
@@ -41,16 +41,6 @@ class Reconstruct(Windowed):
     """Name of released weights, a .safetensors path, or a published checkpoint (.pth.tar)."""
     protocol: Literal["evreal", "etnet", "global"] = "evreal"
     """How images are scored: which SSIM, clipped or not."""
-    fps: Annotated[float | None, value("HZ")] = None
-    """Pictures per second of the film; without it, it lasts as long as the recording."""
-    scale: Annotated[int | None, value("N")] = None
-    """Screen pixels per pixel of the film; without it as many as make it 640 wide."""
-    codec: Literal["mpeg4", "vp9"] = "mpeg4"
-    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
-    overwrite: bool = False
-    """Replace the output where it exists."""
-    json: bool = False
-    """Print JSON."""
 
     def run(self) -> None:
         import numpy as np

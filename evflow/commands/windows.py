@@ -1,4 +1,5 @@
-"""Options of commands that run a network over a recording, window by window."""
+"""Options of commands that run a network over a recording, window by window, and film what it
+makes."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Windowed(Reading):
-    """How a recording is read and cut into windows; what a command that does both inherits."""
+    """How a recording is read, cut into windows, and filmed."""
 
     sync: Literal["auto", "frames", "events", "ms"] = "auto"
     """Where windows end: at the recording's frames, after --window-events, or every --window-ms.
@@ -24,6 +25,16 @@ class Windowed(Reading):
     """Events a window (--sync events); without it .35 a pixel."""
     window_ms: float = 33.0
     """Length of a window (--sync ms, and auto without frames)."""
+    fps: Annotated[float | None, value("HZ")] = None
+    """Pictures per second of the film; without it, it lasts as long as the recording."""
+    scale: Annotated[int | None, value("N")] = None
+    """Screen pixels per pixel of the film; without it as many as make it 640 wide."""
+    codec: Literal["mpeg4", "vp9"] = "mpeg4"
+    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
+    overwrite: bool = False
+    """Replace the output where it exists."""
+    json: bool = False
+    """Print JSON."""
 
     def times(self, recording: Recording) -> np.ndarray:
         """The ends (T,) of the windows; EV020 where options contradict each other."""
