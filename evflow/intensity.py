@@ -7,6 +7,7 @@ that dark pixels do not turn quantisation steps into contrast. `log_eps` is ESIM
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jax.typing import ArrayLike
 from evflow.errors import EvflowDataError
 
 Array = jax.Array
+Values = Any  # jax.Array or np.ndarray, and what comes in comes out
 
 LINLOG_KNEE = 20.0  # DN; v2e's threshold between the linear and the logarithmic part
 LINLOG_SLOPE = float(np.log(LINLOG_KNEE) / LINLOG_KNEE)
@@ -79,12 +81,12 @@ def to_dn(frames: np.ndarray, full_scale: float) -> np.ndarray:
     return np.asarray(frames, np.float32) * np.float32(255.0 / full_scale)
 
 
-def normalised_intensity(dn: Array) -> Array:
+def normalised_intensity(dn: Values) -> Values:
     """I01 = (I + 20) / 275 in (.07, 1]: v2e's rescaling, the N_01 of Eq. 12."""
     return (dn + 20.0) / 275.0
 
 
-def noise_factor(i01: Array) -> Array:
+def noise_factor(i01: Values) -> Values:
     """((F - 1) I01 + 1) of Eq. 12 with F = 0.25: noise falls linearly with intensity."""
     return 1.0 - 0.75 * i01
 

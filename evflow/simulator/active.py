@@ -18,7 +18,7 @@ from evflow.intensity import normalised_intensity, to_log
 from evflow.sensors import SensorModel
 from evflow.simulator import noise, pixel, sensor
 from evflow.simulator.pixel import PixelState, Spikes
-from evflow.simulator.sensor import Sensor, Struck
+from evflow.simulator.sensor import Sensor
 
 Array = jax.Array
 
@@ -43,15 +43,14 @@ class Block:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """What K pixels send in T intervals, each array (T, K). fires: whether there are signal
-    events. ticks: uint32, of the first of them the microseconds from the begin of the block,
-    times 4, + 2 where ON, + 1 where it is not the only one (nonsense in blocks of `TICKS` us and
-    more). struck: noise events, None without."""
+    """What K pixels send in T intervals, each array (T, K). ticks: uint32, 0 where there is no
+    signal event, else of the first of them the microseconds from the begin of the block, times 4,
+    + 2 where ON, + 1 where it is not the only one (nonsense, but not 0, in blocks of `TICKS` us
+    and more). struck: whether there are noise events, None without noise."""
 
-    fires: Array
     ticks: Array
     spikes: Spikes
-    struck: Struck | None
+    struck: Array | None
 
 
 @functools.partial(jax.jit, static_argnames="model")
@@ -152,29 +151,31 @@ def step(
     clock = block.clock[:-1], block.clock[1:]
     pixels, spikes = jax.lax.scan(
         body, pixels, (log_i, i01, dist, block.dt, clock))
-    real, struck = (at < whole.words.size)[None], dist.struck
-    if struck is not None:
-        struck = dataclasses.replace(struck, some=struck.some & real)
+    real = (at < whole.words.size)[None]
+    struck = None if dist.struck is None else dist.struck.some & real
     kept = ("base", "last") if model.refractory_s > 0 else ("base",)
     put = {name: getattr(after, name).at[at].set(getattr(pixels, name), mode="drop")
            for name in kept}
-    sent = Sent((spikes.count != 0) & real, _ticks(spikes, block.dt_us), spikes, struck)
+    ticks = jnp.where((spikes.count != 0) & real, _ticks(spikes, block.dt_us), 0)
+    sent = Sent(ticks, spikes, struck)
     return dataclasses.replace(after, **put), sent
 
 
 def _ticks(spikes: Spikes, dt_us: Array) -> Array:
-    """`Sent.ticks`. Times are rounded up to a microsecond, within (begin, end] of their
-    interval."""
+    """`Sent.ticks` where there are events. Times are rounded up to a microsecond, within
+    (begin, end] of their interval."""
     at = spikes.first if spikes.earliest is None else jnp.maximum(spikes.first, spikes.earliest)
     length = dt_us.astype(at.dtype)[:, None]
     within = jnp.clip(jnp.ceil(at * length), 1, length).astype(jnp.uint32)
     when = (jnp.cumsum(dt_us) - dt_us)[:, None] + within
     on, more = (flag.astype(jnp.uint32) for flag in (spikes.count > 0, abs(spikes.count) > 1))
-    return (when << 2) | (on << 1) | more
+    return jnp.maximum((when << 2) | (on << 1) | more, 1)
 
 
 @functools.partial(jax.jit, static_argnames="model")
-def strike(model: SensorModel, whole: Sensor, block: Block) -> Struck | None:
-    """The noise of a block, (T, N), of sensors whose signal comes from elsewhere."""
+def strike(model: SensorModel, whole: Sensor, block: Block) -> Array | None:
+    """Where there is noise in a block, bool (T, N), for sensors whose signal comes from
+    elsewhere; None without noise."""
     one = functools.partial(sensor.disturb, model, whole)
-    return jax.vmap(one)(_i01(block.frames), block.salts, block.dt).struck
+    struck = jax.vmap(one)(_i01(block.frames), block.salts, block.dt).struck
+    return None if struck is None else struck.some

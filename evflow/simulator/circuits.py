@@ -24,7 +24,7 @@ from evflow.simulator import active, noise, pack, sensor, voltmeter
 from evflow.simulator.active import Block, Sent
 from evflow.simulator.pack import Columns
 from evflow.simulator.pixel import PixelState
-from evflow.simulator.sensor import Sensor, SimState, Struck
+from evflow.simulator.sensor import Sensor, SimState
 
 Array = jax.Array
 Fetch = Callable[[], list[Columns]]
@@ -81,7 +81,8 @@ class _Blocks:
             nominal = noise.nominal_thresholds(model, camera)
             self.most_hz = noise.most_rate(model, camera, nominal)
         self.whole, state = _start(key, frame, camera, nominal, model=model)
-        self.pixels, self.key, self.words = state.pixels, state.key, np.asarray(self.whole.words)
+        self.here = jax.tree.map(np.asarray, self.whole)  # the same, for the host
+        self.pixels, self.key = state.pixels, state.key
         self.interval, self.salts = 0, np.empty((0, 2), np.uint32)
         self.no_clock = np.zeros((BLOCK + 1, 2), np.float32)
         # Fresh memory is dear. Two blocks are under way while a third is filled.
@@ -135,7 +136,7 @@ class Thresholds(_Blocks):
     def _step(
         self, block: Block, dt_us: np.ndarray, after: PixelState, may_send: Array
     ) -> Fetch:
-        sent, count = [], self.words.size
+        sent, count = [], self.here.words.size
         sizes: tuple[int, ...] = ACTIVE
         if self.model.timestamps == "v2e":  # its slots depend on all pixels
             at, sizes = np.arange(count, dtype=np.int32), (count,)
@@ -148,12 +149,14 @@ class Thresholds(_Blocks):
             after, out = active.step(self.model, self.whole, self.pixels, after, block, padded)
             sent.append((some, out))
         self.pixels = after
-        return partial(self._columns, sent, dt_us)
+        return partial(self._columns, sent, block, dt_us)
 
-    def _columns(self, sent: list[tuple[np.ndarray, Sent]], dt_us: np.ndarray) -> list[Columns]:
-        noise = (part for pixels, out in sent for part in pack.noise_columns(
-            self.model, out.struck, pixels, self.words, dt_us))
-        return [*pack.signal_columns(self.model, sent, dt_us), *noise]
+    def _columns(
+        self, sent: list[tuple[np.ndarray, Sent]], block: Block, dt_us: np.ndarray
+    ) -> list[Columns]:
+        struck = [(pixels, out.struck) for pixels, out in sent]
+        return [*pack.signal_columns(self.model, sent, dt_us),
+                *pack.noise_columns(self.model, self.here, struck, block, dt_us)]
 
 
 class Brownian(_Blocks):
@@ -170,9 +173,10 @@ class Brownian(_Blocks):
     def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
         for frames, edges in video:
             dt_us = np.diff(edges)
-            struck = active.strike(self.model, self.whole, self.block(frames, edges))
+            block = self.block(frames, edges)
+            struck = active.strike(self.model, self.whole, block)
             signal = [self._interval(*each) for each in zip(frames, dt_us.tolist(), strict=True)]
-            yield partial(self._columns, signal, struck, dt_us)
+            yield partial(self._columns, signal, struck, block, dt_us)
 
     def _interval(self, frame: np.ndarray, dt_us: float) -> Spiked:
         self.voltage, pixel, fraction, on = voltmeter.fired(
@@ -181,10 +185,11 @@ class Brownian(_Blocks):
         return pixel, fraction, on
 
     def _columns(
-        self, signal: list[Spiked], struck: Struck | None, dt_us: np.ndarray
+        self, signal: list[Spiked], struck: Array | None, block: Block, dt_us: np.ndarray
     ) -> list[Columns]:
         step = np.repeat(np.arange(len(signal)), [len(pixel) for pixel, _, _ in signal])
         pixel, fraction, on = (np.concatenate(c) for c in zip(*signal, strict=True))
-        everywhere = np.arange(self.words.size)
+        everywhere = np.arange(self.here.words.size)
         return [pack.from_fractions(step, pixel, fraction, on, dt_us, noise=False),
-                *pack.noise_columns(self.model, struck, everywhere, self.words, dt_us)]
+                *pack.noise_columns(
+                    self.model, self.here, [(everywhere, struck)], block, dt_us)]

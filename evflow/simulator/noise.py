@@ -10,7 +10,6 @@ interval length; the events of an interval are independent of each other and uni
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +17,10 @@ import numpy as np
 
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
-from evflow.intensity import noise_factor
+from evflow.intensity import Values, noise_factor
 from evflow.sensors import SensorModel
 
 Array = jax.Array
-Values = Any  # jax.Array or np.ndarray
 
 MAX_MEAN = 70.0  # noise events per pixel and interval; beyond ~85 exp(-mean) underflows
 LEAK_THETA = 10.0  # natural log; all of an image sensor's range is 5.5
@@ -81,10 +79,11 @@ def event(
 Tail = tuple[Values, Values, Values]
 
 
-def some(mean: Array) -> Array:
+def some(mean: Values) -> Values:
     """P(N > 0) of a Poisson count N: 1 - exp(-mean), by its series below .03."""
+    xp = mean.__array_namespace__()
     series = mean * (1.0 - mean / 2.0 * (1.0 - mean / 3.0 * (1.0 - mean / 4.0)))
-    return jnp.where(mean < 0.03, series, 1.0 - jnp.exp(-mean))
+    return xp.where(mean < 0.03, series, 1.0 - xp.exp(-mean))
 
 
 def next_tail(mean: Values, current: Tail) -> Tail:
@@ -119,10 +118,10 @@ class Rates:
     """Noise rates in Hz, ON and OFF maps each: rate = steady + varying x noise_factor(I01).
     varying: None where intensity does not matter."""
 
-    steady: tuple[Array, Array]
-    varying: tuple[Array, Array] | None
+    steady: tuple[Values, Values]
+    varying: tuple[Values, Values] | None
 
-    def at(self, i01: Array) -> tuple[Array, Array]:
+    def at(self, i01: Values) -> tuple[Values, Values]:
         """(ON, OFF) rates at normalised intensity i01."""
         (on, off), factor = self.steady, noise_factor(i01)
         if self.varying is None:
@@ -136,21 +135,22 @@ class Odds:
     """Of an interval, per pixel: the mean number of noise events, the probabilities of any and of
     none, and the share of ON among them."""
 
-    mean: Array
-    some: Array
-    none: Array
-    share: Array
+    mean: Values
+    some: Values
+    none: Values
+    share: Values
 
     def tail(self) -> Tail:
         """(P(N > 0), P(N = 0), k = 0), the start of `next_tail`."""
         return self.some, self.none, np.float32(0.0)
 
 
-def odds(rates: Rates, i01: Array, dt: Array) -> Odds:
+def odds(rates: Rates, i01: Values, dt: Values) -> Odds:
     """The odds of an interval of dt seconds at normalised intensity i01."""
+    xp = i01.__array_namespace__()
     on, off = rates.at(i01)
     mean = dt * (on + off)
-    return Odds(mean, some(mean), jnp.exp(-mean), on / jnp.maximum(on + off, 1e-30))
+    return Odds(mean, some(mean), xp.exp(-mean), on / xp.maximum(on + off, 1e-30))
 
 
 def rates(model: SensorModel, camera: Camera, reference: Array, nominal: Array) -> Rates:

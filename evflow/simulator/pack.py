@@ -1,7 +1,7 @@
 """What a block of frames has sent -> a sorted list of events (host, NumPy).
 
 Event times are integer microseconds in (t_prev, t_now] of their frame interval, so intervals
-never overlap. The order is total: time, then pixel, then polarity, then noise after signal.
+never overlap. The order is total: time, OFF before ON, noise after signal, pixel.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from evflow.intensity import normalised_intensity
 from evflow.sensors import SensorModel
 from evflow.simulator import noise
-from evflow.simulator.active import TICKS, Sent
-from evflow.simulator.pixel import Spikes
-from evflow.simulator.sensor import Struck
+from evflow.simulator.active import TICKS, Block, Sent
+from evflow.simulator.sensor import Sensor
 from evflow.types import Events
 
 Array = np.ndarray
@@ -25,13 +25,11 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True)
 class Columns:
-    """Events in no order: microseconds from the begin of the block, pixel, whether ON, whether
-    noise (one flag for all). Integers; their dtype is the callers' choice."""
+    """Events in no order. rank: microseconds from the begin of the block, times 4, + 2 where ON,
+    + 1 where noise. Integers; their dtype is the callers' choice."""
 
-    when: Array
+    rank: Array
     pixel: Array
-    on: Array
-    noise: bool
 
 
 def from_fractions(
@@ -43,7 +41,8 @@ def from_fractions(
     length = dt_us.astype(exact).take(step)
     within = np.clip(np.ceil(fraction * length), 1, length)
     begin = np.cumsum(dt_us) - dt_us
-    return Columns(begin.take(step) + within.astype(np.int64), pixel, on, noise)
+    when = begin.take(step) + within.astype(np.int64)
+    return Columns((when << 2) + 2 * on + noise, pixel)
 
 
 def signal_columns(
@@ -54,42 +53,57 @@ def signal_columns(
     timed = int(dt_us.sum()) < TICKS
     further = []
     for pixels, out in sent:
-        at, pixel = _where(out.fires, pixels, len(dt_us))
-        ticks = _of(out.ticks, at)
+        at, pixel = _where(np.asarray(out.ticks) != 0, pixels, len(dt_us))
         if timed:
-            yield Columns(ticks >> 2, pixel, (ticks >> 1) & 1, noise=False)
+            ticks = _of(out.ticks, at)
+            yield Columns(ticks & ~np.uint32(1), pixel)
             many = np.flatnonzero((ticks & 1).astype(bool))  # there are few
             at, pixel = at.take(many), pixel.take(many)
-        spikes = jax.tree.map(lambda values, at=at: _of(values, at), out.spikes)
-        further.append((at // out.fires.shape[1], pixel, spikes))
-    if further:
-        step, pixel, spikes = jax.tree.map(lambda *parts: np.concatenate(parts), *further)
-        yield _progressions(model, step, pixel, spikes, dt_us, skip=int(timed))
+        further.append((out, at, pixel))
+    if any(len(at) for _, at, _ in further):
+        yield _progressions(model, further, dt_us, skip=int(timed))
 
 
 def _progressions(
-    model: SensorModel, step: Array, pixel: Array, spikes: Spikes, dt_us: Array, skip: int
+    model: SensorModel, sent: list[tuple[Sent, Array, Array]], dt_us: Array, skip: int
 ) -> Columns:
-    """All events of `spikes` but the first `skip` of each."""
-    row, k = _repeated(np.abs(spikes.count) - skip)
-    step, k = step.take(row), (k + skip).astype(np.float32)
-    fraction: Any = spikes.first.take(row) + k * spikes.spacing.take(row)
-    if spikes.earliest is not None:
+    """All events but the first `skip` of each pixel and interval. sent: with what is sent, where
+    in its arrays, and the pixels there."""
+    def spikes(name: str) -> Array:
+        return np.concatenate([_of(getattr(out.spikes, name), at) for out, at, _ in sent])
+
+    count = spikes("count")
+    row, k = _repeated(np.abs(count) - skip)
+    step, pixel = (np.concatenate(parts).take(row) for parts in zip(
+        *((at // out.ticks.shape[1], pixel) for out, at, pixel in sent), strict=True))
+    k = (k + skip).astype(np.float32)
+    fraction: Any = spikes("first").take(row) + k * spikes("spacing").take(row)
+    if sent[0][0].spikes.earliest is not None:
         dead = (model.refractory_s / (dt_us * 1e-6)).astype(np.float32)
-        fraction = np.maximum(fraction, spikes.earliest.take(row) + k * dead.take(step))
-    return from_fractions(
-        step, pixel.take(row), fraction, spikes.count.take(row) > 0, dt_us, noise=False)
+        fraction = np.maximum(fraction, spikes("earliest").take(row) + k * dead.take(step))
+    return from_fractions(step, pixel, fraction, count.take(row) > 0, dt_us, noise=False)
 
 
 def noise_columns(
-    model: SensorModel, struck: Struck | None, pixels: Array, words: Array, dt_us: Array
+    model: SensorModel, whole: Sensor, struck: Sequence[tuple[Array, Any]], block: Block,
+    dt_us: Array,
 ) -> Iterator[Columns]:
-    """The noise events. words: `Sensor.words`, whole."""
-    if struck is None:
+    """The noise events of a block. whole: the sensor in NumPy. struck: where some pixels are
+    struck, None without noise, and which they are.
+
+    What a pixel drew and its odds are worked out again here, for the few that are struck: as
+    maps of all that may be, they cost more to write than all else that a block does.
+    """
+    found = [(flags.shape[1], *_where(np.asarray(flags), pixels, len(dt_us)))
+             for pixels, flags in struck if flags is not None]
+    if not found:
         return
-    at, pixel = _where(struck.some, pixels, len(dt_us))
-    step, odds = at // struck.some.shape[1], jax.tree.map(lambda a: _of(a, at), struck.odds)
-    words, drawn = words.take(pixel), _of(struck.drawn, at)
+    step, pixel = (np.concatenate(parts) for parts in zip(
+        *((at // width, pixel) for width, at, pixel in found), strict=True))
+    words, rates = jax.tree.map(lambda m: m.take(pixel), (whole.words, whole.rates))
+    drawn = noise.draw(words, block.salts.take(step, axis=0).T)
+    i01 = normalised_intensity(block.frames[step, pixel].astype(np.float32))
+    odds = noise.odds(rates, i01, block.dt.take(step))
     row, k = _repeated(_number(odds, noise.uniform(drawn)))
     fraction, on = noise.event(
         model, words[row], drawn[row], k.astype(np.uint32), odds.share[row])
@@ -97,18 +111,19 @@ def noise_columns(
 
 
 def _number(odds: noise.Odds, u: Array) -> Array:
-    """How many noise events each pixel sends that drew u."""
-    tail, number = odds.tail(), np.zeros(len(u), np.int64)
+    """How many noise events each pixel sends that is struck and drew u: at least one, however
+    the device that found it rounds."""
+    tail, number = noise.next_tail(odds.mean, odds.tail()), np.ones(len(u), np.int64)
     while (more := u < tail[0]).any():
         number += more
         tail = noise.next_tail(odds.mean, tail)
     return number
 
 
-def _where(flags: jax.Array, pixels: Array, steps: int) -> tuple[Array, Array]:
+def _where(flags: Array, pixels: Array, steps: int) -> tuple[Array, Array]:
     """Index into arrays (T, K), and pixel, of what is flagged; intervals from `steps` on are
     padding."""
-    at = np.flatnonzero(np.asarray(flags)[:steps])
+    at = np.flatnonzero(flags[:steps])
     row = at // flags.shape[1]
     return at, pixels.take(at - row * flags.shape[1])  # % takes three times as long
 
@@ -130,31 +145,28 @@ def sort(
     """The sorted `Events` of a block whose frames are at `edges` (T + 1,) us, and (N,) bool:
     which of them are noise.
 
-    Time, pixel, polarity and kind in one integer make a sort without an index array; equal
-    integers are equal events.
+    Rank and pixel in one integer make a sort without an index array; equal integers are equal
+    events.
     """
     height, width = shape
-    bits = (4 * height * width - 1).bit_length()  # of pixel, polarity and kind
-    dtype = np.uint32 if (int(edges[-1] - edges[0]) << bits) < 2**32 else np.uint64
+    bits = (height * width - 1).bit_length()
+    dtype = np.uint32 if (int(edges[-1] - edges[0]) << bits + 2) < 2**32 else np.uint64
     nothing = np.empty(0, dtype)
     keys = np.concatenate([nothing, *(_keys(part, bits, dtype) for part in parts)])
     keys.sort()
-    pixel = (keys & dtype((1 << bits) - 1)) >> dtype(2)
+    pixel = keys & dtype((1 << bits) - 1)
     y = pixel // dtype(width)
     x = pixel - y * dtype(width)
-    t = (keys >> dtype(bits)).astype(np.int64)
+    t = (keys >> dtype(bits + 2)).astype(np.int64)
     t += edges[0]
-    on, noise = ((keys & dtype(flag)).astype(bool) for flag in (2, 1))
+    noise, on = ((keys & dtype(flag << bits)).astype(bool) for flag in (1, 2))
     columns = x.astype(np.uint16), y.astype(np.uint16), t, on
     return Events.unchecked(*columns, (width, height)), noise
 
 
 def _keys(part: Columns, bits: int, dtype: type) -> Array:
-    """Time, pixel, polarity and kind, packed into integers that sort so."""
-    keys: Array = part.when.astype(dtype)
-    keys <<= dtype(bits - 2)
+    """Rank and pixel, packed into integers that sort so."""
+    keys: Array = part.rank.astype(dtype)
+    keys <<= dtype(bits)
     keys += part.pixel.astype(dtype)
-    keys <<= dtype(1)
-    keys += part.on.astype(dtype)
-    keys <<= dtype(1)
-    return keys + dtype(part.noise)
+    return keys
