@@ -201,7 +201,8 @@ def _refined(
 ) -> tuple[Summary, Summary]:
     """The summary and its std after refinement, without hot (H, W) pixels."""
     used = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
-    refined = refine_summary(used, summary, std, next(iter(params.values())).get("fusion"))
+    parts = next(iter(params.values()))
+    refined = refine_summary(used, summary, std, parts.get("fusion"), parts.get("signal"))
     return refined.summary, refined.std
 
 

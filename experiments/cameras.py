@@ -44,7 +44,7 @@ class Hidden:
     """A recording and the truth behind it.
 
     nominal: at the recording's mean intensity; video: (T, H, W) DN at 1000 frames/s, of which the
-    recording keeps the frames `kept` (K+1,).
+    recording keeps the frames `kept` (K+1,); noise: (N,) bool, events that are noise.
     """
 
     recording: Recording
@@ -52,6 +52,7 @@ class Hidden:
     nominal: Summary
     video: np.ndarray
     kept: np.ndarray
+    noise: np.ndarray
 
     def signal_events(self) -> np.ndarray:
         """ON and OFF events (2,) less those that noise is expected to send."""
@@ -86,7 +87,7 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
     nominal = sample_nominal(k_nominal, (), protocol.prior, light[0])
     camera = sample_pixels(k_pixels, nominal, protocol.shape, protocol.prior.eta_spread)
     times = np.arange(length) * 1000
-    events = simulate(k_events, frames, times, camera, model=protocol.model)
+    events, labels = simulate(k_events, frames, times, camera, model=protocol.model, labels=True)
     kept = np.arange(lead, length, protocol.frame_ms)
     noise = protocol.frame_noise_dn * jax.random.normal(k_noise, (len(kept), *protocol.shape))
     gray = np.clip(np.rint(frames[kept] + np.asarray(noise)), 0, 255).astype(np.uint8)
@@ -95,7 +96,7 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
     return Hidden(
         Recording(events, gray, times[kept]),
         dataclasses.replace(camera, eta_on=camera.eta_on * gain, eta_off=camera.eta_off * gain),
-        dataclasses.replace(nominal, **seen), frames, kept)
+        dataclasses.replace(nominal, **seen), frames, kept, labels)
 
 
 FRAME_MS = (10, 20, 25, 25, 33, 40)

@@ -5,7 +5,8 @@
 The recordings of `experiments.evaluate`, refined with the true 1000 frames/s video in place of
 frames 25 ms apart. What then remains for theta is the counts' own noise; no method that sees the
 frames alone can do better. The limit of a pixel's theta is its regression on the true video; that
-of eta, that every noise event is known as such (Poisson, all pixels and all of the time). Every
+of eta, that every noise event is known as such (Poisson, all pixels and all of the time); beside
+it, what telling noise from signal gives with the true video and those thresholds. Every
 figure is printed beside that of `estimate_camera` and as their ratio, by number of signal events
 and by speed.
 """
@@ -24,11 +25,14 @@ import numpy as np
 import tyro
 
 from evflow import estimate_camera, finish, io
+from evflow.camera import Summary
 from evflow.intensity import lin_log
 from evflow.recording import pool_recording, refinement_chunks
 from evflow.refine import Chunk, pixel_posterior, refine_summary
 from evflow.refine.path import STEPS
-from evflow.refine.pixels import pixel_evidence
+from evflow.refine.pixels import evidence_of
+from evflow.refine.sightings import sight
+from evflow.refine.signal import told_apart
 from experiments.cameras import Hidden, Protocol
 from experiments.common import write_result
 from experiments.evaluate import ENOUGH, protocols
@@ -64,8 +68,9 @@ def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
     step, part = low - low[0], (at - low)[:, None, None].astype(np.float32)
     path = log_video[step] * (1 - part) + log_video[step + 1] * part
     times = hidden.recording.frame_times[first:first + len(kept)]
-    evidence = pixel_evidence(hidden.recording.events, times, path, STEPS)
-    return dataclasses.replace(chunk, path=path.astype(np.float32), evidence=evidence)
+    sightings = sight(hidden.recording.events, times, path, STEPS)
+    return dataclasses.replace(chunk, path=path.astype(np.float32), sightings=sightings,
+                               evidence=evidence_of(sightings))
 
 
 def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] | None:
@@ -83,6 +88,7 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     maps, _ = pixel_posterior(
         functools.reduce(operator.add, (c.evidence for c in known)), best)
     found = estimate_camera(recording, params)
+    told = _noise_told(params, known, best, start)
     signal, counts = hidden.signal_events(), recording.events.count_map()
     exposure = 1e-6 * recording.events.duration_us * counts[0].size
     result = {"speed": float(np.mean(np.concatenate([c.motion_px for c in chunks])))}
@@ -99,8 +105,20 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
                 np.asarray(getattr(found.camera, name)) - pixels)[fired]),
             f"limit/{name} of pixels that fired": _mean(np.abs(maps[i] - pixels)[fired]),
             f"ours/{eta}": abs(float(getattr(found.summary, eta)) - noise),
-            f"limit/{eta}": float(np.sqrt(2 / np.pi * noise / exposure))}
+            f"limit/{eta}": float(np.sqrt(2 / np.pi * noise / exposure)),
+            f"ours/{eta} beside the known video": abs(float(getattr(found.summary, eta)) - noise),
+            f"limit/{eta} beside the known video": abs(float(told[i]) - noise)}
     return result
+
+
+def _noise_told(
+    params: Any, known: list[Chunk], best: Summary, start: Summary
+) -> np.ndarray:
+    """Noise rates (2,) in Hz of events told apart on the true video, next to nothing known."""
+    theta = np.array([float(best.theta_on), float(best.theta_off)])
+    before = np.log([float(start.eta_on), float(start.eta_off)])
+    log_eta, _ = told_apart(known, theta, before, np.ones(2), next(iter(params.values()))["signal"])
+    return np.exp(log_eta)
 
 
 def _mean(values: Any) -> float:

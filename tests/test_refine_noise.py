@@ -21,7 +21,9 @@ from evflow.refine.noise import (
 )
 from evflow.refine.path import Chunk
 from evflow.refine.pixels import PixelEvidence
+from evflow.refine.sightings import sight
 from evflow.refine.trace import Trace
+from evflow.types import Events
 
 SHAPE, INTERVALS, STEPS = (60, 80), 8, 2
 ETA = np.array([0.6, 0.2])
@@ -30,10 +32,12 @@ UNKNOWN = (np.array([0.2, 0.2]), np.array([1.0, 1.0]))  # a network that has no 
 
 def chunk(counts: np.ndarray, path: np.ndarray) -> Chunk:
     blank = np.zeros(SHAPE)
+    nobody = np.zeros(0, int)
+    none = Events(nobody, nobody, nobody, nobody > 0, SHAPE[::-1])
     trace = Trace(blank.astype(np.int32), blank, blank > 0, counts.astype(np.float32))
     return Chunk(path, np.ones(SHAPE, bool), np.full(INTERVALS, 0.025, np.float32),
                  np.zeros(INTERVALS, np.float32), trace, PixelEvidence.nothing(SHAPE),
-                 np.zeros((2, *SHAPE)))
+                 np.zeros((2, *SHAPE)), sight(none, 25_000 * np.arange(INTERVALS + 1), path, STEPS))
 
 
 def noise(seed: int = 0) -> np.ndarray:

@@ -6,6 +6,7 @@
     recorded against simulated Moments --> the summary   fit.py
     recorded events on the path --> each pixel's theta   pixels.py
     recorded events of quiet pixels --> noise rates      noise.py
+    events, random points --> noise told from signal     points.py, signal.py
 
 A network sees windows; this sees what the recording would look like were the estimate true, and
 moves the estimate until the two agree. Each pixel is compared only after its first event, where

@@ -32,6 +32,7 @@ from evflow.refine.noise import (
     with_tie,
 )
 from evflow.refine.path import STEPS, Chunk
+from evflow.refine.signal import told_apart
 from evflow.refine.trace import trace_of_camera
 from evflow.squash import squash_summary, summary_std, unsquash_summary
 
@@ -217,13 +218,14 @@ def _mean_factor(chunks: list[Chunk]) -> float:
 
 def refine_summary(
     chunks: list[Chunk], summary: Summary, std: Summary, fusion: dict[str, Any] | None = None,
-    *, seed: int = 0,
+    signal: dict[str, Any] | None = None, *, seed: int = 0,
 ) -> Refined:
     """The camera's summary, from the chunks of a recording and the network's estimate.
 
     fusion: {"net": parameters of FusionNet, "mean", "scale", "low", "high": (F,) of the features
     it was trained on, "widen": (6,) calibration of the std}; without it the
-    result is that of the Gauss-Newton steps alone, and std the network's.
+    result is that of the Gauss-Newton steps alone, and std the network's. signal: the network
+    that tells noise from signal (signal.py); without it the noise is that of quiet pixels.
     """
     fit = _Fit(chunks, summary, std, seed)
     fit.choose_start()
@@ -240,18 +242,23 @@ def refine_summary(
             'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
     y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
     result = squash_summary(y)
-    result, result_std = _tied(result, summary_std(result, y_std), fit.factor)
+    result, result_std = _with_noise(chunks, result, summary_std(result, y_std), signal, fit.factor)
     return Refined(result, result_std, features, fit.fresh > 0)
 
 
-def _tied(summary: Summary, std: Summary, factor: float) -> tuple[Summary, Summary]:
-    """The noise rates drawn to those of Eq. 12 where they may well follow it."""
+def _with_noise(
+    chunks: list[Chunk], summary: Summary, std: Summary, signal: dict[str, Any] | None,
+    factor: float,
+) -> tuple[Summary, Summary]:
+    """The noise rates of events told apart, drawn to Eq. 12 where they may well follow it."""
     def both(s: Summary, name: str) -> np.ndarray:
         return np.array([float(getattr(s, f"{name}_{p}")) for p in ("on", "off")])
 
-    eta = both(summary, "eta")
-    log_eta, log_std = with_tie(both(summary, "theta"), both(std, "theta"), np.log(eta),
-                                both(std, "eta") / eta, factor)
+    theta, eta = both(summary, "theta"), both(summary, "eta")
+    log_eta, log_std = np.log(eta), both(std, "eta") / eta
+    if signal is not None:
+        log_eta, log_std = told_apart(chunks, theta, log_eta, log_std, signal)
+    log_eta, log_std = with_tie(theta, both(std, "theta"), log_eta, log_std, factor)
     rates = dict(zip(("eta_on", "eta_off"), jnp.float32(np.exp(log_eta)), strict=True))
     errors = dict(zip(rates, jnp.float32(np.exp(log_eta) * log_std), strict=True))
     return dataclasses.replace(summary, **rates), dataclasses.replace(std, **errors)

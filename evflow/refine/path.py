@@ -14,7 +14,8 @@ import numpy as np
 
 from evflow.intensity import lin_log
 from evflow.io.glitches import SATURATED_DN, exposed
-from evflow.refine.pixels import PixelEvidence, pixel_evidence
+from evflow.refine.pixels import PixelEvidence, evidence_of
+from evflow.refine.sightings import Sightings, sight
 from evflow.refine.trace import Trace, trace_of_events
 from evflow.simulator.interpolate import Interpolator
 from evflow.types import Recording
@@ -33,7 +34,7 @@ class Chunk:
     interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
     evidence: about each pixel's thresholds; quiet: (2, H, W) events in
     intervals in which the pixel's path stays within QUIET, and their seconds. Intervals with a
-    saturated or black frame are in neither.
+    saturated or black frame are in neither. sightings: the events beside the path.
     """
 
     path: np.ndarray
@@ -43,6 +44,7 @@ class Chunk:
     recorded: Trace
     evidence: PixelEvidence
     quiet: np.ndarray
+    sightings: Sightings
 
 
 QUIET = 0.05  # log units: less than the smallest threshold of any use
@@ -84,10 +86,10 @@ def make_chunk(recording: Recording, run: list[int], steps: int = STEPS) -> Chun
     seen = np.stack([exposed(frame) for frame in frames])
     dt_s = np.diff(times).astype(np.float32) * 1e-6
     trace = trace_of_events(recording.events, times, steps)
+    sightings = sight(recording.events, times, fine, steps, seen)
     return Chunk(
-        fine, bright, dt_s, np.array(motion, np.float32), trace,
-        pixel_evidence(recording.events, times, fine, steps, seen),
-        _quiet(fine, trace, dt_s, seen[1:] & seen[:-1]))
+        fine, bright, dt_s, np.array(motion, np.float32), trace, evidence_of(sightings),
+        _quiet(fine, trace, dt_s, seen[1:] & seen[:-1]), sightings)
 
 
 def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, shown: np.ndarray) -> np.ndarray:

@@ -52,7 +52,11 @@ def pixel_evidence(
     """What the events between frames at times_us (K + 1,) say about each pixel, given the path
     (K*steps + 1, H, W) of its log brightness. seen: (K + 1, H, W) bool, frames that show what
     the pixel saw; events of intervals that are not shown are not used."""
-    s = sight(events, times_us, path, steps, seen)
+    return evidence_of(sight(events, times_us, path, steps, seen))
+
+
+def evidence_of(s: Sightings) -> PixelEvidence:
+    """The same of events that are placed beside the path already."""
     return PixelEvidence(_equations(s), unanswered(s))
 
 

@@ -17,14 +17,15 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sightings:
-    """Events, arrays (N,): pixel (flat index), interval, fraction of it, on (bool), and path, the
-    path's value at the event.
+    """Events, arrays (N,): number among the recording's events, pixel (flat index), interval,
+    fraction of it, on (bool), and path, the path's value at the event.
 
     first: index of each pixel's first event; frames: (K + 1, H*W) path at the frames; inner: (K,
     H*W) range of the path within each interval; seen: (K + 1, H*W) bool, frames that show what
     their pixel saw; shape: (H, W).
     """
 
+    number: Array
     pixel: Array
     interval: Array
     fraction: Array
@@ -54,6 +55,7 @@ def sight(
     pixel = used.y.astype(np.int64) * width + used.x
     order = np.argsort(pixel, kind="stable")
     pixel, t, on = pixel[order], used.t[order], used.p[order]
+    number = order + np.searchsorted(events.t, int(times_us[0]) + 1)
     interval = np.searchsorted(times_us, t, side="left") - 1
     fraction = (t - times_us[interval]) / np.diff(times_us)[interval]
     position = np.minimum((interval + fraction) * steps, k * steps - 1e-9)
@@ -62,5 +64,5 @@ def sight(
     parts = flat[1:].reshape(k, steps, -1)
     everything = np.ones((k + 1, height, width), bool) if seen is None else seen
     return Sightings(
-        pixel, interval, fraction, on, value, np.flatnonzero(np.diff(pixel, prepend=-1)),
+        number, pixel, interval, fraction, on, value, np.flatnonzero(np.diff(pixel, prepend=-1)),
         flat[::steps], parts.max(1) - parts.min(1), everything.reshape(k + 1, -1), (height, width))
