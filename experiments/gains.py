@@ -204,6 +204,7 @@ def picture(result: dict[str, Result], path: Path) -> None:
             axis.set_yticks(range(len(labels)), labels)
             axis.set_ylim(-0.6, len(labels) - 0.4)
             axis.set_xlabel(f"{TITLES[name]} ({'+' if name in RISING else '-'} is better)")
+            axis.locator_params(axis="x", nbins=4)
             axis.grid(alpha=0.3)
         line[0].set_title(target)
     plots.save_figure(figure, path)
