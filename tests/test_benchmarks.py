@@ -32,11 +32,13 @@ QUICK = Setting(quick=True)
 RUN_FACTS = {"time", "platform", "python", "cpu", "cpus", "memory_gb", "load_before", "versions",
              "quick"}
 UNITS = {"simulator": {"frames", "events", "GB"}, "voxels": {"events", "GB"},
-         "io": {"events", "GB"}, "estimate": {"frames", "GFLOP"}, "train": set()}
+         "io": {"events", "GB"}, "estimate": {"frames", "GFLOP"}, "train": set(),
+         "networks": {"steps", "pixels"}}
 
 
 @pytest.mark.parametrize("subject", ["simulator", "voxels", "io", "estimate",
-                                     pytest.param("train", marks=pytest.mark.slow)])
+                                     pytest.param("train", marks=pytest.mark.slow),
+                                     pytest.param("networks", marks=pytest.mark.slow)])
 def test_subject_yields_complete_records(subject: str, tmp_path: Path) -> None:
     out = tmp_path / "new" / "results.jsonl"
     assert main(Options(only=(subject,), quick=True, out=out)) == 0

@@ -114,6 +114,17 @@ def test_flow_films_and_scores(
     assert scores["fwl_truth"] == pytest.approx(1.0)
 
 
+def test_flow_needs_no_weights_of_ones_own(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "flow.mp4"
+    assert main(["flow", str(flight), "-o", str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["weights"] == "evflownet-small"
+    assert np.isfinite(found["scores"]["fwl"])
+    assert len(pictures(out)) == len(make(count=12).frames)  # one up to each frame
+
+
 def test_colours_say_where_to_and_how_fast() -> None:
     right, still, left = (np.reshape(v, (2, 1, 1)) for v in ((2, 0), (0, 0), (-1, 0)))
     np.testing.assert_allclose(flow_colours(right, 2.0)[0, 0], [1, 0, 0], atol=1e-5)

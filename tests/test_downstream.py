@@ -87,6 +87,23 @@ def test_statistics_of_batch_norm_get_no_gradient() -> None:
     assert sizes["scale"] > 0
 
 
+@pytest.mark.parametrize("encoders", [3, 4])
+def test_a_fresh_flow_network_hears_its_events(encoders: int) -> None:
+    """Kernels by He, so that ReLUs leave the variance as it is, and a flow that starts near 0."""
+    network = EVFlowNet(base=8, encoders=encoders)
+    assert network.stride == 2**encoders
+    params = network.init(jax.random.key(0), (16, 16))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if path[-1].key == "kernel":
+            gain = float(leaf.std()) * np.sqrt(np.prod(leaf.shape[:-1]))
+            near = 0.1 if path[0].key == "prediction" else np.sqrt(2.0)
+            assert gain == pytest.approx(near, rel=0.4)
+    x = jax.random.normal(jax.random.key(1), (2, 48, 40, 5))
+    flow = np.asarray(apply(network, params, x)[0])
+    assert flow.shape == (2, 2, 48, 40)
+    assert 0 < flow.std() < 0.5
+
+
 def test_the_four_scales_of_flow() -> None:
     network = EVFlowNet(base=4, scales=4)
     params = network.init(jax.random.key(0), (32, 48))

@@ -17,6 +17,7 @@ from evflow.downstream.simulated import (
     SequenceConfig,
     Sequences,
     add_noise,
+    has_events,
     sample_sequences,
     scene_clock,
 )
@@ -114,6 +115,17 @@ def test_the_truth_costs_nothing_and_flicker_does() -> None:
     flicker = float(losses.temporal(s.frames + 0.2 * sign, s.frames, s.back, s.visible, 1))
     assert steady < 0.3 * flicker
     assert float(losses.flow_l1(s.flow + 0.5, s.flow)) == pytest.approx(0.5, rel=1e-5)
+
+
+def test_pixels_without_events_may_count_less() -> None:
+    s = sequences()
+    seen = has_events(s.tensors)
+    assert 0 < float(seen.mean()) < 1
+    off = s.flow + jnp.where(seen, 1.0, 3.0)[:, :, None]
+    for elsewhere, mean in ((1.0, 3.0 - 2.0 * seen.mean()), (0.0, 1.0)):
+        weight = jnp.where(seen, 1.0, elsewhere)
+        assert float(losses.flow_l1(off, s.flow, weight)) == pytest.approx(float(mean), rel=1e-5)
+    assert float(losses.flow_l1(off, s.flow, jnp.zeros_like(weight))) == 0.0
 
 
 def test_the_true_flow_explains_the_frames_best() -> None:

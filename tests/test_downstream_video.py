@@ -90,6 +90,38 @@ def test_missing_released_weights_say_how_they_are_made(monkeypatch: pytest.Monk
         load_network("absent-small")
 
 
+def passing(motion: tuple[float, float], steps: int = 96, side: int = 64) -> Events:
+    """Events of a random texture that moves by `motion` px (x, y) in 30 ms, thresholds .2."""
+    rng = np.random.default_rng(0)
+    waves = rng.uniform(-0.9, 0.9, (40, 2))  # rad/px
+    phases = rng.uniform(0, 2 * np.pi, 40)
+    y, x = np.mgrid[:side, :side]
+    columns: list[list[np.ndarray]] = []
+    level = None
+    for i in range(steps + 1):
+        moved = np.multiply(motion, i / steps)
+        light = 0.2 * sum(np.cos(kx * (x - moved[0]) + ky * (y - moved[1]) + phase)
+                          for (kx, ky), phase in zip(waves, phases, strict=True))
+        level = light.copy() if level is None else level
+        for sign in (1, -1):
+            rows, cols = np.nonzero(sign * (light - level) >= 0.2)
+            level[rows, cols] += 0.2 * sign
+            t = np.full(len(rows), i * 30_000 // steps)
+            columns.append([cols, rows, t, np.full(len(rows), sign > 0)])
+    xs, ys, ts, ps = (np.concatenate(c) for c in zip(*columns, strict=True))
+    return Events(xs, ys, ts, ps, (side, side))
+
+
+@pytest.mark.parametrize("motion", [(4.0, 0.0), (-3.0, 2.0), (0.0, -4.0), (1.0, 1.5)])
+def test_the_released_flow_sees_where_a_texture_goes(motion: tuple[float, float]) -> None:
+    events = passing(motion)
+    trained = load_network("evflownet-small")
+    (found,) = flow.window_flows(trained, events, np.array([0, 30_000]))
+    error = np.hypot(*(found[:, events.y, events.x] - np.reshape(motion, (2, 1)))).mean()
+    assert error < 0.5 * np.hypot(*motion)
+    assert trained.card["held_out"]["aee"] < 0.75 * trained.card["held_out"]["none_aee"]
+
+
 def test_frames_are_made_for_recordings_without() -> None:
     bare = Recording.of_events(make().events)
     calls: list[tuple[int, int]] = []

@@ -103,12 +103,21 @@ def test_presets_fit_together(kind: str, preset: str) -> None:
     shapes = jax.eval_shape(lambda: network.init(jax.random.key(0), (crop, crop)))
     size = sum(4 * math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))
     assert size < MOST_BYTES or preset not in ("small", "debug")
-    assert (learning.data.pause, learning.data.prior.theta) == (0.05, (0.05, 1.0))
+    most = 0.5 if (kind, preset) == ("evflownet", "small") else 1.0
+    assert (learning.data.pause, learning.data.prior.theta) == (0.05, (0.05, most))
 
 
 def test_an_unknown_preset_is_refused() -> None:
     with pytest.raises(EvflowDataError, match=r"EV020.*evflownet"):
         training("unet")
+
+
+def test_a_preset_may_ask_for_normalised_tensors() -> None:
+    for network, normalised in (("evflownet", True), ("e2vid", False)):
+        run = command.configuration(command.Options(out=Path(), network=network))
+        assert run.learning.normalised is normalised
+    asked = command.Options(out=Path(), normalised=True)
+    assert command.configuration(asked).learning.normalised
 
 
 @pytest.mark.slow

@@ -28,16 +28,15 @@ class Flow(Windowed):
     """Show the optical flow, by EV-FlowNet: the hue says where to, the saturation how fast, where
     there are events; and measure how much it sharpens them (FWL; above 1 is better than none).
 
-    Example: evflow flow flight.aedat4 -o flow.mp4 --weights runs/flow/evflownet.safetensors
+    Example: evflow flow flight.aedat4 -o flow.mp4
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """File or folder of any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """.mp4, .avi or .gif."""
-    weights: str
-    """A .safetensors path, as `python -m experiments.train_network --network evflownet` makes it,
-    or a published checkpoint (.pth.tar). None are released yet."""
+    weights: str = "evflownet-small"
+    """Name of released weights, a .safetensors path, or a published checkpoint (.pth.tar)."""
     truth: Annotated[Path | None, value("FILE")] = None
     """True flow, .npz: flow (T, 2, H, W) = (x, y) px over each window, edges_us (T + 1,) of the
     windows, which replace --sync, and valid (T, H, W) where not all of it is."""

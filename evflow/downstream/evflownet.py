@@ -8,6 +8,7 @@ ECCV 2020); or the original's predictions 256 tanh at four scales, each fed to t
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import flax.linen as nn
@@ -22,25 +23,42 @@ Array = jax.Array
 ENCODERS = 4
 BLOCKS = 2
 MOST_PX = 256.0  # what the original's tanh is scaled to
+NEAR_ZERO = 0.1  # of the first prediction's kernel
 
 
 @dataclasses.dataclass(frozen=True)
 class EVFlowNet(Network):
-    """scales: 1 or 4, the two forms. 14 125 346 parameters at base 64 and one scale."""
+    """scales: 1 or 4, the two forms; encoders: how often H and W are halved, 4 of the published
+    ones. 14 125 346 parameters at base 64, four encoders and one scale."""
 
     base: int = 64
     scales: int = 1
+    encoders: int = ENCODERS
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self, "scales", self.scales in (1, ENCODERS), f"1 or {ENCODERS}")
+        require(self, "encoders", self.encoders >= 2, ">= 2")
+        require(self, "scales", self.scales in (1, self.encoders), f"1 or {self.encoders}")
 
     @property
     def stride(self) -> int:
-        return 2**ENCODERS
+        return 2**self.encoders
 
     def module(self) -> nn.Module:
         return _EVFlowNet(self)
+
+    def init(self, key: Array, shape: tuple[int, int]) -> Params:
+        """Fresh params; of one scale by He et al., ICCV 2015, and a prediction near zero flow.
+
+        Flax's own kernels halve the variance at each layer with a ReLU, of which the deepest path
+        has eight and the shortest two: what sees motion of many pixels would hardly be heard.
+        """
+        params = super().init(key, shape)
+        if self.scales > 1:
+            return params
+        gains = {name: NEAR_ZERO if name == "prediction" else math.sqrt(2.0) for name in params}
+        return {name: jax.tree.map(lambda a, gain=gains[name]: gain * a, layer)
+                for name, layer in params.items()}
 
     def _start(self, shape: tuple[int, ...], dtype: Any) -> State:
         return ()
@@ -66,14 +84,14 @@ class _EVFlowNet(nn.Module):
         c = self.c
         skips: list[Array] = []
         flows: list[Array] = []
-        for i in range(ENCODERS):
+        for i in range(c.encoders):
             x = ConvLayer(c.base << i, stride=2, name=f"encoder_{i}")(x)
             skips.append(x)
         for i in range(BLOCKS):
             x = ResidualBlock(name=f"block_{i}")(x)
         for i, skip in enumerate(reversed(skips)):
             x = jnp.concatenate([x, skip, *flows[-1:]], -1)
-            x = self._doubled(x, (c.base << ENCODERS - 2) >> i, f"decoder_{i}")
+            x = self._doubled(x, (c.base << c.encoders - 2) >> i, f"decoder_{i}")
             if c.scales > 1:
                 flow = ConvLayer(2, 1, relu=False, name=f"prediction_{i}")(x)
                 flows.append(MOST_PX * jnp.tanh(flow))

@@ -13,6 +13,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from evflow.downstream.convolution import convolve, for_flax
+
 Array = jax.Array
 
 BN_EPS = 1e-5
@@ -21,7 +23,8 @@ BN_EPS = 1e-5
 def conv(features: int, size: int, stride: int = 1, *, bias: bool = True, name: str) -> nn.Conv:
     """A convolution that keeps H and W (divided by the stride, rounded up)."""
     pad = (size // 2, size // 2)
-    return nn.Conv(features, (size, size), (stride, stride), (pad, pad), use_bias=bias, name=name)
+    return nn.Conv(features, (size, size), (stride, stride), (pad, pad), use_bias=bias, name=name,
+                   conv_general_dilated=for_flax if stride == 1 else None)
 
 
 def upsample2(x: Array) -> Array:
@@ -129,17 +132,30 @@ class ConvLSTM(nn.Module):
 
 
 class ConvGRU(nn.Module):
-    """h' = (1 - u) h + u tanh(conv[x, r h]): the update gate u weighs the new value."""
+    """h' = (1 - u) h + u tanh(conv[x, r h]): the update gate u weighs the new value. Update and
+    reset gate see the same input: two sets of weights, one convolution."""
 
     @nn.compact
     def __call__(self, x: Array, state: Array) -> Array:
-        def gate(name: str, *inputs: Array) -> Array:
-            return conv(x.shape[-1], 3, name=name)(jnp.concatenate(inputs, -1))
-
-        update = nn.sigmoid(gate("update", x, state))
-        reset = nn.sigmoid(gate("reset", x, state))
-        new = jnp.tanh(gate("out", x, state * reset))
+        features = x.shape[-1]
+        gates = [_Weights(features, name=name)(2 * features) for name in ("update", "reset")]
+        kernel, bias = (jnp.concatenate(pair, -1) for pair in zip(*gates, strict=True))
+        opened = convolve(jnp.concatenate([x, state], -1), kernel)
+        update, reset = jnp.split(nn.sigmoid(opened + _over(bias, opened)), 2, -1)
+        new = jnp.tanh(conv(features, 3, name="out")(jnp.concatenate([x, state * reset], -1)))
         return state * (1.0 - update) + new * update
+
+
+class _Weights(nn.Module):
+    """Kernel and bias of a 3x3 convolution, as `conv` has them."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, channels: int) -> tuple[Array, Array]:
+        shape = (3, 3, channels, self.features)
+        return (self.param("kernel", nn.initializers.lecun_normal(), shape),
+                self.param("bias", nn.initializers.zeros, (self.features,)))
 
 
 def decoder(kind: str, features: int, norm: str, name: str) -> Any:

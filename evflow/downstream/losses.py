@@ -57,9 +57,11 @@ def warp(images: Array, back: Array) -> Array:
     return flat.reshape(images.shape)
 
 
-def flow_l1(flow: Array, truth: Array) -> Array:
-    """Mean absolute error of flows (T, B, 2, H, W), px."""
-    return jnp.mean(jnp.abs(flow - truth))
+def flow_l1(flow: Array, truth: Array, weight: Array | float = 1.0) -> Array:
+    """Mean absolute error of flows (T, B, 2, H, W), px; weight (T, B, H, W) of each pixel."""
+    error = jnp.abs(flow - truth).mean(-3)
+    weight = jnp.broadcast_to(jnp.asarray(weight, error.dtype), error.shape)
+    return jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1.0)
 
 
 def photometric(flows: Sequence[Array], before: Array, after: Array) -> Array:

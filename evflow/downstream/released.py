@@ -23,7 +23,7 @@ from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card, save_weights, weights_path
 
 PUBLISHED = (".pth", ".pt", ".tar")
-RELEASED = {"e2vid-small": "e2vid"}  # name: network
+RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: network
 
 
 @dataclasses.dataclass(frozen=True)

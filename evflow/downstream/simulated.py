@@ -180,6 +180,12 @@ def add_noise(key: Array, tensors: Array, config: SequenceConfig) -> Array:
     return tensors + value[None, :, :, None]
 
 
+def has_events(tensors: Array) -> Array:
+    """Where (..., H, W) the tensors (..., H, W, bins) of a batch hold events: most of the noise
+    put on them is below half of one in all bins together."""
+    return jnp.abs(tensors).sum(-1) > 1.0
+
+
 def _flows(scene: Scene, edges: Array, shape: tuple[int, int]) -> tuple[Array, Array, Array]:
     """Flow of every window forward and back, and what of its end was visible at its start."""
     def window(ends: tuple[Array, Array]) -> tuple[Array, Array, Array]:

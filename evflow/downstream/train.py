@@ -21,7 +21,7 @@ from evflow.camera import Camera
 from evflow.downstream import losses
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, run
-from evflow.downstream.simulated import SequenceConfig, Sequences, sample_sequences
+from evflow.downstream.simulated import SequenceConfig, Sequences, has_events, sample_sequences
 from evflow.downstream.tensor import normalise
 from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank
@@ -33,8 +33,9 @@ Array = jax.Array
 class LearningConfig:
     """data: the sequences. steps, warmup, rate, clip: Adam whose rate rises for `warmup` steps
     and falls as a cosine, gradients clipped to a norm. temporal: weight of temporal consistency,
-    after the first `skip` images. normalised: event tensors of deviation 1, which hides the scale
-    of the camera's thresholds. seed: of params and data."""
+    after the first `skip` images. elsewhere: weight, in the L1 of flow, of pixels without events.
+    normalised: event tensors of deviation 1, which hides the scale of the camera's thresholds.
+    seed: of params and data."""
 
     data: SequenceConfig = dataclasses.field(default_factory=SequenceConfig)
     steps: int = 300
@@ -43,11 +44,13 @@ class LearningConfig:
     clip: float = 1.0
     temporal: float = 0.2
     skip: int = 2
+    elsewhere: float = 1.0
     normalised: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least = {"steps": 1, "warmup": 0, "rate": 0.0, "clip": 0.0, "temporal": 0.0, "skip": 0}
+        least = {"steps": 1, "warmup": 0, "rate": 0.0, "clip": 0.0, "temporal": 0.0, "skip": 0,
+                 "elsewhere": 0.0}
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise EvflowDataError("EV020", f"LearningConfig({name}={getattr(self, name)!r}).",
@@ -131,7 +134,7 @@ def sequence_loss(
     tensors = sequences.tensors
     tensors = normalise(tensors) if config.normalised else tensors
     if isinstance(network, EVFlowNet):
-        loss = _flow_loss(network, params, tensors, sequences)
+        loss = _flow_loss(network, params, tensors, sequences, config.elsewhere)
         return loss, {"loss": loss}
     images, _ = run(network, params, tensors, train=True)
     seen = losses.reconstruction(images, sequences.frames, lpips_params)
@@ -141,10 +144,13 @@ def sequence_loss(
     return total, {"loss": total, "reconstruction": seen, "temporal": steady}
 
 
-def _flow_loss(network: EVFlowNet, params: Params, tensors: Array, sequences: Sequences) -> Array:
+def _flow_loss(
+    network: EVFlowNet, params: Params, tensors: Array, sequences: Sequences, elsewhere: float
+) -> Array:
     """Without memory the windows are one batch; the first has no frame at its start."""
     if network.scales == 1:
         flow, _ = network.apply(params, tensors)
-        return losses.flow_l1(flow, sequences.flow)
+        weight = jnp.where(has_events(sequences.tensors), 1.0, elsewhere)
+        return losses.flow_l1(flow, sequences.flow, weight)
     flows = network.pyramid(params, tensors[1:])
     return losses.photometric(flows, sequences.frames[:-1], sequences.frames[1:])
