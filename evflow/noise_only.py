@@ -13,14 +13,7 @@ from evflow.camera_estimate import CameraEstimate
 from evflow.config import PRESETS
 from evflow.errors import EvflowDataError
 from evflow.faults import dead_pixels
-from evflow.stillness import (
-    LEAST_EVENTS,
-    LEAST_US,
-    MOST_HOT,
-    MOVING,
-    busy_pixels,
-    company,
-)
+from evflow.stillness import busy_pixels, unlike_noise
 from evflow.types import Events, Recording
 
 SPREAD = (0.3, 1000.0)  # shape of the gamma distribution of rates over pixels: its range
@@ -62,23 +55,12 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
 
 
 def _require_static(events: Events, hot: np.ndarray) -> None:
-    seen = "events alone tell the noise of a scene at rest only"
-    fix = ("Thresholds are measured against intensity: give frames, --frames DIR --timestamps "
-           "FILE. The noise alone needs some seconds of a static scene.")
-    if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
+    reason = unlike_noise(events, hot)
+    if reason:
         raise EvflowDataError(
-            "EV011", f"{seen}, and there are only {len(events):,} events in "
-            f"{events.duration_us / 1e6:.3f} s to tell it.", fix)
-    excess = company(events, hot)
-    if excess > MOVING:
-        raise EvflowDataError(
-            "EV011", f"{seen}, and the scene moves (events come in company: {excess:.2f} pairs "
-            f"per event beyond chance; {MOVING} is the most of noise).", fix)
-    if hot.mean() > MOST_HOT:
-        raise EvflowDataError(
-            "EV011", f"{seen}, and {hot.mean():.1%} of the pixels are far busier than the others, "
-            f"more than the {MOST_HOT:.0%} that faults may be: light that flickers, or something "
-            "small that moves?", fix)
+            "EV011", f"events alone tell the noise of a scene at rest only, and {reason}",
+            "Thresholds are measured against intensity: give frames, --frames DIR --timestamps "
+            "FILE. The noise alone needs some seconds of a static scene.")
 
 
 def _rates(

@@ -19,7 +19,8 @@ CELL, BIN_US = 8, 2_000  # pixels, us: what counts as near by
 MOVING = 0.05  # excess pairs per event
 LEAST_US, LEAST_EVENTS = 500_000, 1_000
 MOST_EVENTS = 4_000_000  # looked at for company: the first ones
-HOT_PASSES, MOST_HOT = 10, 0.01  # of the pixels; more are not faults but a scene
+HOT_PASSES = 10
+MOST_HOT, MOST_SCATTERED = 0.01, 0.1  # of the pixels: faults, gathered anywhere or at random
 STILL = 0.1  # log units: what frames may change by, their noise averaged over 9x9 pixels
 SMOOTH, DARK_DN = 9, 15.0
 
@@ -29,14 +30,39 @@ def stands_still(recording: Recording) -> bool:
     there are enough events to tell. Then every event is noise, and counting them is the best
     that can be done: on still scenes the error is a third of the network's."""
     events = recording.events
-    if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
+    if events.duration_us < LEAST_US:
         return False
     first = _smooth(recording.frame_dn(0))
     for i in range(1, len(recording.frame_times)):
         if np.abs(_smooth(recording.frame_dn(i)) - first).max() > STILL:
             return False
-    hot = busy_pixels(events.count_map().sum(0))
-    return bool(hot.mean() <= MOST_HOT and company(events, hot) <= MOVING)
+    return not unlike_noise(events, busy_pixels(events.count_map().sum(0)))
+
+
+def unlike_noise(events: Events, hot: np.ndarray) -> str:
+    """What says that events are not the noise of a scene at rest, with its hot (H, W) pixels, or
+    that they are too few to tell; empty where nothing does."""
+    if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
+        return (f"there are only {len(events):,} events in {events.duration_us / 1e6:.3f} s to "
+                "tell it")
+    excess = company(events, hot)
+    if excess > MOVING:
+        return (f"the scene moves (events come in company: {excess:.2f} pairs per event beyond "
+                f"chance; {MOVING} is the most of noise)")
+    share = float(hot.mean())
+    if share > MOST_SCATTERED or (share > MOST_HOT and gathered(hot)):
+        return (f"{share:.1%} of the pixels are far busier than the others, more than the "
+                f"{MOST_HOT:.0%} that faults may be where they lie together and the "
+                f"{MOST_SCATTERED:.0%} where they are scattered: light that flickers, or something "
+                "small that moves?")
+    return ""
+
+
+def gathered(hot: np.ndarray) -> bool:
+    """Whether more of the hot (H, W) pixels are neighbours than of pixels picked at random."""
+    pairs = int((hot[1:] & hot[:-1]).sum() + (hot[:, 1:] & hot[:, :-1]).sum())
+    chance = float(hot.mean()) ** 2 * (hot[1:].size + hot[:, 1:].size)
+    return pairs > chance + 5.0 * np.sqrt(chance) + 3.0
 
 
 def _smooth(frame: np.ndarray) -> np.ndarray:

@@ -147,8 +147,9 @@ def real_flow(trained: Trained, found: list[Part], slices: dict[str, Rotation]) 
             part.events, part.edges_us[part.warmup:], flows[part.warmup:])
     how = FwlConvention(reference="first")
     for name, one in slices.items():
-        tensor = jnp.asarray(event_tensor(one.events, trained.network.bins))
-        flow = np.asarray(trained.network.apply(trained.params, tensor)[0])
+        tensor = jnp.asarray(event_tensor(one.events, trained.network.bins))[None, None]
+        flow = np.asarray(held_out.outputs(
+            trained.network, trained.params, tensor, trained.normalised)[0, 0])
         columns = (*one.xy.T, one.t, one.p, np.ones(len(one.t), np.float32))
         rows[name] = {"fwl": float(fwl(*columns, flow, how)), "convention": how.as_dict(),
                       "fwl_truth": float(fwl(*columns, one.flow, how)),

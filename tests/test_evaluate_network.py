@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -156,3 +157,15 @@ def test_flow_of_a_rotation_is_scored_beside_the_gyroscope(
     row = evaluate_network.real_flow(trained, [], {name: one})[name]
     assert row["fwl_truth"] == pytest.approx(reference, abs=0.01)
     assert row["fwl"] < row["fwl_truth"]
+
+
+def test_flow_of_a_rotation_is_made_of_the_tensors_that_the_network_learned_from(
+    data_file: Callable[[str], Path]
+) -> None:
+    one = recorded.read_rotation(data_file("data/recordings/ijrr_boxes_rotation"))
+    trained = load_network("evflownet-small")
+    assert trained.normalised
+    rows = [evaluate_network.real_flow(t, [], {"boxes": one})["boxes"]["fwl"]
+            for t in (trained, dataclasses.replace(trained, normalised=False))]
+    assert rows[0] == pytest.approx(1.51, abs=0.01)  # as the model card says
+    assert rows[1] < rows[0] - 0.02

@@ -12,7 +12,7 @@ from networks import hidden
 
 from evflow import Events, Recording, check, estimate_camera, read_recording
 from evflow.errors import EvflowDataError
-from evflow.stillness import company, stands_still
+from evflow.stillness import company, gathered, stands_still
 
 SIZE = (64, 48)
 SECONDS = 20.0
@@ -108,6 +108,32 @@ def test_company_is_what_independent_noise_lacks() -> None:
         assert abs(company(recording.events, hot)) < 0.02
     moving = hidden(14, 600)[0].events
     assert company(moving, np.zeros((48, 64), bool)) > 1.0
+
+
+def test_many_hot_pixels_are_faults_where_they_are_scattered() -> None:
+    recording, rates, hot = static(hot=120)  # of 3,072
+    found = estimate_camera(recording)
+    assert (found.hot == hot).all()
+    assert float(found.summary.eta_on) == pytest.approx(rates[0][~hot].mean(), rel=0.03)
+    with pytest.raises(EvflowDataError, match=r"EV011.*13\.0% of the pixels are far busier"):
+        estimate_camera(static(hot=400)[0])
+
+
+def test_a_lamp_that_flickers_is_no_fault() -> None:
+    lamp = np.zeros((48, 64), bool)
+    lamp[20:26, 30:36] = True
+    assert gathered(lamp)
+    events = static(hot=0)[0].events
+    y, x = np.nonzero(lamp)
+    rng = np.random.default_rng(3)
+    which = rng.integers(0, len(x), 15_000)
+    t = rng.integers(0, round(SECONDS * 1e6), 15_000)
+    order = np.argsort(np.concatenate([events.t, t]), kind="stable")
+    columns = ((events.x, x[which]), (events.y, y[which]), (events.t, t),
+               (events.p, np.arange(15_000) % 2 == 0))
+    both = Events(*(np.concatenate(c)[order] for c in columns), SIZE)
+    with pytest.raises(EvflowDataError, match=r"EV011.*1\.2% of the pixels.*lie together"):
+        estimate_camera(Recording.of_events(both))
 
 
 def test_a_short_recording_cannot_tell() -> None:
