@@ -23,11 +23,13 @@ import optax
 import tyro
 
 from evflow import finish, io, load_weights
+from evflow.camera import Summary
 from evflow.recording import pool_recording, refinement_chunks
-from evflow.refine import refine_summary
+from evflow.refine import Chunk, fused, refine_summary
 from evflow.refine.path import STEPS
 from evflow.refine.points import Points, chunk_points
 from evflow.refine.signal import joined, log_intensity, noise_rate
+from evflow.squash import squash_summary, summary_std, unsquash_summary
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
 from experiments.many import Setup, scores
@@ -38,7 +40,6 @@ Row = dict[str, Any]
 WIDTHS = (32, 16)
 BATCH = 4096
 COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier than a Gaussian's
-UNKNOWN = (np.log(0.14), 1.3)  # log Hz and its std: what cameras have
 HELD_OUT = 5  # every n-th recording
 
 
@@ -66,11 +67,9 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> list[Row] | None:
     plan = io.plan_windows(recording)
     if not plan.pairs:
         return None
-    (net,) = params.values()
     stats, _ = pool_recording(params, recording)
     chunks = refinement_chunks(recording, plan.pairs)
-    summary, std = finish(params, stats)
-    found = refine_summary(chunks, summary, std, net["fusion"]).summary
+    found, std = fused_summary(params, chunks, *finish(params, stats))
     theta = np.array([float(found.theta_on), float(found.theta_off)])
     sides: list[list[Points]] = [[], []]
     noise: list[list[np.ndarray]] = [[], []]
@@ -79,9 +78,23 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> list[Row] | None:
         for side, points in enumerate(chunk_points(chunk, theta, STEPS, i)):
             sides[side].append(points)
             noise[side].append((points.event >= 0) & np.append(labels, False)[points.event])
-    true = np.array([float(hidden.nominal.eta_on), float(hidden.nominal.eta_off)])
-    return [{"points": joined(sides[k]), "noise": np.concatenate(noise[k]), "true": true[k],
-             "signal": hidden.signal_events()[k]} for k in (0, 1)]
+    signal = hidden.signal_events()
+    made = []
+    for k, name in enumerate(("eta_on", "eta_off")):
+        true, eta, error = (float(getattr(s, name)) for s in (hidden.nominal, found, std))
+        made.append({"points": joined(sides[k]), "noise": np.concatenate(noise[k]), "true": true,
+                     "before": (np.log(eta), error / eta), "signal": signal[k]})
+    return made
+
+
+def fused_summary(
+    params: Any, chunks: list[Chunk], summary: Summary, std: Summary
+) -> tuple[Summary, Summary]:
+    """What is known of the camera and its std before noise is told from signal."""
+    (net,) = params.values()
+    steps = refine_summary(chunks, summary, std)
+    y, y_std = fused(net["fusion"], jnp.asarray(steps.features), unsquash_summary(steps.summary))
+    return squash_summary(y), summary_std(squash_summary(y), y_std)
 
 
 def train(rows: list[Row], options: Options) -> dict[str, Any]:
@@ -120,7 +133,7 @@ def judged(rows: list[Row], net: dict[str, Any]) -> tuple[float, dict[str, float
     """The factor that widens the std, and figures of recordings that the network has not seen."""
     plain = jax.tree.map(np.asarray, net)
     found = np.array([noise_rate(log_intensity(plain, r["points"].features), r["points"],
-                                 *UNKNOWN) for r in rows])
+                                 *r["before"]) for r in rows])
     true = np.array([r["true"] for r in rows])
     away = np.abs(found[:, 0] - np.log(np.maximum(true, 1e-3))) / found[:, 1]
     widen = float(np.quantile(away, COVERED))
