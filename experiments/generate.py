@@ -191,8 +191,8 @@ def main(options: Options) -> dict[str, Any]:
             found.append(compared(params, jax.random.fold_in(k_data, i), bank, options))
             progress(i + 1, scenes)
     rows, scores = zip(*found, strict=True)
-    result: dict[str, Any] = {name: figures(row) for name, row in jax.tree.map(
-        lambda *sums: np.sum(sums, 0), *rows).items()}
+    result: dict[str, Any] = {name: figures(jax.tree.map(
+        lambda *sums: np.sum(sums, 0), *(row[name] for row in rows))) for name in rows[0]}
     result["auroc"] = separation({name: np.array([s[name] for s in scores]) for name in scores[0]})
     text = table(result)
     print(text)
