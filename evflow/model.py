@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from evflow import encoder, flow, network
+from evflow import encoder, flow, network, pixelwise
 from evflow import summary as pooling
 from evflow.camera import Camera, Summary
 from evflow.config import ModelConfig
@@ -289,9 +289,6 @@ def estimate_with_std(
     return camera, camera_std(camera, y_std)
 
 
-_estimate_y = jax.jit(network.estimate_pixels, static_argnames="config")
-
-
 def estimate_y(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None, summary: Summary | None = None,
@@ -301,7 +298,8 @@ def estimate_y(
     config, net = _net(params)
     voxels, dlogI, window_s, intensity = _prepare(config, voxels, dlogI, window_s, intensity)
     y6, y6_std = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
-    context = _context(window_s, intensity, dlogI.shape)
-    y, y_std = _estimate_y(net, voxels, dlogI, context, y6, config=config)
+    own = dlogI.shape if intensity is not None else (*dlogI.shape[:-2], 1, 1)
+    context = _context(window_s, intensity, own)
+    y, y_std = pixelwise.estimate(config, net, voxels, dlogI, context, y6)
     shared = y6_std[..., None, None, :4]  # an error of the summary moves all pixels alike
     return y, jnp.sqrt(y_std**2 + shared**2)

@@ -24,8 +24,6 @@ from evflow.squash import SCALE, per_channel, squash, squash_summary
 Array = jax.Array
 Params = dict[str, Any]
 
-CHUNK = 640  # pixels at a time: their 16 x 96 encoder activations, 4 MB, stay in the cache
-
 
 class SpreadNet(nn.Module):
     """Log standard deviation of y (..., 4) from what a pixel shows and the condition."""
@@ -62,7 +60,7 @@ def _outputs(config: ModelConfig) -> int:
     return 1 if config.code == "feature" else 2
 
 
-def _encoder_features(
+def encoder_features(
     config: ModelConfig, voxels: Array, dlogI: Array, context: Array, y: Array
 ) -> Array:
     """Encoder input: the paper's [E, dlogI], or ours with the contrast that the events carry
@@ -82,7 +80,7 @@ def encode_changes(
     config: ModelConfig, net: Params, voxels: Array, dlogI: Array, context: Array, y: Array
 ) -> tuple[Array, Array]:
     """Per-pixel changes (..., 2m or feature) and their logits (..., outputs, m)."""
-    features = _encoder_features(config, voxels, dlogI, context, y)
+    features = encoder_features(config, voxels, dlogI, context, y)
     outputs: Any = IntensityEncoder(config, _outputs(config)).apply(
         {"params": net["encoder"]}, features)
     logits, hidden = outputs
@@ -90,14 +88,20 @@ def encode_changes(
 
 
 def condition(config: ModelConfig, changes: Array, context: Array, y: Array) -> Array:
-    """u (..., condition): the changes in units of the camera's thresholds (events expected
-    per sub-window, in asinh), the summary, the context. The paper's u is the feature alone."""
+    """u (..., condition): the events expected, the summary, the context. The paper's u is the
+    feature alone."""
     if config.code == "feature":
         return changes
     camera = squash(y[..., :4])
-    up, down = jnp.split(changes, 2, -1)
-    expected = [up / camera.theta_on[..., None], down / camera.theta_off[..., None]]
-    return jnp.concatenate([jnp.arcsinh(e) for e in expected] + [y, context], -1)
+    thetas = camera.theta_on[..., None], camera.theta_off[..., None]
+    return jnp.concatenate([expected_events(changes, *thetas, axis=-1), y, context], -1)
+
+
+def expected_events(changes: Array, theta_on: Array, theta_off: Array, axis: int) -> Array:
+    """The changes, 2m along `axis`, in units of the camera's thresholds: events expected per
+    sub-window, in asinh."""
+    up, down = jnp.split(changes, 2, axis)
+    return jnp.concatenate([jnp.arcsinh(up / theta_on), jnp.arcsinh(down / theta_off)], axis)
 
 
 def spread(net: Params, voxels: Array, dlogI: Array, context: Array, u: Array) -> Array:
@@ -118,7 +122,7 @@ def init(key: Array, config: ModelConfig, name: str = "default") -> Params:
     shape = (1, 1)
     voxels, dlogI = jnp.zeros((*shape, 2 * config.bins)), jnp.zeros(shape)
     context, y = jnp.zeros((*shape, 3)), jnp.zeros((*shape, 6))
-    features = _encoder_features(config, voxels, dlogI, context, y)
+    features = encoder_features(config, voxels, dlogI, context, y)
     seen = pooling.pixel_features(voxels, dlogI, context)
     wide = jnp.zeros((*shape, seen.shape[-1] + config.flow.condition))
     net = {
@@ -149,34 +153,3 @@ def log_normal(x: Array, mean: Array | float, std: Array | float) -> Array:
 def over_pixels(y: Array, shape: tuple[int, ...]) -> Array:
     """(..., C) of a camera -> (..., H, W, C)."""
     return jnp.broadcast_to(y[..., None, None, :], (*shape, y.shape[-1]))
-
-
-def estimate_pixels(
-    net: Params, voxels: Array, dlogI: Array, context: Array, y6: Array, config: ModelConfig
-) -> tuple[Array, Array]:
-    """Encoder, flow and spread on all pixels, in chunks so that activations stay in cache."""
-    rows = [a.reshape(math.prod(dlogI.shape), -1) for a in (
-        voxels, dlogI[..., None], context, over_pixels(y6, dlogI.shape))]
-    folded = flow.fold(net["flow"], config.flow)
-
-    def pixels(row: tuple[Array, ...]) -> tuple[Array, Array]:
-        voxels, dlogI, context, y = row
-        dlogI = dlogI[..., 0]
-        changes, _ = encode_changes(config, net, voxels, dlogI, context, y)
-        u = condition(config, changes, context, y)
-        residual, _ = flow.forward_folded(folded, voxels, u, config.flow)
-        return residual + centre(config, y), spread(net, voxels, dlogI, context, u)
-
-    y, std = _map_chunks(pixels, rows)
-    return y.reshape(*dlogI.shape, 4), std.reshape(*dlogI.shape, 4)
-
-
-def _map_chunks(f: Any, rows: list[Array]) -> Any:
-    """f over rows (N, C) in chunks of CHUNK, the last one padded with zeros."""
-    n = rows[0].shape[0]
-    if n <= CHUNK:
-        return f(tuple(rows))
-    pad = -n % CHUNK
-    chunks = tuple(jnp.pad(r, ((0, pad), (0, 0))).reshape(-1, CHUNK, r.shape[-1]) for r in rows)
-    out = jax.lax.map(f, chunks)
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:n], out)

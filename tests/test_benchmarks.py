@@ -174,11 +174,11 @@ def test_torch_peer_is_the_same_network() -> None:
     n = dlogI.size
     y6 = torch.tensor(np.tile(np.asarray(unsquash_summary(summary)), (n, 1)))
     rows = torch.tensor(np.asarray(voxels)).reshape(n, -1)
-    theirs = peer_torch.in_chunks(
-        functools.partial(peer_torch.estimate, config=config), net,
-        [rows, torch.tensor(np.asarray(dlogI)).reshape(n), torch.zeros(n, 3), y6], 100)
-    for a, b in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(a.reshape(n, 4), b, rtol=2e-4, atol=2e-4)
+    inputs = [rows, torch.tensor(np.asarray(dlogI)).reshape(n), torch.zeros(n, 3), y6]
+    for run in (peer_torch.in_chunks, functools.partial(peer_torch.on_each_core, cores=3)):
+        theirs = run(functools.partial(peer_torch.estimate, config=config), net, inputs, 100)
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(a.reshape(n, 4), b, rtol=2e-4, atol=2e-4)
     u = jax.random.normal(jax.random.key(1), (n, config.flow.condition))
     exact = jax.jit(flow.forward, static_argnums=3)(
         params["default"]["flow"], voxels.reshape(n, -1), u, config.flow)

@@ -198,6 +198,18 @@ def test_folded_is_the_same_function(config, chunk):
     np.testing.assert_allclose(got_z, z, rtol=0, atol=5e-6 * size)
 
 
+@pytest.mark.parametrize("name", ["additive", "affine-noinjector"])
+@pytest.mark.parametrize("at", [0, 2, 3])
+def test_what_all_pixels_share_of_a_condition_can_be_settled(name, at):
+    config = VARIANTS[name]
+    folded = fold(trained_params(config), config)
+    values, x, own = condition((2,), 3), counts((N, 8)), condition((N, 3))
+    u = jnp.concatenate([own[:, :at], jnp.tile(values[None], (N, 1)), own[:, at:]], axis=1)
+    expected = flow.forward_columns(folded, x.T, u.T, config)
+    got = flow.forward_columns(flow.settle(folded, values, at), x.T, own.T, config)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=2e-5), got, expected)
+
+
 def test_jit_changes_nothing():
     params, x, u = trained_params(ONE_LEVEL), counts((N, 8)), condition((N, 5))
     expected = forward(params, x, u, ONE_LEVEL)

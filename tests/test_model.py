@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from networks import seen, small_params
 
-from evflow import model
+from evflow import model, pixelwise
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.config import MODELS
 from evflow.errors import EvflowDataError
@@ -110,28 +110,10 @@ def test_estimate_compiles_once_per_shape() -> None:
     voxels, dL, _ = seen()
     dlogI = dL.sum(-1)
     model.estimate(small_params(), voxels, dlogI)
-    before = model._estimate_y._cache_size()
+    before = pixelwise._share._cache_size()
     for scale in (1.0, 2.0):
         model.estimate(small_params(), scale * voxels, scale * dlogI, window_s=0.03 * scale)
-    assert model._estimate_y._cache_size() == before
-
-
-def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    voxels, dL, _ = seen()
-    context = jnp.zeros((*dL.shape[:2], 3))
-    from evflow import network
-
-    config, net = model.architecture(small_params()), next(iter(small_params().values()))
-    def estimated() -> Any:
-        # Traced anew, so that it sees the chunk.
-        run = jax.jit(lambda *inputs: network.estimate_pixels(*inputs, config))
-        return run(net, voxels, dL.sum(-1), context, jnp.zeros(6))
-
-    whole = estimated()
-    monkeypatch.setattr(network, "CHUNK", 7)
-    cut = estimated()
-    for a, b in zip(whole, cut, strict=True):
-        np.testing.assert_allclose(a, b, atol=2e-5)
+    assert pixelwise._share._cache_size() == before
 
 
 def test_stats_of_tiles_add_up_to_the_whole() -> None:

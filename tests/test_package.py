@@ -14,7 +14,7 @@ import evflow
 ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
 FLOORS = (
-    ("errors", "checks", "files", "pickles", "folders"),
+    ("errors", "checks", "files", "pickles", "folders", "chunks"),
     ("types", "progress", "distributed", "colour"), ("io",),
     ("camera", "camera_estimate", "sensors", "metrics", "faults"),
     ("pixels", "intensity", "stillness"),
@@ -22,7 +22,8 @@ FLOORS = (
     ("flow", "scenes", "simulator"),
     ("config",), ("squash", "dataset"),
     ("encoder", "summary", "refine"),
-    ("network", "losses", "batch", "noise_only"), ("model",), ("weights", "checkpoint"),
+    ("network", "losses", "batch", "noise_only"), ("pixelwise",), ("model",),
+    ("weights", "checkpoint"),
     ("train", "recording"),
     ("baselines", "downstream"), ("report",), ("commands",), ("cli",),
 )

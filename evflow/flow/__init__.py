@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from evflow.flow.config import FlowConfig
-from evflow.flow.folding import fold, forward_folded
+from evflow.flow.folding import fold, forward_columns, forward_folded, settle
 from evflow.flow.stack import data_init, forward, init, inverse
 
-__all__ = ["FlowConfig", "data_init", "fold", "forward", "forward_folded", "init", "inverse"]
+__all__ = [
+    "FlowConfig", "data_init", "fold", "forward", "forward_columns", "forward_folded", "init",
+    "inverse", "settle",
+]

@@ -6,25 +6,20 @@ every coupling becomes g + f'(g, u) with weights as wide as the level, zero wher
 in A (inputs) or not in B (outputs), and one affine map ends the level: the same function to
 rounding, and no pass over the activations but the products.
 
-Written for one pixel and mapped over chunks of them, so rows are pixels: with nothing left to
-reorder they are 12 % faster than columns.
+Columns are pixels, as in dense.py, but for the arguments and results of `forward_folded`. A step's
+input is [g, u] in one array of which only g changes, so that its first layer is one product.
 """
 
 from __future__ import annotations
-
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow import chunks
 from evflow.flow import actnorm, coupling, injector, shuffle
 from evflow.flow.config import Array, FlowConfig, Params
-
-# A 346x260 frame on one CPU device, in chunks of 1024, 4096, 16384 and whole: 1.03, .73, .61, .64 s
-# on two idle cores (sgemm 337 GF/s; below 4096 XLA's threads cost more than they give), 1.23, 1.11,
-# 1.19, 1.87 s beside other programs; .79 and 1.99 s not folded. With one device per core take 1024.
-CPU_CHUNK = 16384
+from evflow.flow.dense import dense
 
 
 def fold(params: Params, config: FlowConfig) -> Params:
@@ -40,10 +35,28 @@ def fold(params: Params, config: FlowConfig) -> Params:
         offset = jnp.cumsum(bias / scale, axis=0)
         folded[f"level_{index}"] = {
             **level,
-            "actnorm": {"scale": scale[-1], "offset": offset[-1]},
+            "actnorm": {"scale": scale[-1], "bias": scale[-1] * offset[-1]},
             "coupling": jax.vmap(_fold_step)(level["coupling"], scale, offset, jnp.asarray(after)),
         }
     return folded
+
+
+def settle(folded: Params, values: Array, at: int) -> Params:
+    """Folded params for pixels that share the channels at, at + 1, ... of the condition: their
+    `values` (k,) move into the biases, and u comes without them."""
+    def settled(layers: Params, first: int) -> Params:
+        w = layers["w_1"]
+        before, same, after = jnp.split(w, [first, first + len(values)], axis=-2)
+        return {**layers, "w_1": jnp.concatenate([before, after], -2),
+                "b_1": layers["b_1"] + jnp.matmul(values, same, precision="highest")}
+
+    ready: Params = {}
+    for name, level in folded.items():
+        channels = level["coupling"]["offset"].shape[-1]
+        ready[name] = {**level, "coupling": settled(level["coupling"], channels + at)}
+        if "injector" in level:
+            ready[name]["injector"] = settled(level["injector"], at)
+    return ready
 
 
 def forward_folded(
@@ -51,23 +64,40 @@ def forward_folded(
 ) -> tuple[Array, Array]:
     """`forward` without the log-det: x (..., channels), u (..., condition) -> y, z.
 
-    chunk: pixels in flight at once, 2 kB each; None is 16384 on a CPU, all of them elsewhere.
+    chunk: pixels in flight at once, 2 kB each; None chooses by the platform (chunks.py).
     """
     pixels = x.shape[:-1]
-    rows = {"x": x.reshape(-1, x.shape[-1]), "u": u.reshape(-1, u.shape[-1])}
+    rows = (x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1]))
 
-    def run(size: int, rows: Params) -> Array:
-        return jax.lax.map(
-            lambda row: _one_pixel(folded, config, **row), rows, batch_size=max(size, 1))
+    def run(rows: tuple[Array, Array]) -> tuple[Array, Array]:
+        y, z = forward_columns(folded, rows[0].T, rows[1].T, config)
+        return y.T, z.T
 
-    whole = functools.partial(run, len(rows["x"]))
     if chunk is None:
-        out = jax.lax.platform_dependent(
-            rows, cpu=functools.partial(run, CPU_CHUNK), default=whole)
+        y, z = chunks.by_platform(run, rows, alone=True)
     else:
-        out = run(chunk, rows)
-    z, y = jnp.split(out, [config.channels - config.level_channels[-1]], axis=1)
+        y, z = chunks.in_chunks(run, rows, chunk)
     return y.reshape(*pixels, y.shape[1]), z.reshape(*pixels, z.shape[1])
+
+
+def forward_columns(
+    folded: Params, x: Array, u: Array, config: FlowConfig
+) -> tuple[Array, Array]:
+    """x (channels, n), u (condition, n) -> y (width of the last level, n), z (the rest, n)."""
+    h = jnp.arcsinh(x) if config.asinh else x
+    z = h[:0]
+    for index, order in enumerate(shuffle.orders(config)):
+        if index:
+            h, left = jnp.split(h, 2)
+            z = jnp.concatenate([z, left])
+        level = folded[f"level_{index}"]
+        if config.injector:
+            h, _ = injector.forward(level["injector"], h, u, config)
+        gu, _ = jax.lax.scan(
+            lambda gu, w: (_step(w, gu, config), None), jnp.concatenate([h, u]), level["coupling"])
+        h = actnorm.forward(**level["actnorm"], h=gu[:len(h)])
+        h = shuffle.apply(h, _channel_at(order)[1][-1])
+    return h, z
 
 
 def _channel_at(order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,42 +117,26 @@ def _fold_step(params: Params, scale: Array, offset: Array, channel: Array) -> P
     nothing = jnp.zeros((len(last), len(channel)), last.dtype)
     wide = [nothing.at[:, b].set(part) for part in (shift / scale[b][None], *raw)]
     last = jnp.concatenate(wide, axis=1)
+    w_g = jnp.zeros((len(channel), w_h.shape[1]), w_h.dtype).at[a].set(w_h)
     return {
-        **params,
-        "w_h": jnp.zeros((len(channel), w_h.shape[1]), w_h.dtype).at[a].set(w_h),
+        "w_1": jnp.concatenate([w_g, params["w_u"]]),
         "b_1": params["b_1"] + jnp.matmul(offset[a], w_h, precision="highest"),
+        "w_2": params["w_2"],
+        "b_2": params["b_2"],
         "w_3": last[:-1],
         "b_3": last[-1],
         "offset": offset,
     }
 
 
-def _one_pixel(folded: Params, config: FlowConfig, x: Array, u: Array) -> Array:
-    """x (channels,), u (condition,) -> z and y in one vector (channels,)."""
-    h = jnp.arcsinh(x) if config.asinh else x
-    z = h[:0]
-    for index, order in enumerate(shuffle.orders(config)):
-        if index:
-            h, left = jnp.split(h, 2)
-            z = jnp.concatenate([z, left])
-        level = folded[f"level_{index}"]
-        if config.injector:
-            h = injector.forward(level["injector"], h[:, None], u[:, None], config)[0][:, 0]
-        h, _ = jax.lax.scan(lambda g, w: (_step(w, g, u, config), None), h, level["coupling"])
-        h = level["actnorm"]["scale"] * (h + level["actnorm"]["offset"])
-        h = shuffle.apply(h, _channel_at(order)[1][-1])
-    return jnp.concatenate([z, h])
-
-
-def _step(params: Params, g: Array, u: Array, config: FlowConfig) -> Array:
-    """g + f'(g, u), all (C,): a coupling that reads A and moves B by zeros in its weights."""
-    def dense(v: Array, w: str) -> Array:
-        return jnp.matmul(v, params[w], precision="highest")
-
-    hidden = jax.nn.relu(dense(g, "w_h") + dense(u, "w_u") + params["b_1"])
-    hidden = jax.nn.relu(dense(hidden, "w_2") + params["b_2"])
-    out = dense(hidden, "w_3") + params["b_3"]
-    if config.coupling == "additive":
-        return g + out
-    shift, raw = jnp.split(out, 2)
-    return g + shift + (g + params["offset"]) * jnp.expm1(coupling.LOG_SCALE_BOUND * jnp.tanh(raw))
+def _step(params: Params, gu: Array, config: FlowConfig) -> Array:
+    """[g, u] -> [g + f'(g, u), u]: a coupling that reads A and moves B by zeros in its weights."""
+    hidden = jax.nn.relu(dense(params["w_1"], params["b_1"], gu))
+    hidden = jax.nn.relu(dense(params["w_2"], params["b_2"], hidden))
+    out = dense(params["w_3"], params["b_3"], hidden)
+    channels = len(params["offset"])
+    if config.coupling == "affine":
+        out, raw = jnp.split(out, 2)
+        scaled = gu[:channels] + params["offset"][:, None]
+        out += scaled * jnp.expm1(coupling.LOG_SCALE_BOUND * jnp.tanh(raw))
+    return gu.at[:channels].add(out)
