@@ -49,6 +49,7 @@ PAPER = {  # Table X: RMSE, PSNR, SSIM
                  "jaer": (35.10, 17.39, .42), "ours, maps": (32.24, 18.17, .42)},
     "DAVIS346": {"ecc": (54.81, 13.75, .33), "s2r": (50.55, 14.45, .35),
                  "jaer": (57.72, 13.42, .34), "ours, maps": (39.76, 16.37, .37)}}
+# In the picture, beside the systems that were asked for
 SHOWN = ("no events", "default .2", "ecc", "ecc median", "ours, maps")
 
 
@@ -204,8 +205,9 @@ def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
 
 def picture(out: Path, shown: list[tuple[str, np.ndarray, dict[str, np.ndarray]]]) -> None:
     """Frames beside what the systems predict of them, with the RMSE of each."""
-    figure = plots.new_figure(3.0 * (len(SHOWN) + 1), 2.6 * len(shown))
-    axes = figure.subplots(len(shown), len(SHOWN) + 1, squeeze=False)
+    columns = 1 + len(shown[0][2])
+    figure = plots.new_figure(3.0 * columns, 2.6 * len(shown))
+    axes = figure.subplots(len(shown), columns, squeeze=False)
     for row, (name, frame, images) in zip(axes, shown, strict=True):
         for axis, (title, seen) in zip(row, {name: frame, **images}.items(), strict=True):
             rmse = np.sqrt(np.mean((seen - frame) ** 2))
@@ -235,6 +237,7 @@ def main(options: Options) -> dict[str, Any]:
     unknown = sorted(set(systems) - set(SYSTEMS))
     if unknown:
         raise EvflowDataError("EV020", f"systems {unknown}.", f"Choose from {sorted(SYSTEMS)}.")
+    seen = (*SHOWN, *options.systems)
     collected: dict[str, dict[str, dict[str, list[Any]]]] = {}
     shown: dict[str, tuple[str, np.ndarray, dict[str, np.ndarray]]] = {}
     with bar("recordings") as progress:
@@ -252,7 +255,7 @@ def main(options: Options) -> dict[str, Any]:
             chosen = spans(case.recording, 5, 1) or spans(case.recording, 1, 1)
             if chosen and group not in shown:
                 shown[group] = (case.name, case.recording.frame_dn(chosen[0][1]), {
-                    n: image(case.recording, chosen[0], by[n]) for n in SHOWN if n in by})
+                    n: image(case.recording, chosen[0], by[n]) for n in by if n in seen})
             progress(number, number)
     result = {group: {horizon: {name: {
         **{s: mean_ci(np.array(found)[:, i]) for i, s in enumerate(SCORES)},
