@@ -113,3 +113,9 @@ def test_changes_are_told_by_every_system(
             assert rows[system]["log"][0] < rows["no change"]["log"][0]
     assert tasks["next"]["frames alone"]["log"][0] < 0.1  # it is told the answer
     assert cv2.imread(str(tmp_path / "changes.png")) is not None
+
+
+def test_a_picture_shows_the_systems_that_there_are(tmp_path: Path) -> None:
+    frame = np.full(SHAPE, 90.0, np.float32)
+    integrate.picture(tmp_path / "one.png", [("ramp", frame, {"lgan": frame, "ours": frame})])
+    assert cv2.imread(str(tmp_path / "one.png")) is not None
