@@ -44,11 +44,11 @@ def unlike_noise(events: Events, hot: np.ndarray) -> str:
     that they are too few to tell; empty where nothing does."""
     if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
         return (f"there are only {len(events):,} events in {events.duration_us / 1e6:.3f} s to "
-                "tell it")
+                "tell it.")
     excess = company(events, hot)
     if excess > MOVING:
         return (f"the scene moves (events come in company: {excess:.2f} pairs per event beyond "
-                f"chance; {MOVING} is the most of noise)")
+                f"chance; {MOVING} is the most of noise).")
     share = float(hot.mean())
     if share > MOST_SCATTERED or (share > MOST_HOT and gathered(hot)):
         return (f"{share:.1%} of the pixels are far busier than the others, more than the "
