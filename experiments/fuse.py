@@ -21,10 +21,11 @@ import numpy as np
 import optax
 import tyro
 
-from evflow import finish, io, load_weights
+from evflow import Recording, finish, io, load_weights
+from evflow.camera import Summary
 from evflow.files import atomic_write
 from evflow.recording import pool_recording, refinement_chunks
-from evflow.refine import fused, refine_summary
+from evflow.refine import Chunk, fused, refine_summary
 from evflow.refine.fit import FusionNet
 from evflow.squash import squash, unsquash_summary
 from evflow.weights import model_card, save_weights
@@ -56,20 +57,29 @@ class Options:
     overwrite: bool = False
 
 
-def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
-    """Features, y of the stepped estimate and y of the truth; None where nothing fired."""
-    recording = hidden.recording
+def before_refinement(
+    params: Any, recording: Recording
+) -> tuple[list[Chunk], Summary, Summary] | None:
+    """What the refinement starts from: chunks, the network's summary and its std; None where
+    nothing fired."""
     if len(recording.events) < 10:
         return None
     plan = io.plan_windows(recording)
     if not plan.pairs:
         return None
     stats, _ = pool_recording(params, recording)
-    summary, std = finish(params, stats)
-    refined = refine_summary(refinement_chunks(recording, plan.pairs), summary, std)
+    return refinement_chunks(recording, plan.pairs), *finish(params, stats)
+
+
+def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
+    """Features, y of the stepped estimate and y of the truth; None where nothing fired."""
+    start = before_refinement(params, hidden.recording)
+    if start is None:
+        return None
+    refined = refine_summary(*start)
     return {"features": refined.features,
             "y": np.asarray(unsquash_summary(refined.summary)),
-            "network": np.asarray(unsquash_summary(summary)),
+            "network": np.asarray(unsquash_summary(start[1])),
             "true": np.asarray(unsquash_summary(hidden.nominal)),
             "signal": hidden.signal_events()}
 

@@ -22,9 +22,8 @@ import numpy as np
 import optax
 import tyro
 
-from evflow import finish, io, load_weights
+from evflow import load_weights
 from evflow.camera import Summary
-from evflow.recording import pool_recording, refinement_chunks
 from evflow.refine import Chunk, fused, refine_summary
 from evflow.refine.path import STEPS
 from evflow.refine.points import Points, chunk_points
@@ -32,6 +31,7 @@ from evflow.refine.signal import joined, log_intensity, noise_rate
 from evflow.squash import squash_summary, summary_std, unsquash_summary
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
+from experiments.fuse import COVERED, before_refinement
 from experiments.many import Setup, scores
 
 Array = jax.Array
@@ -39,7 +39,6 @@ Row = dict[str, Any]
 
 WIDTHS = (32, 16)
 BATCH = 4096
-COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier than a Gaussian's
 HELD_OUT = 5  # every n-th recording
 
 
@@ -61,15 +60,11 @@ class Options:
 def row(params: Any, hidden: Hidden, _protocol: Protocol) -> list[Row] | None:
     """ON and OFF: points, which of them are noise, the true rate and the events of signal; None
     where nothing fired."""
-    recording = hidden.recording
-    if len(recording.events) < 10:
+    start = before_refinement(params, hidden.recording)
+    if start is None:
         return None
-    plan = io.plan_windows(recording)
-    if not plan.pairs:
-        return None
-    stats, _ = pool_recording(params, recording)
-    chunks = refinement_chunks(recording, plan.pairs)
-    found, std = fused_summary(params, chunks, *finish(params, stats))
+    chunks = start[0]
+    found, std = fused_summary(params, *start)
     theta = np.array([float(found.theta_on), float(found.theta_off)])
     sides: list[list[Points]] = [[], []]
     noise: list[list[np.ndarray]] = [[], []]
