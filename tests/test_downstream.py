@@ -38,6 +38,9 @@ run_jit = jax.jit(run, static_argnames=("network", "train"))
 @tiny
 def test_networks_are_pure_functions_on_any_batch(network: Network) -> None:
     params = network.init(jax.random.key(0), (HEIGHT, WIDTH))
+    if isinstance(network, EVFlowNet):
+        # Random flow of 256 px, which each scale feeds to the next, makes rounding thousandfold.
+        params = jax.tree.map(lambda p: 0.25 * p, params)
     x = jnp.asarray(case_input())[:3]
     image, state = apply(network, params, x)  # three scenes at once, no state
     again, _ = apply(network, params, x)

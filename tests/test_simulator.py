@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -16,8 +17,8 @@ from videos import SHAPE, by_pixel, drifting, milliseconds
 from evflow.camera import Camera, CameraPrior
 from evflow.intensity import LOG_MAPS, to_log
 from evflow.sensors import SensorModel
-from evflow.simulator import active, simulate, simulate_stream
-from evflow.simulator.active import step
+from evflow.simulator import active, circuits, simulate, simulate_stream
+from evflow.simulator.active import step_still
 from evflow.simulator.pixel import floor_divide
 from evflow.types import Events
 
@@ -107,28 +108,43 @@ def test_keys_matter_only_where_something_is_random() -> None:
 
 
 @pytest.mark.parametrize("model", [
-    SensorModel(), SensorModel(leak_hz=20.0), EVERYTHING,
+    SensorModel(), SensorModel(refractory_s=3e-3), SensorModel(leak_hz=20.0), EVERYTHING,
     SensorModel(kind="esim", refractory_s=1e-3), SensorModel(leak_hz=50.0, leak_jitter=2.0),
-    SensorModel(shot_hz=50.0, eta_intensity=True)])
+    SensorModel(log_map="log_eps"), SensorModel(shot_hz=50.0, eta_intensity=True)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_pixels_that_are_passed_over_have_nothing_to_send(
-    model: SensorModel, monkeypatch: pytest.MonkeyPatch
+    model: SensorModel, dtype: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same bytes where every pixel is stepped; and most of a quiet scene is passed over."""
-    frames, times = drifting(40), milliseconds(40)
+    frames, times = drifting(40).astype(dtype), milliseconds(40)
     active_ones = simulate(KEY, frames, times, NOISY, model=model)
-    look, shares = active.look, []
+    pieces, shares = circuits._Thresholds.pieces, []
 
-    def look_at_all(*args: Any) -> Any:
-        after, found = look(*args)
-        shares.append(float(found.mean()))
-        return after, jnp.ones_like(found)
+    def all_pieces(pixels: circuits._Thresholds, at: np.ndarray, block: active.Block) -> Any:
+        shares.append(len(at) / frames[0].size)
+        return pieces(pixels, np.arange(frames[0].size), block)
 
-    monkeypatch.setattr(active, "look", look_at_all)
+    monkeypatch.setattr(circuits._Thresholds, "pieces", all_pieces)
     equal(active_ones, simulate(KEY, frames, times, NOISY, model=model))
     still = np.broadcast_to(frames[:1], frames.shape)
     shares.clear()
     assert len(simulate(KEY, still, times, QUIET, model=SensorModel())) == 0
     assert max(shares) == 0
+
+
+def test_a_source_may_write_over_its_last_frames() -> None:
+    frames, times = drifting(30), milliseconds(30)
+
+    def live(length: int) -> Iterator[np.ndarray]:
+        buffer = np.empty_like(frames[:length])
+        for i in range(0, 30, length):
+            buffer[:] = frames[i : i + length]
+            yield buffer
+
+    for length in (1, 3, 10):
+        stamps = times.reshape(-1, length)
+        equal(simulate(KEY, frames, times, NOISY), Events.concatenate(
+            list(simulate_stream(KEY, live(length), stamps, NOISY))))
 
 
 def test_events_of_very_long_intervals_stay_in_them() -> None:
@@ -146,10 +162,10 @@ def test_events_of_very_long_intervals_stay_in_them() -> None:
 
 def test_video_length_does_not_recompile() -> None:
     simulate(KEY, drifting(5), milliseconds(5), QUIET)
-    before = step._cache_size()
+    before = step_still._cache_size()
     for count in (3, 40, 70):
         simulate(KEY, drifting(count), milliseconds(count), Camera.constant(SHAPE, 0.3, 0.4))
-    assert step._cache_size() == before
+    assert step_still._cache_size() == before
 
 
 def ramps(edges: np.ndarray, log_map: str) -> tuple[np.ndarray, np.ndarray]:

@@ -135,7 +135,8 @@ class _Bag:
             raise EvflowDataError(
                 "EV010", f"reading {path} needs the package 'rosbags'.",
                 'pip install "evflow-jax[ros]"') from e
-        self.reader = Reader(_Bounded(path))
+        bounded: Any = _Bounded(path)  # what `Reader` uses of a path
+        self.reader = Reader(bounded)
 
     def __enter__(self) -> _Bag:
         try:

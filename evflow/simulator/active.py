@@ -1,36 +1,41 @@
 """A block of frames on the device: which pixels may send events, and what those send.
 
-Few pixels fire in a few milliseconds. `look` passes over whole frames once and finds the pixels
-that may; `step` gathers some of them, takes them through the block interval by interval and puts
-their memory back. Cost follows the active pixels; where nothing can fire, only light is worked out.
+Few pixels fire in a few milliseconds. Those that may are gathered, taken through the block interval
+by interval, and their memory is put back, so that cost follows the active pixels. Where the memory
+moves by itself (low-pass, leak), `look` takes all pixels through the light of the block to find
+them, and `step` steps them. Where it stays as it is between events, `limits` of brightness tell
+which frames can matter to a pixel, and `step_still` steps those that saw one.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from evflow.intensity import normalised_intensity, to_log
+from evflow.camera import Camera
+from evflow.intensity import LOG_MAPS, normalised_intensity, to_log
 from evflow.sensors import SensorModel
 from evflow.simulator import noise, pixel, sensor
 from evflow.simulator.pixel import PixelState, Spikes
 from evflow.simulator.sensor import Sensor
 
 Array = jax.Array
+T = TypeVar("T")
 
 TICKS = 1 << 30  # microseconds in a block that leave room for two flags in 32 bits
-SLACK = 1e-4  # of a threshold: what sums in another order may differ by
+SLACK = 1e-4  # of a threshold, or log units: beyond what rounding may differ by
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """T frames and the intervals that end at them. frames: (T, N) DN, uint8 or float32. dt: (T,)
-    seconds. dt_us: (T,) uint32. clock: (T + 1, 2) times of the frame before and of these, see
+    """T intervals. frames: (T + 1, N) DN, uint8 or float32, the frame before and those at which
+    they end. dt: (T,) seconds. dt_us: (T,) uint32. clock: (T + 1, 2) times of the frames, see
     `SimState.time`. salts: (T, 2) of `noise.salts`."""
 
     frames: Any
@@ -53,49 +58,34 @@ class Sent:
     struck: Array | None
 
 
+def is_still(model: SensorModel) -> bool:
+    """Whether a pixel's memory stays as it is between events."""
+    return model.cutoff_hz <= 0 and model.leak_hz <= 0
+
+
+def waits(model: SensorModel) -> bool:
+    """Whether `PixelState.last` counts the seconds since an event."""
+    return model.refractory_s > 0 and model.timestamps == "crossing"
+
+
+@functools.partial(jax.jit, static_argnames=("model", "dtype"))
+def limits(model: SensorModel, camera: Camera, base: Array, dtype: np.dtype) -> Array:
+    """(2, N) DN: only frames brighter than the first or darker than the second can make pixels
+    with this memory fire. dtype: that of the frames."""
+    inverse = LOG_MAPS[model.log_map][1]
+    bright = inverse(base + (camera.theta_on - SLACK))
+    dark = inverse(base - (camera.theta_off - SLACK))
+    if dtype == np.uint8:  # the last values that cannot
+        bright = jnp.clip(jnp.ceil(bright) - 1.0, 0.0, 255.0)
+        dark = jnp.clip(jnp.floor(dark) + 1.0, 0.0, 255.0)
+    return jnp.stack([bright, dark]).astype(dtype)
+
+
 @functools.partial(jax.jit, static_argnames="model")
 def look(
     model: SensorModel, sensor: Sensor, pixels: PixelState, block: Block
 ) -> tuple[PixelState, Array]:
     """The pixels after the block where none of them fires, and (N,) which may."""
-    if model.cutoff_hz > 0 or model.leak_jitter > 0:
-        after, active = _look_at_each(model, sensor, pixels, block)
-    else:
-        after, active = _look_at_extremes(model, sensor, pixels, block)
-    if model.refractory_s > 0 and model.timestamps == "crossing":
-        after = dataclasses.replace(after, last=pixels.last + jnp.sum(block.dt))
-    if sensor.rates is not None:
-        active |= _may_be_struck(sensor, block)
-    return after, active
-
-
-def _beyond(sensor: Sensor, above: Array, below: Array) -> Array:
-    """Whether contrast that reaches from -below to above may cross a threshold."""
-    near = 1.0 - SLACK
-    return ((above >= near * sensor.camera.theta_on)
-            | (below >= near * sensor.camera.theta_off))
-
-
-def _look_at_extremes(
-    model: SensorModel, sensor: Sensor, pixels: PixelState, block: Block
-) -> tuple[PixelState, Array]:
-    """Without a low-pass the brightest and the darkest frame of a pixel decide; whole frames
-    turn into logarithms only for these."""
-    frames = list(block.frames)
-    most, least = (to_log(functools.reduce(pick, frames), model.log_map)
-                   for pick in (jnp.maximum, jnp.minimum))
-    base = pixels.base
-    if sensor.leaking is not None:
-        for dt in block.dt:  # one by one, as `step` does: a sum rounds differently
-            base = base - sensor.leaking * dt
-    active = _beyond(sensor, most - base, pixels.base - least)
-    after = PixelState(to_log(frames[-1], model.log_map), base, pixels.last)
-    return after, active
-
-
-def _look_at_each(
-    model: SensorModel, sensor: Sensor, pixels: PixelState, block: Block
-) -> tuple[PixelState, Array]:
     def body(
         carry: tuple[Array, Array, Array], inputs: tuple[Array, Array, Array]
     ) -> tuple[tuple[Array, Array, Array], None]:
@@ -106,16 +96,27 @@ def _look_at_each(
         if sensor.leaking is not None:
             drawn = noise.draw(sensor.words, salt)
             base = base - noise.leak(model, sensor.leaking, sensor.words, drawn, dt)
-        contrast = log_i - base
-        return (log_i, base, active | _beyond(sensor, contrast, -contrast)), None
+        return (log_i, base, active | _beyond(sensor.camera, log_i - base)), None
 
     start = (pixels.lp, pixels.base, jnp.zeros(pixels.lp.shape, bool))
-    (lp, base, active), _ = jax.lax.scan(body, start, (block.frames, block.dt, block.salts))
-    return PixelState(lp, base, pixels.last), active
+    (lp, base, active), _ = jax.lax.scan(
+        body, start, (block.frames[1:], block.dt, block.salts))
+    last = pixels.last + jnp.sum(block.dt) if waits(model) else pixels.last
+    if sensor.rates is not None:
+        active |= look_for_noise(sensor, block)
+    return PixelState(lp, base, last), active
 
 
-def _may_be_struck(sensor: Sensor, block: Block) -> Array:
-    """Whether noise may strike: the least a pixel draws in the block against the highest odds."""
+def _beyond(camera: Camera, contrast: Array) -> Array:
+    """Whether contrast may cross a threshold; `step` may round otherwise."""
+    near = 1.0 - SLACK
+    return (contrast >= near * camera.theta_on) | (-contrast >= near * camera.theta_off)
+
+
+@jax.jit
+def look_for_noise(sensor: Sensor, block: Block) -> Array:
+    """(N,) whether noise may strike in the block: the least a pixel draws against the highest
+    odds."""
     assert sensor.rates is not None
     least = functools.reduce(jnp.minimum, [noise.draw(sensor.words, salt) for salt in block.salts])
     highest = -jnp.expm1(-noise.peak(sensor.rates) * jnp.max(block.dt))
@@ -132,14 +133,49 @@ def step(
     model: SensorModel, whole: Sensor, before: PixelState, after: PixelState, block: Block,
     at: Array,
 ) -> tuple[PixelState, Sent]:
-    """Take the pixels `at` (K,) int32 through the block, from `before` it.
+    """Take the pixels `at` (K,) int32 through the block, whose frames (T + 1, K) are theirs alone,
+    from `before` it.
 
     Returns `after` (see `look`) with their memory put back, and what they send. Entries of `at`
-    beyond the last pixel are padding: they repeat it and are not put back.
+    beyond the last pixel are padding, all different: they repeat it and are not put back.
     """
-    few, pixels = jax.tree.map(lambda m: m.at[at].get(mode="clip"), (whole, before))
-    frames = block.frames.at[:, at].get(mode="clip")
-    log_i, i01 = to_log(frames, model.log_map), _i01(frames)
+    few, own = _gathered((whole, before), at)
+    own, sent = _through(model, few, own, block, at < whole.words.size)
+    return _put_back(model, after, own, at), sent
+
+
+@functools.partial(jax.jit, static_argnames="model", donate_argnames="pixels")
+def step_still(
+    model: SensorModel, whole: Sensor, pixels: PixelState, block: Block, at: Array,
+    rested: Array | None,
+) -> tuple[PixelState, Sent, Array]:
+    """The same for sensors that are still. rested: (K,) seconds before the block in which the
+    pixels were not stepped, where they wait. Returns their new `limits` (2, K) as well."""
+    few, own = _gathered((whole, pixels), at)
+    last = own.last if rested is None else own.last + rested
+    own = PixelState(to_log(block.frames[0], model.log_map), own.base, last)
+    own, sent = _through(model, few, own, block, at < whole.words.size)
+    new = limits(model, few.camera, own.base, block.frames.dtype)
+    return _put_back(model, pixels, own, at), sent, new
+
+
+def _gathered(maps: T, at: Array) -> T:
+    return jax.tree.map(lambda m: m.at[at].get(mode="clip"), maps)
+
+
+def _put_back(model: SensorModel, pixels: PixelState, own: PixelState, at: Array) -> PixelState:
+    kept = ("base", "last") if model.refractory_s > 0 else ("base",)
+    put = {name: getattr(pixels, name).at[at].set(
+        getattr(own, name), mode="drop", unique_indices=True, indices_are_sorted=True)
+        for name in kept}
+    return dataclasses.replace(pixels, **put)
+
+
+def _through(
+    model: SensorModel, few: Sensor, pixels: PixelState, block: Block, real: Array
+) -> tuple[PixelState, Sent]:
+    """K pixels after a block of frames (T + 1, K), and what those that are real send."""
+    log_i, i01 = to_log(block.frames[1:], model.log_map), _i01(block.frames[1:])
     # All that does not depend on the memory is worked out for the block at once.
     dist = jax.vmap(functools.partial(sensor.disturb, model, few))(i01, block.salts, block.dt)
 
@@ -149,16 +185,11 @@ def step(
         return sensor.advance(model, few.camera, pixels, *inputs)
 
     clock = block.clock[:-1], block.clock[1:]
-    pixels, spikes = jax.lax.scan(
-        body, pixels, (log_i, i01, dist, block.dt, clock))
-    real = (at < whole.words.size)[None]
+    pixels, spikes = jax.lax.scan(body, pixels, (log_i, i01, dist, block.dt, clock))
+    real = real[None]
     struck = None if dist.struck is None else dist.struck.some & real
-    kept = ("base", "last") if model.refractory_s > 0 else ("base",)
-    put = {name: getattr(after, name).at[at].set(getattr(pixels, name), mode="drop")
-           for name in kept}
     ticks = jnp.where((spikes.count != 0) & real, _ticks(spikes, block.dt_us), 0)
-    sent = Sent(ticks, spikes, struck)
-    return dataclasses.replace(after, **put), sent
+    return pixels, Sent(ticks, spikes, struck)
 
 
 def _ticks(spikes: Spikes, dt_us: Array) -> Array:
@@ -177,5 +208,5 @@ def strike(model: SensorModel, whole: Sensor, block: Block) -> Array | None:
     """Where there is noise in a block, bool (T, N), for sensors whose signal comes from
     elsewhere; None without noise."""
     one = functools.partial(sensor.disturb, model, whole)
-    struck = jax.vmap(one)(_i01(block.frames), block.salts, block.dt).struck
+    struck = jax.vmap(one)(_i01(block.frames[1:]), block.salts, block.dt).struck
     return None if struck is None else struck.some

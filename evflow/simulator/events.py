@@ -55,7 +55,8 @@ def simulate(
         raise EvflowDataError(
             "EV002", f"frames {frames.shape} with times {times_us.shape}.",
             "Expected (T, H, W) frames and T times in microseconds.")
-    parts = list(simulate_stream(key, [frames], [times_us], camera, model=model, labels=True))
+    video = blocks([frames], [times_us], camera.shape, BLOCK, copy=False)
+    parts = list(_packed(key, video, camera, model or SensorModel()))
     height, width = camera.shape
     x, y, t, p = (np.concatenate([getattr(part, name) for part, _ in parts]) for name in COLUMNS)
     events = Events.unchecked(x, y, t, p, (width, height))
@@ -79,12 +80,13 @@ def simulate_stream(
     """Events of a video that arrives piece by piece, in bounded memory.
 
     frames_iter yields single frames (H, W) or blocks (T, H, W), times_iter the matching
-    scalars or (T,) arrays in us. Yields `Events` of eight frames at a time, each later than the
-    one before, after reading sixteen frames more; together they are the same bytes as `simulate`
-    for any cut of the input. labels: as in `simulate`.
+    scalars or (T,) arrays in us; a source may write its next frames over the last. Yields
+    `Events` of eight frames at a time, each later than the one before, after reading 8 or 16
+    frames more; together they are the same bytes as `simulate` for any cut of the input.
+    labels: as in `simulate`.
     """
-    packed = _packed(key, blocks(frames_iter, times_iter, camera.shape, BLOCK), camera,
-                     model or SensorModel())
+    video = blocks(frames_iter, times_iter, camera.shape, BLOCK, copy=True)
+    packed = _packed(key, video, camera, model or SensorModel())
     return packed if labels else (events for events, _ in packed)
 
 

@@ -12,29 +12,32 @@ from evflow.errors import EvflowDataError
 
 def blocks(
     frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
-    shape: tuple[int, ...], length: int,
+    shape: tuple[int, ...], length: int, *, copy: bool,
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
     """Flat frames, bytes or float32 DN, and their int64 times, however the input is cut: first
-    the first frame alone, then `length` frames at a time. Raises EV001 for less than two frames,
-    EV002, EV003, EV004, EV007 and EV015 for bad ones."""
-    pairs = _single_frames(frames_iter, times_iter, shape)
+    the first frame alone, then `length` frames at a time. copy: frames as they are when they
+    arrive, for sources that write the next one into the same memory. Raises EV001 for less than
+    two frames, EV002, EV003, EV004, EV007 and EV015 for bad ones."""
+    pairs = ((_flat(frame, copy), t)
+             for frame, t in _single_frames(frames_iter, times_iter, shape))
     taken = list(itertools.islice(pairs, 1))
     if not taken:
         raise EvflowDataError("EV001", "the video has no frames.", "Give at least two frames.")
     count = 0
     while taken:
         count += len(taken)
-        yield [_flat(frame) for frame, _ in taken], np.array([t for _, t in taken], np.int64)
+        yield [frame for frame, _ in taken], np.array([t for _, t in taken], np.int64)
         taken = list(itertools.islice(pairs, length))
     if count < 2:
         raise EvflowDataError("EV001", "the video has one frame.",
                               "Events need a change: give at least two frames.")
 
 
-def _flat(frame: np.ndarray) -> np.ndarray:
+def _flat(frame: np.ndarray, copy: bool) -> np.ndarray:
     if frame.dtype == np.uint16:
         frame = frame.astype(np.float32) * np.float32(255.0 / 65535.0)
-    return (frame if frame.dtype == np.uint8 else frame.astype(np.float32)).ravel()
+    dtype = np.uint8 if frame.dtype == np.uint8 else np.float32
+    return frame.astype(dtype, copy=copy).ravel()
 
 
 def _single_frames(

@@ -55,9 +55,9 @@ def signal_columns(
     for pixels, out in sent:
         at, pixel = _where(np.asarray(out.ticks) != 0, pixels, len(dt_us))
         if timed:
-            ticks = _of(out.ticks, at)
-            yield Columns(ticks & ~np.uint32(1), pixel)
-            many = np.flatnonzero((ticks & 1).astype(bool))  # there are few
+            first = _of(out.ticks, at)
+            yield Columns(first & ~np.uint32(1), pixel)
+            many = np.flatnonzero(first & np.uint32(1))  # there are few
             at, pixel = at.take(many), pixel.take(many)
         further.append((out, at, pixel))
     if any(len(at) for _, at, _ in further):
@@ -85,29 +85,35 @@ def _progressions(
 
 
 def noise_columns(
-    model: SensorModel, whole: Sensor, struck: Sequence[tuple[Array, Any]], block: Block,
+    model: SensorModel, whole: Sensor, struck: Sequence[tuple[Array, Array, Any]], block: Block,
     dt_us: Array,
 ) -> Iterator[Columns]:
-    """The noise events of a block. whole: the sensor in NumPy. struck: where some pixels are
-    struck, None without noise, and which they are.
+    """The noise events of a block. whole: the sensor in NumPy. struck: some pixels, the frames
+    (T + 1, K) that they see, and where they are struck, None without noise.
 
     What a pixel drew and its odds are worked out again here, for the few that are struck: as
     maps of all that may be, they cost more to write than all else that a block does.
     """
-    found = [(flags.shape[1], *_where(np.asarray(flags), pixels, len(dt_us)))
-             for pixels, flags in struck if flags is not None]
+    found = [_struck(pixels, frames, np.asarray(flags), len(dt_us))
+             for pixels, frames, flags in struck if flags is not None]
     if not found:
         return
-    step, pixel = (np.concatenate(parts) for parts in zip(
-        *((at // width, pixel) for width, at, pixel in found), strict=True))
+    step, pixel, dn = (np.concatenate(parts) for parts in zip(*found, strict=True))
     words, rates = jax.tree.map(lambda m: m.take(pixel), (whole.words, whole.rates))
     drawn = noise.draw(words, block.salts.take(step, axis=0).T)
-    i01 = normalised_intensity(block.frames[step, pixel].astype(np.float32))
-    odds = noise.odds(rates, i01, block.dt.take(step))
+    odds = noise.odds(rates, normalised_intensity(dn.astype(np.float32)), block.dt.take(step))
     row, k = _repeated(_number(odds, noise.uniform(drawn)))
     fraction, on = noise.event(
         model, words[row], drawn[row], k.astype(np.uint32), odds.share[row])
     yield from_fractions(step[row], pixel[row], fraction, on, dt_us, noise=True)
+
+
+def _struck(
+    pixels: Array, frames: Array, flags: Array, steps: int
+) -> tuple[Array, Array, Array]:
+    """Interval, pixel and DN, where noise strikes."""
+    at, pixel = _where(flags, pixels, steps)
+    return at // flags.shape[1], pixel, frames[1:].ravel().take(at)
 
 
 def _number(odds: noise.Odds, u: Array) -> Array:
