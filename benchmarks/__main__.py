@@ -4,7 +4,8 @@
     python -m benchmarks --only simulator train   # some subjects (limits are always measured)
     python -m benchmarks --quick                  # tiny inputs: does it run?
 
-Every case runs in a process of its own, except with --quick. Exit code 1 if a case failed.
+Every case runs in a process of its own, and those of a task take turns, except with --quick. Exit
+code 1 if a case failed.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ from benchmarks import (
     bench_voxels,
     limits,
 )
-from benchmarks.harness import Case, Record, Setting, compare, facts, isolated, measure
+from benchmarks.harness import Case, Record, Setting, compare, facts, measure
+from benchmarks.turns import by_task, in_turn
 
 SUBJECTS: dict[str, tuple[Case, ...]] = {
     "limits": limits.CASES,
@@ -53,8 +55,8 @@ SUBJECTS: dict[str, tuple[Case, ...]] = {
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Time evflow on this machine, beside its limits and beside peers: a table on the terminal,
-    JSON lines on the disk. Every case runs in a process of its own, except with --quick. If
-    one failed the exit code is 1.
+    JSON lines on the disk. Every case runs in a process of its own, and those of a task take
+    turns, except with --quick. If one failed the exit code is 1.
 
     Example: evflow bench --only simulator voxels
 
@@ -94,9 +96,11 @@ def run(cases: list[Case], options: Options, console: Console) -> tuple[list[Rec
         jax.config.update("jax_num_cpu_devices", options.devices)
     records: list[Record] = []
     try:
-        for case in cases:
-            console.print(f"{case.subject}: {case.task}, {case.implementation}", highlight=False)
-            records.append((measure if options.quick else isolated)(case, setting))
+        for task in by_task(cases):
+            names = "; ".join(case.implementation for case in task)
+            console.print(f"{task[0].subject}: {task[0].task}, {names}", highlight=False)
+            records += ([measure(case, setting) for case in task] if options.quick
+                        else in_turn(task, setting))
     except KeyboardInterrupt:
         console.print(f"interrupted after {len(records)} of {len(cases)} cases")
         return records, False
@@ -122,8 +126,8 @@ def table(records: list[Record], run: dict[str, Any]) -> Table:
     title = f"{run['cpu']}, {run['cpus']} cores, load {run['load_before']} before; " + ", ".join(
         f"{name} {version}" for name, version in run["versions"].items())
     shown = Table(title=title, caption="x first: time against the first case of the same task, "
-                  "above 1 = slower. % of sgemm, copy: of the best measured in this run. "
-                  "others: cores busy with other processes meanwhile.")
+                  "turn by turn, above 1 = slower. % of sgemm, copy: of the best measured in this "
+                  "run. others: cores busy with other processes meanwhile.")
     for name in ("task", "implementation", "median s", "min s", "per second", "% sgemm", "% copy",
                  "x first", "peak MB", "others"):
         shown.add_column(name, justify="left" if name in ("task", "implementation") else "right")

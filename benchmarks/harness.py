@@ -1,8 +1,8 @@
 """How every benchmark is timed, what it leaves behind, and what it is compared with.
 
 A `Case` names a workload; `prepare(setting)` builds its inputs (not timed) and returns the
-`Workload` to call. `measure` times the calls and returns a `Record`; `compare` adds what only the
-whole run can know: the share of the machine's limits, and the time relative to evflow's.
+`Workload` to call. A `Runner` times its calls and makes a `Record` of them; `compare` adds what
+only the whole run can know: the share of the machine's limits, and the time relative to evflow's.
 Times are wall-clock seconds per call, results ready (`jax.block_until_ready`).
 """
 
@@ -12,7 +12,6 @@ import dataclasses
 import datetime
 import importlib.metadata
 import importlib.util
-import multiprocessing
 import os
 import platform
 import re
@@ -20,7 +19,6 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +27,7 @@ import jax
 import evflow
 
 PACKAGES = ("jax", "jaxlib", "numpy", "numba", "torch")
-BUDGET_S = 20.0  # per case, beyond the least number of repeats
-REPEATS, MOST_REPEATS = 5, 15
+Clocks = tuple[float, float, float | None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,18 +62,23 @@ class Case:
     needs: str = ""
     splits: bool = False
 
+    @property
+    def name(self) -> tuple[str, str, str]:
+        return self.subject, self.task, self.implementation
+
 
 @dataclasses.dataclass(frozen=True)
 class Record:
     """One measured case, one line of JSON.
 
-    seconds: median of `repeats` calls; fastest: the least; first_call: the first, compilation
-    included. peak_mb: highest resident memory during the timed calls, less that before the first
-    call (so it holds what compilation leaves behind); None where the system cannot tell.
+    seconds: median of `times`, one for each timed call; fastest: the least; first_call: the first,
+    compilation included. peak_mb: highest resident memory during the timed calls, less that before
+    the first call (so it holds what compilation leaves behind); None where the system cannot tell.
     others: CPU cores that other processes kept busy meanwhile, on average; above ~.1 the times are
     theirs too (None where the system cannot tell).
     rates: work per second of the median. of_limit: share of the best "sgemm" and "copy" of the
-    same run. relative: seconds over those of the task's first case (above 1 = slower).
+    same run. relative: times over those of the task's first case, turn by turn, the median (above
+    1 = slower).
     devices: JAX devices that shared the pixels. skipped: why there are no figures; failed:
     whether that is an error.
     """
@@ -87,7 +89,7 @@ class Record:
     seconds: float | None = None
     fastest: float | None = None
     first_call: float | None = None
-    repeats: int = 0
+    times: tuple[float, ...] = ()
     peak_mb: float | None = None
     others: float | None = None
     work: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -100,51 +102,58 @@ class Record:
     failed: bool = False
 
 
-def measure(case: Case, setting: Setting) -> Record:
-    """Build the case's inputs and time its calls; a skipped record where a package is absent."""
-    name = (case.subject, case.task, case.implementation)
-    if case.needs and importlib.util.find_spec(case.needs) is None:
-        return Record(*name, skipped=f"skipped: {case.needs} is not installed "
-                                     "(pip install 'evflow-jax[bench]')")
-    if not case.splits:
-        setting = dataclasses.replace(setting, devices=1)
-    workload = case.prepare(setting)
-    before, began = resident_mb("VmRSS"), time.perf_counter()
-    result = jax.block_until_ready(workload.call())
-    first = time.perf_counter() - began
-    least, most = (1, 1) if setting.quick else (REPEATS, MOST_REPEATS)
-    _reset_peak()
-    times: list[float] = []
-    start = _clocks()
-    while len(times) < least or (len(times) < most and sum(times) < BUDGET_S):
-        del result  # or two results would be alive at once, and counted
+def absent(case: Case) -> Record | None:
+    """The record of a case whose package is not installed."""
+    if not case.needs or importlib.util.find_spec(case.needs) is not None:
+        return None
+    return Record(*case.name, skipped=f"skipped: {case.needs} is not installed "
+                                      "(pip install 'evflow-jax[bench]')")
+
+
+class Runner:
+    """A case in this process: built and called once; then each `turn` is a timed call."""
+
+    def __init__(self, case: Case, setting: Setting) -> None:
+        self.case = case
+        self.setting = setting if case.splits else dataclasses.replace(setting, devices=1)
+        self.workload = case.prepare(self.setting)
+        self.before = resident_mb("VmRSS")
+        self.times: list[float] = []
+        self.clocks: list[tuple[Clocks, Clocks]] = []
         began = time.perf_counter()
-        result = jax.block_until_ready(workload.call())
-        times.append(time.perf_counter() - began)
-    peak, others = resident_mb("VmHWM"), _others(start, _clocks())
-    work, seconds = workload.count(result), statistics.median(times)
-    return Record(
-        *name, seconds=seconds, fastest=min(times), first_call=first, repeats=len(times),
-        peak_mb=None if before is None or peak is None else max(peak - before, 0.0),
-        others=others, work=work, rates={unit: amount / seconds for unit, amount in work.items()},
-        devices=setting.devices, note=workload.note)
+        self.result = jax.block_until_ready(self.workload.call())
+        self.first = time.perf_counter() - began
+        _reset_peak()
+
+    def turn(self) -> float:
+        """Seconds of one call."""
+        self.result = None  # or two results would be alive at once, and counted
+        start = _clocks()
+        self.result = jax.block_until_ready(self.workload.call())
+        self.clocks.append((start, _clocks()))
+        self.times.append(self.clocks[-1][1][0] - start[0])
+        return self.times[-1]
+
+    def record(self) -> Record:
+        peak = resident_mb("VmHWM")
+        work, seconds = self.workload.count(self.result), statistics.median(self.times)
+        return Record(
+            *self.case.name, seconds=seconds, fastest=min(self.times), first_call=self.first,
+            times=tuple(self.times),
+            peak_mb=(None if self.before is None or peak is None
+                     else max(peak - self.before, 0.0)),
+            others=_others(self.clocks), work=work,
+            rates={unit: amount / seconds for unit, amount in work.items()},
+            devices=self.setting.devices, note=self.workload.note)
 
 
-def isolated(case: Case, setting: Setting) -> Record:
-    """`measure` in a process of its own: memory is the case's alone, thread pools of JAX, torch
-    and numba do not meet, and the number of JAX devices is free. An error becomes the record."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        try:
-            return pool.submit(_child, case, setting).result()
-        except Exception as e:  # one broken case must not cost the others
-            return Record(case.subject, case.task, case.implementation, failed=True,
-                          skipped=f"{type(e).__name__}: {e}")
-
-
-def _child(case: Case, setting: Setting) -> Record:
-    jax.config.update("jax_num_cpu_devices", setting.devices if case.splits else 1)
-    return measure(case, setting)
+def measure(case: Case, setting: Setting) -> Record:
+    """One turn of a case in this process; a skipped record where its package is absent."""
+    if missing := absent(case):
+        return missing
+    runner = Runner(case, setting)
+    runner.turn()
+    return runner.record()
 
 
 def compare(records: Sequence[Record]) -> list[Record]:
@@ -158,7 +167,8 @@ def compare(records: Sequence[Record]) -> list[Record]:
         reference = first.setdefault((r.subject, r.task), r)
         shares = {task: r.rates[unit] / limit for task, unit in units.items()
                   if (limit := limits[task]) and unit in r.rates}
-        relative = r.seconds / reference.seconds if r.seconds and reference.seconds else None
+        ratios = [a / b for a, b in zip(r.times, reference.times, strict=False)]
+        relative = statistics.median(ratios) if ratios else None
         out.append(dataclasses.replace(r, of_limit=shares, relative=relative))
     return out
 
@@ -177,7 +187,7 @@ def _reset_peak() -> None:
         control.write_text("5")
 
 
-def _clocks() -> tuple[float, float, float | None]:
+def _clocks() -> Clocks:
     """Seconds: wall clock, CPU time of this process, CPU time of all (Linux) since it started."""
     stat, busy = Path("/proc/stat"), None
     if stat.exists():
@@ -186,13 +196,16 @@ def _clocks() -> tuple[float, float, float | None]:
     return time.perf_counter(), time.process_time(), busy
 
 
-def _others(start: tuple[float, float, float | None], end: tuple[float, float, float | None],
-            ) -> float | None:
-    """Cores busy with other processes between two `_clocks`; None below .1 s (a tick is .01 s)."""
-    wall, own = end[0] - start[0], end[1] - start[1]
-    if start[2] is None or end[2] is None or wall < 0.1:
-        return None
-    return max(end[2] - start[2] - own, 0.0) / wall
+def _others(turns: Sequence[tuple[Clocks, Clocks]]) -> float | None:
+    """Cores busy with other processes between pairs of `_clocks`; None below .1 s altogether (a
+    tick is .01 s)."""
+    wall, own, busy = 0.0, 0.0, 0.0
+    for start, end in turns:
+        if start[2] is None or end[2] is None:
+            return None
+        wall, own = wall + end[0] - start[0], own + end[1] - start[1]
+        busy += end[2] - start[2]
+    return max(busy - own, 0.0) / wall if wall >= 0.1 else None
 
 
 def facts() -> dict[str, Any]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import functools
 import json
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,8 @@ pytest.importorskip("tyro")
 
 from benchmarks import bench_estimate, bench_simulator, bench_voxels
 from benchmarks.__main__ import SUBJECTS, Options, main, select
-from benchmarks.harness import Case, Record, Setting, Workload, compare, isolated, measure
+from benchmarks.harness import Case, Record, Setting, Workload, compare, measure
+from benchmarks.turns import by_task, in_turn
 from evflow import flow
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
@@ -53,7 +57,7 @@ def test_subject_yields_complete_records(subject: str, tmp_path: Path) -> None:
             assert "is not installed" in r["skipped"]
             continue
         assert r["seconds"] >= r["fastest"] > 0
-        assert r["repeats"] == 1
+        assert len(r["times"]) == 1
         assert r["relative"] > 0
         assert r["rates"].keys() == r["work"].keys() >= UNITS.get(r["subject"], set())
         for unit, amount in r["work"].items():
@@ -87,18 +91,44 @@ def _broken(_: Setting) -> Workload:
     raise ValueError("no such thing")
 
 
+def _killed(_: Setting) -> Workload:
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError
+
+
+def _whole(_: Setting) -> Workload:
+    return Workload(lambda: time.sleep(1e-3), lambda _: {"calls": 1.0})
+
+
 def test_absent_package_skips_and_error_fails() -> None:
     absent = Case("voxels", "task", "peer", _broken, needs="no_such_package")
     assert "no_such_package is not installed" in measure(absent, QUICK).skipped
-    record = isolated(Case("voxels", "task", "evflow", _broken), QUICK)
-    assert record.failed
-    assert record.skipped == "ValueError: no such thing"
+
+
+def test_cases_of_a_task_take_turns_and_a_broken_one_costs_no_other() -> None:
+    cases = [Case("voxels", "task", name, prepare) for name, prepare in
+             (("evflow", _whole), ("broken", _broken), ("killed", _killed), ("peer", _whole))]
+    ours, broken, killed, peer = compare(in_turn(cases, Setting()))
+    assert broken.failed
+    assert broken.skipped == "ValueError: no such thing"
+    assert killed.failed
+    assert killed.skipped == "its process ended with code -9"
+    assert len(ours.times) == len(peer.times) >= 5
+    assert peer.relative == np.median(np.array(peer.times) / np.array(ours.times))
+    assert broken.relative is None
+
+
+def test_tasks_are_kept_together() -> None:
+    tasks = [[case.name[:2] for case in task] for task in by_task(select(()))]
+    assert all(len(set(names)) == 1 for names in tasks)
+    assert len({names[0] for names in tasks}) == len(tasks)
 
 
 def test_compare_takes_the_best_limit_and_the_first_case() -> None:
     def record(subject: str, task: str, seconds: float | None, **work: float) -> Record:
         rates = {k: v / seconds for k, v in work.items()} if seconds else {}
-        return Record(subject, task, "x", seconds=seconds, work=work, rates=rates)
+        times = () if seconds is None else (seconds, seconds)
+        return Record(subject, task, "x", seconds=seconds, times=times, work=work, rates=rates)
 
     *_, ours, peer, absent = compare([
         record("limits", "sgemm", 1.0, GFLOP=100.0), record("limits", "sgemm", 1.0, GFLOP=200.0),

@@ -153,7 +153,7 @@ def step_still(
     pixels were not stepped, where they wait. Returns their new `limits` (2, K) as well."""
     few, own = _gathered((whole, pixels), at)
     last = own.last if rested is None else own.last + rested
-    own = PixelState(to_log(block.frames[0], model.log_map), own.base, last)
+    own = dataclasses.replace(own, last=last)
     own, sent = _through(model, few, own, block, at < whole.words.size)
     new = limits(model, few.camera, own.base, block.frames.dtype)
     return _put_back(model, pixels, own, at), sent, new
@@ -175,21 +175,40 @@ def _through(
     model: SensorModel, few: Sensor, pixels: PixelState, block: Block, real: Array
 ) -> tuple[PixelState, Sent]:
     """K pixels after a block of frames (T + 1, K), and what those that are real send."""
-    log_i, i01 = to_log(block.frames[1:], model.log_map), _i01(block.frames[1:])
+    logs, i01, real = to_log(block.frames, model.log_map), _i01(block.frames[1:]), real[None]
     # All that does not depend on the memory is worked out for the block at once.
     dist = jax.vmap(functools.partial(sensor.disturb, model, few))(i01, block.salts, block.dt)
-
-    def body(
-        pixels: PixelState, inputs: tuple[Any, ...]
-    ) -> tuple[PixelState, Spikes]:
-        return sensor.advance(model, few.camera, pixels, *inputs)
-
-    clock = block.clock[:-1], block.clock[1:]
-    pixels, spikes = jax.lax.scan(body, pixels, (log_i, i01, dist, block.dt, clock))
-    real = real[None]
+    inputs = (logs[1:], i01, dist, block.dt, (block.clock[:-1], block.clock[1:]))
+    if is_still(model):
+        pixels = dataclasses.replace(pixels, lp=logs[0])
+    pixels, spikes = _spikes(model, few.camera, pixels, inputs)
     struck = None if dist.struck is None else dist.struck.some & real
     ticks = jnp.where((spikes.count != 0) & real, _ticks(spikes, block.dt_us), 0)
     return pixels, Sent(ticks, spikes, struck)
+
+
+def _spikes(
+    model: SensorModel, camera: Camera, pixels: PixelState, inputs: tuple[Any, ...]
+) -> tuple[PixelState, Spikes]:
+    """The pixels after T intervals, and what they send in each. inputs: of `sensor.advance`, log
+    intensities first."""
+    def advance(pixels: PixelState, inputs: tuple[Any, ...]) -> tuple[PixelState, Spikes]:
+        return sensor.advance(model, camera, pixels, *inputs)
+
+    if model.timestamps == "v2e":  # whose slots are visited one by one
+        return jax.lax.scan(advance, pixels, inputs)
+
+    # A loop that also writes times takes twice as long: these are made for all intervals at once.
+    def body(
+        pixels: PixelState, inputs: tuple[Any, ...]
+    ) -> tuple[PixelState, tuple[PixelState, Array]]:
+        after, spikes = advance(pixels, inputs)
+        return after, (pixels, spikes.count)
+
+    after, (begun, count) = jax.lax.scan(body, pixels, inputs)
+    if is_still(model):  # nor need it write what is known
+        begun = dataclasses.replace(begun, lp=jnp.concatenate([pixels.lp[None], inputs[0][:-1]]))
+    return after, dataclasses.replace(jax.vmap(advance)(begun, inputs)[1], count=count)
 
 
 def _ticks(spikes: Spikes, dt_us: Array) -> Array:
