@@ -34,9 +34,9 @@ Spiked = tuple[np.ndarray, np.ndarray, np.ndarray]  # pixel, fraction of the int
 
 BLOCK = 8  # frames; more of them have more active pixels, fewer pass more often over all pixels
 SALTED = 64 * BLOCK  # intervals whose salts are drawn at a time
-# Active pixels that are stepped at a time, padded to one of these: the arrays of the most stay in
-# the cache, and the least is worth a call.
-ACTIVE = (4096, 8192, 16384)
+# Active pixels that are stepped at a time, padded to one of these: a call hands work to another
+# thread and back, which costs more than arrays that leave the cache.
+ACTIVE: tuple[int, ...] = (4096, 8192, 16384)
 
 
 class Circuit(Protocol):
@@ -129,7 +129,7 @@ class _Thresholds(_Blocks):
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Block]]:
         """The pixels `at` some at a time, the same padded with numbers beyond the last pixel, and
         the block as these see it."""
-        count, sizes = self.here.words.size, tuple(ACTIVE)
+        count, sizes = self.here.words.size, ACTIVE
         if self.model.timestamps == "v2e":  # its slots depend on all pixels
             at, sizes = np.arange(count), (count,)
         for first in range(0, len(at), sizes[-1]):
@@ -228,6 +228,7 @@ class Still(_Thresholds):
 
 
 def _picked(pick: np.ufunc, frames: list[np.ndarray]) -> np.ndarray:
+    """The greatest or least of all frames, in place: fresh memory is dear."""
     out = frames[0].copy()
     for frame in frames[1:]:
         pick(out, frame, out=out)
