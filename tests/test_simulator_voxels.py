@@ -37,8 +37,8 @@ def both(camera: Camera, model: SensorModel, frames: np.ndarray, dt_us: int,
     times = dt_us * np.arange(len(frames))
     events = simulate(KEY, frames, times, camera, model=model)
     events = dataclasses.replace(events, t=events.t - 1)
-    direct = simulate_voxels(KEY, to_log(frames, model.log_map), camera, frame_dt_s=dt_us * 1e-6,
-                             model=model, bins=bins)
+    light = frames if frames.dtype == np.uint8 else to_log(frames, model.log_map)
+    direct = simulate_voxels(KEY, light, camera, frame_dt_s=dt_us * 1e-6, model=model, bins=bins)
     return voxelize(events, 0, int(times[-1]), bins), np.asarray(direct), events
 
 
@@ -54,33 +54,38 @@ def agree(a: np.ndarray, b: np.ndarray, events: Events, window_us: int, bins: in
     np.testing.assert_allclose(counts, events.count_map(), atol=1e-3)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
 @pytest.mark.parametrize(("camera", "model"), [
     (QUIET, SensorModel()), (NOISY, SensorModel()), (NOISY, SensorModel(timestamps="v2e")),
     (NOISY, ALL_ON)])
-def test_voxels_are_those_of_the_events(camera: Camera, model: SensorModel) -> None:
-    ours, direct, events = both(camera, model, FRAMES, 1000)
+def test_voxels_are_those_of_the_events(
+    camera: Camera, model: SensorModel, dtype: type
+) -> None:
+    ours, direct, events = both(camera, model, FRAMES.astype(dtype), 1000)
     assert len(events) > 1000
     assert min(events.p.sum(), (~events.p).sum()) > 300
     agree(ours, direct, events, 32_000)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
 @pytest.mark.parametrize(("count", "dt_us", "bins", "refractory_s"), [
     (65, 500, 16, 4e-4), (11, 3000, 16, 4e-4), (2, 30_000, 2, 2.5e-3)])
 def test_any_number_of_frames_and_bins_and_dead_times(
-    count: int, dt_us: int, bins: int, refractory_s: float
+    count: int, dt_us: int, bins: int, refractory_s: float, dtype: type
 ) -> None:
     """Many events per interval, so that pixels wait: late, on time, and from late to on time."""
-    frames = drifting(count, speed=4.0 / count + 0.5)
+    frames = drifting(count, speed=4.0 / count + 0.5).astype(dtype)
     ours, direct, events = both(SENSITIVE, SensorModel(refractory_s=refractory_s), frames, dt_us,
                                 bins)
     assert len(events) > 500
     agree(ours, direct, events, dt_us * (count - 1), bins)
 
 
-def test_noise_with_several_events_an_interval() -> None:
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+def test_noise_with_several_events_an_interval(dtype: type) -> None:
     """Mean 2 per interval and polarity, where the loop over further events runs."""
     camera = Camera.constant(SHAPE, 0.2, 0.2, 2000.0, 2000.0)
-    ours, direct, events = both(camera, SensorModel(), FRAMES, 1000)
+    ours, direct, events = both(camera, SensorModel(), FRAMES.astype(dtype), 1000)
     assert len(events) > 2 * 32 * 1.9 * np.prod(SHAPE)
     agree(ours, direct, events, 32_000)
 

@@ -4,13 +4,15 @@ Few pixels fire in a few milliseconds. Those that may are gathered, taken throug
 by interval, and their memory is put back, so that cost follows the active pixels. Where the memory
 moves by itself (low-pass, leak), `look` takes all pixels through the light of the block to find
 them, and `step` steps them. Where it stays as it is between events, `limits` of brightness tell
-which frames can matter to a pixel, and `step_still` steps those that saw one.
+which frames can matter to a pixel, and `step_still` steps those that saw one. What the steps are
+made into is their `Exit`: events (`sent`), or voxels (`grids.Touched`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -27,6 +29,7 @@ from evflow.simulator.sensor import Sensor
 Array = jax.Array
 T = TypeVar("T")
 
+BLOCK = 8  # frames; more of them have more active pixels, fewer pass more often over all pixels
 TICKS = 1 << 30  # microseconds in a block that leave room for two flags in 32 bits
 SLACK = 1e-4  # of a threshold, or log units: beyond what rounding may differ by
 
@@ -34,15 +37,21 @@ SLACK = 1e-4  # of a threshold, or log units: beyond what rounding may differ by
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """T intervals. frames: (T + 1, N) DN, uint8 or float32, the frame before and those at which
-    they end. dt: (T,) seconds. dt_us: (T,) uint32. clock: (T + 1, 2) times of the frames, see
-    `SimState.time`. salts: (T, 2) of `noise.salts`."""
+    """T intervals, of which `first` is the index of the first. frames: (T + 1, N) DN, uint8 or
+    float32, the frame before and those at which they end. dt: (T,) seconds. dt_us: (T,) uint32.
+    clock: (T + 1, 2) times of the frames, see `SimState.time`. salts: (T, 2) of `noise.salts`."""
 
+    first: Any
     frames: Any
     dt: Any
     dt_us: Any
     clock: Any
     salts: Any
+
+
+# Takes K pixels through a block: (model, their sensor, their state, the block as they see it, (K,)
+# whether they are real) -> (state, what they send). Hashable: `jit` compiles for each.
+Exit = Callable[[SensorModel, Sensor, PixelState, Block, Array], tuple[PixelState, Any]]
 
 
 @jax.tree_util.register_dataclass
@@ -128,11 +137,11 @@ def _i01(frame: Array) -> Array:
     return normalised_intensity(frame.astype(jnp.float32))
 
 
-@functools.partial(jax.jit, static_argnames="model", donate_argnames="after")
+@functools.partial(jax.jit, static_argnames=("model", "exit"), donate_argnames="after")
 def step(
     model: SensorModel, whole: Sensor, before: PixelState, after: PixelState, block: Block,
-    at: Array,
-) -> tuple[PixelState, Sent]:
+    at: Array, exit: Exit,
+) -> tuple[PixelState, Any]:
     """Take the pixels `at` (K,) int32 through the block, whose frames (T + 1, K) are theirs alone,
     from `before` it.
 
@@ -140,21 +149,21 @@ def step(
     beyond the last pixel are padding, all different: they repeat it and are not put back.
     """
     few, own = _gathered((whole, before), at)
-    own, sent = _through(model, few, own, block, at < whole.words.size)
+    own, sent = exit(model, few, own, block, at < whole.words.size)
     return _put_back(model, after, own, at), sent
 
 
-@functools.partial(jax.jit, static_argnames="model", donate_argnames="pixels")
+@functools.partial(jax.jit, static_argnames=("model", "exit"), donate_argnames="pixels")
 def step_still(
     model: SensorModel, whole: Sensor, pixels: PixelState, block: Block, at: Array,
-    rested: Array | None,
-) -> tuple[PixelState, Sent, Array]:
+    rested: Array | None, exit: Exit,
+) -> tuple[PixelState, Any, Array]:
     """The same for sensors that are still. rested: (K,) seconds before the block in which the
     pixels were not stepped, where they wait. Returns their new `limits` (2, K) as well."""
     few, own = _gathered((whole, pixels), at)
     last = own.last if rested is None else own.last + rested
-    own = dataclasses.replace(own, last=last)
-    own, sent = _through(model, few, own, block, at < whole.words.size)
+    own = PixelState(to_log(block.frames[0], model.log_map), own.base, last)
+    own, sent = exit(model, few, own, block, at < whole.words.size)
     new = limits(model, few.camera, own.base, block.frames.dtype)
     return _put_back(model, pixels, own, at), sent, new
 
@@ -171,16 +180,14 @@ def _put_back(model: SensorModel, pixels: PixelState, own: PixelState, at: Array
     return dataclasses.replace(pixels, **put)
 
 
-def _through(
+def sent(
     model: SensorModel, few: Sensor, pixels: PixelState, block: Block, real: Array
 ) -> tuple[PixelState, Sent]:
-    """K pixels after a block of frames (T + 1, K), and what those that are real send."""
+    """The `Exit` to events."""
     logs, i01, real = to_log(block.frames, model.log_map), _i01(block.frames[1:]), real[None]
     # All that does not depend on the memory is worked out for the block at once.
     dist = jax.vmap(functools.partial(sensor.disturb, model, few))(i01, block.salts, block.dt)
     inputs = (logs[1:], i01, dist, block.dt, (block.clock[:-1], block.clock[1:]))
-    if is_still(model):
-        pixels = dataclasses.replace(pixels, lp=logs[0])
     pixels, spikes = _spikes(model, few.camera, pixels, inputs)
     struck = None if dist.struck is None else dist.struck.some & real
     ticks = jnp.where((spikes.count != 0) & real, _ticks(spikes, block.dt_us), 0)

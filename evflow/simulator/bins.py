@@ -8,6 +8,7 @@ those are computed.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +21,13 @@ Array = jax.Array
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """Which bins the intervals of a window touch, host arrays (T,). low: the first bin; offset:
+    """Which bins the intervals of a window touch, arrays (T,). low: the first bin; offset:
     where the interval begins, in bins from `low`; wide: whether it touches more than two bins.
     length: of an interval, in bins. width: bins that an interval touches at most."""
 
-    low: np.ndarray
-    offset: np.ndarray
-    wide: np.ndarray
+    low: Any
+    offset: Any
+    wide: Any
     length: float
     width: int
 

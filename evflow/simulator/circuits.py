@@ -3,6 +3,7 @@
 `Still` and `Drifting` (v2e, ESIM, the paper) and `Brownian` (DVS-Voltmeter) keep the pixels'
 state from block to block. `run` sends blocks to the device and yields what will fetch their events;
 by then the next block is under way: packing the events of the one before keeps a second core busy.
+Voxels are made of `steps`, which `Still` and `Drifting` have.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from evflow.camera import Camera
 from evflow.intensity import to_log
 from evflow.sensors import SensorModel
 from evflow.simulator import active, noise, pack, sensor, voltmeter
-from evflow.simulator.active import Block, Sent
+from evflow.simulator.active import BLOCK, Block, Exit
 from evflow.simulator.pack import Columns
 from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor, SimState
 
 Array = jax.Array
 Fetch = Callable[[], list[Columns]]
-Piece = tuple[np.ndarray, np.ndarray, Sent]  # pixels, the frames they see, what they send
+Piece = tuple[np.ndarray, np.ndarray, Any]  # pixels, the frames they see, what they send
+Stepped = tuple[list[Piece], Block, np.ndarray]  # a block, and the ticks of its intervals
 Spiked = tuple[np.ndarray, np.ndarray, np.ndarray]  # pixel, fraction of the interval, whether ON
 
-BLOCK = 8  # frames; more of them have more active pixels, fewer pass more often over all pixels
 SALTED = 64 * BLOCK  # intervals whose salts are drawn at a time
 # Active pixels that are stepped at a time, padded to one of these: a call hands work to another
 # thread and back, which costs more than arrays that leave the cache.
@@ -50,8 +51,16 @@ def circuit(key: Array, frame: np.ndarray, start_us: int, camera: Camera, model:
     """The sensor at its first frame (H, W). camera: float32 maps (H, W)."""
     if model.kind == "voltmeter":
         return Brownian(key, frame, start_us, camera, model)
+    return thresholds(key, frame, start_us, camera, model, exit=active.sent)
+
+
+def thresholds(
+    key: Array, frame: np.ndarray, start: int, camera: Camera, model: SensorModel, *,
+    exit: Exit, tick_s: float = 1e-6,
+) -> Still | Drifting:
+    """The same for all but DVS-Voltmeter, with any exit. tick_s: unit of the frames' times."""
     kind = Still if active.is_still(model) else Drifting
-    return kind(key, frame, start_us, camera, model)
+    return kind(exit, key, frame, start, camera, model, tick_s)
 
 
 @partial(jax.jit, static_argnames="model")
@@ -78,51 +87,65 @@ class _Blocks:
     """What all kinds share: noise rates, and blocks padded to BLOCK frames."""
 
     def __init__(
-        self, key: Array, frame: np.ndarray, start_us: int, camera: Camera, model: SensorModel
+        self, key: Array, frame: np.ndarray, start: int, camera: Camera, model: SensorModel,
+        tick_s: float = 1e-6,
     ) -> None:
-        self.model, self.start_us, self.most_hz, nominal = model, start_us, 0.0, None
+        self.model, self.begin, self.tick_s = model, start, tick_s
+        self.most_hz, nominal = 0.0, None
         if noise.is_noisy(model, camera):
             nominal = noise.nominal_thresholds(model, camera)
             self.most_hz = noise.most_rate(model, camera, nominal)
         self.whole, state = _start(key, frame, camera, nominal, model=model)
         self.here = jax.tree.map(np.asarray, self.whole)  # the same, for the host
         self.pixels, self.key = state.pixels, state.key
-        self.interval, self.salts = 0, np.empty((0, 2), np.uint32)
+        self.interval, self.salted, self.salts = 0, 0, np.empty((0, 2), np.uint32)
         self.no_clock = np.zeros((BLOCK + 1, 2), np.float32)
         self.before = frame.ravel()
 
     def block(self, frames: list[np.ndarray], edges: np.ndarray) -> Block:
         """The block, whose frames are a list. Raises EV014 where the noise is more than an
         interval can hold."""
-        dt_us = np.diff(edges)
-        noise.check_rate(self.most_hz, float(dt_us.max()) * 1e-6)
+        ticks = np.diff(edges)
+        noise.check_rate(self.most_hz, float(ticks.max()) * self.tick_s)
         if missing := BLOCK - len(frames):
             frames = frames + [frames[-1]] * missing
-            dt_us = np.append(dt_us, np.zeros(missing, np.int64))
+            ticks = np.append(ticks, np.zeros(missing, np.int64))
         frames = [self.before, *frames]
-        self.before = frames[-1]
+        self.before, first = frames[-1], np.int32(self.interval)
+        self.interval += BLOCK
         # Only the frames are always read; jit passes over what a model has no use for.
-        return Block(frames, (dt_us * 1e-6).astype(np.float32), dt_us.astype(np.uint32),
-                     self._clock(edges[0], dt_us), self._next_salts())
+        return Block(first, frames, (ticks * self.tick_s).astype(np.float32),
+                     ticks.astype(np.uint32), self._clock(edges[0], ticks), self._next_salts())
 
-    def _clock(self, begin_us: int, dt_us: np.ndarray) -> np.ndarray:
+    def _clock(self, begin: int, ticks: np.ndarray) -> np.ndarray:
         """(BLOCK + 1, 2) times for v2e's slots, see `SimState.time`."""
         if self.model.timestamps != "v2e":
             return self.no_clock
-        seconds = (begin_us - self.start_us + np.append(0, np.cumsum(dt_us))) * 1e-6
+        seconds = (begin - self.begin + np.append(0, np.cumsum(ticks))) * self.tick_s
         high = seconds.astype(np.float32)
         return np.stack([high, seconds - high], -1).astype(np.float32)
 
     def _next_salts(self) -> np.ndarray:
         if not len(self.salts):
-            self.salts = np.asarray(_salts(self.key, self.interval))
-            self.interval += SALTED
+            self.salts = np.asarray(_salts(self.key, self.salted))
+            self.salted += SALTED
         first, self.salts = np.split(self.salts, [BLOCK])
         return first
 
 
 class _Thresholds(_Blocks):
     """Pixels that compare log intensity with thresholds; only those that may fire are stepped."""
+
+    def __init__(self, exit: Exit, *sensor: Any) -> None:
+        super().__init__(*sensor)
+        self.exit = exit
+
+    def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
+        """What comes of each block; the device may still be at it."""
+        raise NotImplementedError
+
+    def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
+        return (partial(self._columns, *stepped) for stepped in self.steps(video))
 
     def pieces(
         self, at: np.ndarray, block: Block
@@ -142,7 +165,7 @@ class _Thresholds(_Blocks):
                 frame.take(padded, mode="clip", out=row)
             yield some, padded.astype(np.int32), dataclasses.replace(block, frames=seen)
 
-    def fetch(self, pieces: list[Piece], block: Block, dt_us: np.ndarray) -> list[Columns]:
+    def _columns(self, pieces: list[Piece], block: Block, dt_us: np.ndarray) -> list[Columns]:
         sent = [(pixels, out) for pixels, _, out in pieces]
         struck = [(pixels, frames, out.struck) for pixels, frames, out in pieces]
         return [*pack.signal_columns(self.model, sent, dt_us),
@@ -152,50 +175,51 @@ class _Thresholds(_Blocks):
 class Drifting(_Thresholds):
     """Memory moves by itself: the device looks at every pixel."""
 
-    def __init__(self, *sensor: Any) -> None:
-        super().__init__(*sensor)
+    def __init__(self, *exit_and_sensor: Any) -> None:
+        super().__init__(*exit_and_sensor)
         # Fresh memory is dear. The device may read one block while another is filled.
         shape = (BLOCK + 1, self.before.size)
         self.buffers = itertools.cycle([_aligned(shape, self.before.dtype) for _ in range(2)])
 
-    def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
+    def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
         looked: tuple[Any, ...] = ()
         for frames, edges in video:
             block = self.block(frames, edges)
             block = dataclasses.replace(
                 block, frames=np.stack(block.frames, out=next(self.buffers)))
-            fetch = self._step(*looked) if looked else None
+            stepped = self._step(*looked) if looked else None
             # In line behind the step before, which it continues; nothing is waited for here.
             after, may_send = active.look(self.model, self.whole, self.pixels, block)
             looked = block, np.diff(edges), after, may_send
-            if fetch:
-                yield fetch
+            if stepped:
+                yield stepped
         yield self._step(*looked)
 
     def _step(
-        self, block: Block, dt_us: np.ndarray, after: PixelState, may_send: Array
-    ) -> Fetch:
+        self, block: Block, ticks: np.ndarray, after: PixelState, may_send: Array
+    ) -> Stepped:
         pieces: list[Piece] = []
         for some, padded, seen in self.pieces(np.flatnonzero(may_send), block):
-            after, sent = active.step(self.model, self.whole, self.pixels, after, seen, padded)
+            after, sent = active.step(
+                self.model, self.whole, self.pixels, after, seen, padded, exit=self.exit)
             pieces.append((some, seen.frames, sent))
         self.pixels = after
-        return partial(self.fetch, pieces, block, dt_us)
+        return pieces, block, ticks
 
 
 class Still(_Thresholds):
     """Memory stays as it is between events: the host compares the brightest and the darkest
     frame of a block with each pixel's limits, which is fast for bytes."""
 
-    def __init__(self, *sensor: Any) -> None:
-        super().__init__(*sensor)
+    def __init__(self, *exit_and_sensor: Any) -> None:
+        super().__init__(*exit_and_sensor)
         found = active.limits(
             self.model, self.whole.camera, self.pixels.base, self.before.dtype)
         self.bright, self.dark = np.array(found)
-        self.seen_us = np.full(self.before.size, self.start_us)  # when each was stepped last
+        self.seen = np.full(self.before.size, self.begin)  # when each was stepped last
         self.stepped: list[tuple[np.ndarray, Array]] = []  # pixels, their limits from then on
 
-    def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
+    def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
         for frames, edges in video:
             block = self.block(frames, edges)
             struck = None
@@ -209,22 +233,22 @@ class Still(_Thresholds):
                 may_send |= np.asarray(struck)
             yield self._step(block, edges, np.flatnonzero(may_send))
 
-    def _step(self, block: Block, edges: np.ndarray, at: np.ndarray) -> Fetch:
+    def _step(self, block: Block, edges: np.ndarray, at: np.ndarray) -> Stepped:
         pieces: list[Piece] = []
         self.stepped = []
         for some, padded, seen in self.pieces(at, block):
             rested = self._rested(some, padded, edges) if active.waits(self.model) else None
             self.pixels, sent, limits = active.step_still(
-                self.model, self.whole, self.pixels, seen, padded, rested)
+                self.model, self.whole, self.pixels, seen, padded, rested, exit=self.exit)
             self.stepped.append((some, limits))
             pieces.append((some, seen.frames, sent))
-        return partial(self.fetch, pieces, block, np.diff(edges))
+        return pieces, block, np.diff(edges)
 
     def _rested(self, some: np.ndarray, padded: np.ndarray, edges: np.ndarray) -> np.ndarray:
         """Seconds since the last block of these pixels, for which this one is the last now."""
-        since = edges[0] - self.seen_us.take(padded, mode="clip")
-        self.seen_us[some] = edges[-1]
-        return (since * 1e-6).astype(np.float32)
+        since = edges[0] - self.seen.take(padded, mode="clip")
+        self.seen[some] = edges[-1]
+        return (since * self.tick_s).astype(np.float32)
 
 
 def _picked(pick: np.ufunc, frames: list[np.ndarray]) -> np.ndarray:

@@ -20,7 +20,8 @@ from evflow.checks import COLUMNS
 from evflow.errors import EvflowDataError
 from evflow.sensors import SensorModel
 from evflow.simulator import pack
-from evflow.simulator.circuits import BLOCK, circuit
+from evflow.simulator.active import BLOCK
+from evflow.simulator.circuits import circuit
 from evflow.simulator.frames import blocks
 from evflow.types import Events
 

@@ -1,14 +1,14 @@
-"""Log frames -> voxel grid without ever making an event; jit, vmap and scan it.
+"""Frames -> voxel grid without ever making an event.
 
-The frames are scanned, `sensor.advance` says when events fall, `bins` what they weigh, and each
-interval's few touched bins are added to the grid in place. Large frames are taken in tiles of
-pixels, whose state, light and grid stay in the cache from the first frame to the last.
+`simulate_window` is pure; jit, vmap and scan it. Large frames are taken in tiles of pixels, whose
+state, light and grid stay in the cache from the first frame to the last. Where `simulate_voxels`
+is called with bytes on a CPU, untraced, only pixels that may fire are stepped, block by block.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -18,17 +18,16 @@ import numpy as np
 
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
-from evflow.intensity import LOG_MAPS, normalised_intensity, to_log
 from evflow.sensors import SensorModel
-from evflow.simulator import bins as weigh
-from evflow.simulator import noise, sensor, voltmeter
+from evflow.simulator import circuits, noise, sensor
+from evflow.simulator.active import BLOCK
 from evflow.simulator.bins import Schedule
-from evflow.simulator.pixel import PixelState, Spikes
-from evflow.simulator.sensor import Sensor, SimState, Struck
+from evflow.simulator.grids import Touched, as_log, put, scan, scan_brownian
+from evflow.simulator.pixel import PixelState
+from evflow.simulator.sensor import Sensor, SimState
 from evflow.voxel import BINS
 
 Array = jax.Array
-Weights = tuple[list[Array], list[Array]]  # (ON, OFF), one (N,) per touched bin
 
 MOST_LOG = 6.0  # more than the logarithm of 255 DN
 TILE = 8192  # pixels; their maps and grid, some 1.5 MB, are worked on at a time
@@ -51,9 +50,12 @@ def simulate_window(
     high, low = state.time
     clock = jnp.stack([high + dt * jnp.arange(steps + 1), jnp.full(steps + 1, low)], -1)
 
+    plan, lengths = Schedule.of(steps, bins), jnp.full(steps, dt)
+
     def scanned(maps: Any) -> tuple[PixelState, Array]:
         tile, pixels, frames = maps
-        return _scan(model, tile, pixels, frames, salts, clock, dt, bins)
+        pixels, grid = scan(model, tile, pixels, frames, lengths, salts, clock, plan, bins)
+        return pixels, grid.T
 
     maps = (whole, state.pixels, log_frames.reshape(steps, count))
     whole_at_once = count <= TILE or model.timestamps == "v2e"  # whose slots depend on all pixels
@@ -84,116 +86,6 @@ def _tiled(
     shapes = jax.eval_shape(lambda: tile(0)[1])
     empty = jax.tree.map(lambda s: jnp.zeros((count, *s.shape[1:]), s.dtype), shapes)
     return jax.lax.fori_loop(0, tiles, put, empty)
-
-
-def _scan(
-    model: SensorModel, whole: Sensor, pixels: PixelState, log_frames: Array, salts: Array,
-    clock: Array, dt: Array, bins: int,
-) -> tuple[PixelState, Array]:
-    """`simulate_window` on flat maps: log_frames (T, N) -> grid (N, 2 * bins). salts: (T, 2).
-    clock: (T + 1, 2), as in `SimState.time`."""
-    steps, count = log_frames.shape
-    plan = Schedule.of(steps, bins)
-    def body(
-        carry: tuple[PixelState, Array], inputs: tuple[Any, ...]
-    ) -> tuple[tuple[PixelState, Array], None]:
-        (pixels, grid), (frame, low, offset, wide, salt, clock) = carry, inputs
-        log_i = _log(model, frame)
-        i01 = sensor.i01_of(model, log_i)  # dropped by the compiler where nothing uses it
-        dist = sensor.disturb(model, whole, i01, salt, dt)
-        pixels, spikes = sensor.advance(
-            model, whole.camera, pixels, log_i, i01, dist, dt, clock)
-        weights = _weights(model, plan, spikes, offset, wide, dt)
-        if dist.struck is not None:
-            more = _noise_weights(model, plan, whole.words, dist.struck, offset)
-            weights = jax.tree.map(jnp.add, weights, more)
-        return (pixels, weigh.add(grid, low, *weights)), None
-
-    inputs = (log_frames, plan.low, plan.offset, plan.wide, salts, (clock[:-1], clock[1:]))
-    grid = jnp.zeros((2 * bins, count), pixels.lp.dtype)
-    pixels, grid = jax.lax.scan(body, (pixels, grid), inputs)[0]
-    return pixels, grid.T
-
-
-def _log(model: SensorModel, frames: Array) -> Array:
-    """Log intensity of frames, which they hold unless they are bytes."""
-    return to_log(frames, model.log_map) if frames.dtype == jnp.uint8 else frames
-
-
-def _scan_brownian(
-    key: Array, model: SensorModel, whole: Sensor, log_frames: Array, salts: Array, dt: Array,
-    bins: int,
-) -> Array:
-    """DVS-Voltmeter's grid (N, 2 * bins) of flat log frames (T + 1, N), with the camera's noise.
-    key: of the signal."""
-    frames = LOG_MAPS[model.log_map][1](log_frames)
-    plan = Schedule.of(len(frames) - 1, bins)
-
-    def body(
-        carry: tuple[voltmeter.State, Array], inputs: tuple[Any, ...]
-    ) -> tuple[tuple[voltmeter.State, Array], None]:
-        (voltage, grid), (frame, index, salt, low, offset) = carry, inputs
-        touched = jnp.zeros((2, plan.width, frame.size), grid.dtype)
-        voltage, (on, off) = voltmeter.weights(
-            key, index, model.voltmeter, whole.camera, voltage, frame, dt * 1e6, touched, offset,
-            plan.length)
-        weights: Weights = list(on), list(off)
-        struck = sensor.disturb(model, whole, normalised_intensity(frame), salt, dt).struck
-        if struck is not None:
-            more = _noise_weights(model, plan, whole.words, struck, offset)
-            weights = jax.tree.map(jnp.add, weights, more)
-        return (voltage, weigh.add(grid, low, *weights)), None
-
-    steps = jnp.arange(len(frames) - 1)
-    start = voltmeter.start(frames[0]), jnp.zeros((2 * bins, frames.shape[1]), frames.dtype)
-    inputs = (frames[1:], steps, salts, plan.low, plan.offset)
-    return jax.lax.scan(body, start, inputs)[0][1].T
-
-
-def _weights(
-    model: SensorModel, plan: Schedule, spikes: Spikes, offset: Array, wide: Array, dt: Array
-) -> Weights:
-    """Weights of the signal events of an interval."""
-    dead = model.refractory_s / dt if model.waits else None
-
-    def signed(width: int, spikes: Spikes) -> list[Array]:
-        spare = [jnp.zeros_like(spikes.first)] * (plan.width - width)
-        return weigh.signal_bins(width, spikes, offset, plan.length, dead) + spare
-
-    # The branch saves the third bin where it is not touched; it also is where XLA writes the
-    # spikes down once, instead of computing them again for every bin and polarity.
-    return weigh.by_polarity(
-        jax.lax.cond(wide, partial(signed, plan.width), partial(signed, 2), spikes))
-
-
-def _noise_weights(
-    model: SensorModel, plan: Schedule, words: Array, struck: Struck, offset: Array
-) -> Weights:
-    """Weights of the noise events of one interval, each pixel's first and the few others."""
-    u, mean = noise.uniform(struck.drawn), struck.odds.mean
-
-    def placed(k: Array, sent: Array) -> Array:
-        """Where each pixel's k-th event falls, negative for OFF, 0 where none is sent."""
-        at, on = noise.event(model, words, struck.drawn, k, struck.odds.share)
-        return jnp.where(sent, jnp.where(on, at, -at), 0.0)
-
-    def weights(at: Array) -> Weights:
-        return weigh.by_polarity(weigh.noise_bins(
-            plan.width, jnp.abs(at), jnp.sign(at), offset, plan.length))
-
-    def unfinished(carry: tuple[noise.Tail, Weights]) -> Array:
-        return jnp.any(u < carry[0][0])
-
-    def step(carry: tuple[noise.Tail, Weights]) -> tuple[noise.Tail, Weights]:
-        tail, total = carry
-        more = weights(placed(jnp.asarray(tail[2], jnp.uint32), u < tail[0]))
-        return noise.next_tail(mean, tail), jax.tree.map(jnp.add, total, more)
-
-    # Behind a branch XLA writes the places down once, not again for every bin and polarity.
-    first = jax.lax.cond(jnp.any(struck.some), lambda: placed(jnp.zeros((), jnp.uint32),
-                         struck.some), lambda: jnp.zeros_like(u))
-    tail = jax.tree.map(jnp.asarray, noise.next_tail(mean, struck.odds.tail()))
-    return jax.lax.while_loop(unfinished, step, (tail, weights(first)))[1]
 
 
 def simulate_voxels(
@@ -232,6 +124,8 @@ def simulate_voxels(
             "Give one camera (H, W) or one for each video.")
     camera.validate()
     camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), camera)
+    if _by_blocks(model, log_frames, camera):
+        return _in_blocks(key, np.asarray(log_frames), camera, float(frame_dt_s), model, bins)
     nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
     if nominal is not None:
         noise.check_rate(noise.most_rate(model, camera, nominal), frame_dt_s)
@@ -253,6 +147,38 @@ def _check_light(log_frames: np.ndarray) -> None:
             "Is it DN? Pass uint8, or take intensity.to_log first.")
 
 
+def _by_blocks(model: SensorModel, frames: Array, camera: Camera) -> bool:
+    """Whether the host can tell which pixels may fire, and a CPU gains by it."""
+    traced = isinstance(frames, jax.core.Tracer) or isinstance(camera.theta_on, jax.core.Tracer)
+    return (not traced and frames.ndim == 3 and frames.dtype == jnp.uint8
+            and model.kind != "voltmeter" and model.timestamps != "v2e"
+            and jax.default_backend() == "cpu")
+
+
+def _in_blocks(
+    key: Array, frames: np.ndarray, camera: Camera, frame_dt_s: float, model: SensorModel,
+    bins: int,
+) -> Array:
+    """Voxels (H, W, 2 * bins) of bytes (T, H, W), whose active pixels are stepped."""
+    count, *shape = frames.shape
+    touched = Touched(count - 1, bins)
+    pixels = circuits.thresholds(
+        key, frames[0], 0, camera, model, exit=touched, tick_s=frame_dt_s)
+    grid = jnp.zeros((*shape, 2 * bins), jnp.float32)
+
+    def video() -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+        for first in range(1, count, BLOCK):
+            some = frames[first : first + BLOCK]
+            yield list(some.reshape(len(some), -1)), np.arange(first - 1, first + len(some))
+
+    for (pieces, *_), low in zip(pixels.steps(video()), touched.low, strict=True):
+        for at, _, more in pieces:
+            padded = np.zeros(len(more), np.int32)
+            padded[: len(at)] = at
+            grid = put(grid, padded, len(at), low, more)
+    return grid
+
+
 @partial(jax.jit, static_argnames=("frame_dt_s", "model", "bins", "lead"))
 def _voxels(
     key: Array, log_frames: Array, camera: Camera, nominal: Array | None, *, frame_dt_s: float,
@@ -260,17 +186,17 @@ def _voxels(
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
         if model.kind != "voltmeter":
-            first = _log(model, frames[0])
+            first = as_log(model, frames[0])
             whole, state = sensor.start(key, first, camera, model, nominal)
             return simulate_window(model, whole, state, frames[1:], frame_dt_s, bins)[1]
         key, signal = jax.random.split(key)
-        frames = _log(model, frames)
+        frames = as_log(model, frames)
         whole, state = sensor.start(key, frames[0], camera, model, nominal)
         steps, *shape = frames.shape
         salts = noise.salts(state.key, jnp.arange(steps - 1))
         dt = jnp.asarray(frame_dt_s, jnp.float32)
-        grid = _scan_brownian(signal, model, whole, frames.reshape(steps, -1), salts, dt, bins)
-        return grid.reshape(*shape, 2 * bins)
+        grid = scan_brownian(signal, model, whole, frames.reshape(steps, -1), salts, dt, bins)
+        return grid
 
     if not lead:
         return one(key, log_frames, camera, nominal)
