@@ -98,6 +98,7 @@ def test_bytes_give_the_same_grid_as_their_logarithms(model: SensorModel) -> Non
     ours, theirs = (np.asarray(simulate_voxels(KEY, f, NOISY, frame_dt_s=1e-3, model=model))
                     for f in (frames, to_log(frames, model.log_map)))
     assert ours.sum() > 1000
+    assert ours.shape == (*SHAPE, 32)
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
     batch = simulate_voxels(KEY, np.stack([frames] * 2), NOISY, frame_dt_s=1e-3, model=model)
     assert batch.shape == (2, *ours.shape)

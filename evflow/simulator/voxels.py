@@ -196,7 +196,7 @@ def _voxels(
         salts = noise.salts(state.key, jnp.arange(steps - 1))
         dt = jnp.asarray(frame_dt_s, jnp.float32)
         grid = scan_brownian(signal, model, whole, frames.reshape(steps, -1), salts, dt, bins)
-        return grid
+        return grid.reshape(*shape, 2 * bins)
 
     if not lead:
         return one(key, log_frames, camera, nominal)
