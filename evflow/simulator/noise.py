@@ -187,7 +187,8 @@ def nominal_thresholds(model: SensorModel, camera: Camera) -> Array:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in theta):
         return jnp.median(jnp.stack(theta).reshape(2, *lead, -1), axis=-1)
     maps = np.stack([np.asarray(t) for t in theta])
-    return jnp.asarray(np.median(maps.reshape(2, *lead, -1), axis=-1))
+    with jax.ensure_compile_time_eval():  # known within jit too, for `most_rate`
+        return jnp.asarray(np.median(maps.reshape(2, *lead, -1), axis=-1))
 
 
 def is_noisy(model: SensorModel, camera: Camera) -> bool:
