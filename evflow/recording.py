@@ -33,7 +33,6 @@ from evflow.io.glitches import exposed
 from evflow.noise_only import estimate_noise
 from evflow.refine import (
     Chunk,
-    calibrated,
     make_chunk,
     pixel_posterior,
     plan_chunks,
@@ -204,7 +203,7 @@ def _refined(
     used = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
     parts = next(iter(params.values()))
     refined = refine_summary(used, summary, std, parts.get("fusion"), parts.get("signal"))
-    return refined.summary, calibrated(parts.get("intervals"), refined.summary, refined.std)
+    return refined.summary, refined.std
 
 
 def _with_regression(

@@ -11,7 +11,6 @@ fitted to all recordings.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,11 +30,10 @@ from evflow.refine.fit import FusionNet
 from evflow.squash import squash, unsquash_summary
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.many import Score, Setup, scores
+from experiments.many import Setup, scores
 
 Array = jax.Array
-Row = dict[str, np.ndarray]  # of a recording
-Rows = dict[str, np.ndarray]  # of all, stacked
+Rows = dict[str, np.ndarray]
 
 FOLDS = 5
 JITTER, DEGREES = 0.5, 30.0  # in standard deviations; of Student's t
@@ -73,7 +71,7 @@ def before_refinement(
     return refinement_chunks(recording, plan.pairs), *finish(params, stats)
 
 
-def row(params: Any, hidden: Hidden, _protocol: Protocol) -> Row | None:
+def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
     """Features, y of the stepped estimate and y of the truth; None where nothing fired."""
     start = before_refinement(params, hidden.recording)
     if start is None:
@@ -86,30 +84,29 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> Row | None:
             "signal": hidden.signal_events()}
 
 
-def gathered(
-    score: Score[Row | None], setup: Setup, jobs: Sequence[tuple[int, Protocol]], workers: int,
-    path: Path | None,
-) -> Rows:
-    """Rows of all recordings, stacked; saved now and then at `path`, and resumed from there."""
-    found: list[Row] = []
+def collect(options: Options) -> Rows:
+    """Rows of all recordings, stacked; saved now and then where asked for."""
+    found: list[dict[str, np.ndarray]] = []
     begin = 0
-    if path and path.exists():
-        with np.load(path) as saved:
+    if options.rows and options.rows.exists():
+        with np.load(options.rows) as saved:
             begin = int(saved["next"])
             names = [n for n in saved.files if n != "next"]
             found = [dict(zip(names, r, strict=True))
                      for r in zip(*(saved[n] for n in names), strict=True)]
-    made = scores(score, setup, jobs[begin:], workers, "recordings")
-    for i, result in enumerate(made, begin + 1):
-        if result is not None:
-            found.append(result)
-        if path and (i % 50 == 0 or i == len(jobs)):
-            with atomic_write(path, overwrite=True) as t, open(t, "wb") as f:
+    setup = Setup(str(options.weights), options.seed, photos=True)
+    jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i))))
+            for i in range(begin, options.recordings)]
+    for i, made in enumerate(scores(row, setup, jobs, options.workers, "recordings"), begin + 1):
+        if made is not None:
+            found.append(made)
+        if options.rows and (i % 50 == 0 or i == options.recordings):
+            with atomic_write(options.rows, overwrite=True) as t, open(t, "wb") as f:
                 np.savez(f, allow_pickle=False, next=i, **stack(found))
     return stack(found)
 
 
-def stack(rows: list[Row]) -> Rows:
+def stack(rows: list[dict[str, np.ndarray]]) -> Rows:
     return {k: np.stack([r[k] for r in rows]) for k in rows[0]}
 
 
@@ -185,10 +182,7 @@ def figures_of(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
 def main(options: Options) -> dict[str, Any]:
     params = load_weights(options.weights)
     (name, net), = params.items()
-    setup = Setup(str(options.weights), options.seed, photos=True)
-    jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i))))
-            for i in range(options.recordings)]
-    rows = gathered(row, setup, jobs, options.workers, options.rows)
+    rows = collect(options)
     y, std = cross_validated(rows, options)
     widen = np.quantile(np.abs(y - rows["true"]) / std, COVERED, axis=0)
     figures = figures_of(rows, y, std * widen)

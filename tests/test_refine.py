@@ -25,7 +25,6 @@ from evflow.refine.moments import measure
 from evflow.refine.pixels import PixelEvidence, pixel_evidence
 from evflow.refine.trace import NEVER, trace_of_camera, trace_of_events
 from evflow.types import Events
-from experiments import intervals
 
 SHAPE = (12, 16)
 STEPS, INTERVALS = 8, 3
@@ -244,16 +243,3 @@ def test_hot_pixels_come_alone() -> None:
     quiet[0, 28:33, 5:9] = 100.0
     found = hot_pixels(quiet, 0.1)
     assert np.argwhere(found).tolist() == [[5, 5], [20, 30], [20, 31]]
-
-
-def test_the_fit_of_intervals_undoes_what_was_done_to_a_std() -> None:
-    """Errors of known std, announced too small where they are large and too large where small."""
-    rng = np.random.default_rng(0)
-    true = np.exp(rng.uniform(-5, -1, 4000))
-    error, announced = rng.normal(0, true), 0.5 * true**0.8
-    level, power = intervals.fit(error, announced)
-    assert power == pytest.approx(1 / 0.8, abs=0.04)
-    found = np.exp(level) * announced**power
-    for small in (true < 0.05, true >= 0.05):
-        share = (np.abs(error) < found)[small].mean()
-        assert share == pytest.approx(intervals.COVERED, abs=0.03)

@@ -12,7 +12,7 @@ from networks import hidden
 
 from evflow import estimate_camera, load_weights
 from evflow.weights import model_card, weights_path
-from experiments import fuse, intervals, tell_apart
+from experiments import fuse, tell_apart
 
 pytestmark = pytest.mark.slow
 RELEASED = weights_path("default")
@@ -51,22 +51,3 @@ def test_noise_is_told_apart_by_a_network_and_its_std_is_calibrated(tmp_path: Pa
     (net,) = made.values()
     assert float(net["signal"]["widen"]) == pytest.approx(figures["widen"])
     assert np.isfinite(float(estimate_camera(hidden(14, 300)[0], made).summary.eta_on))
-
-
-def test_intervals_are_calibrated_and_leave_the_estimate_alone(tmp_path: Path) -> None:
-    options = intervals.Options(RELEASED, tmp_path / "wider.safetensors", recordings=12,
-                                rows=tmp_path / "rows.npz")
-    figures = intervals.main(options)
-    made = load_weights(options.out)
-    assert changed(load_weights("default"), made) <= {"intervals"}
-    (net,) = made.values()
-    recording = hidden(14, 300)[0]
-    before, after = (estimate_camera(recording, {"default": {**net, "intervals": given}})
-                     for given in (None, net["intervals"]))
-    for i, name in enumerate(("theta_on", "theta_off", "eta_on", "eta_off")):
-        value = float(getattr(before.summary, name))
-        assert float(getattr(after.summary, name)) == value
-        old, new = (float(getattr(found.summary_std, name)) for found in (before, after))
-        level, power = figures[f"level/{name}"], figures[f"power/{name}"]
-        assert new == pytest.approx(value * np.exp(level) * (old / value) ** power, rel=1e-4)
-        assert float(net["intervals"]["level"][i]) == pytest.approx(level)

@@ -13,11 +13,10 @@ moves the estimate until the two agree. Each pixel is compared only after its fi
 its memory is known: nothing depends on what happened before the recording began.
 """
 
-from evflow.refine.fit import Refined, calibrated, fused, refine_summary
+from evflow.refine.fit import Refined, fused, refine_summary
 from evflow.refine.path import Chunk, make_chunk, plan_chunks
 from evflow.refine.pixels import pixel_posterior
 
 __all__ = [
-    "Chunk", "Refined", "calibrated", "fused", "make_chunk", "pixel_posterior", "plan_chunks",
-    "refine_summary",
+    "Chunk", "Refined", "fused", "make_chunk", "pixel_posterior", "plan_chunks", "refine_summary",
 ]

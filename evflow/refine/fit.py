@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import PARAMETERS, THETA_MIN, Camera, Summary
+from evflow.camera import THETA_MIN, Camera, Summary
 from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log_inverse, noise_factor, normalised_intensity
 from evflow.refine.moments import Moments, measure
@@ -272,16 +272,3 @@ def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Arr
         {"params": fusion["net"]}, (inside - fusion["mean"]) / fusion["scale"])
     correction, log_std = outputs
     return y + correction, jnp.exp(log_std) * fusion["widen"]
-
-
-def calibrated(intervals: dict[str, Any] | None, summary: Summary, std: Summary) -> Summary:
-    """The std of a refined summary so that its intervals hold the truth as often as they say:
-    std -> exp(level) std^power of log theta and log eta. intervals: {"level", "power": (4,)},
-    fitted by experiments.intervals; without them the std as it is."""
-    if intervals is None:
-        return std
-    changed = {}
-    for name, level, power in zip(PARAMETERS, intervals["level"], intervals["power"], strict=True):
-        value = getattr(summary, name)
-        changed[name] = value * jnp.exp(level) * (getattr(std, name) / value) ** power
-    return dataclasses.replace(std, **changed)
