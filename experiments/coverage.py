@@ -2,7 +2,8 @@
 
     python -m experiments.coverage --preset full --workers 2
 
-Cameras, scenes and sensors of the whole training distribution, none of them seen in training.
+Cameras, scenes and sensors of the whole training distribution, none of them seen in training; with
+--photos also scenes of the photographs that training shows.
 An interval of probability p should hold the truth in a share p of the cases: for the camera's
 summary over recordings, and for the maps over pixels. Draws the calibration curve.
 """
@@ -41,6 +42,8 @@ class Options:
     seed: int = 5_000_077
     recordings: int | None = None
     """Number of cameras (default: the preset's)."""
+    photos: bool = False
+    """Whether scenes show the photographs of the training, too."""
     workers: int = 1
 
 
@@ -116,7 +119,8 @@ def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
 def main(options: Options) -> dict[str, Any]:
     count = options.recordings or {"debug": 12, "full": 1000}[options.preset]
     jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i)))) for i in range(count)]
-    made = scores(score, Setup(options.weights, options.seed), jobs, options.workers, "cameras")
+    setup = Setup(options.weights, options.seed, options.photos)
+    made = scores(score, setup, jobs, options.workers, "cameras")
     rows = [row for row in made if row is not None]
     found = curves(rows)
     result = {"levels": LEVELS.tolist(), "cameras": len(rows), "curves": found,
