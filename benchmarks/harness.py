@@ -28,6 +28,7 @@ import evflow
 
 PACKAGES = ("jax", "jaxlib", "numpy", "numba", "torch")
 Clocks = tuple[float, float, float | None]
+TURN_S = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Case:
 class Record:
     """One measured case, one line of JSON.
 
-    seconds: median of `times`, one for each timed call; fastest: the least; first_call: the first,
+    seconds: median of `times`, a call's in each turn; fastest: the least; first_call: the first,
     compilation included. peak_mb: highest resident memory during the timed calls, less that before
     the first call (so it holds what compilation leaves behind); None where the system cannot tell.
     others: CPU cores that other processes kept busy meanwhile, on average; above ~.1 the times are
@@ -111,7 +112,8 @@ def absent(case: Case) -> Record | None:
 
 
 class Runner:
-    """A case in this process: built and called once; then each `turn` is a timed call."""
+    """A case in this process: built and called once; then each `turn` is calls for half a second,
+    one at least: after a pause, or another process, the first of them finds cold caches."""
 
     def __init__(self, case: Case, setting: Setting) -> None:
         self.case = case
@@ -126,12 +128,15 @@ class Runner:
         _reset_peak()
 
     def turn(self) -> float:
-        """Seconds of one call."""
-        self.result = None  # or two results would be alive at once, and counted
-        start = _clocks()
-        self.result = jax.block_until_ready(self.workload.call())
+        """Seconds of a call, the mean of the turn's."""
+        start, now, calls = _clocks(), 0.0, 0
+        least = 0.0 if self.setting.quick else TURN_S
+        while not calls or now - start[0] < least:
+            self.result = None  # or two results would be alive at once, and counted
+            self.result = jax.block_until_ready(self.workload.call())
+            now, calls = time.perf_counter(), calls + 1
         self.clocks.append((start, _clocks()))
-        self.times.append(self.clocks[-1][1][0] - start[0])
+        self.times.append((now - start[0]) / calls)
         return self.times[-1]
 
     def record(self) -> Record:
