@@ -108,7 +108,7 @@ def test_absent_package_skips_and_error_fails() -> None:
 def test_cases_of_a_task_take_turns_and_a_broken_one_costs_no_other() -> None:
     cases = [Case("voxels", "task", name, prepare) for name, prepare in
              (("evflow", _whole), ("broken", _broken), ("killed", _killed), ("peer", _whole))]
-    ours, broken, killed, peer = compare(in_turn(cases, Setting()))
+    ours, broken, killed, peer = compare(in_turn(cases, QUICK))
     assert broken.failed
     assert broken.skipped == "ValueError: no such thing"
     assert killed.failed
