@@ -30,7 +30,7 @@ from evflow.cli import Command, main
 from evflow.errors import CODES
 from evflow.io import write_recording
 from evflow.io.base import FORMATS, WRITERS
-from experiments import make_dataset, train_network
+from experiments import make_dataset, see_better, train_network
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -175,7 +175,7 @@ def test_links_lead_somewhere(document: Path) -> None:
 def test_options_exist(document: Path) -> None:
     known = {"--help"}
     commands = [typing.get_args(c)[0] for c in typing.get_args(Command)]
-    for options in (*commands, make_dataset.Options, train_network.Options):
+    for options in (*commands, make_dataset.Options, see_better.Options, train_network.Options):
         for field in dataclasses.fields(options):
             flag = field.name.replace("_", "-")
             known |= {f"--{flag}", f"--no-{flag}"}
