@@ -28,7 +28,7 @@ import evflow
 
 PACKAGES = ("jax", "jaxlib", "numpy", "numba", "torch")
 Clocks = tuple[float, float, float | None]
-TURN_S = 0.5
+TURN_S = 0.5  # at least
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Runner:
         _reset_peak()
 
     def turn(self) -> float:
-        """Seconds of a call, the mean of the turn's."""
+        """Make a turn, whose mean call joins `times`; the seconds that it took."""
         start, now, calls = _clocks(), 0.0, 0
         least = 0.0 if self.setting.quick else TURN_S
         while not calls or now - start[0] < least:
@@ -137,7 +137,7 @@ class Runner:
             now, calls = time.perf_counter(), calls + 1
         self.clocks.append((start, _clocks()))
         self.times.append((now - start[0]) / calls)
-        return self.times[-1]
+        return now - start[0]
 
     def record(self) -> Record:
         peak = resident_mb("VmHWM")

@@ -98,7 +98,7 @@ class _Blocks:
         self.whole, state = _start(key, frame, camera, nominal, model=model)
         self.here = jax.tree.map(np.asarray, self.whole)  # the same, for the host
         self.pixels, self.key = state.pixels, state.key
-        self.interval, self.salted, self.salts = 0, 0, np.empty((0, 2), np.uint32)
+        self.interval, self.salts = 0, np.empty((0, 2), np.uint32)
         self.no_clock = np.zeros((BLOCK + 1, 2), np.float32)
         self.before = frame.ravel()
 
@@ -111,11 +111,12 @@ class _Blocks:
             frames = frames + [frames[-1]] * missing
             ticks = np.append(ticks, np.zeros(missing, np.int64))
         frames = [self.before, *frames]
-        self.before, first = frames[-1], np.int32(self.interval)
-        self.interval += BLOCK
+        self.before = frames[-1]
         # Only the frames are always read; jit passes over what a model has no use for.
-        return Block(first, frames, (ticks * self.tick_s).astype(np.float32),
-                     ticks.astype(np.uint32), self._clock(edges[0], ticks), self._next_salts())
+        block = Block(np.int32(self.interval), frames, (ticks * self.tick_s).astype(np.float32),
+                      ticks.astype(np.uint32), self._clock(edges[0], ticks), self._next_salts())
+        self.interval += BLOCK
+        return block
 
     def _clock(self, begin: int, ticks: np.ndarray) -> np.ndarray:
         """(BLOCK + 1, 2) times for v2e's slots, see `SimState.time`."""
@@ -127,8 +128,7 @@ class _Blocks:
 
     def _next_salts(self) -> np.ndarray:
         if not len(self.salts):
-            self.salts = np.asarray(_salts(self.key, self.salted))
-            self.salted += SALTED
+            self.salts = np.asarray(_salts(self.key, self.interval))
         first, self.salts = np.split(self.salts, [BLOCK])
         return first
 

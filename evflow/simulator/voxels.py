@@ -49,7 +49,6 @@ def simulate_window(
     salts = noise.salts(state.key, intervals)
     high, low = state.time
     clock = jnp.stack([high + dt * jnp.arange(steps + 1), jnp.full(steps + 1, low)], -1)
-
     plan, lengths = Schedule.of(steps, bins), jnp.full(steps, dt)
 
     def scanned(maps: Any) -> tuple[PixelState, Array]:
