@@ -17,7 +17,7 @@ from videos import SHAPE, by_pixel, drifting, milliseconds
 from evflow.camera import Camera, CameraPrior
 from evflow.intensity import LOG_MAPS, to_log
 from evflow.sensors import SensorModel
-from evflow.simulator import active, circuits, simulate, simulate_stream
+from evflow.simulator import active, circuits, pack, simulate, simulate_stream
 from evflow.simulator.active import step_still
 from evflow.simulator.pixel import floor_divide
 from evflow.types import Events
@@ -53,6 +53,18 @@ def test_the_clock_may_start_anywhere(model: SensorModel, start: int) -> None:
     events = simulate(KEY, frames, milliseconds(40), NOISY, model=model)
     later = simulate(KEY, frames, milliseconds(40, start), NOISY, model=model)
     equal(later, dataclasses.replace(events, t=events.t + start))
+
+
+@pytest.mark.parametrize("model", [SensorModel(), EVERYTHING, V2E])
+def test_keys_of_32_and_of_64_bits_are_the_same_events(
+    monkeypatch: pytest.MonkeyPatch, model: SensorModel
+) -> None:
+    frames, times = drifting(20), milliseconds(20, 500)
+    assert pack.Keys.of(frames[0].size, 8 * 500).dtype is np.uint32
+    short = simulate(KEY, frames, times, NOISY, model=model)
+    monkeypatch.setattr(pack.Keys, "of", lambda pixels, _: pack.Keys(
+        (pixels - 1).bit_length(), np.uint64))
+    equal(simulate(KEY, frames, times, NOISY, model=model), short)
 
 
 @pytest.mark.parametrize("model", [EVERYTHING, V2E])

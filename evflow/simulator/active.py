@@ -39,7 +39,8 @@ SLACK = 1e-4  # of a threshold, or log units: beyond what rounding may differ by
 class Block:
     """T intervals, of which `first` is the index of the first. frames: (T + 1, N) DN, uint8 or
     float32, the frame before and those at which they end. dt: (T,) seconds. dt_us: (T,) uint32.
-    clock: (T + 1, 2) times of the frames, see `SimState.time`. salts: (T, 2) of `noise.salts`."""
+    clock: (T + 1, 2) times of the frames, see `SimState.time`. salts: (T, 2) of `noise.salts`.
+    bits: uint32, of a pixel's number in `Sent.first`."""
 
     first: Any
     frames: Any
@@ -47,22 +48,24 @@ class Block:
     dt_us: Any
     clock: Any
     salts: Any
+    bits: Any
 
 
-# Takes K pixels through a block: (model, their sensor, their state, the block as they see it, (K,)
-# whether they are real) -> (state, what they send). Hashable: `jit` compiles for each.
+# Takes K pixels through a block: (model, their sensor, their state, the block as they see it, their
+# numbers (K,), -1 for padding) -> (state, what they send). Hashable: `jit` compiles for each.
 Exit = Callable[[SensorModel, Sensor, PixelState, Block, Array], tuple[PixelState, Any]]
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """What K pixels send in T intervals, each array (T, K). ticks: uint32, 0 where there is no
+    """What K pixels send in T intervals, each array (T, K). first: uint32, 0 where there is no
     signal event, else of the first of them the microseconds from the begin of the block, times 4,
     + 2 where ON, + 1 where it is not the only one (nonsense, but not 0, in blocks of `TICKS` us
-    and more). struck: whether there are noise events, None without noise."""
+    and more); and below these, in `Block.bits` bits if any, the pixel. struck: whether there are
+    noise events, None without noise."""
 
-    ticks: Array
+    first: Array
     spikes: Spikes
     struck: Array | None
 
@@ -149,7 +152,7 @@ def step(
     beyond the last pixel are padding, all different: they repeat it and are not put back.
     """
     few, own = _gathered((whole, before), at)
-    own, sent = exit(model, few, own, block, at < whole.words.size)
+    own, sent = exit(model, few, own, block, _numbers(whole, at))
     return _put_back(model, after, own, at), sent
 
 
@@ -163,9 +166,13 @@ def step_still(
     few, own = _gathered((whole, pixels), at)
     last = own.last if rested is None else own.last + rested
     own = PixelState(to_log(block.frames[0], model.log_map), own.base, last)
-    own, sent = exit(model, few, own, block, at < whole.words.size)
+    own, sent = exit(model, few, own, block, _numbers(whole, at))
     new = limits(model, few.camera, own.base, block.frames.dtype)
     return _put_back(model, pixels, own, at), sent, new
+
+
+def _numbers(whole: Sensor, at: Array) -> Array:
+    return jnp.where(at < whole.words.size, at, -1)
 
 
 def _gathered(maps: T, at: Array) -> T:
@@ -181,17 +188,20 @@ def _put_back(model: SensorModel, pixels: PixelState, own: PixelState, at: Array
 
 
 def sent(
-    model: SensorModel, few: Sensor, pixels: PixelState, block: Block, real: Array
+    model: SensorModel, few: Sensor, pixels: PixelState, block: Block, number: Array
 ) -> tuple[PixelState, Sent]:
     """The `Exit` to events."""
-    logs, i01, real = to_log(block.frames, model.log_map), _i01(block.frames[1:]), real[None]
+    logs, i01 = to_log(block.frames, model.log_map), _i01(block.frames[1:])
+    number = number[None]
+    real = number >= 0
     # All that does not depend on the memory is worked out for the block at once.
     dist = jax.vmap(functools.partial(sensor.disturb, model, few))(i01, block.salts, block.dt)
     inputs = (logs[1:], i01, dist, block.dt, (block.clock[:-1], block.clock[1:]))
     pixels, spikes = _spikes(model, few.camera, pixels, inputs)
     struck = None if dist.struck is None else dist.struck.some & real
-    ticks = jnp.where((spikes.count != 0) & real, _ticks(spikes, block.dt_us), 0)
-    return pixels, Sent(ticks, spikes, struck)
+    below = jnp.where(block.bits > 0, number, 0).astype(jnp.uint32)
+    first = (_ticks(spikes, block.dt_us) << block.bits) | below
+    return pixels, Sent(jnp.where((spikes.count != 0) & real, first, 0), spikes, struck)
 
 
 def _spikes(
@@ -219,8 +229,8 @@ def _spikes(
 
 
 def _ticks(spikes: Spikes, dt_us: Array) -> Array:
-    """`Sent.ticks` where there are events. Times are rounded up to a microsecond, within
-    (begin, end] of their interval."""
+    """`Sent.first` where there are events, but for the pixels. Times are rounded up to a
+    microsecond, within (begin, end] of their interval."""
     at = spikes.first if spikes.earliest is None else jnp.maximum(spikes.first, spikes.earliest)
     length = dt_us.astype(at.dtype)[:, None]
     within = jnp.clip(jnp.ceil(at * length), 1, length).astype(jnp.uint32)

@@ -112,10 +112,10 @@ def _packed(
     fetch = None
     for fetched in pixels.run(watched()):
         if fetch:
-            yield pack.sort(fetch(), edges.popleft(), shape)
+            yield pack.sort(*fetch(), int(edges.popleft()[0]), shape)
         fetch = fetched
     if fetch:
-        yield pack.sort(fetch(), edges.popleft(), shape)
+        yield pack.sort(*fetch(), int(edges.popleft()[0]), shape)
 
 
 def _checked_camera(camera: Camera) -> Camera:

@@ -90,7 +90,7 @@ class Touched:
         return low
 
     def __call__(
-        self, model: SensorModel, few: Sensor, pixels: PixelState, block: Block, real: Array
+        self, model: SensorModel, few: Sensor, pixels: PixelState, block: Block, _: Array
     ) -> tuple[PixelState, Array]:
         low, offset, wide = (jax.lax.dynamic_slice_in_dim(jnp.asarray(rows), block.first, BLOCK)
                              for rows in (self.plan.low, self.plan.offset, self.plan.wide))
