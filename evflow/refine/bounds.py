@@ -8,9 +8,10 @@ only: between them its error is of the size of the thresholds.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import log_ndtr
+from jax.scipy import special
 
 from evflow.refine.sightings import Sightings
 
@@ -22,6 +23,7 @@ NOTHING = -1.0  # log units: bounds no threshold
 EXCESS = 0.1
 ERROR = (0.15, 0.15, 0.2)  # of the rise, the fall, the range
 BOUNDED = ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))  # what each bounds: theta_on, theta_off, their sum
+log_ndtr = jax.jit(special.log_ndtr)  # as single operations it compiles for a second
 
 
 def unanswered(s: Sightings) -> Array:

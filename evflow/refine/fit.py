@@ -74,21 +74,17 @@ class FusionNet(nn.Module):
 def _simulated(
     key: Array, path: Array, dt_s: Array, bright: Array, values: Array, fresh: Array, steps: int
 ) -> Moments:
-    """Moments of V cameras on one chunk, leading axis V. values (V, 6): theta, eta, sigma; all see
-    the same random numbers, so that their differences are the cameras'."""
+    """Moments of a camera on one chunk. values (6,): theta, eta, sigma; cameras of one key see the
+    same random numbers, so that their differences are the cameras'."""
     k_pixels, k_trace = jax.random.split(key)
     draws = jax.random.normal(k_pixels, (2, *path.shape[1:]))
-
-    def one(row: tuple[Array, Array]) -> Moments:
-        (on, off, eta_on, eta_off, sigma_on, sigma_off), start = row[0], row[1]
-        full = jnp.ones_like(draws[0])
-        camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
-                        jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
-                        eta_on * full, eta_off * full)
-        trace = trace_of_camera(k_trace, path, dt_s, camera, start, steps)
-        return measure(trace, path, dt_s, bright, steps)
-
-    return jax.lax.map(one, (values, fresh))
+    on, off, eta_on, eta_off, sigma_on, sigma_off = values
+    full = jnp.ones_like(draws[0])
+    camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
+                    jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
+                    eta_on * full, eta_off * full)
+    trace = trace_of_camera(k_trace, path, dt_s, camera, fresh, steps)
+    return measure(trace, path, dt_s, bright, steps)
 
 
 @partial(jax.jit, static_argnames="steps")
@@ -134,14 +130,16 @@ class _Fit:
                                 for c in chunks])
 
     def simulate(self, values: np.ndarray, fresh: list[float]) -> Moments:
-        """Summed moments, leading axis V; `fresh` holds for the first chunk alone."""
-        rows = jnp.asarray(values, jnp.float32)
-        parts = []
+        """Summed moments of V cameras, leading axis V; `fresh` holds for the first chunk alone."""
+        cameras = list(zip(values.astype(np.float32), np.array(fresh, np.float32), strict=True))
+        totals: list[list[Moments]] = [[] for _ in cameras]
         for i, c in enumerate(self.chunks):
-            start = jnp.asarray(fresh if i == 0 else [0.0] * len(fresh), jnp.float32)
-            parts.append(_simulated(jax.random.fold_in(self.key, i), c.path, c.dt_s, c.bright,
-                                    rows, start, STEPS))
-        return _total(parts)
+            key, path = jax.random.fold_in(self.key, i), jnp.asarray(c.path)
+            # One by one: a program for every number of cameras takes seconds to compile.
+            for parts, (row, start) in zip(totals, cameras, strict=True):
+                parts.append(_simulated(key, path, c.dt_s, c.bright, row,
+                                        start if i == 0 else np.float32(0.0), STEPS))
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *map(_total, totals))
 
     def choose_start(self) -> None:
         """Does the recording start as a simulation does? Whichever start makes the number of
