@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
 
@@ -15,6 +13,7 @@ from evflow import load_weights
 from evflow.config import PRESETS
 from evflow.progress import bar
 from evflow.scenes import make_bank
+from evflow.workers import worker_pool
 from experiments.cameras import Hidden, Protocol, hidden_recording
 
 Result = TypeVar("Result")
@@ -67,7 +66,5 @@ def _scores(
         prepare(setup)
         yield from map(partial(one, score), jobs)
         return
-    # A fresh interpreter: JAX's threads do not survive a fork.
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=prepare,
-                             initargs=(setup,)) as pool:
+    with worker_pool(workers, prepare, setup) as pool:
         yield from pool.map(partial(one, score), jobs)

@@ -10,13 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import multiprocessing
 import os
 import shutil
-import signal
-import threading
-from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -28,6 +24,7 @@ from evflow.dataset.manifest import Manifests, Part, Progress, Record
 from evflow.dataset.store import Format, write_sequence
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
+from evflow.workers import worker_pool
 
 DRAFTS = ".drafts-"
 
@@ -162,30 +159,10 @@ def _drafts(jobs: list[Job], workers: int) -> Generator[Made]:
     if workers == 1 or len(jobs) < 2:
         yield from map(_draft, jobs)
         return
-    others = set(multiprocessing.active_children())
-    # A fresh interpreter: JAX's threads do not survive a fork.
-    pool = ProcessPoolExecutor(
-        min(workers, len(jobs)), multiprocessing.get_context("spawn"), initializer=_follow_parent)
     try:
-        yield from pool.map(_draft, jobs)
+        with worker_pool(min(workers, len(jobs))) as pool:
+            yield from pool.map(_draft, jobs)
     except BrokenProcessPool as e:
         raise EvflowDataError(
             "EV019", "a worker process died (out of memory?).",
             "The same command goes on; fewer --workers need less memory.") from e
-    finally:
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()  # what they still do is not wanted
-        pool.shutdown(cancel_futures=True)
-
-
-def _follow_parent() -> None:
-    """A worker leaves Ctrl-C to its parent, and ends where that is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_after, args=(parent.join,), daemon=True).start()
-
-
-def _end_after(wait: Callable[[], None]) -> None:
-    wait()
-    os._exit(1)
