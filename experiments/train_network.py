@@ -31,7 +31,7 @@ from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, run
 from evflow.downstream.presets import training
 from evflow.downstream.recorded import recorded_bank, sample_recorded
-from evflow.downstream.released import save_network
+from evflow.downstream.released import load_network, save_network
 from evflow.downstream.simulated import Sequences, has_events, sample_sequences
 from evflow.downstream.tensor import normalise
 from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
@@ -69,6 +69,8 @@ class Options:
     of its alexnet.ckpt (default: L1 + SSIM)."""
     camera: Path | None = None
     """camera.npz of the camera to train for (default: cameras of a wide prior)."""
+    start: str | None = None
+    """Weights to go on from (a released name or a file), of the same network."""
     recordings: tuple[Path, ...] = ()
     """Recordings of one sensor, with frames, to train on in place of simulated sequences."""
     max_seconds: float = math.inf
@@ -90,6 +92,7 @@ class Run:
     lpips: str | None
     camera: str | None
     recordings: tuple[str, ...] = ()
+    start: str | None = None
 
     @property
     def steps(self) -> int:
@@ -107,7 +110,7 @@ def main(options: Options) -> dict[str, Any]:
     tx = optimiser(learning)
     step = jax.jit(make_step(network, learning, tx, sample))
     state = train(lambda state: step(state, bank, camera, loss_weights),
-                  init_state(network, learning, tx), config, options)
+                  init_state(network, learning, tx, begun(config)), config, options)
     result = measure(network, state.params, learning, camera, options.batches)
     result = {"steps": int(state.step)} | result
     card = {"preset": options.preset, "steps": int(state.step), "seed": learning.seed,
@@ -129,6 +132,19 @@ def source(recordings: tuple[Path, ...], learning: LearningConfig) -> tuple[Any,
     return make_bank(jax.random.fold_in(jax.random.key(learning.seed), 7)), sample_sequences
 
 
+def begun(config: Run) -> Params | None:
+    """Params to go on from, None for fresh ones; EV018 where they are another network's."""
+    if config.start is None:
+        return None
+    trained = load_network(config.start)
+    if (trained.network, trained.normalised) != (config.network, config.learning.normalised):
+        raise EvflowDataError(
+            "EV018", f"{config.start} is {trained.network}, normalised={trained.normalised}; "
+            f"this run trains {config.network}, normalised={config.learning.normalised}.",
+            "Start from weights of the same network and preset, or leave --start out.")
+    return trained.params
+
+
 def configuration(options: Options) -> Run:
     """The run of these options; EV020 where they contradict each other."""
     network, learning = training(options.network, options.preset)
@@ -143,7 +159,8 @@ def configuration(options: Options) -> Run:
         raise EvflowDataError("EV020", "--camera with --recordings, which have their own.",
                               "Leave one out.")
     camera = None if options.camera is None else str(options.camera)
-    return Run(network, learning, options.lpips, camera, tuple(map(str, options.recordings)))
+    recordings = tuple(map(str, options.recordings))
+    return Run(network, learning, options.lpips, camera, recordings, options.start)
 
 
 def measure(

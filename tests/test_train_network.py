@@ -120,6 +120,17 @@ def test_a_preset_may_ask_for_normalised_tensors() -> None:
     assert command.configuration(asked).learning.normalised
 
 
+def test_a_run_goes_on_from_weights_of_its_own_network() -> None:
+    asked = command.Options(out=Path(), network="e2vid", start="e2vid-small")
+    begun = command.begun(command.configuration(asked))
+    jax.tree.map(np.testing.assert_array_equal, begun, load_network("e2vid-small").params)
+    assert command.begun(command.configuration(command.Options(out=Path()))) is None
+    for other in ({"network": "firenet"}, {"normalised": True}):
+        config = command.configuration(dataclasses.replace(asked, **other))
+        with pytest.raises(EvflowDataError, match=r"EV018 .*e2vid-small"):
+            command.begun(config)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["firenet", "evflownet"])
 def test_the_command_trains_resumes_and_measures(tmp_path: Path, kind: str) -> None:

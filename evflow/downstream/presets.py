@@ -26,11 +26,13 @@ WIDE = SequenceConfig(prior=WidePrior())
 _FLOW = dataclasses.replace(
     WIDE, sequences=16, windows=2, crop=64, noise=0.0, prior=WidePrior(theta=(0.05, 0.5)),
     scene=dataclasses.replace(WIDE.scene, contrast=(0.5, 1.0), speed_px_s=(10.0, 350.0)))
+# Long enough to see scenes stand still: a memory of fewer windows fades.
+_LONG = dataclasses.replace(WIDE, sequences=5, windows=24)
 _TINY = dataclasses.replace(WIDE, sequences=2, windows=4, crop=16, steps_per_window=2)
 _LARGE = dataclasses.replace(WIDE, sequences=4, windows=40, crop=128)
 
 TRAININGS: dict[tuple[str, str], tuple[Network, LearningConfig]] = {
-    ("e2vid", "small"): (E2VID_SMALL, LearningConfig(WIDE, steps=3000, warmup=50)),
+    ("e2vid", "small"): (E2VID_SMALL, LearningConfig(_LONG, steps=3000, warmup=50)),
     ("firenet", "small"): (FireNet(), LearningConfig(
         dataclasses.replace(WIDE, sequences=4), steps=3000, warmup=50)),
     # Three encoders leave the first, which sees the motion, 16 features; 0.22 M parameters.
