@@ -21,10 +21,12 @@ from evflow.downstream import (
     run,
     signed,
 )
-from evflow.downstream.tensor import windows_between
+from evflow.downstream.tensor import reconstructions, windows_between
 from evflow.errors import EvflowDataError
 from evflow.types import Events
 from evflow.voxel import voxelize
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 TINY = [E2VID(base=4, encoders=1, blocks=1), FireNet(base=4), EVFlowNet(base=4, scales=4),
         E2VID(base=4, encoders=1, blocks=0, skip="concat", norm="batch", decoder="transposed",
@@ -188,5 +190,20 @@ def test_reconstruct_is_apply_window_by_window() -> None:
     for times, code in (([], "EV001"), ([5, 3], "EV004")):
         with pytest.raises(EvflowDataError, match=code):
             reconstruct(network, params, events, np.array(times))
+
+
+def test_a_window_without_events_may_repeat_the_image() -> None:
+    events, network = some_events(), FireNet(base=4)
+    params = network.init(jax.random.key(0), (8, 12))
+    times = np.array([3000, 3000, 3000, 6000])  # the second and the third hold nothing
+    given = np.stack(list(reconstructions(network, params, events, times, hold=True)))
+    np.testing.assert_array_equal(given[1:3], given[:1].repeat(2, 0))
+    np.testing.assert_array_equal(given[[0, 3]], reconstruct(
+        network, params, events, times[[0, 3]]))
+    assert not np.array_equal(reconstruct(network, params, events, times)[1], given[0])
+    first = np.array([-1, 3000])  # nothing to repeat yet
+    np.testing.assert_array_equal(
+        np.stack(list(reconstructions(network, params, events, first, hold=True))),
+        reconstruct(network, params, events, first))
 
 

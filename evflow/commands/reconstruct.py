@@ -61,7 +61,8 @@ class Reconstruct(Windowed):
         scores = self._scores(int(seen)) if times is recording.frame_times else None
         with bar("reconstructing") as progress:
             images = reconstructions(
-                trained.network, trained.params, recording.events, times, **trained.how)
+                trained.network, trained.params, recording.events, times, **trained.how,
+                hold=True)
             images = _watched(images, recording, scores, int(seen), len(times), progress)
             said = (self._folder(images, times) if kind == "" else
                     self._film(images, times, recording))

@@ -74,11 +74,13 @@ def _step(
 
 def reconstructions(
     network: Network, params: Params, events: Events, frame_times_us: np.ndarray, *,
-    normalised: bool = False,
+    normalised: bool = False, hold: bool = False,
 ) -> Iterator[np.ndarray]:
     """What `reconstruct` stacks, one at a time: images (H, W), or flow (2, H, W).
 
-    Raises, before the first, what `reconstruct` raises.
+    hold: where not one event came since the image before, that one again, and the memory as it
+    was; a network's memory of a scene fades after more windows than it was trained on.
+    Raises, before the first image, what `reconstruct` raises.
     """
     times = np.asarray(frame_times_us, np.int64)
     if not times.size:
@@ -88,13 +90,17 @@ def reconstructions(
 
     def images() -> Iterator[np.ndarray]:
         width, height = events.size
-        state = network.start((height, width))
+        state, image = network.start((height, width)), None
         for window in windows_between(events.t, times):
+            if hold and image is not None and window.start == window.stop:
+                yield image
+                continue
             part = Events.unchecked(events.x[window], events.y[window], events.t[window],
                                     events.p[window], events.size)
             tensor = event_tensor(part, network.bins)
-            image, state = _step(network, params, tensor, state, normalised)
-            yield np.asarray(image)
+            made, state = _step(network, params, tensor, state, normalised)
+            image = np.asarray(made)
+            yield image
 
     return images()
 

@@ -61,7 +61,7 @@ def with_reconstructed_frames(
             "network's warm-up.", "Two more are needed: take a longer recording.")
     frames = np.empty((len(times) - warm_up, *recording.events.size[::-1]), np.float32)
     images = reconstructions(
-        trained.network, trained.params, recording.events, times, **trained.how)
+        trained.network, trained.params, recording.events, times, **trained.how, hold=True)
     for i, image in enumerate(images):
         if i >= warm_up:
             frames[i - warm_up] = 255.0 * np.clip(image, 0.0, 1.0)
