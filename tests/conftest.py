@@ -30,6 +30,18 @@ def _bounded_memory() -> Iterator[None]:
         gc.collect()
 
 
+@pytest.fixture(scope="module")
+def quick_compilation() -> Iterator[None]:
+    """For tests of what programs do rather than how they round, and which run once: compiled
+    without optimisation, in half of the time. Other modules never meet these programs."""
+    import jax
+
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder EVFLOW_DATA, which holds data/ (recordings, formats, images) and goldens/."""

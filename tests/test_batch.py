@@ -17,6 +17,8 @@ from evflow.config import PRESETS, NuisanceConfig
 from evflow.scenes import SceneConfig, TextureBank, make_bank
 from evflow.sensors import SensorModel
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
 
 

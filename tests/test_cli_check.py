@@ -14,6 +14,8 @@ from evflow import Recording, write_events
 from evflow.cli import main
 from evflow.io.adjust import shifted
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -17,6 +17,8 @@ from evflow.downstream import video
 from evflow.report.flow import flow_colours, flow_image, wheel
 from evflow.types import Events
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:

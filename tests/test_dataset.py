@@ -33,6 +33,8 @@ from evflow.io import iter_windows, read_recording
 from evflow.types import Events
 from experiments import make_dataset
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 FORMATS = ("dsec", "npy")
 
 

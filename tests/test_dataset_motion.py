@@ -14,6 +14,8 @@ import pytest
 from evflow.dataset import optical_flow
 from evflow.scenes import Layer, Scene, SceneConfig, Trajectory, make_bank, render, sample_scene
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @functools.cache
 def scenes(count: int = 8) -> list[tuple[Scene, tuple[int, int]]]:

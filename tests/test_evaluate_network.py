@@ -22,6 +22,8 @@ from evflow.types import Events
 from experiments import evaluate_network, recorded
 from experiments.evaluate_network import Options
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 SIZE = (32, 24)
 
 

@@ -25,6 +25,8 @@ from experiments import (
     train,
 )
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 def test_quickstart_draws_truth_beside_estimate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

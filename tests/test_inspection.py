@@ -19,6 +19,8 @@ from evflow.errors import CODES, EvflowDataError
 from evflow.inspection import frames_offset
 from evflow.io.adjust import flipped, shifted
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.fixture(scope="module")
 def sound() -> Recording:

@@ -18,6 +18,8 @@ from evflow.io.adjust import flipped, shifted, with_frames
 from evflow.io.glitches import exposed
 from evflow.io.times import read_times
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.fixture(scope="module")
 def watched() -> tuple[Recording, Camera]:

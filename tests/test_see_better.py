@@ -23,6 +23,8 @@ from experiments.conditions import Workshop, conditions, told
 from experiments.see_better import Options, files
 from experiments.trainings import FOUR, Trainings, slug
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 SHAPE = (24, 32)
 
 

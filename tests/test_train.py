@@ -17,6 +17,8 @@ from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank, make_bank
 from evflow.train import TrainState, init_state, loss_fn, make_run_step, optimiser
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 CONFIG = small_config(steps=40, warmup=2)
 TX = optimiser(CONFIG)
 
