@@ -13,18 +13,16 @@ from evflow.camera_estimate import CameraEstimate
 from evflow.config import PRESETS
 from evflow.errors import EvflowDataError
 from evflow.faults import dead_pixels
+from evflow.rates import pixel_rates
 from evflow.stillness import busy_pixels, unlike_noise
 from evflow.types import Events, Recording
-
-SPREAD = (0.3, 1000.0)  # shape of the gamma distribution of rates over pixels: its range
 
 
 def estimate_noise(recording: Recording) -> CameraEstimate:
     """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
 
-    A pixel's rate is the mean of its posterior: a gamma distribution fitted to all pixels that
-    are not hot, times the Poisson likelihood of its events; a hot pixel's is its own count. The
-    summary is the mean over pixels that are not hot. Thresholds are those of the prior that the
+    A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
+    over pixels that are not hot. Thresholds are those of the prior that the
     network was trained on, with its width; `valid` is False everywhere.
     Raises EV011 where the scene moves, or is too short to tell.
     """
@@ -69,14 +67,11 @@ def _rates(
     """Rates (H, W) of one polarity in Hz and their std, the mean of the others than hot pixels
     and its std."""
     normal = counts[~hot].astype(np.float64)
-    mean, variance = float(normal.mean()), float(normal.var())
-    # Poisson counts of gamma-distributed rates: variance = mean + mean^2 / shape
-    shape = np.clip(mean**2 / max(variance - mean, 1e-9), *SPREAD)
-    worth = shape / max(mean, 1.0 / normal.size)  # exposures that the prior is worth
-    rate = np.where(hot, counts, (counts + shape) / (1.0 + worth))
-    error = np.where(hot, np.sqrt(counts + 1.0), np.sqrt(counts + shape) / (1.0 + worth))
-    mean_error = np.sqrt(max(variance, mean, 1.0 / normal.size) / normal.size)
-    return rate / seconds, error / seconds, mean / seconds, float(mean_error) / seconds
+    mean, variance, least = float(normal.mean()), float(normal.var()), 1.0 / normal.size
+    rate, error = pixel_rates(
+        counts, np.full(hot.shape, seconds), max(mean, least) / seconds, hot)
+    mean_error = np.sqrt(max(variance, mean, least) / normal.size)
+    return rate, error, mean / seconds, float(mean_error) / seconds
 
 
 def _warnings(hot: np.ndarray, total: np.ndarray, frames: bool) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from evflow.inspection.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.intensity import delta_log_intensity, lin_log
 from evflow.io.glitches import exposed
 from evflow.noise_only import estimate_noise
+from evflow.rates import pixel_rates, quiet_time
 from evflow.refine import (
     Chunk,
     make_chunk,
@@ -95,7 +96,8 @@ def estimate_camera(
         quiet = np.sum([c.quiet for c in chunks], 0)
         hot = hot_pixels(quiet, float(summary.eta_on + summary.eta_off))
         summary, summary_std = _refined(params, chunks, hot, summary, summary_std)
-    camera, std = _fuse(params, windows(), summary, summary_std)
+    camera, std, quiet = _fuse(params, windows(), summary, summary_std, hot)
+    camera, std = _with_rates(camera, std, quiet, hot, summary, summary_std)
     if chunks:
         camera, std = _with_regression(camera, std, chunks, summary, summary_std)
     dead = dead_pixels(n_events)
@@ -161,19 +163,24 @@ def _shown_stats(params: model.Params, window: Window, shown: np.ndarray) -> mod
 
 
 def _fuse(
-    params: model.Params, windows: Iterator[Window], summary: Summary, summary_std: Summary
-) -> tuple[Camera, Camera]:
+    params: model.Params, windows: Iterator[Window], summary: Summary, summary_std: Summary,
+    hot: np.ndarray,
+) -> tuple[Camera, Camera, np.ndarray]:
     """Product of the windows' posteriors: each is N(y, s^2) and contains the prior (the
     summary and the mismatch) once, so the prior's precision is taken off all but one. The
-    summary's own error, which all pixels share, is added to the std at the end."""
+    summary's own error, which all pixels share, is added to the std at the end. Beside it, the
+    `quiet_time` of all windows."""
     y6 = unsquash_summary(summary)[None, None]
     prior, prior_precision = y6[..., :4], network.base_std(y6) ** -2.0
     precision, weighted = jnp.zeros_like(prior), jnp.zeros_like(prior)
+    quiet, noise = np.zeros((2, 2, *hot.shape)), np.array([summary.eta_on, summary.eta_off])
     for window in windows:
         voxels, dlogI, given = window_inputs(window)
         y, s = model.estimate_y(params, voxels, dlogI, summary=summary, **given)
-        shown = jnp.asarray(exposed(window.frame0, window.frame1))[..., None]
-        gained = jnp.where(shown, jnp.maximum(s**-2.0 - prior_precision, 0.0), 0.0)
+        shown = exposed(window.frame0, window.frame1)
+        quiet += quiet_time(window.events.count_map(), np.asarray(dlogI), shown, hot,
+                            window.window_s, noise)
+        gained = jnp.maximum(s**-2.0 - prior_precision, 0.0) * jnp.asarray(shown)[..., None]
         # A posterior mean is shrunk towards the prior; (gained) (x - prior) = s^-2 (y - prior)
         # is the window's own evidence x before shrinkage.
         weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
@@ -182,7 +189,22 @@ def _fuse(
     camera = squash(prior + weighted / total)
     relative = [getattr(summary_std, n) / getattr(summary, n) for n in PARAMETERS]
     shared = jnp.stack(relative, -1)[None, None] / per_channel(SCALE, y6)
-    return camera, camera_std(camera, jnp.sqrt(1.0 / total + shared**2))
+    return camera, camera_std(camera, jnp.sqrt(1.0 / total + shared**2)), quiet
+
+
+def _with_rates(
+    camera: Camera, std: Camera, quiet: np.ndarray, hot: np.ndarray, summary: Summary,
+    summary_std: Summary,
+) -> tuple[Camera, Camera]:
+    """The maps with each pixel's noise rates from its quiet time: a window holds too little noise
+    of a pixel for the network to say more than the camera's."""
+    rates, errors = {}, {}
+    for name, (events, seconds) in zip(("eta_on", "eta_off"), quiet, strict=True):
+        mean, error = (float(getattr(s, name)) for s in (summary, summary_std))
+        rate, own = pixel_rates(events, seconds, mean, hot)
+        rates[name] = jnp.asarray(rate, jnp.float32)
+        errors[name] = jnp.asarray(np.hypot(own, rate * (error / mean)), jnp.float32)
+    return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)
 
 
 def refinement_chunks(

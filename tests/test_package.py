@@ -18,7 +18,7 @@ FLOORS = (
      "workers"),
     ("types", "progress", "distributed", "colour"), ("io",),
     ("camera", "camera_estimate", "sensors", "metrics", "faults"),
-    ("pixels", "intensity", "stillness"),
+    ("pixels", "intensity", "stillness", "rates"),
     ("voxel", "inspection", "exports"),
     ("flow", "scenes", "simulator"),
     ("config",), ("squash", "dataset"),

@@ -102,7 +102,7 @@ def scatter_panel(found: CameraEstimate) -> Panel:
 
 
 def _r(a: np.ndarray, b: np.ndarray) -> float | None:
-    return float(np.corrcoef(a, b)[0, 1]) if a.size > 1 and a.std() > 0 < b.std() else None
+    return float(np.corrcoef(a, b)[0, 1]) if a.size > 1 and np.ptp(a) > 0 < np.ptp(b) else None
 
 
 def fault_panel(found: CameraEstimate) -> Panel:

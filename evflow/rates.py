@@ -1,0 +1,84 @@
+"""Each pixel's noise rate, beside the camera's: what the pixel sends while nothing happens near it.
+
+Over pixels the rates are gamma-distributed around the camera's, counts are Poisson: given the
+spread, the posterior of a pixel's rate is a gamma distribution again. The spread itself is what
+makes the counts of all pixels likely (a negative binomial), so that pixels differ by as much as
+the recording shows them to, and a short one leaves all of them at the camera's rate.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+Array = np.ndarray
+
+SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate over its mean
+SPREAD, SPREAD_ERROR = 0.045, 0.6  # expected before any data, and the std of its log
+NEGLIGIBLE = 1e-4  # probability of a spread that is left out
+
+AROUND = 9  # pixels: side of the neighbourhood in which events are company
+STILL = 0.05  # log units: of 3x3 pixels from frame to frame; less than any threshold of use
+DRIFT = 0.1  # log units per second, of 5x5 pixels: slower than a frame's noise, yet it sends events
+
+
+def pixel_rates(
+    events: Array, seconds: Array, rate_hz: float, hot: Array
+) -> tuple[Array, Array]:
+    """Noise rates (H, W) in Hz and their std, around the camera's, which is rate_hz.
+
+    events (H, W): sent in the seconds (H, W) for which the pixel was watched, 0 for never. Pixels
+    are compared with each other, so that what few events are not noise cancel. hot (H, W) bool:
+    pixels unlike the others, whose rates follow from their own events alone.
+    """
+    n, seconds = events.astype(np.float64), np.asarray(seconds, np.float64)
+    sent, watched = float(n[~hot].sum()), float(seconds[~hot].sum())
+    expected = seconds * (sent / watched if watched > 0 else 0.0)
+    mean, square = np.zeros(n.shape), np.zeros(n.shape)
+    for shape, weight in zip(*_shapes(n[~hot], expected[~hot]), strict=True):
+        relative = (n + shape) / (expected + shape)
+        mean += weight * relative
+        square += weight * relative * (relative + 1.0 / (expected + shape))
+    rate, std = rate_hz * mean, rate_hz * np.sqrt(square - mean**2)
+    own = hot & (n > 0)
+    rate[own], std[own] = n[own] / seconds[own], np.sqrt(n[own] + 1.0) / seconds[own]
+    return rate, std
+
+
+def _shapes(n: Array, expected: Array) -> tuple[Array, Array]:
+    """Shapes of the gamma distribution, and how probable the counts (N,) make each."""
+    shapes = SPREADS**-2.0
+    above = np.bincount(n.astype(np.int64), minlength=1)[::-1].cumsum()[::-1][1:]
+    k = np.arange(len(above))  # `above`: how many pixels sent more than k
+    log_p = np.array([(above * np.log(a + k)).sum()
+                      - (a * np.log1p(expected / a) + n * np.log(a + expected)).sum()
+                      for a in shapes])
+    log_p -= 0.5 * (np.log(SPREADS / SPREAD) / SPREAD_ERROR) ** 2
+    weights = np.exp(log_p - log_p.max())
+    weights /= weights.sum()
+    used = weights > NEGLIGIBLE
+    return shapes[used], weights[used] / weights[used].sum()
+
+
+def quiet_time(
+    counts: Array, dlog: Array, seen: Array, hot: Array, seconds: float, rates: Array
+) -> Array:
+    """(2, 2, H, W) float32, ON and OFF: events of pixels around which nothing happens in a window
+    between two frames, and the seconds for which they were watched.
+
+    counts (2, H, W): ON and OFF events; dlog (H, W): change of log intensity; seen (H, W) bool:
+    where the frames show what the pixel saw; rates (2,): the camera's noise in Hz, whose events
+    are no company, nor are those of hot (H, W) pixels. A pixel's own events do not enter the
+    choice, so that what it sends is a fair sample.
+    """
+    change = np.ascontiguousarray(np.abs(dlog), np.float32)
+    still = seen & (cv2.dilate(change, np.ones((3, 3), np.uint8)) < STILL)
+    still &= np.abs(cv2.blur(np.ascontiguousarray(dlog, np.float32), (5, 5))) < DRIFT * seconds
+    found = []
+    for own, rate in zip(counts, rates, strict=True):
+        others = np.where(hot, 0, own).astype(np.float32)
+        near = cv2.boxFilter(others, -1, (AROUND, AROUND), normalize=False,
+                             borderType=cv2.BORDER_CONSTANT) - others
+        alone = still & (near < max(0.5, rate * seconds * AROUND**2))
+        found.append([own * alone, seconds * alone])
+    return np.array(found, np.float32)
