@@ -18,6 +18,8 @@ from evflow.errors import EvflowDataError
 from evflow.squash import squash, squash_summary, unsquash, unsquash_summary
 from evflow.weights import load_weights
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.fixture(scope="module")
 def shipped() -> dict[str, Any]:
