@@ -14,7 +14,7 @@ import numpy as np
 Array = np.ndarray
 
 SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate over its mean
-SPREAD, SPREAD_ERROR = 0.045, 0.6  # expected before any data, and the std of its log
+SPREAD, SPREAD_ERROR = 0.05, 0.6  # expected before any data, and the std of its log
 NEGLIGIBLE = 1e-4  # probability of a spread that is left out
 
 AROUND = 9  # pixels: side of the neighbourhood in which events are company

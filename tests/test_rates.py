@@ -69,7 +69,7 @@ def test_spreads_are_as_likely_as_the_negative_binomial_says() -> None:
     n = np.random.default_rng(3).poisson(expected * 1.2)
     shapes, weights = _shapes(n, expected)
     likely = np.array([stats.nbinom.logpmf(n, a, a / (a + expected)).sum() for a in shapes])
-    prior = -0.5 * (np.log(shapes**-0.5 / 0.045) / 0.6) ** 2
+    prior = -0.5 * (np.log(shapes**-0.5 / 0.05) / 0.6) ** 2
     np.testing.assert_allclose(np.log(weights[1:] / weights[:-1]), np.diff(likely + prior),
                                rtol=1e-8, atol=1e-8)
 

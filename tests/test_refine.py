@@ -131,6 +131,31 @@ def test_regression_finds_each_pixels_thresholds(
     np.testing.assert_allclose(wide, 0.08, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("share", "least", "most"), [(1.0, 0.84, 0.88), (0.3, 0.99, 1.01)])
+def test_contrast_that_the_path_lacks_is_made_up_for(
+    share: float, least: float, most: float
+) -> None:
+    """A path of .86 of the contrast, known events in a share of the pixels: the thresholds are
+    those of the summary where most pixels tell, else of the path."""
+    rng = np.random.default_rng(0)
+    shape = (30, 40)
+    true = 0.25 + 0.05 * rng.standard_normal((2, *shape))
+    a, b = (np.cumsum(rng.integers(0, 2, (60, *shape)), 0) for _ in range(2))
+    y = 0.86 * (true[0] * a - true[1] * b) + 0.02 * rng.standard_normal(a.shape)
+    a, b, y = (v - v.mean(0) for v in (a, -b, y))
+    sums = [(u * v).sum(0) for u, v in ((a, a), (a, b), (b, b), (a, y), (b, y), (y, y))]
+    heard = rng.random(shape) < share
+    evidence = PixelEvidence(
+        np.stack([*sums, np.full(shape, 60.0)]) * heard, np.full((3, *shape), NOTHING))
+    theta, std = pixel_posterior(
+        evidence, Summary(*(jnp.float32(v) for v in (0.25, 0.25, 0.0, 0.0, 0.05, 0.05))))
+    gain = np.median((0.86 * true / theta)[:, heard])
+    assert least < gain < most
+    if share == 1.0:
+        assert np.abs(theta - true).mean() < 0.1 * 0.05
+        assert (np.abs(theta - true) < std).mean() > 0.68
+
+
 def test_no_change_beyond_a_threshold_goes_unanswered(
     video: tuple[np.ndarray, np.ndarray], camera: Camera, events: Events
 ) -> None:
