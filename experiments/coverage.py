@@ -1,9 +1,11 @@
 """Are the intervals honest? Coverage over many simulated cameras, by events and duration.
 
     python -m experiments.coverage --preset full --workers 2
+    python -m experiments.coverage --recordings 60 --intervals 240 --eta-spread 0.5
 
 Cameras, scenes and sensors of the whole training distribution, none of them seen in training; with
---photos also scenes of the photographs that training shows.
+--photos also scenes of the photographs that training shows. Longer recordings than in training,
+and pixels whose noise differs more, have to be asked for.
 An interval of probability p should hold the truth in a share p of the cases: for the camera's
 summary over recordings, and for the maps over pixels. Draws the calibration curve.
 """
@@ -28,7 +30,8 @@ from experiments.common import write_result
 from experiments.many import Setup, scores
 
 LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
-EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf), "seconds": (0, 0.15, 0.25, 0.5, 2.0)}
+EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf),
+         "seconds": (0, 0.15, 0.25, 0.5, 2.0, np.inf)}
 Rows = list[dict[str, Any]]
 
 
@@ -44,7 +47,22 @@ class Options:
     """Number of cameras (default: the preset's)."""
     photos: bool = False
     """Whether scenes show the photographs of the training, too."""
+    intervals: int | None = None
+    """Frame intervals of every recording (default: 8 to 24, of 10 to 40 ms)."""
+    eta_spread: float | None = None
+    """Standard deviation of log noise rates over pixels (default: 0 or .1, as in training)."""
     workers: int = 1
+
+
+def drawn(rng: np.random.Generator, options: Options) -> Protocol:
+    """A protocol of the training distribution, but for what the options say."""
+    protocol = draw_protocol(rng)
+    if options.intervals is not None:
+        protocol = dataclasses.replace(protocol, intervals=options.intervals)
+    if options.eta_spread is not None:
+        prior = dataclasses.replace(protocol.prior, eta_spread=options.eta_spread)
+        protocol = dataclasses.replace(protocol, prior=prior)
+    return protocol
 
 
 def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, Any] | None:
@@ -118,7 +136,7 @@ def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
 
 def main(options: Options) -> dict[str, Any]:
     count = options.recordings or {"debug": 12, "full": 1000}[options.preset]
-    jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i)))) for i in range(count)]
+    jobs = [(i, drawn(np.random.default_rng((options.seed, i)), options)) for i in range(count)]
     setup = Setup(options.weights, options.seed, options.photos)
     made = scores(score, setup, jobs, options.workers, "cameras")
     rows = [row for row in made if row is not None]
