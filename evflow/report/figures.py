@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from evflow.report.plots import OFF_COLOUR, ON_COLOUR, new_figure
+from evflow.report.plots import OFF_COLOUR, ON_COLOUR, new_figure, robust_range
 
 INK = "#1d2129"
 SIDES = {"on": ("ON", ON_COLOUR), "off": ("OFF", OFF_COLOUR)}
@@ -62,15 +62,6 @@ def histogram(values: np.ndarray, summary: float, colour: Any, unit: str) -> byt
         axis.spines["left"].set_visible(False)
 
     return svg(draw, 3.0, 1.5)
-
-
-def robust_range(values: np.ndarray, share: float = 1.0) -> tuple[float, float]:
-    """(low, high): all but `share` per cent of the finite values at either end; never empty."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 1.0
-    low, high = (float(v) for v in np.percentile(finite, [share, 100 - share]))
-    return (low, high) if high > low else (low - 0.5 * abs(low) - 1e-6, low + 0.5 * abs(low) + 1e-6)
 
 
 def on_against_off(on: np.ndarray, off: np.ndarray, symbol: str, unit: str) -> bytes:

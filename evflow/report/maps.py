@@ -8,7 +8,7 @@ from evflow.camera import PARAMETERS
 from evflow.recording import CameraEstimate
 from evflow.report import figures, page
 from evflow.report.page import Panel, figure, grid, number, paragraph, spread
-from evflow.report.plots import OFF_COLOUR, ON_COLOUR
+from evflow.report.plots import OFF_COLOUR, ON_COLOUR, robust_range
 from evflow.report.verdict import known
 
 TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON", "eta_off": "η OFF"}
@@ -24,8 +24,8 @@ def map_panel(found: CameraEstimate) -> Panel:
             "show the camera's summary." if found.valid.any() else "")
     body = paragraph(
         "Thresholds θ in natural-log units of brightness, noise rates η in Hz per pixel, each "
-        "above its standard deviation. Colours span the middle 98 % of the pixels of a map. "
-        + pale)
+        "above its standard deviation. Colours span the middle 98 % of the pixels of a map, "
+        "a tenth of its value at least. " + pale)
     k = page.blocks(found.n_events)[1]
     if k > 1:
         body += paragraph(f"A point of a map is the mean of {k}×{k} pixels.", "note")
@@ -41,7 +41,7 @@ def _card(found: CameraEstimate, name: str) -> str:
     parts = []
     for maps, label in ((found.camera, TITLES[name]), (found.std, "std")):
         values = np.asarray(getattr(maps, name))
-        span = figures.robust_range(_trusted(values, found))
+        span = robust_range(_trusted(values, found))
         parts.append(_coloured(values, found.valid, span, label))
     values = _trusted(np.asarray(getattr(found.camera, name)), found)
     summary, std = (float(getattr(s, name)) for s in (found.summary, found.summary_std))

@@ -20,6 +20,7 @@ from evflow.types import Events
 
 TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON [Hz]", "eta_off": "η OFF [Hz]"}
 ON_COLOUR, OFF_COLOUR = (0.80, 0.20, 0.18), (0.13, 0.35, 0.75)  # red and blue, as in the paper
+LEAST_RANGE = 0.05  # of a map's middle value, to either side
 
 
 def require() -> None:
@@ -58,9 +59,21 @@ def event_image(events: Events, t0_us: int, t1_us: int) -> np.ndarray:
     return 1.0 - strength * (1.0 - colour)
 
 
+def robust_range(values: np.ndarray, share: float = 1.0) -> tuple[float, float]:
+    """(low, high): all but `share` per cent of the finite values at either end; at least a tenth of
+    their middle apart, or a map that is all but even would look as uneven as any."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 1.0
+    low, high = (float(v) for v in np.percentile(finite, [share, 100 - share]))
+    middle = 0.5 * (low + high)
+    half = max(0.5 * (high - low), LEAST_RANGE * abs(middle) + 1e-6)
+    return middle - half, middle + half
+
+
 def _map(axis: Any, values: np.ndarray, title: str) -> None:
-    low, high = np.percentile(values, [1, 99])
-    image = axis.imshow(values, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis")
+    low, high = robust_range(values)
+    image = axis.imshow(values, vmin=low, vmax=high, cmap="viridis")
     axis.figure.colorbar(image, ax=axis, shrink=0.8)
     axis.set_title(title)
     axis.set_axis_off()
