@@ -25,7 +25,7 @@ Params = dict[str, Any]
 PIVOT = np.log(0.3)  # log Hz: where scale and exponent are independent, among the noise rates
 DEPARTURE = (0.7, 0.1)  # std of log scale and of the exponent; .5-.8 and .1-.2 of held-out scenes
 # What no length of a recording takes away: measured on simulated ones of 2 to 8 s.
-RATE_ERROR, RATE_ERROR_HZ = 0.04, 0.005  # of the log rate; signal taken for noise
+RATE_ERROR, RATE_ERROR_HZ = 0.05, 0.006  # of the log rate; signal taken for noise
 MOST_LOG = 20.0
 LONGEST_STEP, CONVERGED, MOST_PASSES = 0.7, 1e-3, 50
 
@@ -56,7 +56,7 @@ def told_apart(
         found.append(noise_rate(log_signal, points, before, std))
     rates, errors = np.array(found).T
     lasting = np.hypot(RATE_ERROR, RATE_ERROR_HZ / np.exp(rates))
-    return rates, np.hypot(errors * float(net["widen"]), lasting)
+    return rates, np.maximum(errors * float(net["widen"]), lasting)
 
 
 def joined(parts: Sequence[Points]) -> Points:
