@@ -180,7 +180,8 @@ def _fuse(
         shown = exposed(window.frame0, window.frame1)
         quiet += quiet_time(window.events.count_map(), np.asarray(dlogI), shown, hot,
                             window.window_s, noise)
-        gained = jnp.maximum(s**-2.0 - prior_precision, 0.0) * jnp.asarray(shown)[..., None]
+        told = jnp.maximum(s**-2.0 - prior_precision, 0.0)
+        gained = jnp.where(jnp.asarray(shown)[..., None], told, 0.0)
         # A posterior mean is shrunk towards the prior; (gained) (x - prior) = s^-2 (y - prior)
         # is the window's own evidence x before shrinkage.
         weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
