@@ -124,6 +124,15 @@ def test_the_rate_is_found_whatever_the_signal(eta: float, scale: float, exponen
     assert 0.5 < np.sqrt(np.mean(np.square(away))) < 1.6
 
 
+@pytest.mark.parametrize("start", [0.02, 0.14, 1.0, 2.0])
+def test_the_rate_is_found_from_any_start(start: float) -> None:
+    """Also where the first step would be long in scale and exponent."""
+    log_signal, points = process(0, 0.05, 0.9, 1.3)
+    found, std = noise_rate(log_signal, points, np.log(start), 1.5)
+    assert std < 0.3
+    assert abs(found - np.log(0.05)) < 2.0 * std
+
+
 def test_without_points_nothing_is_learnt() -> None:
     nothing = Points(np.zeros((0, FEATURES), np.float32), np.zeros(0, int), np.zeros(0))
     found, std = noise_rate(np.zeros(0), nothing, np.log(0.3), 0.5)

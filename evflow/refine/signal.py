@@ -87,7 +87,9 @@ def noise_rate(
         slopes = np.stack([np.exp(v[0]) / total, made / total, made * away / total])
         gradient = slopes @ (event - chance) - precision * (v - mean)
         curvature = (slopes * (chance * (1 - chance))) @ slopes.T + np.diag(precision)
-        step = np.clip(np.linalg.solve(curvature, gradient), -LONGEST_STEP, LONGEST_STEP)
+        step = np.linalg.solve(curvature, gradient)
+        # Shortened as a whole: cut component by component it need not lead uphill.
+        step *= min(1.0, LONGEST_STEP / max(np.abs(step).max(), CONVERGED))
         while (new := objective(v + step))[0] < value - 1e-9 and np.abs(step).max() > CONVERGED:
             step = 0.5 * step
         v, (value, made, total) = v + step, new
