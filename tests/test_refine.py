@@ -232,7 +232,7 @@ def test_steps_find_the_thresholds_from_a_wrong_start(seed: int) -> None:
     assert np.isfinite(found.features).all()
 
 
-def test_fusion_holds_features_inside_what_it_knows() -> None:
+def test_fusion_holds_features_inside_what_it_knows_and_is_less_sure() -> None:
     features = jnp.linspace(-1.0, 1.0, 5)
     net = FusionNet().init(jax.random.key(0), features)["params"]
     net = jax.tree.map(lambda p: p + 0.1, net)
@@ -240,9 +240,10 @@ def test_fusion_holds_features_inside_what_it_knows() -> None:
               "high": jnp.ones(5), "widen": jnp.ones(6)}
     y = jnp.zeros(6)
     inside, std = fused(fusion, features, y)
-    beyond, _ = fused(fusion, features.at[-1].set(9.0), y)
+    beyond, wider = fused(fusion, features.at[-1].set(9.0), y)
     np.testing.assert_array_equal(inside, beyond)
-    assert bool((std > 0).all())
+    _, widest = fused(fusion, features.at[-1].set(9.0).at[0].set(-9.0), y)
+    assert bool((std > 0).all() & (std < wider).all() & (wider < widest).all())
 
 
 def test_hot_pixels_are_those_that_fire_while_nothing_moves() -> None:

@@ -43,6 +43,7 @@ LONGEST_STEP = 0.5  # log theta per pass
 MODEL_ERROR = 0.04  # of a balance residual, beside the counts' own: what interpolation leaves
 EMPTY = 0.3  # balance weight below which there is no residual to speak of
 FRESH_ODDS = 2.0  # log odds that it takes to call a start fresh: few recordings do
+BEYOND = 0.05  # of the variance, for each feature beyond those of training: measured up to 8 s
 THETA_ERROR = 0.05  # relative error of the stepped thresholds, for the noise that follows them
 
 
@@ -264,9 +265,11 @@ def _with_noise(
 
 def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:
     """y (..., 6) corrected, and its std; features beyond those of training are held at its
-    edge, so that a longer recording is taken for the longest known."""
+    edge, so that a longer recording is taken for the longest known, and make the std wider."""
     inside = jnp.clip(features, fusion["low"], fusion["high"])
+    beyond = (inside != features).sum(-1, keepdims=True)
     outputs: Any = FusionNet().apply(
         {"params": fusion["net"]}, (inside - fusion["mean"]) / fusion["scale"])
     correction, log_std = outputs
-    return y + correction, jnp.exp(log_std) * fusion["widen"]
+    return y + correction, (
+        jnp.exp(log_std) * fusion["widen"] * jnp.sqrt(1.0 + BEYOND * beyond))
