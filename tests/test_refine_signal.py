@@ -144,6 +144,18 @@ def test_without_points_nothing_is_learnt() -> None:
     assert (rate < np.log(0.02)).all()  # 384 pixel seconds without an event
 
 
+def test_an_error_is_left_however_much_noise_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many times the recording: the std shrinks slower than by counts, and not without end."""
+    monkeypatch.setattr(points_module, "RANDOM_POINTS", 256)
+    start, wide = np.log([0.1, 0.1]), np.array([2.0, 2.0])
+    parts = [chunk(noise(s)) for s in range(2)]
+    found = [told_apart(parts * many, THETA, start, wide, network(SILENT))[1]
+             for many in (1, 16, 256)]
+    assert (found[1] > 0.3 * found[0]).all()
+    assert (found[2] > 0.8 * found[1]).all()
+    assert (found[1] < found[0]).all()
+
+
 def test_crowds_tell_nothing_and_are_left_out() -> None:
     rng = np.random.default_rng(3)
     t = np.sort(rng.integers(1, TIMES[-1] + 1, 40_000))

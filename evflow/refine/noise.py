@@ -46,7 +46,7 @@ LEAST_PRIOR, MOST_PRIOR = 1.0, 30.0  # events that the network's word on a noise
 
 # Of "does the noise follow Eq. 12?": free rates are log-uniform over a factor of a hundred.
 FREE_RANGE = np.log(100.0)
-TIED_ODDS = 0.2  # before any data: not more, as it costs where the noise is free
+TIED_ODDS = 0.1  # before any data: not more, as it costs where the noise is free
 TIED_ERROR = 0.05  # log units: of the intensity factor
 
 

@@ -24,8 +24,10 @@ Params = dict[str, Any]
 
 PIVOT = np.log(0.3)  # log Hz: where scale and exponent are independent, among the noise rates
 DEPARTURE = (0.7, 0.1)  # std of log scale and of the exponent; .5-.8 and .1-.2 of held-out scenes
-# What no length of a recording takes away: measured on simulated ones of 2 to 8 s.
-RATE_ERROR, RATE_ERROR_HZ = 0.05, 0.006  # of the log rate; signal taken for noise
+# What the network gets wrong about a scene it gets wrong everywhere, and no length of a recording
+# takes that away. Measured on simulated recordings of .4 to 8 s:
+ALIKE = 500.0  # noise events, from where that error outweighs the events' own
+USUAL = 120.0  # noise events of the recordings that "widen" was fitted to: it holds their share
 MOST_LOG = 20.0
 LONGEST_STEP, CONVERGED, MOST_PASSES = 0.7, 1e-3, 50
 
@@ -53,10 +55,12 @@ def told_apart(
     for points, before, std in zip(map(joined, zip(*parts, strict=True)), log_eta, log_std,
                                    strict=True):
         log_signal = log_intensity(net, points.features)
-        found.append(noise_rate(log_signal, points, before, std))
+        rate, error = noise_rate(log_signal, points, before, std)
+        odds = np.minimum(log_signal[points.event >= 0] - rate, MOST_LOG)  # of signal
+        noise = (1.0 / (1.0 + np.exp(odds))).sum()
+        found.append((rate, error * np.sqrt((ALIKE + noise) / (ALIKE + USUAL))))
     rates, errors = np.array(found).T
-    lasting = np.hypot(RATE_ERROR, RATE_ERROR_HZ / np.exp(rates))
-    return rates, np.maximum(errors * float(net["widen"]), lasting)
+    return rates, errors * float(net["widen"])
 
 
 def joined(parts: Sequence[Points]) -> Points:
