@@ -43,7 +43,7 @@ LONGEST_STEP = 0.5  # log theta per pass
 MODEL_ERROR = 0.04  # of a balance residual, beside the counts' own: what interpolation leaves
 EMPTY = 0.3  # balance weight below which there is no residual to speak of
 FRESH_ODDS = 2.0  # log odds that it takes to call a start fresh: few recordings do
-BEYOND = 0.05  # of the variance, for each feature beyond those of training: measured up to 8 s
+BEYOND = 0.04  # of the variance, for each feature beyond those of training: measured up to 8 s
 THETA_ERROR = 0.05  # relative error of the stepped thresholds, for the noise that follows them
 
 
