@@ -27,7 +27,7 @@ from evflow.camera import Summary
 from evflow.refine import Chunk, fused, refine_summary
 from evflow.refine.path import STEPS
 from evflow.refine.points import Points, chunk_points
-from evflow.refine.signal import joined, log_intensity, noise_rate
+from evflow.refine.signal import joined, log_intensity, rate_at
 from evflow.squash import squash_summary, summary_std, unsquash_summary
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
@@ -127,8 +127,7 @@ def train(rows: list[Row], options: Options) -> dict[str, Any]:
 def judged(rows: list[Row], net: dict[str, Any]) -> tuple[float, dict[str, float]]:
     """The factor that widens the std, and figures of recordings that the network has not seen."""
     plain = jax.tree.map(np.asarray, net)
-    found = np.array([noise_rate(log_intensity(plain, r["points"].features), r["points"],
-                                 *r["before"]) for r in rows])
+    found = np.array([rate_at(plain, r["points"], *r["before"]) for r in rows])
     true = np.array([r["true"] for r in rows])
     away = np.abs(found[:, 0] - np.log(np.maximum(true, 1e-3))) / found[:, 1]
     widen = float(np.quantile(away, COVERED))

@@ -51,16 +51,19 @@ def told_apart(
     rates before. signal: the network, and "widen" (), the calibration of the std."""
     net = jax.tree.map(np.asarray, signal)
     parts = [chunk_points(c, theta, STEPS, seed + i) for i, c in enumerate(chunks)]
-    found = []
-    for points, before, std in zip(map(joined, zip(*parts, strict=True)), log_eta, log_std,
-                                   strict=True):
-        log_signal = log_intensity(net, points.features)
-        rate, error = noise_rate(log_signal, points, before, std)
-        odds = np.minimum(log_signal[points.event >= 0] - rate, MOST_LOG)  # of signal
-        noise = (1.0 / (1.0 + np.exp(odds))).sum()
-        found.append((rate, error * np.sqrt((ALIKE + noise) / (ALIKE + USUAL))))
+    sides = map(joined, zip(*parts, strict=True))
+    found = [rate_at(net, *given) for given in zip(sides, log_eta, log_std, strict=True)]
     rates, errors = np.array(found).T
     return rates, errors * float(net["widen"])
+
+
+def rate_at(net: Params, points: Points, log_eta: float, log_std: float) -> tuple[float, float]:
+    """Log noise rate of one polarity and its std, before "widen", with the network's own error."""
+    log_signal = log_intensity(net, points.features)
+    rate, error = noise_rate(log_signal, points, log_eta, log_std)
+    odds = np.minimum(log_signal[points.event >= 0] - rate, MOST_LOG)  # of signal
+    noise = (1.0 / (1.0 + np.exp(odds))).sum()
+    return rate, error * float(np.sqrt((ALIKE + noise) / (ALIKE + USUAL)))
 
 
 def joined(parts: Sequence[Points]) -> Points:
