@@ -26,8 +26,8 @@ PIVOT = np.log(0.3)  # log Hz: where scale and exponent are independent, among t
 DEPARTURE = (0.7, 0.1)  # std of log scale and of the exponent; .5-.8 and .1-.2 of held-out scenes
 # What the network gets wrong about a scene it gets wrong everywhere, and no length of a recording
 # takes that away. Measured on simulated recordings of .4 to 8 s:
-ALIKE = 400.0  # noise events, from where that error outweighs the events' own
-USUAL = 150.0  # noise events of the recordings that "widen" was fitted to: it holds their share
+ALIKE = 300.0  # noise events, from where that error outweighs the events' own
+USUAL = 180.0  # noise events of the recordings that "widen" was fitted to: it holds their share
 MOST_LOG = 20.0
 LONGEST_STEP, CONVERGED, MOST_PASSES = 0.7, 1e-3, 50
 
