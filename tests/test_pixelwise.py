@@ -15,6 +15,7 @@ from evflow import chunks, model, network, pixelwise
 from evflow.camera import Summary
 from evflow.config import MODELS
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 close = {"rtol": 0, "atol": 2e-5}
 
 
