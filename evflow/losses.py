@@ -12,7 +12,7 @@ Array = jax.Array
 
 EPSILON = 1e-3  # of the Charbonnier losses (Eq. 7)
 COUNT_LIMIT = 6.0  # asinh(200): events per bin above it are no camera's, only an untrained flow's
-RARE = 0.1  # events per bin below which errors count alike
+RARE = 0.05  # events per bin below which errors count alike
 FAR = 30.0  # standard deviations: pixels at the threshold's clamp fire a hundred times as often
 
 

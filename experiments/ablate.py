@@ -25,7 +25,7 @@ import tyro
 
 from evflow import flow, network
 from evflow.batch import sample_batch
-from evflow.config import PRESETS, LossConfig, TrainConfig
+from evflow.config import PRESETS, TrainConfig
 from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank
 from evflow.squash import squash, unsquash_summary
@@ -59,7 +59,7 @@ class Options:
 def variants(study: Study, base: TrainConfig) -> dict[str, TrainConfig]:
     """Training configurations by name."""
     def losses(**changes: Any) -> TrainConfig:
-        return dataclasses.replace(base, loss=dataclasses.replace(LossConfig(), **changes))
+        return dataclasses.replace(base, loss=dataclasses.replace(base.loss, **changes))
 
     def steps(k: int) -> TrainConfig:
         return dataclasses.replace(base, model=dataclasses.replace(

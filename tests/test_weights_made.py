@@ -11,10 +11,10 @@ import pytest
 from networks import hidden
 
 from evflow import estimate_camera, load_weights
-from evflow.weights import model_card, weights_path
-from experiments import fuse, tell_apart
+from evflow.errors import EvflowDataError
+from evflow.weights import model_card, save_weights, weights_path
+from experiments import combine, fuse, tell_apart
 
-pytestmark = pytest.mark.slow
 RELEASED = weights_path("default")
 
 
@@ -25,6 +25,33 @@ def changed(before: dict[str, Any], after: dict[str, Any]) -> set[str]:
     return {part for part, leaves in same.items() if not all(jax.tree.leaves(leaves))}
 
 
+def doubled(path: Path) -> str:
+    """Weights twice the released ones, as a run that trained pixels alone writes them."""
+    (name, net), = load_weights("default").items()
+    twice = {k: jax.tree.map(lambda a: 2 * a, net[k]) for k in (*combine.PIXELS, "summary")}
+    save_weights(path, {name: twice}, {"steps": 3})
+    return str(path)
+
+
+@pytest.mark.parametrize(("part", "differ"), [
+    ("pixels", {"encoder", "flow", "spread"}), ("summary", {"summary"})])
+def test_parts_are_taken_from_other_weights(
+    part: str, differ: set[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "new.safetensors"
+    combine.main(combine.Options("default", out, **{part: doubled(tmp_path / "run.safetensors")}))
+    before, made = load_weights("default"), load_weights(out)
+    gone = set() if part == "pixels" else {"fusion", "signal"}  # they answer to the summary
+    kept = {name: {k: v for k, v in net.items() if k not in gone} for name, net in before.items()}
+    assert set(made["default"]) == set(kept["default"])
+    assert changed(kept, made) == differ
+    assert model_card(out)[part] == {"steps": 3}
+    assert ("calibration" in model_card(out)) == (part == "summary")
+    with pytest.raises(EvflowDataError, match="neither"):
+        combine.main(combine.Options("default", out))
+
+
+@pytest.mark.slow
 def test_the_fusion_is_fitted_and_resumes(tmp_path: Path) -> None:
     rows = tmp_path / "rows.npz"
     options = fuse.Options(RELEASED, tmp_path / "first.safetensors", recordings=12, steps=20,
@@ -41,6 +68,7 @@ def test_the_fusion_is_fitted_and_resumes(tmp_path: Path) -> None:
     assert np.isfinite(float(found.summary.theta_on))
 
 
+@pytest.mark.slow
 def test_noise_is_told_apart_by_a_network_and_its_std_is_calibrated(tmp_path: Path) -> None:
     options = tell_apart.Options(RELEASED, tmp_path / "told.safetensors", recordings=15, steps=60)
     figures = tell_apart.main(options)
