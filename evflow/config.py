@@ -169,7 +169,7 @@ PRESETS: dict[str, TrainConfig] = {
     # The default's parts that see pixels one by one: many small scenes rather than few large ones.
     # Counts are compared pixel by pixel too, as a single one's thresholds may be asked for.
     "pixels": TrainConfig(
-        loss=LossConfig(parameter=2.0, patches=(1, 4, 8)),
+        loss=LossConfig(dequantise=0.005, patches=(1, 4, 8)),
         nuisances=NuisanceConfig(odd_pixels=0.15), parts=("encoder", "flow", "spread"), crop=32,
         block=(8, 8), windows=1, scenes=16, steps=4500),
     "paper": TrainConfig(
