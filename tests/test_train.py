@@ -30,7 +30,8 @@ def bank() -> TextureBank:
 
 @pytest.fixture(scope="module")
 def fresh(bank: TextureBank) -> TrainState:
-    return init_state(CONFIG, TX, bank, "default")
+    """Committed to a device, as what is restored is, so that one program runs both."""
+    return jax.device_put(init_state(CONFIG, TX, bank, "default"), jax.devices()[0])
 
 
 @pytest.fixture(scope="module")
