@@ -171,8 +171,9 @@ PRESETS: dict[str, TrainConfig] = {
     # are those of a running camera, as a video does not say that the memory is at its first frame.
     "pixels": TrainConfig(
         loss=LossConfig(dequantise=0.005, patches=(1, 4, 8)),
-        nuisances=NuisanceConfig(fresh=0.0, odd_pixels=0.15), parts=("encoder", "flow", "spread"), crop=32,
-        block=(8, 8), windows=1, scenes=16, steps=4500),
+        nuisances=NuisanceConfig(fresh=0.0, odd_pixels=0.15),
+        parts=("encoder", "flow", "spread"), crop=32, block=(8, 8), windows=1, scenes=16,
+        steps=4500),
     "paper": TrainConfig(
         model=PAPER_MODEL,
         loss=LossConfig(
