@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rec") / "flight.h5"
-    write_events(path, hidden(15)[0])
+    write_events(path, hidden(15, 440)[0])
     return path
 
 
@@ -29,8 +29,8 @@ def test_info(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(flight), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["size"] == [64, 48]
-    assert facts["frames"] == 7
-    assert facts["windows"] == 6
+    assert facts["frames"] == 11
+    assert facts["windows"] == 10
 
 
 def test_estimate_then_simulate(
@@ -39,7 +39,7 @@ def test_estimate_then_simulate(
     out = tmp_path / "cam"
     assert main(["estimate", str(flight), "-o", str(out), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
-    assert facts["windows"] == 6
+    assert facts["windows"] == 10
     assert Camera.load(out / "camera.npz").shape == (48, 64)
     assert json.loads((out / "camera.json").read_text())["summary"] == facts["summary"]
     for name in ("maps.png", "histograms.png"):

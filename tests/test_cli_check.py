@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """flight.npz, late.npz (frames 50 ms late), bare.npz (no frames), frames.npy."""
     folder = tmp_path_factory.mktemp("check")
-    recording = hidden(14, 500)[0]
+    recording = hidden(14, 440)[0]
     write_events(folder / "flight.npz", recording, format="npz")
     write_events(folder / "late.npz", shifted(recording, 50_000), format="npz")
     write_events(folder / "bare.npz", Recording.of_events(recording.events), format="npz")

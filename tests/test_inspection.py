@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 @pytest.fixture(scope="module")
 def sound() -> Recording:
     """A lively scene seen for half a second; frames every 40 ms."""
-    return hidden(14, 500)[0]
+    return hidden(14, 440)[0]
 
 
 def changed(recording: Recording, **columns: Any) -> Recording:

@@ -100,13 +100,19 @@ def test_bytes_give_the_same_grid_as_their_logarithms(model: SensorModel) -> Non
     assert ours.sum() > 1000
     assert ours.shape == (*SHAPE, 32)
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+@pytest.mark.parametrize("model", [SensorModel(), ALL_ON])
+def test_bytes_within_a_program_are_those_outside(model: SensorModel) -> None:
+    """Where the host cannot tell which pixels fire: in jit, in vmap, or beside what is traced."""
+    frames = FRAMES.astype(np.uint8)
     call = partial(simulate_voxels, camera=NOISY, frame_dt_s=1e-3, model=model)
-    known = jnp.asarray(frames)
+    ours, known = np.asarray(call(KEY, frames)), jnp.asarray(frames)
     for grid in (jax.jit(lambda key: call(key, frames))(KEY),
                  jax.vmap(lambda key: call(key, frames))(KEY[None])[0],
                  jax.jit(lambda one: one * call(KEY, known))(1.0)):
         np.testing.assert_allclose(ours, grid, atol=1e-5)
-    batch = simulate_voxels(KEY, np.stack([frames] * 2), NOISY, frame_dt_s=1e-3, model=model)
+    batch = call(KEY, np.stack([frames] * 2))
     assert batch.shape == (2, *ours.shape)
 
 

@@ -145,10 +145,15 @@ class Thresholds(nn.Module):
             mean, log_std = UNKNOWN + MEAN_UNIT * mean, np.log(START_STD) + 0.5 * log_std
             shape = (len(mean), 2, *mean.shape[2:])
             return jnp.broadcast_to(mean, shape), jnp.broadcast_to(jnp.exp(log_std), shape)
-        constant = self.param("mean", lambda _: jnp.log(jnp.full((2, 1, 1), UNKNOWN)))
-        spread = self.param("spread", lambda _: jnp.log(jnp.full((2, 1, 1), START_STD)))
+        constant = self.param("mean", _log_constant(UNKNOWN), (2, 1, 1))
+        spread = self.param("spread", _log_constant(START_STD), (2, 1, 1))
         mean = jnp.exp(constant[None] + DEPARTURE * jnp.tanh(mean))
         return mean, jnp.exp(spread[None] + DEPARTURE * jnp.tanh(log_std))
+
+
+def _log_constant(value: float) -> nn.initializers.Initializer:
+    # Of a type of its own: a weak one becomes another after a step, for which all compiles again.
+    return nn.initializers.constant(np.log(np.float32(value)), jnp.float32)
 
 
 @partial(jax.jit, static_argnames="system")
