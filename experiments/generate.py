@@ -6,7 +6,9 @@ A code is made from the video alone; events are generated for the camera, for ca
 thresholds halved and doubled (both polarities, ON or OFF alone), and for cameras in which the
 thresholds of single pixels change while the summary stays. Reported per variant: events per
 polarity relative to the simulator's, |value| where neither of two simulations fires, and the
-per-pixel correlation with a simulation relative to that between two of them. `auroc`: how well
+per-pixel correlation with a simulation relative to that between two of them. The simulated cameras
+have been running, but for the last rows: pixels whose memory is at the window's first frame, as at
+the start of a simulation, which the inverse direction does not know of. `auroc`: how well
 `log_prob` at the true code (the video and the camera's summary) tells events of a camera within
 the prior, N(summary, mismatch), from those of one whose thresholds are doubled or halved, scene by
 scene: how often it is higher, and how often it is nearer to that of one more simulation at the
@@ -83,12 +85,14 @@ def scene_of(key: Array, bank: TextureBank, options: Options) -> tuple[Array, Ca
 
 
 @partial(jax.jit, static_argnames="window_s")
-def simulated(key: Array, frames: Array, camera: Camera, window_s: float) -> Array:
+def simulated(
+    key: Array, frames: Array, camera: Camera, window_s: float, running: float = 1.0
+) -> Array:
     """voxels (H, W, 2 BINS) of a camera that has been running: its memory is anywhere between
-    the thresholds."""
+    the thresholds. running 0: it is at the first frame."""
     k_phase, k_sim = jax.random.split(key)
     phase = jax.random.uniform(k_phase, camera.theta_on.shape)
-    phase = phase * (camera.theta_on + camera.theta_off) - camera.theta_off
+    phase = running * (phase * (camera.theta_on + camera.theta_off) - camera.theta_off)
     nominal = noise.nominal_thresholds(MODEL, camera)
     pixels, state = sensor.start(k_sim, frames[0], camera, MODEL, nominal, phase)
     dt = jnp.float32(window_s / (len(frames) - 1))
@@ -174,9 +178,12 @@ def compared(
     for name, (other, where) in variants(k_pixels, camera).items():
         one, two = (simulated(k, frames, other, options.window_s) for k in (k_one, k_two))
         # Single pixels leave the medians alone, so that both give the same summary.
-        rows[name] = compare(generate(params, k_made, other, code), one, two, where)
+        made = generate(params, k_made, other, code)
+        rows[name] = compare(made, one, two, where)
         if name in ("as it is", *CHANGED):
             scores[name] = likely(one, two)
+            one, two = (simulated(k, frames, other, options.window_s, 0.0) for k in (k_one, k_two))
+            rows[f"{name}, from the first frame"] = compare(made, one, two, where)
     return rows, scores
 
 
@@ -191,8 +198,9 @@ def main(options: Options) -> dict[str, Any]:
             found.append(compared(params, jax.random.fold_in(k_data, i), bank, options))
             progress(i + 1, scenes)
     rows, scores = zip(*found, strict=True)
+    names = sorted(rows[0], key=lambda name: "first frame" in name)  # these last
     result: dict[str, Any] = {name: figures(jax.tree.map(
-        lambda *sums: np.sum(sums, 0), *(row[name] for row in rows))) for name in rows[0]}
+        lambda *sums: np.sum(sums, 0), *(row[name] for row in rows))) for name in names}
     result["auroc"] = separation({name: np.array([s[name] for s in scores]) for name in scores[0]})
     text = table(result)
     print(text)
