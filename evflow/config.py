@@ -167,13 +167,15 @@ MODELS = {"default": ModelConfig(), "paper": PAPER_MODEL}
 PRESETS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     # The default's parts that see pixels one by one: many small scenes rather than few large ones.
-    # Counts are compared pixel by pixel too, as a single one's thresholds may be asked for; they
-    # are those of a running camera, as a video does not say that the memory is at its first frame.
+    # Counts are compared pixel by pixel too, as a single one's thresholds may be asked for. They
+    # are those that a video and (theta, eta) tell: of a running camera without low-pass or dead
+    # time, whose light is followed between the bins.
     "pixels": TrainConfig(
-        loss=LossConfig(dequantise=0.005, patches=(1, 4, 8)),
+        loss=LossConfig(event=3.0, dequantise=0.005, patches=(1, 4, 8)),
+        sensors=(*TrainConfig.sensors[:3], TrainConfig.sensors[0]),
         nuisances=NuisanceConfig(fresh=0.0, odd_pixels=0.15),
         parts=("encoder", "flow", "spread"), crop=32, block=(8, 8), windows=1, scenes=16,
-        steps=4500),
+        steps_per_window=32, steps=4500),
     "paper": TrainConfig(
         model=PAPER_MODEL,
         loss=LossConfig(
