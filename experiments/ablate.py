@@ -9,6 +9,9 @@ number of steps; the camera's summary is given (the true one and a little noise)
 subject. Scored on held-out cameras: the map against the sequence's value (the paper's measure) and
 against each pixel's own, the events that the inverse direction makes relative to the simulator's,
 and the likelihood of events (bits of the flow, where it has one).
+
+Each variant's weights, with the released summary, are kept beside the table: `see_better
+--estimators` asks what networks see that are trained on what they estimate (Tables VII and IX).
 """
 
 from __future__ import annotations
@@ -25,12 +28,13 @@ import tyro
 
 from evflow import flow, network
 from evflow.batch import sample_batch
-from evflow.config import PRESETS, TrainConfig
+from evflow.config import PRESETS, TrainConfig, as_dict
 from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank
 from evflow.squash import squash, unsquash_summary
 from evflow.train import cut_block, init_state, make_run_step, optimiser
-from experiments.common import write_result
+from evflow.weights import load_weights, save_weights
+from experiments.common import provenance, slug, write_result
 
 Array = jax.Array
 Study = Literal["losses", "steps", "networks"]
@@ -150,16 +154,25 @@ def main(options: Options) -> dict[str, Any]:
     k_train, k_held = jax.random.split(jax.random.key(options.seed + 9_000_011))
     bank = make_bank(k_train, base.textures)
     held = make_bank(k_held, base.textures, photos=False)
+    out = options.out / options.study
     result: dict[str, Any] = {}
     for name, config in chosen.items():
         params, seconds = train(config, bank, name)
         result[name] = {**score(params, config, held, options), "seconds": seconds}
+        save_estimator(out / f"{slug(name)}.safetensors", params, config)
     text = table(result, base.steps)
     print(text)
-    out = options.out / options.study
     write_result(out / "ablate.json", result, dataclasses.asdict(options))
     (out / "ablate.md").write_text(text + "\n")
     return result
+
+
+def save_estimator(path: Path, params: dict[str, Any], config: TrainConfig) -> None:
+    """Keep a variant as weights that estimate: its own summary was never trained."""
+    (name, net), = params.items()
+    if config.model.pool:
+        net = net | {"summary": load_weights()["default"]["summary"]}
+    save_weights(path, {name: net}, {"config": as_dict(config), **provenance()}, overwrite=True)
 
 
 def table(result: dict[str, Any], steps: int) -> str:

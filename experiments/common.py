@@ -1,4 +1,4 @@
-"""What every experiment shares: provenance of a result, and where results go."""
+"""What every experiment shares: provenance of a result, where results go, names of files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 from pathlib import Path
 from typing import Any
 
@@ -31,3 +32,8 @@ def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> 
     with atomic_write(path, overwrite=True) as temporary:
         record = {"result": result, "config": config, **provenance()}
         temporary.write_text(json.dumps(record, indent=2, default=str) + "\n")
+
+
+def slug(name: str) -> str:
+    """A name that is a file name everywhere."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", name)

@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import json
 import math
-import re
 import time
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank
 from evflow.weights import model_card
 from experiments import eventgan_sequences, held_out, targets
-from experiments.common import provenance, write_result
+from experiments.common import provenance, slug, write_result
 from experiments.conditions import EVENTGAN, Condition, Workshop, conditions, digest, told
 
 Params = dict[str, Any]
@@ -233,8 +232,3 @@ class Trainings:
                     s.network, load_weights(path), clips.tensors, s.learning.normalised)
                 found[condition.label] = np.asarray(images[-1])
         return found
-
-
-def slug(name: str) -> str:
-    """A name that is a file name everywhere."""
-    return re.sub(r"[^A-Za-z0-9.+-]+", "_", name)

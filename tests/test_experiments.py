@@ -7,9 +7,11 @@ from pathlib import Path
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import evflow as ef
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card
 from experiments import (
@@ -24,6 +26,7 @@ from experiments import (
     quickstart,
     train,
 )
+from experiments.common import slug
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -132,3 +135,7 @@ def test_ablations_train_and_score(study: ablate.Study, tmp_path: Path) -> None:
     result = ablate.main(ablate.Options(study, out=tmp_path, steps=2, batches=1))
     assert len(result) == 2
     assert all(np.isfinite(row["pixel/theta_on"]) for row in result.values())
+    for name in result:  # weights that estimate
+        params = load_weights(tmp_path / study / f"{slug(name)}.safetensors")
+        seen = ef.estimate(params, jnp.zeros((2, 3, 32)), jnp.zeros((2, 3)))
+        assert np.isfinite(seen.theta_on).all()

@@ -19,9 +19,10 @@ from evflow.errors import EvflowDataError
 from evflow.scenes import make_bank
 from evflow.types import Events
 from experiments import eventgan_sequences, gains, see_better, targets
+from experiments.common import slug
 from experiments.conditions import Workshop, conditions, told
 from experiments.see_better import Options, files
-from experiments.trainings import FOUR, Trainings, slug
+from experiments.trainings import FOUR, Trainings
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
