@@ -20,8 +20,13 @@ import numpy as np
 from evflow import Recording, estimate_camera, load_weights
 from evflow.baselines import SYSTEMS
 from evflow.camera import Camera, Summary, sample_pixels
+from evflow.camera_estimate import CameraEstimate
 from evflow.downstream.prior import WidePrior
 from evflow.errors import EvflowDataError
+from evflow.io import iter_windows
+from evflow.model import Params, architecture, estimate_y, finish
+from evflow.recording import pool_recording, window_inputs
+from evflow.squash import squash
 from evflow.weights import weights_path
 from experiments.targets import Target
 
@@ -92,25 +97,42 @@ class Workshop:
         keys = jax.random.split(jax.random.key(3), self.count)
         return jax.vmap(lambda key: whole.drawn(key, error))(keys)
 
-    def estimated(self, target: Target, name: str = OURS, params: Any = None) -> Camera:
-        """The target as `estimate_camera` sees its recording. params: of an estimator that is
-        taken as it is, without refinement, which would make up for its faults."""
-        path = self.folder / f"{target.name} {name}.npz"
-        if not path.is_file():
-            found = estimate_camera(self.record(target), self.params if params is None else params,
-                                    refine="auto" if params is None else "off")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            found.save(path)
-        return self.stored(path)
+    def estimated(self, target: Target) -> Camera:
+        """The target as `estimate_camera` sees its recording."""
+        return self.kept(target, OURS, lambda r: estimate_camera(r, self.params))
+
+    def mapped(self, target: Target, name: str, params: Params) -> Camera:
+        """The target as a network alone sees its recording."""
+        return self.kept(target, name, lambda r: network_maps(r, params))
 
     def compared(self, target: Target, name: str) -> Camera:
         """The target as a compared system sees its recording."""
+        return self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera)
+
+    def kept(
+        self, target: Target, name: str, measure: Callable[[Recording], Camera | CameraEstimate]
+    ) -> Camera:
+        """What was measured of the target's recording, now or before."""
         path = self.folder / f"{target.name} {name}.npz"
         if not path.is_file():
-            fitted = SYSTEMS[name].fit(self.record(target))
+            measured = measure(self.record(target))
             path.parent.mkdir(parents=True, exist_ok=True)
-            fitted.camera.save(path)
+            measured.save(path)
         return self.stored(path)
+
+
+def network_maps(recording: Recording, params: Params) -> Camera:
+    """Maps (H, W) that the network gives of a recording, averaged over its windows in y: neither
+    refinement nor its own word on how little a pixel tells, which leaves most of a weak network's
+    maps to the summary, makes up for its faults."""
+    config, summary = architecture(params), None
+    if config.pool:
+        summary, _ = finish(params, pool_recording(params, recording)[0])
+    seen = []
+    for window in iter_windows(recording):
+        voxels, dlogI, given = window_inputs(window)
+        seen.append(estimate_y(params, voxels, dlogI, summary=summary, **given)[0])
+    return squash(jnp.mean(jnp.stack(seen), 0), config.output)
 
 
 def conditions(
@@ -144,7 +166,7 @@ def conditions(
     for name, path in estimators.items():
         params = load_weights(path)
         found += [Condition(name, f"{t.name} {name}", (t,),
-                            _bound(shop.estimated, t, name, params), digest(weights_path(path)))
+                            _bound(shop.mapped, t, name, params), digest(weights_path(path)))
                   for t in targets]
     return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path))
                     for name, path in cameras.items()]

@@ -16,8 +16,8 @@ log(1 + 255 I) / log 256; flow by its error at pixels with events, and FWL (vote
 rounded to the nearest pixel) beside that of the true flow.
 
 A finished training stays in --out with its scores: the same command goes on with what is missing.
-Tables VII and IX: weights of ablated estimators as --estimators "8 steps=PATH" ...; any camera
-file is a condition by --cameras NAME=PATH. Writes see_better.json, .md, .png and _clips.png.
+Tables VII and IX: weights that `experiments.ablate` keeps, as --estimators "8 steps=PATH" ...; any
+camera file is a condition by --cameras NAME=PATH. Writes see_better.json, .md, .png and _clips.png.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Options:
     cameras: tuple[str, ...] = ()
     """More conditions, NAME=camera.npz, tested on all targets."""
     estimators: tuple[str, ...] = ()
-    """More conditions, NAME=weights.safetensors of estimators, without refinement."""
+    """More conditions, NAME=weights.safetensors: what their network alone sees."""
     weights: str = "default"
     """Of evflow's estimator."""
     eventgan: Path | None = None

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from networks import hidden, small_params
 from scipy import stats
 
 from evflow.camera import Camera
@@ -20,7 +21,7 @@ from evflow.scenes import make_bank
 from evflow.types import Events
 from experiments import eventgan_sequences, gains, see_better, targets
 from experiments.common import slug
-from experiments.conditions import Workshop, conditions, told
+from experiments.conditions import Workshop, conditions, network_maps, told
 from experiments.see_better import Options, files
 from experiments.trainings import FOUR, Trainings
 
@@ -105,6 +106,15 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
     np.testing.assert_allclose(made["plain"].theta_on, 0.3)
     assert 0.03 < float(jnp.std(made["uncertain"].theta_on)) < 0.07
     assert found["plain"].source != found["uncertain"].source
+
+
+def test_an_ablated_network_is_taken_by_its_own_maps() -> None:
+    recording, _ = hidden(0, 120)
+    (name, net), = small_params().items()
+    weaker = jax.tree.map(lambda a: 0.9 * a, net["flow"])
+    maps = [network_maps(recording, {name: net | {"flow": flow}}) for flow in (net["flow"], weaker)]
+    assert maps[0].shape == maps[1].shape == (48, 64)
+    assert float(jnp.abs(maps[0].theta_on - maps[1].theta_on).mean()) > 0.001
 
 
 def test_unclear_conditions_are_refused(tmp_path: Path) -> None:

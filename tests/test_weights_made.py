@@ -40,7 +40,9 @@ def test_parts_are_taken_from_other_weights(
 ) -> None:
     first, out = tmp_path / "first.safetensors", tmp_path / "new.safetensors"
     save_weights(first, load_weights("default"), {"pixels": {"steps": 1}, "calibration": {}})
-    combine.main(combine.Options(str(first), out, **{part: doubled(tmp_path / "run.safetensors")}))
+    run = doubled(tmp_path / "run.safetensors")
+    taken = {"pixels": (run,)} if part == "pixels" else {"summary": run}
+    combine.main(combine.Options(str(first), out, **taken))
     before, made = load_weights("default"), load_weights(out)
     gone = set() if part == "pixels" else {"fusion", "signal"}  # they answer to the summary
     kept = {name: {k: v for k, v in net.items() if k not in gone} for name, net in before.items()}
@@ -50,6 +52,17 @@ def test_parts_are_taken_from_other_weights(
     assert ("calibration" in model_card(out)) == (part == "summary")  # it is of the pixels
     with pytest.raises(EvflowDataError, match="neither"):
         combine.main(combine.Options("default", out))
+
+
+def test_the_mean_of_several_runs_is_taken(tmp_path: Path) -> None:
+    twice, out = doubled(tmp_path / "run.safetensors"), tmp_path / "mean.safetensors"
+    combine.main(combine.Options("default", out, pixels=("default", twice)))
+    (before,), (made,) = (load_weights(w).values() for w in ("default", out))
+    for part in combine.PIXELS:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(b, 1.5 * a, rtol=1e-6),
+                     before[part], made[part])
+    assert model_card(out)["pixels"]["steps"] == 3
+    assert len(model_card(out)["pixels"]["mean_with"]) == 1
 
 
 @pytest.mark.slow
