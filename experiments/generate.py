@@ -148,8 +148,10 @@ def figures(total: Row) -> dict[str, float]:
 
 
 def auroc(inside: np.ndarray, outside: np.ndarray) -> float:
-    """How often a draw of `inside` (scenes, n) exceeds one of `outside` of the same scene."""
-    return float((inside[:, :, None] > outside[:, None, :]).mean())
+    """How often a draw of `inside` (scenes, n) exceeds one of `outside` of the same scene; equal
+    ones, as of a scene that stands still, count half."""
+    apart = inside[:, :, None] - outside[:, None, :]
+    return float((0.5 * (1.0 + np.sign(apart))).mean())
 
 
 def separation(scores: dict[str, np.ndarray]) -> dict[str, float]:

@@ -123,6 +123,11 @@ def test_generated_events_are_compared_with_simulated_ones(tmp_path: Path) -> No
     assert 0 < result["as it is"]["two simulations"] <= 1
 
 
+def test_equal_scores_count_half() -> None:
+    inside, outside = np.array([[1.0, 2.0]]), np.array([[0.0, 2.0]])
+    assert generate.auroc(inside, outside) == (1 + 0 + 1 + 0.5) / 4
+
+
 @pytest.mark.slow
 def test_the_encoder_is_scored_beside_frames_and_events(tmp_path: Path) -> None:
     result = changes.main(changes.Options(out=tmp_path, batches=1))
