@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from networks import hidden, small_params
+import recordings
+from networks import small_params
 from scipy import stats
 
 from evflow.camera import Camera
@@ -108,8 +109,9 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
     assert found["plain"].source != found["uncertain"].source
 
 
+@pytest.mark.slow
 def test_an_ablated_network_is_taken_by_its_own_maps() -> None:
-    recording, _ = hidden(0, 120)
+    recording = recordings.make(count=3)
     (name, net), = small_params().items()
     weaker = jax.tree.map(lambda a: 0.9 * a, net["flow"])
     maps = [network_maps(recording, {name: net | {"flow": flow}}) for flow in (net["flow"], weaker)]
