@@ -7,6 +7,7 @@ Student's over seeds. The bootstrap resamples clips, or seeds and clips for the 
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -201,10 +202,10 @@ def picture(result: dict[str, Result], path: Path) -> None:
                     if label == ORACLE:
                         axis.axvline(change["mean"], color="0.6", ls="--", lw=0.8)
             axis.axvline(0.0, color="0.2", lw=0.8)
-            axis.set_yticks(range(len(labels)), labels)
+            axis.set_yticks(range(len(labels)), labels if axis is line[0] else [])
             axis.set_ylim(-0.6, len(labels) - 0.4)
             axis.set_xlabel(f"{TITLES[name]} ({'+' if name in RISING else '-'} is better)")
-            axis.locator_params(axis="x", nbins=4)
+            axis.locator_params(axis="x", nbins=3)
             axis.grid(alpha=0.3)
         line[0].set_title(target)
     plots.save_figure(figure, path)
@@ -216,7 +217,7 @@ def examples(images: dict[str, np.ndarray], path: Path) -> None:
     figure = plots.new_figure(1.4 * columns + 0.5, 1.4 * len(images))
     axes = figure.subplots(len(images), columns, squeeze=False)
     for line, (label, stack) in zip(axes, images.items(), strict=True):
-        line[0].set_ylabel(label)
+        line[0].set_ylabel(textwrap.fill(label, 14))
         for axis, image in zip(line, stack, strict=False):
             axis.imshow(image, cmap="gray", vmin=0, vmax=1)
             axis.set_xticks([])
