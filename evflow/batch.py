@@ -116,13 +116,13 @@ def _sequence(
 ) -> Batch:
     """One camera on one scene: frames (W*steps + 1, H, W') DN for the events, seen (W+1, H, W')
     what the frame camera makes of them."""
-    k_nominal, k_pixels, k_phase, k_sim, k_frame = jax.random.split(key, 5)
+    k_nominal, k_pixels, k_phase, k_sim, k_frame, k_odd, k_hot = jax.random.split(key, 7)
     shape = (frames.shape[1], frames.shape[2])
     reference = noise_factor(jnp.mean(normalised_intensity(frames[0])))
     nominal = sample_nominal(k_nominal, (), config.prior, reference)
     camera = sample_pixels(k_pixels, nominal, shape, config.prior.eta_spread)
-    camera = _with_odd_pixels(jax.random.fold_in(k_pixels, 2), camera, config.nuisances)
-    camera = _with_hot_pixels(jax.random.fold_in(k_pixels, 1), camera, config.nuisances)
+    camera = _with_odd_pixels(k_odd, camera, config.nuisances)
+    camera = _with_hot_pixels(k_hot, camera, config.nuisances)
     log_frames = lin_log(frames)
     # A window is cut from a running camera, each pixel somewhere between its thresholds; or it
     # is the start of a simulation, whose memory is the first frame.

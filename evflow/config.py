@@ -108,7 +108,7 @@ class NuisanceConfig:
 
     @staticmethod
     def none() -> NuisanceConfig:
-        """Frames as they are meant to be, of a camera that has been running."""
+        """Sharp frames, with noise alone, of a camera that has been running."""
         return NuisanceConfig(fresh=0.0, hot_pixels=0.0, jitter_s=0.0, exposure_s=0.0,
                               exposures=1)
 

@@ -2,16 +2,14 @@
 
 Two passes over the windows, each in bounded memory: the first adds up `Stats`, the second
 estimates every pixel of every window at the final summary and fuses the windows by their
-precision. Between them the summary is refined by simulating stretches of the recording
-(evflow/refine), which also give each pixel's thresholds. A pixel that says nothing keeps the
-camera's summary, with a wide std.
+precision. Between them the recording is surveyed stretch by stretch (evflow/refine): some are
+simulated, to refine the summary, and all tell each pixel's thresholds. A pixel that says nothing
+keeps the camera's summary, with a wide std.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import operator
 import os
 from collections.abc import Callable, Iterator
 from typing import Literal
@@ -34,12 +32,12 @@ from evflow.noise_only import estimate_noise
 from evflow.rates import pixel_rates, quiet_time
 from evflow.refine import (
     Chunk,
-    make_chunk,
+    PixelEvidence,
     pixel_posterior,
-    plan_chunks,
+    plan_runs,
     refine_summary,
+    survey,
 )
-from evflow.simulator.interpolate import MIN_SIDE
 from evflow.squash import SCALE, camera_std, per_channel, squash, unsquash_summary
 from evflow.stillness import stands_still
 from evflow.types import Recording, Window
@@ -64,8 +62,8 @@ def estimate_camera(
     stretches of the recording with the estimate and corrects it, which takes the error of
     theta on held-out cameras from .022 to .011, and counts the noise where nothing moves; "off"
     leaves it to the network alone.
-    progress(done, total) is called after every window. What usually goes wrong with a recording
-    is not looked for here: `check(recording).raise_if_failed()` before.
+    progress(done, total) is called after every window and stretch. What usually goes wrong with
+    a recording is not looked for here: `check(recording).raise_if_failed()` before.
     Raises EV011 (no frames, and the scene moves), EV012, EV017 where the recording cannot tell,
     EV020 on a bad option.
     """
@@ -78,28 +76,31 @@ def estimate_camera(
         return estimate_noise(recording)
     params = load_weights() if params is None else params
     plan = io.plan_windows(recording, min_window_us)
-    total, done = 2 * len(plan.pairs), 0
+    runs = plan_runs(recording, plan.pairs) if refine == "auto" else []
+    total, done = 2 * len(plan.pairs) + len(runs), 0
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total)
 
     def windows() -> Iterator[Window]:
-        nonlocal done
         for window in io.iter_windows(recording, min_window_us, plan):
             yield window
-            done += 1
-            if progress:
-                progress(done, total)
+            advance()
 
     stats, n_events, n_shown = _pool(params, windows())
     summary, summary_std = model.finish(params, stats)
-    chunks = refinement_chunks(recording, plan.pairs) if refine == "auto" else []
+    surveyed = survey(recording, runs, advance)
     hot = np.zeros(n_events.shape, bool)
-    if chunks:
-        quiet = np.sum([c.quiet for c in chunks], 0)
-        hot = hot_pixels(quiet, float(summary.eta_on + summary.eta_off))
-        summary, summary_std = _refined(params, chunks, hot, summary, summary_std)
+    if runs:
+        hot = hot_pixels(surveyed.quiet, float(summary.eta_on + summary.eta_off))
+        summary, summary_std = _refined(params, surveyed.chunks, hot, summary, summary_std)
     camera, std, quiet = _fuse(params, windows(), summary, summary_std, hot)
     camera, std = _with_rates(camera, std, quiet, hot, summary, summary_std)
-    if chunks:
-        camera, std = _with_regression(camera, std, chunks, summary, summary_std)
+    if runs:
+        camera, std = _with_regression(camera, std, surveyed.evidence, summary, summary_std)
     dead = dead_pixels(n_events)
     return CameraEstimate(
         camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
@@ -208,17 +209,6 @@ def _with_rates(
     return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)
 
 
-def refinement_chunks(
-    recording: Recording, pairs: tuple[tuple[int, int], ...]
-) -> list[Chunk]:
-    """The stretches of a recording that the refinement simulates; none where frames are too
-    small for optical flow."""
-    if max(recording.frames.shape[1:]) < MIN_SIDE:
-        return []
-    usable = [i for first, last in pairs for i in range(first, last)]
-    return [make_chunk(recording, run) for run in plan_chunks(recording, usable)]
-
-
 def _refined(
     params: model.Params, chunks: list[Chunk], hot: np.ndarray, summary: Summary, std: Summary
 ) -> tuple[Summary, Summary]:
@@ -230,11 +220,10 @@ def _refined(
 
 
 def _with_regression(
-    camera: Camera, std: Camera, chunks: list[Chunk], summary: Summary, summary_std: Summary
+    camera: Camera, std: Camera, evidence: PixelEvidence, summary: Summary, summary_std: Summary
 ) -> tuple[Camera, Camera]:
     """The maps with each pixel's thresholds from its regression on the path; the summary's own
     error, which all pixels share, is added to the std."""
-    evidence = functools.reduce(operator.add, (c.evidence for c in chunks))
     theta, error = pixel_posterior(evidence, summary)
     shared = (float(summary_std.theta_on), float(summary_std.theta_off))
     on, off = (jnp.sqrt(e**2 + s**2) for e, s in zip(jnp.asarray(error), shared, strict=True))

@@ -1,7 +1,7 @@
 """Training: one step with forward and inverse losses (Eq. 11). No loop lives here.
 
 `make_train_step(config, tx)` returns train_step(state, batch) -> (state, metrics), pure and
-jit-able. Randomness comes from fold_in(state.key, state.step), so a resumed run repeats the
+jit-able. Randomness comes from the state's key and step (`step_key`), so a resumed run repeats the
 uninterrupted one bit by bit.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -80,10 +80,10 @@ def init_state(
     name: the architecture's key in params, "default" or "paper".
     """
     key = jax.random.key(config.seed)
-    k_params, k_data, k_run = jax.random.split(key, 3)
+    k_params, k_data, k_run, k_block = jax.random.split(key, 4)
     params = jax.jit(network.init, static_argnums=(1, 2))(k_params, config.model, name)
     batch = jax.jit(sample_batch, static_argnames="config")(k_data, bank, config)
-    block = cut_block(k_data, batch, config)
+    block = cut_block(k_block, batch, config)
     y = _over(unsquash_summary(batch.nominal), block.y)
     net = params[name]
     changes = encoder.split_sign(block.changes)
@@ -303,13 +303,19 @@ def loss_fn(
     return total, {"loss": total, **{f"loss/{k}": v for k, v in parts.items()}, **metrics}
 
 
+def step_key(state: TrainState, use: Literal["losses", "data"]) -> Array:
+    """The key of a step's random numbers, by what they are for."""
+    kind = jax.random.fold_in(state.key, ("losses", "data").index(use))
+    return jax.random.fold_in(kind, state.step)
+
+
 def make_train_step(
     config: TrainConfig, tx: optax.GradientTransformation
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
     """train_step(state, batch) -> (state, metrics), to be jitted by the caller."""
 
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        key = jax.random.fold_in(state.key, state.step)
+        key = step_key(state, "losses")
         grad = jax.value_and_grad(loss_fn, has_aux=True)
         (_, metrics), grads = grad(state.params, batch, key, config)
         updates, opt_state = tx.update(grads, state.opt_state, state.params)
@@ -329,7 +335,6 @@ def make_run_step(
     train_step = make_train_step(config, tx)
 
     def run_step(state: TrainState, bank: TextureBank) -> tuple[TrainState, Metrics]:
-        key = jax.random.fold_in(jax.random.fold_in(state.key, 1), state.step)
-        return train_step(state, sample_batch(key, bank, config))
+        return train_step(state, sample_batch(step_key(state, "data"), bank, config))
 
     return run_step

@@ -24,8 +24,8 @@ import tyro
 from evflow import Recording, finish, io, load_weights
 from evflow.camera import Summary
 from evflow.files import atomic_write
-from evflow.recording import pool_recording, refinement_chunks
-from evflow.refine import Chunk, fused, refine_summary
+from evflow.recording import pool_recording
+from evflow.refine import Chunk, fused, refine_summary, refinement_chunks
 from evflow.refine.fit import FusionNet
 from evflow.squash import squash, unsquash_summary
 from evflow.weights import model_card, save_weights
@@ -87,11 +87,15 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarra
 def collect(options: Options) -> Rows:
     """Rows of all recordings, stacked; saved now and then where asked for."""
     found: list[dict[str, np.ndarray]] = []
-    begin = 0
+    begin, origin = 0, f"{options.seed} {sha256(options.weights.read_bytes()).hexdigest()}"
     if options.rows and options.rows.exists():
         with np.load(options.rows) as saved:
+            if str(saved["origin"]) != origin:
+                raise EvflowDataError(
+                    "EV013", f"{options.rows} holds rows of other weights or of another seed.",
+                    "Choose another --rows.")
             begin = int(saved["next"])
-            names = [n for n in saved.files if n != "next"]
+            names = [n for n in saved.files if n not in ("next", "origin")]
             found = [dict(zip(names, r, strict=True))
                      for r in zip(*(saved[n] for n in names), strict=True)]
     setup = Setup(str(options.weights), options.seed, photos=True)
@@ -102,7 +106,7 @@ def collect(options: Options) -> Rows:
             found.append(made)
         if options.rows and (i % 50 == 0 or i == options.recordings):
             with atomic_write(options.rows, overwrite=True) as t, open(t, "wb") as f:
-                np.savez(f, allow_pickle=False, next=i, **stack(found))
+                np.savez(f, allow_pickle=False, next=i, origin=origin, **stack(found))
     return stack(found)
 
 
@@ -121,7 +125,7 @@ def fit(rows: Rows, options: Options) -> dict[str, Any]:
     data = {k: jnp.asarray(rows[k], jnp.float32) for k in ("features", "y", "true")}
 
     def loss(net: Any, key: Array) -> Array:
-        # Jitter: a thousand recordings support little more than a linear map of the features.
+        # Jitter: some thousand recordings support little more than a linear map of the features.
         noise = JITTER * jax.random.normal(key, data["features"].shape)
         features = data["features"] + fusion["scale"][None] * noise
         y, std = predict({**fusion, "net": net}, features, data["y"])
@@ -160,8 +164,8 @@ def cross_validated(rows: Rows, options: Options) -> tuple[np.ndarray, np.ndarra
 
 
 def figures_of(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
-    """Mean |theta| and |eta| errors of network, steps and fusion, and coverage of 68 and 95 %,
-    over recordings with 200 signal events of the polarity."""
+    """Mean |theta| and |eta| errors of network, steps and fusion over recordings with 200 signal
+    events of the polarity; coverage of 68 and 95 % over all recordings."""
     figures: dict[str, Any] = {"recordings": len(y)}
     for i, name in enumerate(("theta_on", "theta_off", "eta_on", "eta_off")):
         used = rows["signal"][:, i % 2] >= 200

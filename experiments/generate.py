@@ -166,7 +166,7 @@ def compared(
     params: Params, key: Array, bank: TextureBank, options: Options
 ) -> tuple[dict[str, Row], dict[str, list[float]]]:
     """Of one scene: the sums of every variant, and log_prob of simulations at the true code."""
-    k_scene, k_pixels, k_made, k_one, k_two = jax.random.split(key, 5)
+    k_scene, k_pixels, k_made, k_one, k_two, k_typical = jax.random.split(key, 6)
     frames, camera = scene_of(k_scene, bank, options)
     changes = jnp.moveaxis(jnp.diff(frames[::4], axis=0), 0, -1)
     code = code_from_video(params, changes, camera, window_s=options.window_s,
@@ -176,8 +176,8 @@ def compared(
         return [float(log_prob(params, voxels, code).mean()) for voxels in seen]
 
     rows = {}
-    typical = likely(*(simulated(jax.random.fold_in(key, i), frames, camera, options.window_s)
-                       for i in range(REFERENCES)))
+    typical = likely(*(simulated(k, frames, camera, options.window_s)
+                       for k in jax.random.split(k_typical, REFERENCES)))
     scores = {"reference": [float(np.mean(typical))]}
     for name, (other, where) in variants(k_pixels, camera).items():
         one, two = (simulated(k, frames, other, options.window_s) for k in (k_one, k_two))

@@ -27,8 +27,8 @@ import tyro
 from evflow import estimate_camera, finish, io
 from evflow.camera import Summary
 from evflow.intensity import lin_log
-from evflow.recording import pool_recording, refinement_chunks
-from evflow.refine import Chunk, pixel_posterior, refine_summary
+from evflow.recording import pool_recording
+from evflow.refine import Chunk, pixel_posterior, refine_summary, refinement_chunks
 from evflow.refine.path import STEPS
 from evflow.refine.pixels import evidence_of
 from evflow.refine.sightings import sight

@@ -17,11 +17,19 @@ from evflow.camera import Camera, CameraPrior, Summary
 from evflow.faults import hot_pixels
 from evflow.intensity import lin_log
 from evflow.io import plan_windows
-from evflow.recording import refinement_chunks
-from evflow.refine import fused, pixel_posterior, plan_chunks, refine_summary
+from evflow.refine import (
+    fused,
+    path,
+    pixel_posterior,
+    plan_runs,
+    refine_summary,
+    refinement_chunks,
+    survey,
+)
 from evflow.refine.bounds import ERROR, EXCESS, NOTHING, bounded
 from evflow.refine.fit import FusionNet
 from evflow.refine.moments import measure
+from evflow.refine.path import plan_chunks
 from evflow.refine.pixels import PixelEvidence, pixel_evidence
 from evflow.refine.trace import NEVER, trace_of_camera, trace_of_events
 from evflow.types import Events
@@ -206,10 +214,35 @@ def test_chunks_are_runs_of_equal_length() -> None:
     recording = Recording(
         Events(np.zeros(2, int), np.zeros(2, int), np.array([0, 1_000_000]), np.ones(2, bool),
                (16, 12)), np.zeros((41, 12, 16), np.uint8), np.arange(41) * 25_000)
-    runs = plan_chunks(recording, [*range(8), *range(10, 29), 35])
-    assert runs == [list(range(8)), list(range(10, 18)), list(range(18, 26))]
-    assert plan_chunks(recording, [3, 4, 9]) == [[3, 4]]
-    assert plan_chunks(recording, []) == []
+    runs = plan_runs(recording, [(0, 8), (10, 12), (12, 29), (35, 36)])
+    whole = [list(range(8)), list(range(10, 18)), list(range(18, 26))]
+    assert runs == [*whole, [26, 27, 28], [35]]
+    assert plan_chunks(recording, runs) == whole
+    assert plan_chunks(recording, plan_runs(recording, [(3, 5), (9, 10)])) == [[3, 4]]
+    assert plan_chunks(recording, plan_runs(recording, [])) == []
+
+
+def test_pixels_learn_from_every_stretch_and_few_are_simulated(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long recording simulates what its budget allows, but no event of a pixel is lost."""
+    recording, _ = hidden(3, 710)
+    pairs = plan_windows(recording).pairs
+    runs = plan_runs(recording, pairs)
+    calls: list[None] = []
+    everything = survey(recording, runs, lambda: calls.append(None))
+    assert [len(run) for run in runs] == [8, 8, 1]
+    assert (len(everything.chunks), len(calls)) == (2, 3)
+    monkeypatch.setattr(path, "CHUNK_PIXELS", 1)
+    little = survey(recording, runs)
+    assert len(little.chunks) == 1
+    np.testing.assert_array_equal(everything.evidence.equations, little.evidence.equations)
+    np.testing.assert_array_equal(everything.evidence.bounds, little.evidence.bounds)
+    np.testing.assert_array_equal(everything.quiet, little.quiet)
+    first, last = recording.frame_times[[pairs[0][0], pairs[-1][1]]].tolist()
+    inside = recording.events.slice(first + 1, last + 1)
+    assert everything.evidence.equations[6].sum() <= len(inside)
+    assert everything.evidence.equations[6].sum() > 0.95 * len(inside)
 
 
 @pytest.mark.parametrize("seed", [3, 5])

@@ -196,7 +196,7 @@ def train_step(state: GanState, pair: Pair, config: GanConfig) -> tuple[GanState
     """One step on one batch: the critic twice, each time on other halves of it, made and true;
     the generator once; the cycle networks once, on true volumes."""
     nets, txs, keys = networks(config), optimisers(config), jax.random.split(
-        jax.random.fold_in(state.key, state.step), 2)
+        jax.random.fold_in(jax.random.fold_in(state.key, 0), state.step), 2)
     params, opts, metrics = dict(state.params), dict(state.opt_state), {}
 
     def update(name: str, slope: Params) -> None:

@@ -19,8 +19,7 @@ from evflow.baselines.base import usable
 from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log
-from evflow.recording import refinement_chunks
-from evflow.refine import Chunk, make_chunk
+from evflow.refine import Chunk, make_chunk, refinement_chunks
 from evflow.refine.noise import combined_rate, quiet_events
 from evflow.refine.path import STEPS
 from evflow.refine.pixels import pixel_evidence

@@ -134,19 +134,20 @@ def _draw(key: Array, prior: CameraPrior | WidePrior, frame: Array) -> Camera:
     height, width = frame.shape
     if isinstance(prior, WidePrior):
         return prior.sample(key, (height, width))
+    k_nominal, k_pixels = jax.random.split(key)
     light = noise_factor(jnp.mean(normalised_intensity(frame)))
-    nominal = sample_nominal(key, (), prior, light)
-    return sample_pixels(key, nominal, (height, width), prior.eta_spread)
+    nominal = sample_nominal(k_nominal, (), prior, light)
+    return sample_pixels(k_pixels, nominal, (height, width), prior.eta_spread)
 
 
 def _crop(key: Array, camera: Camera, shape: tuple[int, int]) -> Camera:
     """A random part of a camera's maps, or of one of several cameras'."""
-    k_row, k_column = jax.random.split(key)
+    k_row, k_column, k_which = jax.random.split(key, 3)
     *several, rows, columns = camera.shape
     start = [jax.random.randint(k_row, (), 0, rows - shape[0] + 1),
              jax.random.randint(k_column, (), 0, columns - shape[1] + 1)]
     if several:
-        start.insert(0, jax.random.randint(jax.random.fold_in(key, 2), (), 0, several[0]))
+        start.insert(0, jax.random.randint(k_which, (), 0, several[0]))
     size = (*(1 for _ in several), *shape)
     return jax.tree.map(lambda m: jax.lax.dynamic_slice(m, start, size).reshape(shape), camera)
 

@@ -14,9 +14,10 @@ its memory is known: nothing depends on what happened before the recording began
 """
 
 from evflow.refine.fit import Refined, fused, refine_summary
-from evflow.refine.path import Chunk, make_chunk, plan_chunks
-from evflow.refine.pixels import pixel_posterior
+from evflow.refine.path import Chunk, Survey, make_chunk, plan_runs, refinement_chunks, survey
+from evflow.refine.pixels import PixelEvidence, pixel_posterior
 
 __all__ = [
-    "Chunk", "Refined", "fused", "make_chunk", "pixel_posterior", "plan_chunks", "refine_summary",
+    "Chunk", "PixelEvidence", "Refined", "Survey", "fused", "make_chunk", "pixel_posterior",
+    "plan_runs", "refine_summary", "refinement_chunks", "survey",
 ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -17,12 +18,12 @@ from evflow.io.glitches import SATURATED_DN, exposed
 from evflow.refine.pixels import PixelEvidence, evidence_of
 from evflow.refine.sightings import Sightings, sight
 from evflow.refine.trace import Trace, trace_of_events
-from evflow.simulator.interpolate import Interpolator
+from evflow.simulator.interpolate import MIN_SIDE, Interpolator
 from evflow.types import Recording
 
 INTERVALS = 8  # frame intervals per chunk: 200 ms at 40 Hz
 STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 px a step
-CHUNK_PIXELS = 8 * 346 * 260  # pixels of all chunks used, of a long recording
+CHUNK_PIXELS = 8 * 346 * 260  # pixels of all chunks simulated, of a long recording
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,17 +52,61 @@ QUIET = 0.05  # log units: less than the smallest threshold of any use
 DARK_DN = 15.0  # below, half a DN of noise is .03 in log
 
 
-def plan_chunks(recording: Recording, intervals: list[int]) -> list[list[int]]:
-    """Runs of up to INTERVALS consecutive usable frame intervals, evenly thinned to the budget.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Survey:
+    """What the refinement reads of a recording. chunks: the stretches that it simulates, whole;
+    evidence and quiet, as in Chunk: sums over all stretches, those included."""
 
-    intervals: indices i of usable intervals (frame i to i+1), ascending.
-    """
+    chunks: list[Chunk]
+    evidence: PixelEvidence
+    quiet: np.ndarray
+
+
+def survey(
+    recording: Recording, runs: list[list[int]], advance: Callable[[], None] = lambda: None
+) -> Survey:
+    """A recording's stretches, one after the other in the memory of one and of those kept.
+    runs: of `plan_runs`; advance() is called after each."""
+    width, height = recording.events.size
+    simulated = plan_chunks(recording, runs)
+    chunks, evidence = [], PixelEvidence.nothing((height, width))
+    quiet = np.zeros((2, height, width))
+    for run in runs:
+        chunk = make_chunk(recording, run)
+        evidence, quiet = evidence + chunk.evidence, quiet + chunk.quiet
+        if run in simulated:
+            chunks.append(chunk)
+        advance()
+    return Survey(chunks, evidence, quiet)
+
+
+def refinement_chunks(
+    recording: Recording, pairs: Iterable[tuple[int, int]]
+) -> list[Chunk]:
+    """The stretches of a recording that the refinement simulates, of the windows between the
+    pairs of frames (first, last)."""
+    runs = plan_runs(recording, pairs)
+    return [make_chunk(recording, run) for run in plan_chunks(recording, runs)]
+
+
+def plan_runs(recording: Recording, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
+    """Runs of up to INTERVALS consecutive frame intervals i (frame i to i + 1) in the windows
+    between the pairs of frames (first, last), ascending; none where frames are too small for
+    optical flow."""
+    if max(recording.frames.shape[1:]) < MIN_SIDE:
+        return []
     runs: list[list[int]] = []
-    for i in intervals:
+    for i in itertools.chain.from_iterable(range(*pair) for pair in pairs):
         if runs and runs[-1][-1] == i - 1 and len(runs[-1]) < INTERVALS:
             runs[-1].append(i)
         else:
             runs.append([i])
+    return runs
+
+
+def plan_chunks(recording: Recording, runs: list[list[int]]) -> list[list[int]]:
+    """The runs that are simulated, again and again: the longest, evenly thinned to the budget.
+    The camera's parameters are alike everywhere, so some of a long recording tell them."""
     longest = max((len(run) for run in runs), default=0)
     runs = [run for run in runs if len(run) == longest]
     width, height = recording.events.size
