@@ -36,7 +36,7 @@ class CameraEstimate:
     warnings: tuple[str, ...]
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
-        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events."""
+        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead."""
         extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
         return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
                                 n_events=self.n_events, hot=self.hot, dead=self.dead)

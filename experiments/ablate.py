@@ -8,7 +8,7 @@ Every variant trains its per-pixel parts on the same scenes, from the same seed,
 number of steps; the camera's summary is given (the true one and a little noise), as it is not the
 subject. Scored on held-out cameras: the map against the sequence's value (the paper's measure) and
 against each pixel's own, the events that the inverse direction makes relative to the simulator's,
-and the likelihood of events (bits of the flow, where it has one).
+and the likelihood of events (in nats, of the flow, where it has one).
 
 Each variant's weights, with the released summary, are kept beside the table: `see_better
 --estimators` asks what networks see that are trained on what they estimate (Tables VII and IX).

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import tyro
 
 from evflow import Recording, finish, io, load_weights
 from evflow.camera import Summary
+from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
 from evflow.recording import pool_recording
 from evflow.refine import Chunk, fused, refine_summary, refinement_chunks
@@ -200,4 +202,7 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    try:
+        main(tyro.cli(Options, description=__doc__))
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None

@@ -69,7 +69,7 @@ class Options:
     scenes: int | None = None
     """Scenes per step, a multiple of the number of devices (default: the preset's)."""
     parts: tuple[str, ...] | None = None
-    """Parts that learn, of: summary encoder flow spread (default: the preset's, all)."""
+    """Parts that learn, of: summary encoder flow spread (default: the preset's)."""
     start: str | None = None
     """Weights (a name or a file) whose parts of equal shape are the starting point."""
     seed: int = 0

@@ -24,10 +24,10 @@ from evflow.baselines.steps import (
     shrunk_rates,
 )
 from evflow.camera import THETA_MIN, Camera, Summary
+from evflow.camera_estimate import CameraEstimate
 from evflow.errors import EvflowDataError
 from evflow.faults import dead_pixels
 from evflow.intensity import lin_log
-from evflow.recording import CameraEstimate
 from evflow.types import Recording
 
 Span = tuple[int, int]

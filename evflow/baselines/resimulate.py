@@ -64,9 +64,12 @@ def scene_of(recording: Recording, path: Path, quiet: bool = True) -> Scene:
         between = np.median(np.diff(recording.frame_times))
         steps = int(np.clip(round(BLOCK_US / between), 1, len(recording.frames) - 1))
         chunks = [_given(recording, run, steps) for run in _runs(found) if len(run) >= steps]
-    if not chunks:
+    if not chunks and path == "flow":
         raise EvflowDataError("EV017", "the frames are too small for optical flow.",
                               'Give the video between them: path="given".')
+    if not chunks:
+        raise EvflowDataError("EV017", f"no {steps} frame intervals in a row are usable.",
+                              "Give a video without gaps and glitches, or a longer one.")
     seen = np.sum([statistics(c.recorded, c.bright) for c in chunks], 0, np.float64)
     eta = np.zeros(2)
     if quiet:

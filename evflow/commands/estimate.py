@@ -16,7 +16,7 @@ from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
-    from evflow.recording import CameraEstimate
+    from evflow.camera_estimate import CameraEstimate
     from evflow.types import Recording
 
 FILES = ("camera.npz", "camera.json", "maps.png", "histograms.png", "report.html")

@@ -52,7 +52,7 @@ def make_sequence(config: DatasetConfig, seed: int, number: int) -> EventSequenc
     if config.model.eta_intensity:
         gain = float(np.mean(film.light[config.lead :])) / film.light[0]
     video = np.stack(film.kept)
-    log = np.asarray(to_log(video, config.model.log_map or "linlog"))
+    log = np.asarray(to_log(video, config.model.log_map))
     noise = config.frame_noise_dn * np.asarray(jax.random.normal(k_noise, video.shape))
     flow, visible = _flows(scene, _instants(config)[config.lead :: config.every], config.shape)
     return EventSequence(

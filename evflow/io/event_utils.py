@@ -41,7 +41,7 @@ def read(path: Path, hints: Hints) -> Recording:
         xs, ys, ts, ps = columns.values()
         names = sorted(f["images"]) if "images" in f else []
         images = [_image(path, f["images"], name) for name in names]
-        size, notes = _size(path, f, images, columns)
+        size, notes = _size(f, images, columns)
         native = "s" if ts.dtype.kind == "f" else "us"
         chunks = tables.blocks(n, lambda part: (xs[part], ys[part], ts[part], ps[part]),
                                max(tables.stored_rows(column) for column in columns.values()))
@@ -74,7 +74,7 @@ def _rgb(pixels: np.ndarray) -> np.ndarray:
 
 
 def _size(
-    path: Path, f: Any, images: list[Any], columns: dict[str, Any]
+    f: Any, images: list[Any], columns: dict[str, Any]
 ) -> tuple[Size | None, tuple[str, ...]]:
     if images:
         return (int(images[0].shape[1]), int(images[0].shape[0])), ()

@@ -60,7 +60,7 @@ class Refined:
 
 class FusionNet(nn.Module):
     """features (F,) -> correction of y (6,) and log std of y (6,): a linear map and a little
-    more, as it learns from a thousand recordings."""
+    more, as it learns from some thousand recordings."""
 
     width: int = 32
 

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from evflow.camera_estimate import CameraEstimate
 from evflow.errors import EvflowDataError
 from evflow.inspection import check
 from evflow.inspection.agreement import frame_steps
-from evflow.recording import CameraEstimate, Progress
+from evflow.recording import Progress
 from evflow.report import page
 from evflow.report.maps import fault_panel, map_panel, scatter_panel
 from evflow.report.page import Panel, bullets, number, paragraph, plural, spread, table
@@ -105,7 +106,7 @@ def write_report(
     judged = judge_estimate(found, evidence.trial, evidence.held)
     panels = [_verdict(found, evidence, judged), map_panel(found), scatter_panel(found),
               *_trial_panels(recording, evidence), fault_panel(found), _held_panel(found, evidence),
-              _assumptions(found, recording, evidence, weights, source, command)]
+              _assumptions(found, recording, weights, source, command)]
     step()
     numbers = {"grade": worst(judged), "trial": _numbers(evidence.trial),
                "held_out": _numbers(evidence.held)}
@@ -236,8 +237,8 @@ def _held_panel(found: CameraEstimate, evidence: Evidence) -> Panel:
 
 
 def _assumptions(
-    found: CameraEstimate, recording: Recording, evidence: Evidence,
-    weights: str | os.PathLike, source: str | os.PathLike | None, command: str,
+    found: CameraEstimate, recording: Recording, weights: str | os.PathLike,
+    source: str | os.PathLike | None, command: str,
 ) -> Panel:
     events = recording.events
     report = check(recording)

@@ -15,9 +15,10 @@ import numpy as np
 
 from evflow import io
 from evflow.camera import Camera
+from evflow.camera_estimate import CameraEstimate
 from evflow.errors import EvflowDataError
 from evflow.metrics.streams import compare
-from evflow.recording import CameraEstimate, estimate_camera
+from evflow.recording import estimate_camera
 from evflow.sensors import SensorModel
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample

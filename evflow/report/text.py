@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from evflow.recording import CameraEstimate
+from evflow.camera_estimate import CameraEstimate
 
 LABELS = {
     "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON (Hz/pixel)",
