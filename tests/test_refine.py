@@ -236,6 +236,7 @@ def test_pixels_learn_from_every_stretch_and_few_are_simulated(
     monkeypatch.setattr(path, "CHUNK_PIXELS", 1)
     little = survey(recording, runs)
     assert len(little.chunks) == 1
+    assert plan_chunks(recording, runs) == [runs[1]]  # the middle: a recording's ends are its worst
     np.testing.assert_array_equal(everything.evidence.equations, little.evidence.equations)
     np.testing.assert_array_equal(everything.evidence.bounds, little.evidence.bounds)
     np.testing.assert_array_equal(everything.quiet, little.quiet)

@@ -112,7 +112,8 @@ def plan_chunks(recording: Recording, runs: list[list[int]]) -> list[list[int]]:
     width, height = recording.events.size
     most = max(1, CHUNK_PIXELS // (width * height))
     if len(runs) > most:
-        runs = [runs[round(k)] for k in np.linspace(0, len(runs) - 1, most)]
+        middles = (np.arange(most) + 0.5) * len(runs) / most  # of as many equal parts
+        runs = [runs[int(k)] for k in middles]
     return runs
 
 
