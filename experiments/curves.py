@@ -136,7 +136,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
                 shown = {v: k[kind][parameter] for v, k in points.items() if kind in k}
                 axis.plot(list(shown), list(shown.values()), marker="o", markersize=3, label=kind)
             axis.set(xscale="log", ylim=(0, None), xlabel=name if j else None)
-            axis.set_xticks([float(v) for v in points], [f"{float(v):g}" for v in points])
+            axis.set_xticks(list(points), [f"{v:g}" for v in points], rotation=60)
             axis.minorticks_off()
             if i == 0:
                 axis.set_ylabel(f"|{'θ' if parameter == 'theta' else 'η'} − true|")
