@@ -22,10 +22,10 @@ from benchmarks.harness import Case, Setting, Workload, cores
 from evflow import flow
 from evflow.camera import Camera, Summary
 from evflow.config import MODELS, PRESETS, ModelConfig
+from evflow.coordinates import unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.model import estimate, estimate_y, finish, summarize
 from evflow.network import architecture, init
-from evflow.squash import unsquash_summary
 from evflow.weights import load_weights
 
 Params = dict[str, Any]

@@ -17,9 +17,9 @@ import torch
 import torch.nn.functional as F
 
 from evflow.config import ModelConfig
+from evflow.coordinates import CENTRE, SCALE
 from evflow.encoder import LOG_RANGE
 from evflow.flow import FlowConfig, shuffle
-from evflow.squash import CENTRE, SCALE
 
 Tensor = torch.Tensor
 Weights = dict[str, Any]

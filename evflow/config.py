@@ -28,7 +28,7 @@ class ModelConfig:
     code: "changes" builds the condition from the m signed intensity changes alone, so that a
         video is enough to generate; "feature" passes the encoder's hidden feature, which
         contains the events themselves (paper).
-    output: "log" or "tanh" coordinates of the parameters (see squash.py).
+    output: "log" or "tanh" coordinates of the parameters (see coordinates.py).
     changes: m, intensity changes per window. piece: encoder features per change.
     """
 

@@ -29,9 +29,7 @@ from evflow import encoder, flow, network, pixelwise
 from evflow import summary as pooling
 from evflow.camera import Camera, Summary
 from evflow.config import ModelConfig
-from evflow.errors import EvflowDataError
-from evflow.network import Params, architecture
-from evflow.squash import (
+from evflow.coordinates import (
     camera_std,
     squash,
     squash_summary,
@@ -39,6 +37,8 @@ from evflow.squash import (
     unsquash,
     unsquash_summary,
 )
+from evflow.errors import EvflowDataError
+from evflow.network import Params, architecture
 from evflow.summary import Stats
 
 __all__ = [

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from evflow import encoder, flow
 from evflow import summary as pooling
 from evflow.config import MODELS, ModelConfig
+from evflow.coordinates import SCALE, per_channel, squash, squash_summary
 from evflow.encoder import IntensityEncoder
 from evflow.errors import EvflowDataError
-from evflow.squash import SCALE, per_channel, squash, squash_summary
 
 Array = jax.Array
 Params = dict[str, Any]

@@ -33,10 +33,8 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(
         *(_rates(n, hot, seconds) for n in counts), strict=True)
-    low, high = PRESETS["default"].prior.theta
-    middle, width = 0.5 * (low + high), (high - low) / np.sqrt(12.0)
-    spread = PRESETS["default"].prior.mismatch
-    mismatch, mismatch_width = 0.5 * sum(spread), (spread[1] - spread[0]) / np.sqrt(12.0)
+    middle, width = uniform(PRESETS["default"].prior.theta)
+    mismatch, mismatch_width = uniform(PRESETS["default"].prior.mismatch)
 
     def camera(theta: float, eta: tuple[np.ndarray, ...]) -> Camera:
         flat = jnp.full(hot.shape, theta, jnp.float32)
@@ -50,6 +48,11 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
         camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
         dead_pixels(total), 0, _warnings(hot, total, recording.has_frames))
+
+
+def uniform(bounds: tuple[float, float]) -> tuple[float, float]:
+    """Mean and standard deviation of a prior between bounds: of what nothing was measured."""
+    return 0.5 * sum(bounds), (bounds[1] - bounds[0]) / float(np.sqrt(12.0))
 
 
 def _require_static(events: Events, hot: np.ndarray) -> None:

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 
 from evflow import chunks, encoder, flow, network
 from evflow.config import ModelConfig
+from evflow.coordinates import squash
 from evflow.network import Params
-from evflow.squash import squash
 
 Array = jax.Array
 

@@ -23,12 +23,13 @@ from evflow import io, model, network
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.camera_estimate import CameraEstimate
 from evflow.config import PRESETS
+from evflow.coordinates import SCALE, camera_std, per_channel, squash, unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.faults import dead_pixels, hot_pixels
 from evflow.inspection.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.intensity import delta_log_intensity, lin_log
 from evflow.io.glitches import exposed
-from evflow.noise_only import estimate_noise
+from evflow.noise_only import estimate_noise, uniform
 from evflow.rates import pixel_rates, quiet_time
 from evflow.refine import (
     Chunk,
@@ -38,7 +39,6 @@ from evflow.refine import (
     refine_summary,
     survey,
 )
-from evflow.squash import SCALE, camera_std, per_channel, squash, unsquash_summary
 from evflow.stillness import stands_still
 from evflow.types import Recording, Window
 from evflow.voxel import voxelize
@@ -47,7 +47,8 @@ from evflow.weights import load_weights
 Array = jax.Array
 Progress = Callable[[int, int], None]
 
-FEW_EVENTS = 200  # signal events per polarity below which a threshold is called undetermined
+FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
+BEYOND_NOISE = 3.0  # standard deviations by which fewer events must exceed the noise to tell it
 
 
 def estimate_camera(
@@ -97,6 +98,8 @@ def estimate_camera(
     if runs:
         hot = hot_pixels(surveyed.quiet, float(summary.eta_on + summary.eta_off))
         summary, summary_std = _refined(params, surveyed.chunks, hot, summary, summary_std)
+    unknown = _unknown(stats, summary)
+    summary, summary_std = _without(unknown, summary, summary_std)
     camera, std, quiet = _fuse(params, windows(), summary, summary_std, hot)
     camera, std = _with_rates(camera, std, quiet, hot, summary, summary_std)
     if runs:
@@ -105,7 +108,7 @@ def estimate_camera(
     return CameraEstimate(
         camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         len(plan.pairs),
-        (*io.condensed(plan.skipped), *_warnings(stats, n_events, summary, hot, dead)))
+        (*io.condensed(plan.skipped), *_warnings(stats, unknown, n_events, summary, hot, dead)))
 
 
 def window_inputs(window: Window) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
@@ -219,6 +222,27 @@ def _refined(
     return refined.summary, refined.std
 
 
+def _unknown(stats: model.Stats, summary: Summary) -> tuple[str, ...]:
+    """The polarities, of "on" and "off", whose few events are not more than noise sends."""
+    found = []
+    for name in ("on", "off"):
+        events = float(getattr(stats, f"events_{name}"))
+        noise = float(getattr(summary, f"eta_{name}") * stats.exposure)
+        if events < FEW_EVENTS and events - noise < BEYOND_NOISE * np.sqrt(max(events, 1.0)):
+            found.append(name)
+    return tuple(found)
+
+
+def _without(
+    unknown: tuple[str, ...], summary: Summary, std: Summary
+) -> tuple[Summary, Summary]:
+    """The summary and its std with the prior's thresholds where nothing tells them."""
+    middle, width = uniform(PRESETS["default"].prior.theta)
+    names = [f"theta_{name}" for name in unknown]
+    return (dataclasses.replace(summary, **dict.fromkeys(names, jnp.float32(middle))),
+            dataclasses.replace(std, **dict.fromkeys(names, jnp.float32(width))))
+
+
 def _with_regression(
     camera: Camera, std: Camera, evidence: PixelEvidence, summary: Summary, summary_std: Summary
 ) -> tuple[Camera, Camera]:
@@ -233,7 +257,8 @@ def _with_regression(
 
 
 def _warnings(
-    stats: model.Stats, n_events: np.ndarray, summary: Summary, hot: np.ndarray, dead: np.ndarray
+    stats: model.Stats, unknown: tuple[str, ...], n_events: np.ndarray, summary: Summary,
+    hot: np.ndarray, dead: np.ndarray,
 ) -> list[str]:
     found = []
     for name, mask, what in (
@@ -247,9 +272,12 @@ def _warnings(
     low, high = PRESETS["default"].prior.theta
     for name, events in (("on", stats.events_on), ("off", stats.events_off)):
         theta = float(getattr(summary, f"theta_{name}"))
-        if float(events) < FEW_EVENTS:
-            found.append(f"only {int(events)} {name.upper()} events: theta_{name} is "
-                         "undetermined; its value is the prior's.")
+        if name in unknown:
+            found.append(f"only {int(events)} {name.upper()} events, as noise sends: theta_{name} "
+                         "is undetermined, its value is the prior's, and the other threshold was "
+                         "measured without it: it may be further off than its std.")
+        elif float(events) < FEW_EVENTS:
+            found.append(f"only {int(events)} {name.upper()} events: theta_{name} is uncertain.")
         elif not low <= theta <= high:
             found.append(f"theta_{name} = {theta:.2f} lies outside the {low}-{high} that the "
                          "network was trained on: an extrapolation. Frames with a gamma or an "

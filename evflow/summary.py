@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.config import ModelConfig
-from evflow.squash import CENTRE, SCALE, per_channel
+from evflow.coordinates import CENTRE, SCALE, per_channel
 
 Array = jax.Array
 

@@ -18,9 +18,9 @@ import optax
 from evflow import encoder, flow, losses, network, summary
 from evflow.batch import Batch, sample_batch
 from evflow.config import LossConfig, TrainConfig
+from evflow.coordinates import squash, squash_summary, unsquash, unsquash_summary
 from evflow.distributed import by_shard
 from evflow.scenes import TextureBank
-from evflow.squash import squash, squash_summary, unsquash, unsquash_summary
 from evflow.summary import Stats
 
 Array = jax.Array

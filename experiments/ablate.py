@@ -29,9 +29,9 @@ import tyro
 from evflow import flow, network
 from evflow.batch import sample_batch
 from evflow.config import PRESETS, TrainConfig, as_dict
+from evflow.coordinates import squash, unsquash_summary
 from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank
-from evflow.squash import squash, unsquash_summary
 from evflow.train import cut_block, init_state, make_run_step, optimiser
 from evflow.weights import load_weights, save_weights
 from experiments.common import provenance, slug, write_result

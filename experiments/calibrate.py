@@ -21,10 +21,10 @@ import tyro
 from evflow import flow, losses, network
 from evflow.batch import Batch, sample_batch
 from evflow.config import TrainConfig, preset
+from evflow.coordinates import unsquash_summary
 from evflow.model import architecture
 from evflow.progress import bar
 from evflow.scenes import make_bank
-from evflow.squash import unsquash_summary
 from evflow.train import cut_block
 from evflow.weights import load_weights, model_card, save_weights
 

@@ -21,12 +21,12 @@ from evflow import Recording, estimate_camera, load_weights
 from evflow.baselines import SYSTEMS
 from evflow.camera import Camera, Summary, sample_pixels
 from evflow.camera_estimate import CameraEstimate
+from evflow.coordinates import squash
 from evflow.downstream.prior import WidePrior
 from evflow.errors import EvflowDataError
 from evflow.io import iter_windows
 from evflow.model import Params, architecture, estimate_y, finish
 from evflow.recording import pool_recording, window_inputs
-from evflow.squash import squash
 from evflow.weights import weights_path
 from experiments.targets import Target
 

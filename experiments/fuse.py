@@ -24,12 +24,12 @@ import tyro
 
 from evflow import Recording, finish, io, load_weights
 from evflow.camera import Summary
+from evflow.coordinates import squash, unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
 from evflow.recording import pool_recording
 from evflow.refine import Chunk, fused, refine_summary, refinement_chunks
 from evflow.refine.fit import FusionNet
-from evflow.squash import squash, unsquash_summary
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
 from experiments.many import Setup, scores

@@ -24,11 +24,11 @@ import tyro
 
 from evflow import load_weights
 from evflow.camera import Summary
+from evflow.coordinates import squash_summary, summary_std, unsquash_summary
 from evflow.refine import Chunk, fused, refine_summary
 from evflow.refine.path import STEPS
 from evflow.refine.points import Points, chunk_points
 from evflow.refine.signal import joined, log_intensity, rate_at
-from evflow.squash import squash_summary, summary_std, unsquash_summary
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
 from experiments.fuse import COVERED, before_refinement

@@ -24,12 +24,12 @@ from benchmarks.harness import Case, Record, Setting, Workload, compare, measure
 from benchmarks.turns import by_task, in_turn
 from evflow import flow
 from evflow.camera import Camera
+from evflow.coordinates import unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.intensity import uint8_table
 from evflow.model import estimate_y
 from evflow.network import architecture
 from evflow.simulator import simulate, simulate_voxels
-from evflow.squash import unsquash_summary
 from evflow.voxel import voxelize
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from videos import code_of
 
-from evflow.simulator.interpolate import MAX_STEPS, unzip, upsample
+from evflow.simulator.interpolate import MAX_STEPS, Interpolator, unzip, upsample
 
 SIZE = 96
 
@@ -42,6 +42,15 @@ def test_linear_motion_is_followed_and_blending_is_much_worse(dx: float, dy: flo
         blended = np.abs((1 - s) * a + s * b - truth)[inner].mean()
         assert error < 0.2 * blended
         assert error < 2.0
+
+
+@pytest.mark.parametrize("shape", [(8, 64), (64, 8), (15, 64), (1, 40), (3, 48), (12, 12)])
+def test_narrow_frames_are_filled_too(shape: tuple[int, int]) -> None:
+    frames = np.random.default_rng(0).uniform(0, 255, (2, *shape)).astype(np.float32)
+    made, motion = Interpolator().between(*frames, 4)
+    assert [f.shape for f in made] == [shape] * 3
+    assert np.isfinite(made).all()
+    assert np.isfinite(motion)
 
 
 def test_steps_follow_the_wanted_motion() -> None:

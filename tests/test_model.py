@@ -14,8 +14,8 @@ from networks import seen, small_params
 from evflow import model, pixelwise
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.config import MODELS
+from evflow.coordinates import squash, squash_summary, unsquash, unsquash_summary
 from evflow.errors import EvflowDataError
-from evflow.squash import squash, squash_summary, unsquash, unsquash_summary
 from evflow.weights import load_weights
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

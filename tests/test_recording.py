@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from networks import SHAPE, hidden
 from scipy import ndimage
 
-from evflow import Camera, Events, Recording, estimate_camera, load_weights
+from evflow import Camera, Events, Recording, estimate_camera, load_weights, simulate
 from evflow.camera import PARAMETERS
 from evflow.errors import EvflowDataError
 
@@ -82,6 +83,23 @@ def test_saved_and_loaded(watched: tuple[Recording, Camera], tmp_path: Path) -> 
         assert {"theta_on_std", "eta_off_std", "valid", "n_events"} <= set(data)
     with pytest.raises(EvflowDataError, match="EV013"):
         found.save(path)
+
+
+def test_a_fade_in_does_not_tell_the_threshold_of_off() -> None:
+    """Brightness that only rises: OFF events are noise, and the prior's width stays."""
+    ms = np.arange(101)
+    scene = np.asarray(hidden(14)[0].frames[0], np.float32) / 3 + 20
+    frames = scene[None] * (1.0 + ms[:, None, None] / 100.0)
+    camera = Camera.constant(SHAPE, theta_on=0.2, theta_off=0.5, eta_on=0.1, eta_off=0.1)
+    events = simulate(jax.random.key(1), frames, ms * 1000, camera)
+    gray = np.rint(frames[::25]).astype(np.uint8)
+    found = estimate_camera(Recording(events, gray, ms[::25] * 1000))
+    assert 0.1 < float(found.summary_std.theta_off) < 0.2
+    assert abs(float(found.summary.theta_off) - 0.5) < 2 * float(found.summary_std.theta_off)
+    assert (np.asarray(found.std.theta_off) > 0.1).all()
+    assert float(found.summary_std.theta_on) < 0.1
+    assert any("theta_off is undetermined" in w for w in found.warnings)
+    assert not any("theta_on is undetermined" in w for w in found.warnings)
 
 
 def test_polarity_without_events_is_said_to_be_undetermined(

@@ -48,8 +48,16 @@ SSIM = {
 }
 
 
+def _require_floats(*images: Array) -> None:
+    for image in images:
+        if not jnp.issubdtype(image.dtype, jnp.floating):
+            raise EvflowDataError("EV003", f"an image of {image.dtype}.",
+                                  "Expected floats on [0, 1]: divide bytes by 255.")
+
+
 def mse(image: Array, reference: Array) -> Array:
     """Mean squared error."""
+    _require_floats(image, reference)
     return jnp.mean((image - reference) ** 2, (-2, -1))
 
 
@@ -70,6 +78,7 @@ def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
     """
     if preset not in SSIM:
         raise EvflowDataError("EV020", f"SSIM preset {preset!r}.", f"Choose one of {list(SSIM)}.")
+    _require_floats(image, reference)
     how = SSIM[preset]
     if min(image.shape[-2:]) < max(len(how.window), 2):
         raise EvflowDataError("EV002", f"images of {image.shape[-2:]} pixels.",

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import THETA_MIN, Camera, Summary
+from evflow.coordinates import squash_summary, summary_std, unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log_inverse, noise_factor, normalised_intensity
 from evflow.refine.moments import Moments, measure
@@ -34,7 +35,6 @@ from evflow.refine.noise import (
 from evflow.refine.path import STEPS, Chunk
 from evflow.refine.signal import told_apart
 from evflow.refine.trace import trace_of_camera
-from evflow.squash import squash_summary, summary_std, unsquash_summary
 
 Array = jax.Array
 

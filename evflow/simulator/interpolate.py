@@ -17,7 +17,8 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 
-MIN_SIDE = 12  # pixels on the longer side; DIS refuses smaller frames
+MIN_SIDE = 12  # pixels on the longer side: smaller frames show no motion
+PATCHES = 16  # pixels: two of DIS' patches
 MAX_STEPS = 64  # frames per pair; beyond it the motion is too fast to trust the flow anyway
 MOTION_QUANTILE = 99.5  # per cent of pixels that must move less than the wanted step
 
@@ -68,8 +69,9 @@ class Interpolator:
     def motion(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Motion (H, W, 2) in pixels (x, y) that carries a into b, that which carries b into a,
         and how far the fast pixels move."""
-        first, second = _gray8(a), _gray8(b)
-        there, back = (self._dis.calc(*pair, None) for pair in ((first, second), (second, first)))
+        first, second = _padded(_gray8(a)), _padded(_gray8(b))
+        there, back = (self._dis.calc(*pair, None)[:a.shape[0], :a.shape[1]]
+                       for pair in ((first, second), (second, first)))
         return there, back, _motion(there)
 
     def between(self, a: np.ndarray, b: np.ndarray, steps: int) -> tuple[list[np.ndarray], float]:
@@ -80,6 +82,11 @@ class Interpolator:
 
 def _gray8(frame: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(frame), 0, 255).astype(np.uint8)
+
+
+def _padded(image: np.ndarray) -> np.ndarray:
+    """At least PATCHES pixels on each side: DIS ends the process at some narrower frames."""
+    return np.pad(image, [(0, max(0, PATCHES - n)) for n in image.shape], mode="edge")
 
 
 def _motion(flow: np.ndarray) -> float:
