@@ -85,10 +85,12 @@ def test_saved_and_loaded(watched: tuple[Recording, Camera], tmp_path: Path) -> 
         found.save(path)
 
 
-def test_a_fade_in_does_not_tell_the_threshold_of_off() -> None:
+def test_a_fade_in_does_not_tell_the_threshold_of_off(
+    watched: tuple[Recording, Camera]
+) -> None:
     """Brightness that only rises: OFF events are noise, and the prior's width stays."""
     ms = np.arange(131)
-    scene = np.asarray(hidden(14)[0].frames[0], np.float32) / 3 + 20
+    scene = np.asarray(watched[0].frames[0], np.float32) / 3 + 20
     frames = scene[None] * (1.0 + ms[:, None, None] / 100.0)
     camera = Camera.constant(SHAPE, theta_on=0.1, theta_off=0.5, eta_on=0.1, eta_off=0.1)
     events = simulate(jax.random.key(1), frames, ms * 1000, camera)

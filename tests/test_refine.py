@@ -226,8 +226,12 @@ def test_pixels_learn_from_every_stretch_and_few_are_simulated(
     monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A long recording simulates what its budget allows, but no event of a pixel is lost."""
-    recording, _ = hidden(3, 710)
-    pairs = plan_windows(recording).pairs
+    rng, n, shape = np.random.default_rng(0), 3000, (24, 32)
+    y, x = (rng.integers(0, size, n) for size in shape)
+    events = Events(x, y, np.sort(rng.integers(0, 680_000, n)), rng.random(n) < 0.5, shape[::-1])
+    frames = rng.integers(40, 200, (18, *shape)).astype(np.uint8)
+    recording = Recording(events, frames, np.arange(18) * 40_000)
+    pairs = [(0, 10), (10, 17)]
     runs = plan_runs(recording, pairs)
     calls: list[None] = []
     everything = survey(recording, runs, lambda: calls.append(None))
