@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ from evflow.files import atomic_write
 from evflow.recording import pool_recording
 from evflow.refine import Chunk, fused, refine_summary, refinement_chunks
 from evflow.refine.fit import FusionNet
-from evflow.weights import model_card, save_weights
+from evflow.weights import model_card, save_weights, weights_hash
 from experiments.cameras import Hidden, Protocol, draw_protocol
 from experiments.many import Setup, scores
 
@@ -89,10 +88,10 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarra
 def collect(options: Options) -> Rows:
     """Rows of all recordings, stacked; saved now and then where asked for."""
     found: list[dict[str, np.ndarray]] = []
-    begin, origin = 0, f"{options.seed} {sha256(options.weights.read_bytes()).hexdigest()}"
+    begin, origin = 0, f"{options.seed} {weights_hash(options.weights)}"
     if options.rows and options.rows.exists():
         with np.load(options.rows) as saved:
-            if str(saved["origin"]) != origin:
+            if str(saved.get("origin")) != origin:
                 raise EvflowDataError(
                     "EV013", f"{options.rows} holds rows of other weights or of another seed.",
                     "Choose another --rows.")

@@ -56,7 +56,7 @@ def _require_floats(*images: Array) -> None:
 
 
 def mse(image: Array, reference: Array) -> Array:
-    """Mean squared error."""
+    """Mean squared error. Raises EV003 for images of integers, as do all that build on it."""
     _require_floats(image, reference)
     return jnp.mean((image - reference) ** 2, (-2, -1))
 
@@ -74,7 +74,8 @@ def psnr(image: Array, reference: Array) -> Array:
 def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
     """Structural similarity by a convention of `SSIM`: "evreal", "etnet" or "global".
 
-    Raises EV020 for another preset, EV002 for images smaller than its window.
+    Raises EV020 for another preset, EV003 for images of integers, EV002 for images smaller than
+    its window.
     """
     if preset not in SSIM:
         raise EvflowDataError("EV020", f"SSIM preset {preset!r}.", f"Choose one of {list(SSIM)}.")
