@@ -29,7 +29,8 @@ from evflow.files import atomic_write
 from evflow.recording import pool_recording
 from evflow.refine import Chunk, fused, refine_summary, refinement_chunks
 from evflow.refine.fit import FusionNet
-from evflow.weights import model_card, save_weights, weights_hash
+from evflow.report.provenance import weights_hash
+from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
 from experiments.many import Setup, scores
 
