@@ -27,9 +27,10 @@ from evflow.coordinates import SCALE, camera_std, per_channel, squash, unsquash_
 from evflow.errors import EvflowDataError
 from evflow.faults import dead_pixels, hot_pixels
 from evflow.inspection.contents import ACTIVE_SHARE, VALID_EVENTS
-from evflow.intensity import delta_log_intensity, lin_log
+from evflow.intensity import lin_log
 from evflow.io.glitches import exposed
-from evflow.noise_only import estimate_noise, uniform
+from evflow.noise_only import estimate_noise
+from evflow.polarity import untold, without
 from evflow.rates import pixel_rates, quiet_time
 from evflow.refine import (
     Chunk,
@@ -48,7 +49,6 @@ Array = jax.Array
 Progress = Callable[[int, int], None]
 
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
-BEYOND_NOISE = 3.0  # standard deviations by which fewer events must exceed the noise to tell it
 
 
 def estimate_camera(
@@ -94,12 +94,14 @@ def estimate_camera(
     stats, n_events, n_shown = _pool(params, windows())
     summary, summary_std = model.finish(params, stats)
     surveyed = survey(recording, runs, advance)
-    hot = np.zeros(n_events.shape, bool)
+    hot, chunks = np.zeros(n_events.shape, bool), surveyed.chunks
     if runs:
         hot = hot_pixels(surveyed.quiet, float(summary.eta_on + summary.eta_off))
-        summary, summary_std = _refined(params, surveyed.chunks, hot, summary, summary_std)
-    unknown = _unknown(stats, summary)
-    summary, summary_std = _without(unknown, summary, summary_std)
+        chunks = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
+        summary, summary_std = _refined(params, chunks, summary, summary_std)
+    unknown = untold(stats, summary)
+    if unknown:
+        summary, summary_std = without(unknown, chunks, summary, summary_std)
     camera, std, quiet = _fuse(params, windows(), summary, summary_std, hot)
     camera, std = _with_rates(camera, std, quiet, hot, summary, summary_std)
     if runs:
@@ -114,8 +116,8 @@ def estimate_camera(
 def window_inputs(window: Window) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
     """voxels (H, W, 32), dlogI (H, W) and conditions of one window of a recording."""
     voxels = voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
-    intensity = 0.5 * (lin_log(window.frame0) + lin_log(window.frame1))
-    dlogI = delta_log_intensity(window.frame0, window.frame1)
+    before, after = lin_log(window.frame0), lin_log(window.frame1)
+    intensity, dlogI = 0.5 * (before + after), after - before
     return voxels, dlogI, {"window_s": window.window_s, "intensity": intensity}
 
 
@@ -213,34 +215,12 @@ def _with_rates(
 
 
 def _refined(
-    params: model.Params, chunks: list[Chunk], hot: np.ndarray, summary: Summary, std: Summary
+    params: model.Params, chunks: list[Chunk], summary: Summary, std: Summary
 ) -> tuple[Summary, Summary]:
-    """The summary and its std after refinement, without hot (H, W) pixels."""
-    used = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
+    """The summary and its std after refinement."""
     parts = next(iter(params.values()))
-    refined = refine_summary(used, summary, std, parts.get("fusion"), parts.get("signal"))
+    refined = refine_summary(chunks, summary, std, parts.get("fusion"), parts.get("signal"))
     return refined.summary, refined.std
-
-
-def _unknown(stats: model.Stats, summary: Summary) -> tuple[str, ...]:
-    """The polarities, of "on" and "off", whose few events are not more than noise sends."""
-    found = []
-    for name in ("on", "off"):
-        events = float(getattr(stats, f"events_{name}"))
-        noise = float(getattr(summary, f"eta_{name}") * stats.exposure)
-        if events < FEW_EVENTS and events - noise < BEYOND_NOISE * np.sqrt(max(events, 1.0)):
-            found.append(name)
-    return tuple(found)
-
-
-def _without(
-    unknown: tuple[str, ...], summary: Summary, std: Summary
-) -> tuple[Summary, Summary]:
-    """The summary and its std with the prior's thresholds where nothing tells them."""
-    middle, width = uniform(PRESETS["default"].prior.theta)
-    names = [f"theta_{name}" for name in unknown]
-    return (dataclasses.replace(summary, **dict.fromkeys(names, jnp.float32(middle))),
-            dataclasses.replace(std, **dict.fromkeys(names, jnp.float32(width))))
 
 
 def _with_regression(
@@ -275,7 +255,7 @@ def _warnings(
         if name in unknown:
             found.append(f"only {int(events)} {name.upper()} events, as noise sends: theta_{name} "
                          "is undetermined, its value is the prior's, and the other threshold was "
-                         "measured without it: it may be further off than its std.")
+                         "measured alone, less precisely.")
         elif float(events) < FEW_EVENTS:
             found.append(f"only {int(events)} {name.upper()} events: theta_{name} is uncertain.")
         elif not low <= theta <= high:

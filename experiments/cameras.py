@@ -20,6 +20,7 @@ from evflow.intensity import noise_factor, normalised_intensity
 from evflow.scenes import Scene, TextureBank, render, sample_scene
 from evflow.scenes.config import SceneConfig
 from evflow.sensors import SensorModel
+from evflow.types import Events
 
 Array = jax.Array
 
@@ -27,7 +28,9 @@ Array = jax.Array
 @dataclasses.dataclass(frozen=True)
 class Protocol:
     """What the recordings are like. fresh: the events begin at the first frame, with its
-    brightness in the memory; else the camera has been running for 20 ms."""
+    brightness in the memory; else the camera has been running for 20 ms. fade: instead of moving,
+    the scene's brightness is multiplied by this in all. off: whether OFF events come as they
+    should, have a threshold that nothing reaches, or are sent but left out of the recording."""
 
     prior: CameraPrior = CameraPrior()
     scene: SceneConfig = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
@@ -37,6 +40,8 @@ class Protocol:
     intervals: int = 8
     frame_noise_dn: float = 0.5
     fresh: bool = False
+    fade: float = 1.0
+    off: Literal["sent", "unreached", "dropped"] = "sent"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,6 +67,8 @@ class Hidden:
         return np.array([events.p.sum(), (~events.p).sum()]) - np.array(noise)
 
 
+BLACK, WHITE = 20.0, 250.0  # DN of a fade: its black when darkest, its white when brightest
+UNREACHED = 8.0  # a threshold beyond every change of 8-bit frames
 BLOCK = 64  # frames rendered at a time: one compiled program for recordings of any length
 
 
@@ -76,6 +83,14 @@ def _frames(scene: Scene, shape: tuple[int, int], count: int) -> np.ndarray:
     return np.concatenate(parts)[:count]
 
 
+def _faded(image: np.ndarray, factor: float, count: int) -> np.ndarray:
+    """(count, H, W) DN: an image (H, W) whose brightness changes steadily by a factor."""
+    gains = factor ** np.linspace(0.0, 1.0, count, dtype=np.float32)
+    gains /= gains.min()
+    room = WHITE / gains.max() - BLACK
+    return (BLACK + room * np.clip(image, 0, 255) / 255) * gains[:, None, None]
+
+
 def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidden:
     """Draw a scene and a camera; simulate the recording."""
     k_scene, k_nominal, k_pixels, k_events, k_noise = jax.random.split(key, 5)
@@ -83,11 +98,19 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
     length = lead + protocol.frame_ms * protocol.intervals + 1
     scene = _scene(k_scene, bank, protocol.scene, protocol.shape)
     frames = _frames(scene, protocol.shape, length)
+    if protocol.fade != 1.0:
+        frames = _faded(frames[length // 2], protocol.fade, length)
     light = noise_factor(normalised_intensity(jnp.asarray(frames)).mean((1, 2)))
     nominal = sample_nominal(k_nominal, (), protocol.prior, light[0])
+    if protocol.off == "unreached":
+        nominal = dataclasses.replace(nominal, theta_off=jnp.float32(UNREACHED))
     camera = sample_pixels(k_pixels, nominal, protocol.shape, protocol.prior.eta_spread)
     times = np.arange(length) * 1000
     events, labels = simulate(k_events, frames, times, camera, model=protocol.model, labels=True)
+    if protocol.off == "dropped":
+        on = events.p
+        labels = labels[on]
+        events = Events(events.x[on], events.y[on], events.t[on], events.p[on], events.size)
     kept = np.arange(lead, length, protocol.frame_ms)
     noise = protocol.frame_noise_dn * jax.random.normal(k_noise, (len(kept), *protocol.shape))
     gray = np.clip(np.rint(frames[kept] + np.asarray(noise)), 0, 255).astype(np.uint8)

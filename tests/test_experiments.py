@@ -25,6 +25,7 @@ from experiments import (
     evaluate,
     generate,
     limits,
+    one_polarity,
     quickstart,
     train,
 )
@@ -109,6 +110,13 @@ def test_coverage_counts_what_it_says(tmp_path: Path) -> None:
                   if k.startswith("theta_on, seconds"))
     assert counted == result["cameras"]
     assert cv2.imread(str(tmp_path / "coverage.png")) is not None
+
+
+@pytest.mark.slow
+def test_one_polarity_alone_is_scored_and_said(tmp_path: Path) -> None:
+    result = one_polarity.main(one_polarity.Options(out=tmp_path))
+    assert set(result) == set(one_polarity.CASES)
+    assert all(row["said"] > 0.5 and row["std"] > 0 for row in result.values())
 
 
 @pytest.mark.slow

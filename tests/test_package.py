@@ -24,7 +24,7 @@ FLOORS = (
     ("flow", "scenes", "simulator"),
     ("config",), ("coordinates", "dataset"),
     ("encoder", "summary", "refine"),
-    ("network", "losses", "batch", "noise_only"), ("pixelwise",), ("model",),
+    ("network", "losses", "batch", "noise_only", "polarity"), ("pixelwise",), ("model",),
     ("weights", "checkpoint"),
     ("train", "recording"),
     ("baselines", "downstream"), ("report",), ("commands",), ("cli",), ("__main__",),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +75,15 @@ def test_uneven_noise_is_found_pixel_by_pixel_and_its_errors_hold() -> None:
     assert even.std() < 0.02 * even.mean()  # as its truth is
 
 
+def test_double_precision_changes_next_to_nothing(watched: tuple[Recording, Camera]) -> None:
+    found = estimate_camera(watched[0])
+    with jax.enable_x64(True):
+        again = estimate_camera(watched[0])
+    for name in PARAMETERS:
+        assert float(getattr(again.summary, name)) == pytest.approx(
+            float(getattr(found.summary, name)), rel=0.02)
+
+
 def test_saved_and_loaded(watched: tuple[Recording, Camera], tmp_path: Path) -> None:
     found = estimate_camera(watched[0])
     path = found.save(tmp_path / "camera.npz")
@@ -85,33 +95,43 @@ def test_saved_and_loaded(watched: tuple[Recording, Camera], tmp_path: Path) -> 
         found.save(path)
 
 
-def test_a_fade_in_does_not_tell_the_threshold_of_off(
-    watched: tuple[Recording, Camera]
+@pytest.mark.parametrize("eta_off", [0.1, 1.5])  # .1: few OFF events; 1.5: hundreds, all noise
+def test_a_fade_in_tells_the_threshold_of_on_alone(
+    watched: tuple[Recording, Camera], eta_off: float
 ) -> None:
-    """Brightness that only rises: OFF events are noise, and the prior's width stays."""
+    """Brightness that only rises: OFF keeps the prior's width, ON is found within its own."""
     ms = np.arange(131)
     scene = np.asarray(watched[0].frames[0], np.float32) / 3 + 20
     frames = scene[None] * (1.0 + ms[:, None, None] / 100.0)
-    camera = Camera.constant(SHAPE, theta_on=0.1, theta_off=0.5, eta_on=0.1, eta_off=0.1)
+    camera = Camera.constant(SHAPE, theta_on=0.1, theta_off=0.5, eta_on=0.1, eta_off=eta_off)
     events = simulate(jax.random.key(1), frames, ms * 1000, camera)
     gray = np.rint(frames[20:121:25]).astype(np.uint8)
     found = estimate_camera(Recording(events, gray, ms[20:121:25] * 1000))
     assert 0.1 < float(found.summary_std.theta_off) < 0.2
     assert abs(float(found.summary.theta_off) - 0.5) < 2 * float(found.summary_std.theta_off)
     assert (np.asarray(found.std.theta_off) > 0.1).all()
-    assert float(found.summary_std.theta_on) < 0.1
+    std_on = float(found.summary_std.theta_on)
+    assert abs(float(found.summary.theta_on) - 0.1) < 2 * std_on < 0.05
+    # No pixel stands still: nobody can tell ON noise from ON signal.
+    assert float(found.summary_std.eta_on) > 0.3
+    assert float(found.summary.eta_off) == pytest.approx(eta_off, rel=0.3)
     assert any("theta_off is undetermined" in w for w in found.warnings)
     assert not any("theta_on is undetermined" in w for w in found.warnings)
 
 
+@pytest.mark.parametrize("refine", ["auto", "off"])
 def test_polarity_without_events_is_said_to_be_undetermined(
-    watched: tuple[Recording, Camera]
+    watched: tuple[Recording, Camera], refine: Literal["auto", "off"]
 ) -> None:
-    events = watched[0].events
+    """And what it did to the pixels' memory widens the other threshold."""
+    events, camera = watched[0].events, watched[1]
     on = events.p
     only_on = Events(events.x[on], events.y[on], events.t[on], events.p[on], events.size)
-    found = estimate_camera(dataclasses.replace(watched[0], events=only_on))
+    found = estimate_camera(dataclasses.replace(watched[0], events=only_on), refine=refine)
     assert any("theta_off is undetermined" in w for w in found.warnings)
+    away = float(found.summary.theta_on) - float(jnp.median(camera.theta_on))
+    assert abs(away) < 2 * float(found.summary_std.theta_on)
+    assert float(found.summary_std.theta_on) > 0.2 * float(found.summary.theta_on)
 
 
 def test_a_dead_pixel_is_listed(watched: tuple[Recording, Camera]) -> None:
@@ -133,6 +153,7 @@ def test_refusals(watched: tuple[Recording, Camera]) -> None:
         ("EV011", lambda: estimate_camera(bare, params)),
         ("EV020", lambda: estimate_camera(recording, params, refine="always")),
         ("EV016", lambda: estimate_camera("/nonexistent.aedat4", params)),
+        ("EV020", lambda: estimate_camera(recording.events, params)),
     ):
         with pytest.raises(EvflowDataError, match=code):
             call()

@@ -31,7 +31,7 @@ from evflow.refine.fit import FusionNet
 from evflow.refine.moments import measure
 from evflow.refine.path import plan_chunks
 from evflow.refine.pixels import PixelEvidence, pixel_evidence
-from evflow.refine.trace import NEVER, trace_of_camera, trace_of_events
+from evflow.refine.trace import FRESH, NEVER, trace_of_camera, trace_of_events
 from evflow.types import Events
 
 SHAPE = (12, 16)
@@ -61,7 +61,7 @@ def test_simulated_trace_is_the_trace_of_the_simulated_events(
 ) -> None:
     frames, times = video
     dt_s = jnp.full(INTERVALS, STEPS * 1e-3)
-    made = trace_of_camera(jax.random.key(2), lin_log(frames), dt_s, camera, jnp.ones(()), STEPS)
+    made = trace_of_camera(jax.random.key(2), lin_log(frames), dt_s, camera, FRESH, STEPS)
     seen = trace_of_events(events, times[::STEPS], STEPS)
     np.testing.assert_array_equal(made.counts, seen.counts)
     np.testing.assert_array_equal(made.first_on, seen.first_on)

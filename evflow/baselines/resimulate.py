@@ -118,4 +118,5 @@ def _simulated(
     camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
                     jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
                     eta_on * full, eta_off * full)
-    return statistics(trace_of_camera(k_trace, path, dt_s, camera, fresh, steps), bright)
+    start = (1.0 - fresh) * jnp.ones(2)
+    return statistics(trace_of_camera(k_trace, path, dt_s, camera, start, steps), bright)

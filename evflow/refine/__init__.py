@@ -4,6 +4,7 @@
     recorded events, simulated events --> Trace          trace.py
     Trace + path --> Moments, additive                   moments.py
     recorded against simulated Moments --> the summary   fit.py
+    the same of one polarity alone --> its threshold     alone.py
     recorded events on the path --> each pixel's theta   pixels.py
     recorded events of quiet pixels --> noise rates      noise.py
     events, random points --> noise told from signal     points.py, signal.py
@@ -13,11 +14,13 @@ moves the estimate until the two agree. Each pixel is compared only after its fi
 its memory is known: nothing depends on what happened before the recording began.
 """
 
+from evflow.refine.alone import foreseen, refine_alone
 from evflow.refine.fit import Refined, fused, refine_summary
 from evflow.refine.path import Chunk, Survey, make_chunk, plan_runs, refinement_chunks, survey
 from evflow.refine.pixels import PixelEvidence, pixel_posterior
 
 __all__ = [
-    "Chunk", "PixelEvidence", "Refined", "Survey", "fused", "make_chunk", "pixel_posterior",
-    "plan_runs", "refine_summary", "refinement_chunks", "survey",
+    "Chunk", "PixelEvidence", "Refined", "Survey", "foreseen", "fused", "make_chunk",
+    "pixel_posterior", "plan_runs", "refine_alone", "refine_summary", "refinement_chunks",
+    "survey",
 ]

@@ -10,6 +10,7 @@ how sure it is.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -34,9 +35,10 @@ from evflow.refine.noise import (
 )
 from evflow.refine.path import STEPS, Chunk
 from evflow.refine.signal import told_apart
-from evflow.refine.trace import trace_of_camera
+from evflow.refine.trace import FRESH, RUNNING, trace_of_camera
 
 Array = jax.Array
+Start = tuple[float, float]
 
 OFFSETS = (0.2, 0.08, 0.05)  # log theta: finite differences of the passes
 LONGEST_STEP = 0.5  # log theta per pass
@@ -73,18 +75,18 @@ class FusionNet(nn.Module):
 
 @partial(jax.jit, static_argnames="steps")
 def _simulated(
-    key: Array, path: Array, dt_s: Array, bright: Array, values: Array, fresh: Array, steps: int
+    key: Array, path: Array, dt_s: Array, bright: Array, values: Array, start: Array, steps: int
 ) -> Moments:
     """Moments of a camera on one chunk. values (6,): theta, eta, sigma; cameras of one key see the
     same random numbers, so that their differences are the cameras'."""
     k_pixels, k_trace = jax.random.split(key)
-    draws = jax.random.normal(k_pixels, (2, *path.shape[1:]))
+    draws = jax.random.normal(k_pixels, (2, *path.shape[1:]), path.dtype)
     on, off, eta_on, eta_off, sigma_on, sigma_off = values
     full = jnp.ones_like(draws[0])
     camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
                     jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
                     eta_on * full, eta_off * full)
-    trace = trace_of_camera(k_trace, path, dt_s, camera, fresh, steps)
+    trace = trace_of_camera(k_trace, path, dt_s, camera, start, steps)
     return measure(trace, path, dt_s, bright, steps)
 
 
@@ -112,7 +114,7 @@ def square_residual(moments: Moments, theta: np.ndarray) -> np.ndarray:
     return (np.maximum(square, 0.0) / (on * off) + EMPTY) / (one + EMPTY)
 
 
-class _Fit:
+class Fit:
     """The passes over one recording's chunks; holds what they share."""
 
     def __init__(self, chunks: list[Chunk], start: Summary, std: Summary, seed: int) -> None:
@@ -125,38 +127,41 @@ class _Fit:
         self.values = self.prior.copy()
         self.quiet = np.sum([quiet_events(c, STEPS) for c in chunks], 0)
         self.values[2:4] = combined_rate(self.quiet, self.prior[2:4], self.prior_std[2:4])
-        self.fresh = 0.0
+        self.start = self.later = RUNNING
         self.factor = _mean_factor(chunks)
         self.recorded = _total([_recorded(c.recorded, c.path, c.dt_s, c.bright, STEPS)
                                 for c in chunks])
 
-    def simulate(self, values: np.ndarray, fresh: list[float]) -> Moments:
-        """Summed moments of V cameras, leading axis V; `fresh` holds for the first chunk alone."""
-        cameras = list(zip(values.astype(np.float32), np.array(fresh, np.float32), strict=True))
+    def simulate(self, values: np.ndarray, starts: Sequence[Start] = ()) -> Moments:
+        """Summed moments of V cameras, leading axis V. starts: of the first chunk; all others, of
+        a camera that has been running, begin as `later`."""
+        starts = starts or [self.start] * len(values)
+        cameras = list(zip(values.astype(np.float32), np.array(starts, np.float32), strict=True))
+        later = np.array(self.later, np.float32)
         totals: list[list[Moments]] = [[] for _ in cameras]
         for i, c in enumerate(self.chunks):
             key, path = jax.random.fold_in(self.key, i), jnp.asarray(c.path)
             # One by one: a program for every number of cameras takes seconds to compile.
             for parts, (row, start) in zip(totals, cameras, strict=True):
                 parts.append(_simulated(key, path, c.dt_s, c.bright, row,
-                                        start if i == 0 else np.float32(0.0), STEPS))
+                                        later if i else start, STEPS))
         return jax.tree.map(lambda *leaves: np.stack(leaves), *map(_total, totals))
 
-    def choose_start(self) -> None:
-        """Does the recording start as a simulation does? Whichever start makes the number of
-        pixels that fire at once the likelier (Poisson)."""
-        both = self.simulate(np.stack([self.values] * 2), [0.0, 1.0])
-        made = np.asarray(both.early) + 0.5
-        seen = float(self.recorded.early)
-        log_likelihood = seen * np.log(made) - made
-        self.fresh = float(log_likelihood[1] > log_likelihood[0] + FRESH_ODDS)
+    def choose_start(self, others: Sequence[Start] = (FRESH,)) -> None:
+        """Does the recording start as a camera that has been running, or otherwise? Whichever
+        start makes the number of pixels that fire at once the likelier (Poisson)."""
+        starts = [self.later, *others]
+        made = np.asarray(self.simulate(np.stack([self.values] * len(starts)), starts).early) + 0.5
+        log_likelihood = float(self.recorded.early) * np.log(made) - made
+        log_likelihood[0] += FRESH_ODDS
+        self.start = starts[int(np.argmax(log_likelihood))]
 
     def step(self, offset: float) -> None:
         """One Gauss-Newton step of log theta."""
         values = np.stack([self.values] * 3)
         values[1, 0] *= np.exp(offset)
         values[2, 1] *= np.exp(offset)
-        moments = self.simulate(values, [self.fresh] * 3)
+        moments = self.simulate(values)
         excess = (balance_residual(self.recorded, values[:, :2])
                   - balance_residual(moments, values[:, :2]))[:, :3].mean(1)  # lags 1, 2, 4
         jacobian = ((excess[1:] - excess[0]) / offset).T
@@ -167,12 +172,16 @@ class _Fit:
         curvature = jacobian.T @ precision @ jacobian + held
         gradient = jacobian.T @ precision @ excess[0] + held @ away
         change = -np.linalg.solve(curvature, gradient)
-        self.values[:2] *= np.exp(np.clip(change, -LONGEST_STEP, LONGEST_STEP))
-        self.values[:2] = np.clip(self.values[:2], 0.02, 2.0)
+        self.move(slice(2), change)
+
+    def move(self, which: int | slice, change: np.ndarray | float) -> None:
+        """Change log theta, of ON 0 and OFF 1, by no more than a pass may."""
+        moved = self.values[which] * np.exp(np.clip(change, -LONGEST_STEP, LONGEST_STEP))
+        self.values[which] = np.clip(moved, 0.02, 2.0)
 
     def features(self) -> np.ndarray:
         """Everything the fusion sees, (F,), at the final values."""
-        made = jax.tree.map(lambda a: a[0], self.simulate(self.values[None], [self.fresh]))
+        made = jax.tree.map(lambda a: a[0], self.simulate(self.values[None]))
         seen, theta = self.recorded, self.values[:2]
 
         def ratio(name: str) -> np.ndarray:
@@ -184,14 +193,14 @@ class _Fit:
         light = np.mean([c.path[0].mean() for c in self.chunks])
         pixels = max(float(seen.pixels), 1.0)
         parts = [
-            np.log(self.values / self.prior)[:4], np.log(self.prior_std),
+            np.log(self.values[:4] / self.prior[:4]), np.log(self.prior_std),
             np.log(self.values[:4]), np.log(self.values[4:] + 0.01), residual.ravel(),
             ratio("roots"), ratio("active"), ratio("events"), [ratio("early")],
             np.log(square_residual(seen, theta) / square_residual(made, theta)),
             np.log(size[[0, -1]] + EMPTY).ravel(), np.log(seen.events + 1.0),
             np.log((seen.active + 1.0) / pixels), *self.noise_features(),
             np.log([float(seen.exposure) + 1.0, pixels]),
-            [np.log(motion.mean() + 0.1), np.log(motion.max() + 0.1), light, self.fresh,
+            [np.log(motion.mean() + 0.1), np.log(motion.max() + 0.1), light, self.start == FRESH,
              np.log(np.mean([c.dt_s.mean() for c in self.chunks]) / 0.025)],
         ]
         return np.concatenate([np.asarray(p, np.float64).ravel() for p in parts]).astype(
@@ -226,14 +235,14 @@ def refine_summary(
     result is that of the Gauss-Newton steps alone, and std the network's. signal: the network
     that tells noise from signal (signal.py); without it the noise is that of quiet pixels.
     """
-    fit = _Fit(chunks, summary, std, seed)
+    fit = Fit(chunks, summary, std, seed)
     fit.choose_start()
     for offset in OFFSETS:
         fit.step(offset)
     features = fit.features()
     stepped = Summary(*(jnp.float32(v) for v in fit.values))
     if fusion is None:
-        return Refined(stepped, std, features, fit.fresh > 0)
+        return Refined(stepped, std, features, fit.start == FRESH)
     if fusion["mean"].shape != features.shape:
         raise EvflowDataError(
             "EV018", f"the weights' fusion sees {fusion['mean'].size} features of a recording, "
@@ -242,7 +251,7 @@ def refine_summary(
     y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
     result = squash_summary(y)
     result, result_std = _with_noise(chunks, result, summary_std(result, y_std), signal, fit.factor)
-    return Refined(result, result_std, features, fit.fresh > 0)
+    return Refined(result, result_std, features, fit.start == FRESH)
 
 
 def _with_noise(

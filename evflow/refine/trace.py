@@ -20,6 +20,7 @@ Array = jax.Array
 ArrayLike = jax.Array | np.ndarray
 
 NEVER = np.int32(1 << 30)
+RUNNING, FRESH = (1.0, 1.0), (0.0, 0.0)  # starts
 
 
 @jax.tree_util.register_dataclass
@@ -59,21 +60,22 @@ def trace_of_events(events: Events, times_us: np.ndarray, steps: int) -> Trace:
 
 
 def trace_of_camera(
-    key: Array, path: Array, dt_s: Array, camera: Camera, fresh: Array, steps: int
+    key: Array, path: Array, dt_s: Array, camera: Camera, start: ArrayLike, steps: int
 ) -> Trace:
     """The Trace of a camera (H, W) that sees path (K*steps + 1, H, W).
 
-    fresh: 1.0 starts with the memory at the first frame, as a simulation does; 0.0 anywhere
-    between the thresholds. At most one noise event per pixel, polarity and interval is drawn
-    (rates are ~.1 Hz, intervals ~25 ms); it stores the brightness of its instant.
+    start: (2,), shares of theta_off and theta_on between which brightness lies about the memory:
+    FRESH as in a simulation, RUNNING after motion, (0, 1) after a rise. At most one noise event
+    per pixel, polarity and interval is drawn (rates are ~.1 Hz, intervals ~25 ms); it stores the
+    brightness of its instant.
     """
     k_phase, k_noise, k_when = jax.random.split(key, 3)
     shape, intervals = path.shape[1:], dt_s.shape[0]
-    phase = jax.random.uniform(k_phase, shape) * (camera.theta_on + camera.theta_off)
-    phase = (1.0 - fresh) * (phase - camera.theta_off)
+    below, above = start[0] * camera.theta_off, start[1] * camera.theta_on
+    phase = jax.random.uniform(k_phase, shape, path.dtype) * (above + below) - below
     eta = jnp.stack([camera.eta_on, camera.eta_off])
     chance = -jnp.expm1(-eta[None] * dt_s[:, None, None, None])
-    noise = jax.random.uniform(k_noise, (intervals, 2, *shape)) < chance
+    noise = jax.random.uniform(k_noise, (intervals, 2, *shape), path.dtype) < chance
     when = jax.random.randint(k_when, (intervals, 2, *shape), 0, steps)
 
     def step(carry: tuple[Array, ...], x: tuple[Array, ...]) -> tuple[tuple[Array, ...], None]:
@@ -111,8 +113,8 @@ def trace_of_camera(
         return a.reshape(intervals, steps, *a.shape[1:])
 
     index = jnp.arange(intervals * steps, dtype=jnp.int32)
-    start = (path[0] - phase, jnp.full(shape, NEVER), jnp.zeros(shape, path.dtype),
-             jnp.zeros(shape, bool))
+    before = (path[0] - phase, jnp.full(shape, NEVER), jnp.zeros(shape, path.dtype),
+              jnp.zeros(shape, bool))
     end, counts = jax.lax.scan(
-        interval, start, (blocks(index), blocks(path[:-1]), blocks(path[1:]), noise, when))
+        interval, before, (blocks(index), blocks(path[:-1]), blocks(path[1:]), noise, when))
     return Trace(end[1], jnp.clip(end[2], 0.0, 1.0), end[3], counts)
