@@ -62,7 +62,9 @@ class Camera:
 
     @staticmethod
     def sample(key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None) -> Camera:
-        """One camera with pixels (..., H, W); leading axes are independent cameras."""
+        """One camera with pixels (..., H, W); leading axes are independent cameras. EV002."""
+        if len(shape) < 2:
+            raise EvflowDataError("EV002", f"shape is {shape}.", "Expected (..., H, W).")
         prior = prior or CameraPrior()
         k_nominal, k_pixels = jax.random.split(key)
         nominal = sample_nominal(k_nominal, shape[:-2], prior)
@@ -112,6 +114,9 @@ class Camera:
     def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: Any) -> Path:
         """Write an .npz with the four maps, `extra` arrays beside them, and the units."""
         self.validate()
+        if taken := {*PARAMETERS, "meta"} & set(extra):
+            raise EvflowDataError("EV020", f"extra arrays named {', '.join(sorted(taken))}.",
+                                  "The camera's own maps have these names; choose others.")
         units = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
         arrays: dict[str, Any] = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
         arrays |= {k: np.asarray(v) for k, v in extra.items()}
@@ -201,11 +206,14 @@ class CameraPrior:
                                   "Choose 'eq12', 'independent', 'mixed' or 'none'.")
         lowest = {"theta": np.nextafter(0.0, 1.0), "mismatch": 0.0, "eta": np.nextafter(0.0, 1.0)}
         for name, bound in lowest.items():
-            low, high = getattr(self, name)
-            if not bound <= low <= high < np.inf:
+            span = np.asarray(getattr(self, name))
+            if span.shape != (2,) or not bound <= span[0] <= span[1] < np.inf:
                 raise EvflowDataError(
-                    "EV020", f"CameraPrior({name}={(low, high)}).",
+                    "EV020", f"CameraPrior({name}={getattr(self, name)}).",
                     f"Give (low, high), low <= high, {'>=' if bound == 0 else '>'} 0.")
+        if not 0 <= self.eta_spread < np.inf:
+            raise EvflowDataError("EV020", f"CameraPrior(eta_spread={self.eta_spread}).",
+                                  "A standard deviation of log eta: >= 0.")
 
 
 @jax.tree_util.register_dataclass

@@ -22,6 +22,7 @@ Values = Any  # jax.Array or np.ndarray, and what comes in comes out
 LINLOG_KNEE = 20.0  # DN; v2e's threshold between the linear and the logarithmic part
 LINLOG_SLOPE = float(np.log(LINLOG_KNEE) / LINLOG_KNEE)
 LOG_EPS = 1e-3
+MOST_LOG = 6.0  # more than the logarithm of 255 DN
 
 
 def lin_log(dn: ArrayLike) -> Array:
@@ -74,6 +75,23 @@ def to_log(frames: ArrayLike, log_map: str = "linlog") -> Array:
     return LOG_MAPS[log_map][0](frames.astype(jnp.float32))
 
 
+def check_log(name: str, values: Any) -> None:
+    """EV007 where not all is finite (a sum tells in a third of the time, unless it overflows),
+    EV003 where it cannot be a logarithm of DN. Traced values pass."""
+    if isinstance(values, jax.core.Tracer):
+        return
+    values = np.asarray(values)
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = values.sum() / max(values.size, 1)
+        if not (np.isfinite(mean) or np.isfinite(values).all()):
+            raise EvflowDataError("EV007", f"{name} holds NaN or infinite values.",
+                                  "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")
+    if mean > MOST_LOG:
+        raise EvflowDataError(
+            "EV003", f"{name} has a mean of {mean:.3g}, but white (255 DN) has 5.54.",
+            "Is it DN? Take intensity.to_log first.")
+
+
 def to_dn(frames: np.ndarray, full_scale: float) -> np.ndarray:
     """Frames on 0..full_scale (255, 1023, 4095, 65535...) as float32 DN on 0..255 (host)."""
     if not full_scale > 0:
@@ -92,12 +110,32 @@ def noise_factor(i01: Values) -> Values:
 
 
 def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
-    """Change of lin-log intensity between two frames (..., H, W) of DN 0..255 -> float32."""
+    """Change of lin-log intensity between two frames (..., H, W) of DN 0..255 -> float32.
+
+    uint8, floats on 0..255, or uint16 on 0..65535 (`to_dn` for fewer bits). Raises EV002 (shape,
+    colour), EV003 (range), EV007 (NaN).
+    """
     for name, frame in (("frame0", frame0), ("frame1", frame1)):
-        if np.ndim(frame) < 2:
-            raise EvflowDataError("EV002", f"{name} has shape {np.shape(frame)}.",
-                                  "Expected (..., H, W).")
+        _check_frame(name, frame)
     if np.shape(frame0) != np.shape(frame1):
         raise EvflowDataError(
             "EV002", f"the frames differ in shape: {np.shape(frame0)} and {np.shape(frame1)}.")
     return to_log(frame1) - to_log(frame0)
+
+
+def _check_frame(name: str, frame: ArrayLike) -> None:
+    shape = np.shape(frame)
+    if len(shape) < 2:
+        raise EvflowDataError("EV002", f"{name} has shape {shape}.", "Expected (..., H, W).")
+    if len(shape) > 2 and shape[-1] in (3, 4) and shape[-2] > 16:
+        raise EvflowDataError("EV002", f"{name} has shape {shape}: colour?",
+                              "Expected gray frames (..., H, W): evflow.types.luma(frame).")
+    if isinstance(frame, jax.core.Tracer) or np.asarray(frame).dtype.kind != "f":
+        return
+    low, high = float(np.min(frame, initial=0.0)), float(np.max(frame, initial=0.0))
+    if not np.isfinite([low, high]).all():
+        raise EvflowDataError("EV007", f"{name} holds NaN or infinite values.")
+    if low < 0 or high > 255.5 or 0 < high <= 1:
+        raise EvflowDataError(
+            "EV003", f"{name} reaches from {low:.4g} to {high:.4g}.",
+            "Expected DN on 0..255, not their logarithm nor 0..1; scale with intensity.to_dn.")

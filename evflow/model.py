@@ -38,6 +38,7 @@ from evflow.coordinates import (
     unsquash_summary,
 )
 from evflow.errors import EvflowDataError
+from evflow.intensity import check_log
 from evflow.network import Params, architecture
 from evflow.summary import Stats
 
@@ -71,6 +72,19 @@ def _net(params: Params) -> tuple[ModelConfig, Params]:
     return architecture(params), next(iter(params.values()))
 
 
+def _real(values: ArrayLike) -> Array:
+    """As float32; float64 stays where JAX's x64 mode keeps it."""
+    values = jnp.asarray(values)
+    return values if values.dtype == jnp.float64 else values.astype(jnp.float32)
+
+
+def _check_shape(name: str, values: ArrayLike, expected: tuple[int, ...], code: Code) -> None:
+    if np.shape(values) != expected:
+        raise EvflowDataError(
+            "EV002", f"{name} has shape {np.shape(values)}, the code's pixels are "
+            f"{code.context.shape[:-1]}.", f"Expected {expected}: both of one window.")
+
+
 def _prepare(
     config: ModelConfig, voxels: ArrayLike, dlogI: ArrayLike, window_s: Any, intensity: Any
 ) -> tuple[Array, Array, Array, Array | None]:
@@ -92,15 +106,26 @@ def _prepare(
                 "A logarithm of missing pixels? Set them to 0.")
     if not isinstance(window_s, jax.core.Tracer) and not (np.asarray(window_s) > 0).all():
         raise EvflowDataError("EV020", f"window_s={window_s}.", "It is a length in seconds, > 0.")
-    voxels, dlogI = jnp.asarray(voxels, jnp.float32), jnp.asarray(dlogI, jnp.float32)
+    voxels, dlogI = _real(voxels), _real(dlogI)
     lead = dlogI.shape[:-2]
-    window_s = jnp.broadcast_to(jnp.asarray(window_s, jnp.float32), lead)
+    window_s = _spread_over("window_s", jnp.asarray(window_s, jnp.float32), lead)
     if intensity is not None:
+        check_log("intensity", intensity)
         intensity = jnp.asarray(intensity, jnp.float32)
         if intensity.shape == lead:
             intensity = intensity[..., None, None]
-        intensity = jnp.broadcast_to(intensity, dlogI.shape)
+        intensity = _spread_over("intensity", intensity, dlogI.shape)
     return voxels, dlogI, window_s, intensity
+
+
+def _spread_over(name: str, values: Array, shape: tuple[int, ...]) -> Array:
+    """Broadcast to shape, or EV002."""
+    try:
+        return jnp.broadcast_to(values, shape)
+    except ValueError:
+        raise EvflowDataError(
+            "EV002", f"{name} has shape {values.shape}.",
+            f"Expected one value, or {shape} as the voxels.") from None
 
 
 def summarize(
@@ -179,7 +204,7 @@ def code_from_video(
     intensity: Any = None,
 ) -> Code:
     """Code without any events: true log-intensity changes dL (..., H, W, m) of the window's m
-    equal parts, and the summary of `camera` (maps (..., H, W) or (H, W))."""
+    equal parts, and the summary of `camera` (maps (..., H, W) or (H, W)). Raises EV002, EV015."""
     config, _ = _net(params)
     if config.code == "feature":
         raise EvflowDataError(
@@ -191,9 +216,18 @@ def code_from_video(
                               f"Expected (..., H, W, {config.changes}).")
     _, _, window_s, intensity = _prepare(
         config, jnp.zeros((*dL.shape[:-1], 2 * config.bins)), dL[..., 0], window_s, intensity)
-    lead = dL.shape[:-3]
-    known = jax.tree.map(lambda v: jnp.broadcast_to(v, lead), camera_summary(camera))
+    known = _of_pixels(camera, dL.shape[:-1])
     return Code(encoder.split_sign(dL), known, _context(window_s, intensity, dL.shape[:-1]))
+
+
+def _of_pixels(camera: Camera, shape: tuple[int, ...]) -> Summary:
+    """The summary (...,) of a camera with maps (..., H, W) or (H, W), or EV015."""
+    lead = camera.shape[:-2]
+    if camera.shape[-2:] != shape[-2:] or lead not in ((), shape[:-2]):
+        raise EvflowDataError(
+            "EV015", f"the camera is {camera.shape}, the pixels are {shape}.",
+            "Give maps (H, W), or one camera for each of the leading axes.")
+    return jax.tree.map(lambda v: jnp.broadcast_to(v, shape[:-2]), camera_summary(camera))
 
 
 def camera_summary(camera: Camera) -> Summary:
@@ -215,9 +249,10 @@ def _flow_condition(config: ModelConfig, code: Code) -> tuple[Array, Array]:
 
 def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array, Array]:
     """voxels (..., H, W, 32) -> y (..., H, W, 4), z (..., H, W, 28), log_det (..., H, W) of
-    d(y, z)/d voxels at fixed code (Eqs. 3-5)."""
+    d(y, z)/d voxels at fixed code (Eqs. 3-5). Raises EV002 for voxels of other pixels."""
     config, net = _net(params)
-    return _forward(net, jnp.asarray(voxels, jnp.float32), code, config=config)
+    _check_shape("voxels", voxels, (*code.context.shape[:-1], 2 * config.bins), code)
+    return _forward(net, _real(voxels), code, config=config)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -230,9 +265,12 @@ def _forward(
 
 
 def inverse(params: Params, y: Array, z: Array, code: Code) -> Array:
-    """(y, z) -> voxels, the exact inverse of `forward` at the same code."""
+    """(y, z) -> voxels, the exact inverse of `forward` at the same code; EV002 as there."""
     config, net = _net(params)
-    return _inverse(net, y, z, code, config=config)
+    pixels = code.context.shape[:-1]
+    for name, values, channels in (("y", y, 4), ("z", z, 2 * config.bins - 4)):
+        _check_shape(name, values, (*pixels, channels), code)
+    return _inverse(net, _real(y), _real(z), code, config=config)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -247,11 +285,11 @@ def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
     The code's summary is replaced by the camera's, which has been running: its pixels' memory is
     anywhere between the thresholds. A simulation that starts at the window's first frame sends
     about a tenth fewer events, and a fifth where thresholds are high. Values are not clipped:
-    noise of the latents leaves small negative weights.
+    noise of the latents leaves small negative weights. Raises EV015 for a camera of other pixels.
     """
     config, _ = _net(params)
     shape = code.context.shape[:-1]
-    known = jax.tree.map(lambda v: jnp.broadcast_to(v, shape[:-2]), camera_summary(camera))
+    known = _of_pixels(camera, shape)
     y = jnp.broadcast_to(unsquash(camera, config.output), (*shape, 4))
     z = jax.random.normal(key, (*shape, 2 * config.bins - 4))
     return inverse(params, y, z, dataclasses.replace(code, summary=known))

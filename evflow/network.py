@@ -44,6 +44,10 @@ def architecture(params: Params) -> ModelConfig:
             "EV018", f"params have the top-level keys {sorted(params)}.",
             f"Expected exactly one of {sorted(MODELS)}, as load_weights() returns.")
     name, net = next(iter(params.items()))
+    missing = {"encoder", "spread", "flow"} - set(net)
+    if missing:
+        raise EvflowDataError("EV018", f"params[{name!r}] has no {', '.join(sorted(missing))}.",
+                              "Pass what load_weights() returns, whole.")
     base = MODELS[name]
     steps = net["flow"]["level_0"]["actnorm"]["raw"].shape[0]
     hidden = net["flow"]["level_0"]["coupling"]["w_2"].shape[-1]

@@ -24,7 +24,12 @@ BINS = 16
 
 
 def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np.ndarray:
-    """Host events -> float32 (H, W, 2*bins) for the window [t0_us, t0_us + window_us)."""
+    """Host events -> float32 (H, W, 2*bins) for the window [t0_us, t0_us + window_us), integer
+    microseconds. Raises EV003, EV020."""
+    for name, value in (("t0_us", t0_us), ("window_us", window_us)):
+        if not isinstance(value, int | np.integer):
+            raise EvflowDataError("EV003", f"{name} is {value!r}.",
+                                  "Times are integer microseconds: round(seconds * 1e6).")
     if window_us <= 0 or bins < 2:
         raise EvflowDataError(
             "EV020", f"window_us={window_us}, bins={bins}.", "Need a window > 0 and >= 2 bins.")

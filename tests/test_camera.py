@@ -104,6 +104,7 @@ def test_saving_never_overwrites_unasked_nor_writes_nonsense(tmp_path: Path) -> 
     other.save(path, overwrite=True)
     assert same(Camera.load(path), other)
     assert code_of(lambda: altered("eta_on", -1.0).save(tmp_path / "bad.npz")) == "EV014"
+    assert code_of(lambda: other.save(tmp_path / "bad.npz", theta_on=np.ones(3))) == "EV020"
     assert os.listdir(tmp_path) == ["c.npz"]
 
 
@@ -269,7 +270,7 @@ def test_leading_axes_are_independent_cameras() -> None:
 
 @pytest.mark.parametrize("bad", [
     {"noise": "x"}, {"theta": (0.0, 0.5)}, {"theta": (0.5, 0.1)}, {"mismatch": (-0.1, 0.1)},
-    {"eta": (0.0, 1.0)}])
+    {"eta": (0.0, 1.0)}, {"theta": 0.2}, {"eta_spread": -1.0}])
 def test_bad_priors_are_named(bad: dict) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         CameraPrior(**bad)

@@ -187,7 +187,7 @@ def test_reconstruct_is_apply_window_by_window() -> None:
                for a, b in ((0, 3001), (3001, 6001), (6001, 9001))]
     expected, _ = run_jit(network, params, jnp.stack(tensors))
     np.testing.assert_allclose(images, expected, atol=1e-5)
-    for times, code in (([], "EV001"), ([5, 3], "EV004")):
+    for times, code in (([], "EV001"), ([5, 3], "EV004"), ([0.5, 1.0], "EV003")):
         with pytest.raises(EvflowDataError, match=code):
             reconstruct(network, params, events, np.array(times))
 

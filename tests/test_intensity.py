@@ -141,3 +141,11 @@ def test_delta_log_intensity_mixes_bytes_and_floats() -> None:
     (np.zeros((2, 3)), np.zeros((3, 2))), (np.zeros((1, 2, 3)), np.zeros((2, 3)))])
 def test_delta_log_intensity_refuses_wrong_shapes(a: np.ndarray, b: np.ndarray) -> None:
     assert code_of(lambda: delta_log_intensity(a, b)) == "EV002"
+
+
+@pytest.mark.parametrize(("frame", "code"), [
+    (np.full((24, 32, 3), 100, np.uint8), "EV002"), (np.full((2, 3), 0.5), "EV003"),
+    (np.full((2, 3), -1.0), "EV003"), (np.full((2, 3), 300.0), "EV003"),
+    (np.full((2, 3), np.nan), "EV007")])
+def test_delta_log_intensity_refuses_what_is_no_gray_dn(frame: np.ndarray, code: str) -> None:
+    assert code_of(lambda: delta_log_intensity(frame, frame)) == code

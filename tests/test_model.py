@@ -47,6 +47,17 @@ def test_inverse_undoes_forward_on_trained_weights(shipped: dict[str, Any]) -> N
         assert float(jnp.abs(back - voxels).max()) <= 1e-3
 
 
+def test_inverse_undoes_forward_in_double_precision(shipped: dict[str, Any]) -> None:
+    rng = np.random.default_rng(0)
+    voxels, dlogI = rng.poisson(0.3, (4, 5, 32)).astype(float), rng.normal(0, 0.3, (4, 5))
+    with jax.enable_x64(True):
+        code = model.encode(shipped, voxels, dlogI)
+        y, z, _ = model.forward(shipped, voxels, code)
+        again = model.inverse(shipped, y, z, code)
+        assert {a.dtype for a in (y, z, again)} == {jnp.dtype("float64")}
+        np.testing.assert_allclose(again, voxels, rtol=0, atol=1e-9)
+
+
 def test_log_det_is_that_of_the_jacobian(shipped: dict[str, Any]) -> None:
     voxels, dL, camera = seen()
     for params in (shipped, small_params()):
@@ -178,6 +189,15 @@ def test_squash_and_unsquash_are_inverse() -> None:
     ("EV007", lambda p, v, d: model.estimate(p, v, d.at[0, 0].set(jnp.inf))),
     ("EV020", lambda p, v, d: model.estimate(p, v, d, window_s=0.0)),
     ("EV018", lambda p, v, d: model.estimate({"other": {}}, v, d)),
+    ("EV018", lambda p, v, d: model.estimate({"default": {}}, v, d)),
+    ("EV002", lambda p, v, d: model.estimate(p, v, d, window_s=np.full(3, 0.05))),
+    ("EV002", lambda p, v, d: model.estimate(p, v, d, intensity=d.T[:2] * 0)),
+    ("EV003", lambda p, v, d: model.estimate(p, v, d, intensity=np.full(d.shape, 128.0))),
+    ("EV002", lambda p, v, d: model.forward(p, v[:-1], model.encode(p, v, d))),
+    ("EV002", lambda p, v, d: model.log_prob(p, v[..., :30], model.encode(p, v, d))),
+    ("EV002", lambda p, v, d: model.inverse(p, v[..., :4], v[..., :4], model.encode(p, v, d))),
+    ("EV015", lambda p, v, d: model.generate(
+        p, jax.random.key(0), Camera.constant((2, *d.shape)), model.encode(p, v, d))),
     ("EV002", lambda p, v, d: model.code_from_video(p, d, Camera.constant(d.shape))),
 ])
 def test_bad_input_is_named(code: str, call: Any) -> None:

@@ -112,3 +112,19 @@ def test_vmap_over_cameras() -> None:
     (LOG, {"model": SensorModel(kind="voltmeter")}, "EV020")])
 def test_bad_input(log: jax.Array, options: dict[str, Any], code: str) -> None:
     assert code_of(lambda: simulate_counts(KEY, log, QUIET, frame_dt_s=1e-3, **options)) == code
+
+
+def test_bytes_pass_through_the_log_map() -> None:
+    raw = FRAMES.clip(0, 255).astype(np.uint8)
+    counts = simulate_counts(KEY, raw, QUIET, frame_dt_s=1e-3)
+    np.testing.assert_array_equal(counts, simulate_counts(KEY, to_log(raw), QUIET, frame_dt_s=1e-3))
+
+
+@pytest.mark.parametrize(("change", "code"), [
+    ({"log_frames": jnp.full((3, *SHAPE), jnp.nan)}, "EV007"),
+    ({"log_frames": jnp.full((3, *SHAPE), 128.0)}, "EV003"),
+    ({"frame_dt_s": -1e-3}, "EV020"), ({"frame_dt_s": np.nan}, "EV020"),
+    ({"camera": dataclasses.replace(QUIET, eta_on=QUIET.eta_on + 1e7)}, "EV014")])
+def test_bad_input_is_refused(change: dict[str, Any], code: str) -> None:
+    given = {"log_frames": LOG, "camera": QUIET, "frame_dt_s": 1e-3} | change
+    assert code_of(lambda: simulate_counts(KEY, **given)) == code

@@ -47,6 +47,7 @@ TIMES = np.array([0, 1000, 2000])
     ({"frames": with_value(300.0)}, "EV003", "to 300"),
     ({"frames": with_value(-1.0)}, "EV003", "from -1"),
     ({"frames": frames(dtype=np.float32) * 50}, "EV003", "to_dn"),
+    ({"frames": frames(dtype=np.float32) / 255}, "EV003", "on 0..1"),
     ({"frames": frames(dtype=np.int32)}, "EV003", "int32"),
     ({"frames": frames(dtype=bool)}, "EV003", "bool"),
     ({"frames": frames().astype(object)}, "EV003", "object"),

@@ -171,3 +171,11 @@ def test_sums_of_hat_weights_are_those_of_the_single_events(
     expected = [np.maximum(0.0, 1.0 - np.abs(at - j)).sum() for j in range(width)]
     sums = hat_sums(width, jnp.float32(first), jnp.float32(spacing), jnp.float32(count))
     np.testing.assert_allclose(np.stack(sums), expected, atol=2e-5)
+
+
+def test_bytes_in_double_precision_mode_too() -> None:
+    frames = FRAMES.astype(np.uint8)
+    single = simulate_voxels(KEY, frames, QUIET, frame_dt_s=1e-3)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(simulate_voxels(KEY, frames, QUIET, frame_dt_s=1e-3), single,
+                                   atol=1e-4)

@@ -161,3 +161,8 @@ def test_silence_is_zeros() -> None:
 @pytest.mark.parametrize(("window", "bins"), [(0, 16), (-5, 16), (1000, 1), (1000, 0)])
 def test_impossible_windows_are_refused(window: int, bins: int) -> None:
     assert code_of(lambda: voxelize(random_events(3), T0, window, bins)) == "EV020"
+
+
+@pytest.mark.parametrize("window", [(0.0, 1000), (0, 1e3)])
+def test_times_in_seconds_are_refused(window: tuple[Any, Any]) -> None:
+    assert code_of(lambda: voxelize(random_events(10), *window)) == "EV003"

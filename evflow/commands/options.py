@@ -157,9 +157,11 @@ def refuse(options: Any, names: Iterable[str], why: str) -> None:
 
 
 def check_finite(options: Any) -> None:
-    """EV020 where a number among the options is NaN or infinite."""
+    """EV020 where a number among the options is NaN, infinite or, of a seed, beyond 64 bits."""
     for field in dataclasses.fields(options):
         number = getattr(options, field.name)
+        if field.name == "seed" and not -2**63 <= number < 2**63:
+            raise EvflowDataError("EV020", f"--seed {number}.", "Give one of at most 64 bits.")
         if isinstance(number, float) and not math.isfinite(number):
             raise EvflowDataError("EV020", f"{flag(field.name)} {number}.",
                                   "Give a finite number.")

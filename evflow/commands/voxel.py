@@ -109,10 +109,11 @@ def _windows(
 
 
 def _changes(recording: Recording, pairs: tuple[tuple[int, int], ...]) -> Iterator[np.ndarray]:
-    from evflow.intensity import delta_log_intensity
+    from evflow.intensity import to_log
 
     for first, last in pairs:
-        yield np.asarray(delta_log_intensity(recording.frame_dn(first), recording.frame_dn(last)))
+        before, after = (to_log(recording.frame_dn(i)) for i in (first, last))
+        yield np.asarray(after - before)
 
 
 def _store(

@@ -82,9 +82,12 @@ def reconstructions(
     was; a network's memory of a scene fades after more windows than it was trained on.
     Raises, before the first image, what `reconstruct` raises.
     """
-    times = np.asarray(frame_times_us, np.int64)
+    times = np.asarray(frame_times_us)
     if not times.size:
         raise EvflowDataError("EV001", "frame_times_us is empty.")
+    if times.dtype.kind not in "iu":
+        raise EvflowDataError("EV003", f"frame_times_us has dtype {times.dtype}.",
+                              "Times are integer microseconds: np.rint(t * 1e6).astype(np.int64).")
     if np.any(np.diff(times) < 0):
         raise EvflowDataError("EV004", "frame_times_us falls.", "Pass them in order.")
 

@@ -94,6 +94,10 @@ def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
     Raises EV008 (unknown format), EV009 (damaged), EV010 (a package is missing), EV016 (not
     there), EV020 (unknown hint), EV023 (whole seconds), and what `Events` and `Recording` raise.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise EvflowDataError(
+            "EV020", f"a path was expected, not {type(path).__name__}.",
+            "Events without frames become a recording by Recording.of_events(events).")
     told = Hints.parse(hints)
     path = Path(path)
     found = find_format(path)

@@ -48,16 +48,22 @@ SSIM = {
 }
 
 
-def _require_floats(*images: Array) -> None:
+def _check(*images: Array) -> None:
+    """EV003 for images of integers, EV002 for two of different sizes."""
     for image in images:
         if not jnp.issubdtype(image.dtype, jnp.floating):
             raise EvflowDataError("EV003", f"an image of {image.dtype}.",
                                   "Expected floats on [0, 1]: divide bytes by 255.")
+    if len({image.shape[-2:] for image in images}) > 1:
+        raise EvflowDataError(
+            "EV002", f"images of different shapes: {', '.join(str(i.shape) for i in images)}.",
+            "Expected (..., H, W) of one size; resize one of them.")
 
 
 def mse(image: Array, reference: Array) -> Array:
-    """Mean squared error. Raises EV003 for images of integers, as do all that build on it."""
-    _require_floats(image, reference)
+    """Mean squared error. Raises EV002 for images of two sizes and EV003 for images of integers,
+    as do all that build on it."""
+    _check(image, reference)
     return jnp.mean((image - reference) ** 2, (-2, -1))
 
 
@@ -79,7 +85,7 @@ def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
     """
     if preset not in SSIM:
         raise EvflowDataError("EV020", f"SSIM preset {preset!r}.", f"Choose one of {list(SSIM)}.")
-    _require_floats(image, reference)
+    _check(image, reference)
     how = SSIM[preset]
     if min(image.shape[-2:]) < max(len(how.window), 2):
         raise EvflowDataError("EV002", f"images of {image.shape[-2:]} pixels.",

@@ -17,8 +17,10 @@ import jax.numpy as jnp
 
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
+from evflow.intensity import check_log
 from evflow.sensors import SensorModel
 from evflow.simulator import noise, pixel, sensor
+from evflow.simulator.grids import as_log
 from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor, SimState
 
@@ -31,12 +33,15 @@ def simulate_counts(
 ) -> Array:
     """Events per pixel (H, W, 2) = [ON, OFF] of a video, float32; jit, vmap, differentiate it.
 
-    log_frames: (T, H, W) natural-log intensity in the map of `model.log_map`, frame_dt_s apart.
+    log_frames: (T, H, W) natural-log intensity in the map of `model.log_map`, or uint8 DN that
+    pass through it, frame_dt_s apart.
     camera: maps (H, W). smooth: width of the ramps in thresholds, 0 (exact counts, no gradient)
     to 1; above 0 the noise is its expectation, and the key only draws the leak's pattern. Raises
-    EV002, EV015, EV020 (options; a model that has no smooth counts).
+    EV002, EV003, EV007 (frames), EV014 (camera, more noise than an interval holds), EV015, EV020
+    (options; a model that has no smooth counts).
     """
     model = model or SensorModel()
+    log_frames = as_log(model, jnp.asarray(log_frames))
     if log_frames.ndim != 3 or len(log_frames) < 2:
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
                               "Expected (T, H, W) with at least two frames; vmap for more.")
@@ -49,8 +54,14 @@ def simulate_counts(
         raise EvflowDataError(
             "EV020", f"{model} has no {'smooth ' if smooth else ''}counts.",
             "Leave out refractory_s and leak_jitter, or add up simulate_voxels over bins.")
+    check_log("log_frames", log_frames)
+    timed = not isinstance(frame_dt_s, jax.core.Tracer)
+    if timed and not 0 < float(frame_dt_s) < math.inf:
+        raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}.", "A length in seconds, > 0.")
     camera = camera.validate()
     nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
+    if nominal is not None and timed:
+        noise.check_rate(noise.most_rate(model, camera, nominal), float(frame_dt_s))
     return _counts(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32),
                    model=model, smooth=float(smooth))
 

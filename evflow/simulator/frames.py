@@ -45,7 +45,7 @@ def _single_frames(
     shape: tuple[int, ...],
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Validated (frame, time) pairs, whatever the blocks they came in."""
-    dtype, last, index = None, None, 0
+    dtype, last, index, brightest = None, None, 0, 0.0
     for block, times in itertools.zip_longest(frames_iter, times_iter):
         if block is None or times is None:
             raise EvflowDataError(
@@ -54,7 +54,7 @@ def _single_frames(
         block, times = np.asarray(block), np.atleast_1d(np.asarray(times))
         block = block[None] if block.ndim == 2 else block
         _check_block(block, times, shape, dtype, index)
-        dtype = block.dtype
+        dtype, brightest = block.dtype, max(brightest, float(block.max(initial=0)))
         for frame, t in zip(block, times.tolist(), strict=True):
             if last is not None and t <= last:
                 raise EvflowDataError(
@@ -62,6 +62,10 @@ def _single_frames(
                     "Frame times must increase strictly.")
             last, index = t, index + 1
             yield frame, t
+    if dtype is not None and dtype.kind == "f" and 0 < brightest <= 1:
+        raise EvflowDataError(
+            "EV003", f"no value of the float frames is above {brightest:.4g}.",
+            "Expected DN on 0..255; these seem to be on 0..1: multiply by 255.")
 
 
 def _check_block(

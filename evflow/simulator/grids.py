@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from evflow.intensity import LOG_MAPS, normalised_intensity, to_log
 from evflow.sensors import SensorModel
@@ -132,11 +133,13 @@ def scan_brownian(
 
 
 @functools.partial(jax.jit, donate_argnames="grid")
-def put(grid: Array, at: Array, count: int, low: int, more: Array) -> Array:
+def put(grid: Array, at: Array, count: int, low: ArrayLike, more: Array) -> Array:
     """grid (H, W, 2 * bins) with more (K, 2, span) of the first `count` flat pixels `at` (K,) added
     to the bins from `low` on."""
+    zero, low = jnp.zeros((), at.dtype), jnp.asarray(low, at.dtype)  # indices of one dtype
+
     def one(i: Array, grid: Array) -> Array:  # XLA's scatter takes twice as long on a CPU
-        start = (at[i], 0, low)
+        start = (at[i], zero, low)
         old = jax.lax.dynamic_slice(grid, start, (1, *more.shape[1:]))
         return jax.lax.dynamic_update_slice(grid, old + more[i][None], start)
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
+from evflow.intensity import check_log
 from evflow.sensors import SensorModel
 from evflow.simulator import circuits, noise, sensor
 from evflow.simulator.active import BLOCK
@@ -29,7 +30,6 @@ from evflow.voxel import BINS
 
 Array = jax.Array
 
-MOST_LOG = 6.0  # more than the logarithm of 255 DN
 TILE = 8192  # pixels; their maps and grid, some 1.5 MB, are worked on at a time
 
 
@@ -111,9 +111,8 @@ def simulate_voxels(
     if not 0 < frame_dt_s < math.inf or bins < 2:
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}, bins={bins}.",
                               "Need frame_dt_s > 0 and bins >= 2.")
-    known = not isinstance(log_frames, jax.core.Tracer) and log_frames.dtype != jnp.uint8
-    if known:
-        _check_light(np.asarray(log_frames))
+    if log_frames.dtype != jnp.uint8:
+        check_log("log_frames", log_frames)
     if camera.shape[-2:] != log_frames.shape[-2:]:
         raise EvflowDataError(
             "EV015", f"the camera is {camera.shape[-2:]}, the frames {log_frames.shape[-2:]}.")
@@ -131,20 +130,6 @@ def simulate_voxels(
         noise.check_rate(noise.most_rate(model, camera, nominal), frame_dt_s)
     return _voxels(key, log_frames, camera, nominal, frame_dt_s=float(frame_dt_s), model=model,
                    bins=bins, lead=lead)
-
-
-def _check_light(log_frames: np.ndarray) -> None:
-    """EV007 where not all is finite (a sum tells in a third of the time, unless it overflows),
-    EV003 where it cannot be a logarithm of DN."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        mean = log_frames.sum() / max(log_frames.size, 1)
-        if not (np.isfinite(mean) or np.isfinite(log_frames).all()):
-            raise EvflowDataError("EV007", "log_frames holds NaN or infinite values.",
-                                  "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")
-    if mean > MOST_LOG:
-        raise EvflowDataError(
-            "EV003", f"log_frames has a mean of {mean:.3g}, but white (255 DN) has 5.54.",
-            "Is it DN? Pass uint8, or take intensity.to_log first.")
 
 
 def _by_blocks(key: Array, model: SensorModel, frames: Array, camera: Camera) -> bool:
