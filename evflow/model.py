@@ -11,7 +11,7 @@ arrays; everything static follows from the name (config.MODELS) and the leaves' 
 
 Shapes: voxels (..., H, W, 32), dlogI (..., H, W); pooling is over (H, W) only. Keyword-only
 conditions: window_s, seconds, default .05, a float or (...,); intensity, mean log intensity
-(lin-log of DN), (..., H, W), optional.
+(lin-log of DN), (..., H, W), optional; NaN where it is unknown.
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ def _prepare(
     lead = dlogI.shape[:-2]
     window_s = _spread_over("window_s", jnp.asarray(window_s, jnp.float32), lead)
     if intensity is not None:
-        check_log("intensity", intensity)
+        if not isinstance(intensity, jax.core.Tracer):
+            given = np.asarray(intensity)
+            check_log("intensity", given[~np.isnan(given)])
         intensity = jnp.asarray(intensity, jnp.float32)
         if intensity.shape == lead:
             intensity = intensity[..., None, None]

@@ -193,6 +193,7 @@ def test_squash_and_unsquash_are_inverse() -> None:
     ("EV002", lambda p, v, d: model.estimate(p, v, d, window_s=np.full(3, 0.05))),
     ("EV002", lambda p, v, d: model.estimate(p, v, d, intensity=d.T[:2] * 0)),
     ("EV003", lambda p, v, d: model.estimate(p, v, d, intensity=np.full(d.shape, 128.0))),
+    ("EV007", lambda p, v, d: model.estimate(p, v, d, intensity=np.full(d.shape, np.inf))),
     ("EV002", lambda p, v, d: model.forward(p, v[:-1], model.encode(p, v, d))),
     ("EV002", lambda p, v, d: model.log_prob(p, v[..., :30], model.encode(p, v, d))),
     ("EV002", lambda p, v, d: model.inverse(p, v[..., :4], v[..., :4], model.encode(p, v, d))),
