@@ -99,11 +99,15 @@ def _prepare(
         raise EvflowDataError(
             "EV002", f"dlogI has shape {np.shape(dlogI)}, voxels {np.shape(voxels)}.",
             "dlogI must be voxels' shape without the channels: (..., H, W).")
+    if np.size(dlogI) == 0:
+        raise EvflowDataError("EV001", f"voxels of shape {np.shape(voxels)} hold no pixel.")
     for name, value in (("voxels", voxels), ("dlogI", dlogI), ("window_s", window_s)):
         if not isinstance(value, jax.core.Tracer) and not np.isfinite(np.asarray(value)).all():
             raise EvflowDataError(
                 "EV007", f"{name} holds NaN or infinite values.",
                 "A logarithm of missing pixels? Set them to 0.")
+    if not isinstance(voxels, jax.core.Tracer):
+        _check_counts(np.asarray(voxels))
     if not isinstance(window_s, jax.core.Tracer) and not (np.asarray(window_s) > 0).all():
         raise EvflowDataError("EV020", f"window_s={window_s}.", "It is a length in seconds, > 0.")
     voxels, dlogI = _real(voxels), _real(dlogI)
@@ -118,6 +122,14 @@ def _prepare(
             intensity = intensity[..., None, None]
         intensity = _spread_over("intensity", intensity, dlogI.shape)
     return voxels, dlogI, window_s, intensity
+
+
+def _check_counts(voxels: np.ndarray) -> None:
+    """EV003 for what no counts are; `generate`'s own, a fraction of an event below 0, pass."""
+    if (least := voxels.min()) <= -1 or voxels.sum() < 0:
+        raise EvflowDataError(
+            "EV003", f"voxels go down to {least:.3g}, but they are numbers of events.",
+            "Signed polarities in one grid, or normalised? Take evflow.voxelize.")
 
 
 def _spread_over(name: str, values: Array, shape: tuple[int, ...]) -> Array:

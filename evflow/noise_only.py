@@ -15,7 +15,7 @@ from evflow.errors import EvflowDataError
 from evflow.faults import dead_pixels
 from evflow.rates import pixel_rates
 from evflow.stillness import busy_pixels, unlike_noise
-from evflow.types import Events, Recording
+from evflow.types import Recording
 
 
 def estimate_noise(recording: Recording) -> CameraEstimate:
@@ -29,7 +29,7 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
     events = recording.events
     counts = events.count_map()
     hot = busy_pixels(counts.sum(0))
-    _require_static(events, hot)
+    _require_static(recording, hot)
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(
         *(_rates(n, hot, seconds) for n in counts), strict=True)
@@ -55,13 +55,15 @@ def uniform(bounds: tuple[float, float]) -> tuple[float, float]:
     return 0.5 * sum(bounds), (bounds[1] - bounds[0]) / float(np.sqrt(12.0))
 
 
-def _require_static(events: Events, hot: np.ndarray) -> None:
-    reason = unlike_noise(events, hot)
+def _require_static(recording: Recording, hot: np.ndarray) -> None:
+    reason = unlike_noise(recording.events, hot)
     if reason:
         raise EvflowDataError(
             "EV011", f"events alone tell the noise of a scene at rest only, and {reason}",
-            "Thresholds are measured against intensity: give frames, --frames DIR --timestamps "
-            "FILE. The noise alone needs some seconds of a static scene.")
+            ("It has frames: measure its thresholds too (--protocol motion). " if
+             recording.has_frames else "Thresholds are measured against intensity: give frames, "
+             "--frames DIR --timestamps FILE. ") +
+            "The noise alone needs some seconds of a static scene.")
 
 
 def _rates(

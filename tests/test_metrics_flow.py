@@ -106,6 +106,13 @@ def test_flow_metrics_batch_and_differentiate() -> None:
     assert float(rise) > 0
 
 
+def test_no_events_tell_nothing() -> None:
+    none = [column[:0] for column in edge()]
+    assert np.isnan(fwl(*none, constant(3.0)))
+    assert np.isnan(fwl(*none, constant(3.0), convention=FwlConvention(reference="first")))
+    assert not np.isfinite(metrics.rsat(*none, constant(3.0)))
+
+
 ROTATIONS = {"boxes": 1.56, "dynamic": 2.06}
 
 

@@ -108,6 +108,7 @@ def test_metrics_are_differentiable_and_follow_the_type() -> None:
 
 @pytest.mark.parametrize(("call", "code"), [
     (lambda a, b: metrics.ssim(a, b, "best"), "EV020"),
+    (lambda a, b: lpips({}, a[:31], b[:31]), "EV002"),
     (lambda a, b: metrics.ssim(a[:9], b[:9]), "EV002"),
     (lambda a, b: metrics.ssim(a, b[:-1]), "EV002"),
     (lambda a, b: metrics.rmse(a, b[:, :1]), "EV002"),

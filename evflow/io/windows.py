@@ -84,7 +84,7 @@ def iter_windows(
         why = "; ".join(plan.skipped[:3]) or "the frames span less than that"
         raise EvflowDataError(
             "EV017", f"no window of {min_us / 1e3:g} ms or more can be used ({why}).",
-            "Record longer, or lower min_us.")
+            "Record longer, or take shorter windows (min_us, --window-ms).")
     return (_window(recording, pair, index) for index, pair in enumerate(plan.pairs))
 
 

