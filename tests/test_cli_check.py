@@ -133,7 +133,8 @@ def test_estimate_of_noise_alone(
     assert run("estimate", folder / "bare.npz", "-o", tmp_path / "no") == 1
     assert "EV011" in (error := capsys.readouterr().err)
     assert "--frames DIR" in error
-    assert run("estimate", folder / "flight.npz", "-o", tmp_path / "no", "--protocol", "static") == 1
+    static = ("--protocol", "static", "-o", tmp_path / "no")
+    assert run("estimate", folder / "flight.npz", *static) == 1
     assert "--protocol motion" in capsys.readouterr().err
     static = data_file("data/recordings/noise_static_dvxplorer640/events.npz")
     pytest.importorskip("matplotlib")
