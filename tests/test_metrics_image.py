@@ -235,6 +235,12 @@ def test_scores_with_lpips_name_the_network() -> None:
     assert 0 < scores["lpips"] < 1
 
 
+def test_images_too_small_for_lpips_have_their_other_scores() -> None:
+    scores = metrics.score_images({"x": pair((2, 24, 48))}, lpips_params={})
+    assert scores["lpips"] is None
+    assert 0 < scores["ssim"] < 1
+
+
 @pytest.mark.parametrize(("content", "code"), [
     (pickle.dumps({"AlexNet_0": np.zeros(3, np.float32)}, 2), "EV009|EV018"),
     (pickle.dumps(np.save), "EV009"), (b"", "EV009"),

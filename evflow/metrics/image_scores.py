@@ -18,7 +18,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.metrics import image as measures
-from evflow.metrics.lpips import Params, lpips
+from evflow.metrics.lpips import LEAST_SIDE, Params, lpips
 
 Array = jax.Array
 
@@ -58,7 +58,8 @@ PROTOCOLS = {
 def frame_scores(
     images: Array, references: Array, protocol: ImageProtocol, lpips_params: Params | None = None
 ) -> dict[str, Array]:
-    """mse, rmse (DN), psnr (dB), ssim and, with weights, lpips, each (...), of (..., H, W)."""
+    """mse, rmse (DN), psnr (dB), ssim and, with weights, lpips, each (...), of (..., H, W); lpips
+    of images too small for it is NaN."""
     if protocol.clip:
         images, references = (jnp.clip(a, 0.0, 1.0) for a in (images, references))
     if protocol.domain == "log":
@@ -70,7 +71,9 @@ def frame_scores(
         "ssim": measures.ssim(images, references, protocol.ssim),
     }
     if lpips_params is not None:
-        scores["lpips"] = lpips(lpips_params, images, references)
+        measured = min(images.shape[-2:]) >= LEAST_SIDE
+        scores["lpips"] = (lpips(lpips_params, images, references) if measured
+                           else jnp.full_like(scores["mse"], jnp.nan))
     return scores
 
 
@@ -81,7 +84,7 @@ def score_images(
     """Scores of sequences {name: (images, references)}, each (T, H, W) on [0, 1]; JSON-ready.
 
     Holds "protocol", "lpips_net", "frames", the means, and "sequences" with the mean of each.
-    A mean that is not finite (PSNR of equal images) is None.
+    A mean that is not finite (PSNR of equal images, LPIPS of images too small for it) is None.
     Raises EV001 (nothing to score), EV002 (shapes), EV007 (NaN), EV020 (unknown protocol).
     """
     if isinstance(protocol, str):
