@@ -70,7 +70,7 @@ def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
     times = hidden.recording.frame_times[first:first + len(kept)]
     sightings = sight(hidden.recording.events, times, path, STEPS)
     return dataclasses.replace(chunk, path=path.astype(np.float32), sightings=sightings,
-                               evidence=evidence_of(sightings))
+                               evidence=evidence_of(sightings, first=first == 0))
 
 
 def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] | None:

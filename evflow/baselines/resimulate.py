@@ -86,7 +86,7 @@ def _given(recording: Recording, run: list[int], steps: int) -> Chunk:
     coarse = Recording(events, recording.frames[index[::steps]], times)
     chunk = make_chunk(coarse, list(range(len(times) - 1)), steps)
     path = np.asarray(lin_log(np.stack([recording.frame_dn(int(i)) for i in index])))
-    evidence = pixel_evidence(events, times, path, steps)
+    evidence = pixel_evidence(events, times, path, steps, first=run[0] == 0)
     return dataclasses.replace(chunk, path=path, evidence=evidence)
 
 

@@ -1,9 +1,9 @@
 """What a pixel did not say: changes of the path that no event answered bound its thresholds.
 
 After an event the memory is the path's value there. Where the path then rises by d and the next
-event is no ON event, theta_on > d; likewise for falls. Before the first event the memory is
-unknown, but a range r without event means theta_on + theta_off > r. The path is read at frames
-only: between them its error is of the size of the thresholds.
+event is no ON event, theta_on > d; likewise for falls. What happens before the first event is
+start.py's. The path is read at frames only: between them its error is of the size of the
+thresholds.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ NOTHING = -1.0  # log units: bounds no threshold
 # The largest of several changes exceeds the true one by its error, which is taken off. Errors of
 # the path after an event between frames; measured on simulated recordings with 25 ms frames.
 EXCESS = 0.1
-ERROR = (0.15, 0.15, 0.2)  # of the rise, the fall, the range
-BOUNDED = ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))  # what each bounds: theta_on, theta_off, their sum
+ERROR = 0.15
 log_ndtr = jax.jit(special.log_ndtr)  # as single operations it compiles for a second
 
 
@@ -57,14 +56,16 @@ def _following(s: Sightings, k: int) -> Array:
     return following
 
 
-def bounded(mean: Array, covariance: Array, bounds: Array) -> tuple[Array, Array]:
+def bounded(
+    mean: Array, covariance: Array, bounds: Array, error: float = ERROR
+) -> tuple[Array, Array]:
     """The belief mean (2, ...), covariance (2, 2, ...) in theta_on, theta_off, once it is known
-    that they exceed the bounds (3, ...): moments of the truncated Gaussian, one bound at a time."""
-    for weights, bound, error in zip(BOUNDED, bounds, ERROR, strict=True):
-        c = np.array(weights)
-        along = np.einsum("ij...,j->i...", covariance, c)
-        scale = np.sqrt(np.einsum("i...,i->...", along, c) + error**2)
-        margin = (np.einsum("i...,i->...", mean, c) - (bound - EXCESS)) / scale
+    that they exceed the bounds (2, ...), which have this error: moments of the truncated
+    Gaussian, one bound at a time."""
+    for i, bound in enumerate(bounds):
+        along = covariance[:, i]
+        scale = np.sqrt(along[i] + error**2)
+        margin = (mean[i] - (bound - EXCESS)) / scale
         # phi / Phi, by logarithms: far below the bound both vanish
         log_mills = -0.5 * margin**2 - np.asarray(log_ndtr(jnp.asarray(margin, jnp.float32)))
         pull = np.where(bound == NOTHING, 0.0, np.exp(log_mills) / np.sqrt(2 * np.pi))

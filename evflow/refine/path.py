@@ -134,7 +134,8 @@ def make_chunk(recording: Recording, run: list[int], steps: int = STEPS) -> Chun
     trace = trace_of_events(recording.events, times, steps)
     sightings = sight(recording.events, times, fine, steps, seen)
     return Chunk(
-        fine, bright, dt_s, np.array(motion, np.float32), trace, evidence_of(sightings),
+        fine, bright, dt_s, np.array(motion, np.float32), trace,
+        evidence_of(sightings, first=run[0] == 0),
         _quiet(fine, trace, dt_s, seen[1:] & seen[:-1]), sightings)
 
 

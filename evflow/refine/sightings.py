@@ -1,7 +1,8 @@
 """A pixel's events beside the path of its brightness.
 
 Events are ordered by pixel, then time; each is placed in its frame interval and given the path's
-value at its instant. pixels.py and bounds.py read what the two tell of the pixel's thresholds.
+value at its instant. pixels.py, start.py and bounds.py read what the two tell of the pixel's
+thresholds.
 """
 
 from __future__ import annotations
@@ -13,6 +14,11 @@ import numpy as np
 from evflow.types import Events
 
 Array = np.ndarray
+
+PATH_ERROR = 0.04  # log units: error of the path at a frame, from the frame's noise
+RANGE_ERROR = 0.2  # of the path's range in an interval: its error half-way between two frames
+TYPICAL_THETA = 0.25  # log units: turns events into a range, where the path may have missed it
+HIDDEN = 1e-9  # weight of an event whose brightness no frame shows: nothing, yet no 0 / 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,3 +72,33 @@ def sight(
     return Sightings(
         number, pixel, interval, fraction, on, value, np.flatnonzero(np.diff(pixel, prepend=-1)),
         flat[::steps], parts.max(1) - parts.min(1), everything.reshape(k + 1, -1), (height, width))
+
+
+def trusted(s: Sightings) -> Array:
+    """(N,) weights of the path at the events, 1 at a frame: PATH_ERROR² over its variance."""
+    span = np.maximum(s.inner[s.interval, s.pixel], TYPICAL_THETA * _net_range(s))
+    between = 4 * s.fraction * (1 - s.fraction)
+    weight = 1.0 / (1.0 + (RANGE_ERROR / PATH_ERROR * span) ** 2 * between)
+    return np.asarray(weight * np.where(s.shown, 1.0, HIDDEN))
+
+
+def _net_range(s: Sightings) -> Array:
+    """(N,): how many net events the pixel went up and down in the interval of each event. What
+    moves there and back between two frames is seen by the events alone."""
+    sign = np.where(s.on, 1, -1)
+    net = np.cumsum(sign)
+    new = (np.diff(s.pixel, prepend=-1) != 0) | (np.diff(s.interval, prepend=-1) != 0)
+    begin = np.flatnonzero(new)
+    before = (net - sign)[begin]
+    high = np.maximum(np.maximum.reduceat(net, begin), before)
+    low = np.minimum(np.minimum.reduceat(net, begin), before)
+    return (high - low)[np.cumsum(new) - 1]
+
+
+def counted(s: Sightings) -> tuple[Array, Array, Array]:
+    """(N,) each: which of the pixels that fired an event is of, and its pixel's ON events and
+    minus its OFF events so far, itself included."""
+    group = np.cumsum(np.diff(s.pixel, prepend=-1) != 0) - 1
+    on, off = np.cumsum(s.on.astype(np.float64)), np.cumsum(1.0 - s.on)
+    before_on, before_off = (on - s.on)[s.first], (off - 1.0 + s.on)[s.first]
+    return group, on - before_on[group], before_off[group] - off
