@@ -153,8 +153,8 @@ def test_contrast_that_the_path_lacks_is_made_up_for(
     a, b, y = (v - v.mean(0) for v in (a, -b, y))
     sums = [(u * v).sum(0) for u, v in ((a, a), (a, b), (b, b), (a, y), (b, y), (y, y))]
     heard = rng.random(shape) < share
-    evidence = PixelEvidence(
-        np.stack([*sums, np.full(shape, 60.0)]) * heard, np.full((3, *shape), NOTHING))
+    evidence = dataclasses.replace(
+        PixelEvidence.nothing(shape), equations=np.stack([*sums, np.full(shape, 60.0)]) * heard)
     theta, std = pixel_posterior(
         evidence, Summary(*(jnp.float32(v) for v in (0.25, 0.25, 0.0, 0.0, 0.05, 0.05))))
     gain = np.median((0.86 * true / theta)[:, heard])
@@ -182,7 +182,7 @@ def test_no_change_beyond_a_threshold_goes_unanswered(
 def test_bounds_move_the_belief_only_where_they_contradict_it() -> None:
     mean = np.full((2, 3), 0.2)
     covariance = np.einsum("ij,k->ijk", np.diag([0.01, 0.01]), np.ones(3))
-    bounds = np.full((3, 3), NOTHING)
+    bounds = np.full((2, 3), NOTHING)
     bounds[0] = NOTHING, 0.05, 0.6  # unknown, far below, far above
     after, spread = bounded(mean, covariance, bounds)
     np.testing.assert_allclose(after[:, 0], 0.2)
@@ -190,7 +190,7 @@ def test_bounds_move_the_belief_only_where_they_contradict_it() -> None:
     assert spread[0, 0, 2] < 0.8 * 0.01
     np.testing.assert_allclose(after[1], 0.2)  # theta_off is not concerned
     draws = np.random.default_rng(0).normal(0.2, 0.1, 1_000_000)
-    weight = np.asarray(norm.cdf((draws - (0.6 - EXCESS)) / ERROR[0]))
+    weight = np.asarray(norm.cdf((draws - (0.6 - EXCESS)) / ERROR))
     np.testing.assert_allclose(after[0, 2], np.average(draws, weights=weight), atol=1e-3)
 
 
