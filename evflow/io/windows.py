@@ -18,7 +18,8 @@ from evflow.io.glitches import faulty_frames
 from evflow.types import Recording, Window
 
 MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
-EDGE_US = 1_000  # the events may begin or end this much inside the first or last frame
+EDGE_US = 5_000  # the events may begin or end this much inside the first or last frame: of a camera
+# that starts at the first frame the first one comes when brightness has changed by a threshold
 EDGE_EVENTS = 10  # or this many of the intervals at which events come there
 DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
 
