@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.inspection.findings import Finding
+from evflow.io.gaps import PACKET, event_gaps
 from evflow.io.windows import DROPPED
 from evflow.types import Recording
 
@@ -18,9 +19,6 @@ LEAST_EVENTS = 1_000
 MOST_HZ = 5_000.0  # events per second and pixel, mean of a whole sensor: none sends as many
 STRETCHED_HZ, TICK_US = 0.1, 1_000  # nor so few where anything moves; times of a us, stretched
 LASTING_HZ, FLASH = 1_500.0, 20  # nor, after 20 events a pixel, this: links carry 60 to 1,150
-PACKET = 64  # events: the time they take says how dense the recording is
-SAMPLES = 1_000_000  # packets looked at
-GAP_PACKETS, GAP_US = 50, 30_000  # a gap is longer than both
 JUMP_US = 10_000_000  # a jump is longer, and longer than all the rest of the recording
 
 
@@ -68,14 +66,10 @@ def _coarse(t: np.ndarray) -> bool:
 
 def _gaps(recording: Recording) -> list[Finding]:
     t = recording.events.t
-    if len(t) < 4 * PACKET:
-        return []
-    between = np.diff(t)
-    stride = len(t) // SAMPLES + 1
-    packet = float(np.median(t[PACKET::stride] - t[:-PACKET:stride]))
-    at = np.flatnonzero(between > max(GAP_PACKETS * packet, GAP_US))
+    at = event_gaps(t)
     if not len(at):
         return []
+    between = np.diff(t)
     rest = int(t[-1] - t[0]) - int(between[at].sum())
     longest = int(at[np.argmax(between[at])])
     lost_us = int(between[longest])
@@ -90,7 +84,8 @@ def _gaps(recording: Recording) -> list[Finding]:
     return [Finding(
         "EV025", "warning", f"no events between {from_s:.3f} s and {to_s:.3f} s{more}: dropped "
         "packets, or a scene that stood still?",
-        f"If packets were lost, leave the gap out: --stop {from_s:.3f} or --start {to_s:.3f}.")]
+        "Windows there are left out of an estimate. To leave it out elsewhere: "
+        f"--stop {from_s:.3f} or --start {to_s:.3f}.")]
 
 
 def _dropped(recording: Recording) -> list[Finding]:

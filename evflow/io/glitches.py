@@ -1,13 +1,15 @@
 """Frames that do not show what the pixels saw: flashes and black frames, exposure changes.
 
 A recording's frames come from another circuit than its events. Where the frame camera alone
-stumbles, the change of brightness between two frames says nothing about thresholds.
+stumbles, the change of brightness between two frames says nothing about thresholds. The frames
+alone tell flashes and changes of what stands still; beside the events they tell the rest.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from evflow.io.unexplained import contradicted
 from evflow.types import Recording
 
 DARK_DN, LEAST = 15.0, 0.1  # pixels below do not count; so many of all must be brighter
@@ -18,13 +20,19 @@ OTHER_SHARE = 0.02
 EXPOSURE = 0.08  # log units: change that most pixels share
 ALIKE, ALIKE_SHARE = 0.05, 0.6  # log units, share of pixels
 SATURATED_DN, BLACK_DN = 252.0, 0.5  # a frame at either end hides what its pixel saw
-LIT_SHARE = 0.3  # of the pixels have events where the light itself changed
+LIT_SHARE = 0.3  # of the pixels, more ON than OFF or the reverse, where the light itself changed
 
 
-def faulty_frames(recording: Recording) -> tuple[dict[int, str], dict[int, str]]:
-    """({frame: fault}, {i: fault of the step from frame i to i + 1}), a short reason each."""
-    glitches: dict[int, str] = {}
-    steps: dict[int, str] = {}
+def faulty_frames(
+    recording: Recording, start_us: int, stop_us: int
+) -> tuple[dict[int, str], dict[int, str]]:
+    """({frame: fault}, {i: fault of the step from frame i to i + 1}), a short reason each.
+    start_us, stop_us: the time that the events cover."""
+    frames, intervals = contradicted(recording, start_us, stop_us)
+    glitches = dict.fromkeys(frames, "a frame that shows something else than the events (old, or "
+                             "damaged?)")
+    steps = dict.fromkeys((i for i in intervals if not _lit(recording, i)),
+                          "all of the frame changes by more than the events say (auto-exposure?)")
     shown: list[np.ndarray] = []
     for i in range(len(recording.frame_times)):
         small = recording.frame_dn(i)[::STRIDE, ::STRIDE]
@@ -70,6 +78,7 @@ def _bright(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _lit(recording: Recording, i: int) -> bool:
-    """Whether many pixels fire between frames i and i + 1."""
+    """Whether many pixels fire alike between frames i and i + 1."""
     t0, t1 = (int(t) for t in recording.frame_times[i:i + 2])
-    return bool((recording.events.slice(t0, t1).count_map().sum(0) > 0).mean() > LIT_SHARE)
+    on, off = recording.events.slice(t0, t1).count_map()
+    return bool(abs((on > off).mean() - (off > on).mean()) > LIT_SHARE)

@@ -1,8 +1,8 @@
 """Windows: the pieces of a recording between two frames, from which a camera is estimated.
 
 A window runs from one frame to the first that is at least `min_us` later; the next begins where
-it ends. Only windows that the events cover are used, and none across a dropped or a faulty frame:
-there the brightness path between its two frames is unknown for too long, or wrong.
+it ends. Only windows that the events cover are used, and none across a gap of theirs, a dropped or
+a faulty frame: there the brightness path between its two frames is unknown for too long, or wrong.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.gaps import event_gaps
 from evflow.io.glitches import faulty_frames
 from evflow.types import Recording, Window
 
@@ -43,33 +44,61 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     check_overlap(recording)
     times = recording.frame_times
     start, stop = _covered(recording)
-    late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
-    glitches, steps = faulty_frames(recording)
+    obstacles = _obstacles(recording, start, stop)
     pairs: list[tuple[int, int]] = []
     skipped: list[str] = []
     first = 0
     while (last := int(np.searchsorted(times, times[first] + min_us))) < len(times):
-        gap = late[(late >= first) & (late < last)]
-        outside = times[first] < start or times[last] > stop
-        if len(gap):
-            i = int(gap[0])
-            lost_ms = (times[i + 1] - times[i]) / 1e3
-            skipped.append(
-                f"frames {first}-{last}: no frame for {lost_ms:.1f} ms after frame {i} (dropped?)")
-            first = i + 1
-            continue
-        faults = [(i, why) for i, why in glitches.items() if first <= i <= last] + [
-            (i, why) for i, why in steps.items() if first <= i < last]
-        if faults:
-            skipped.append(f"frames {first}-{last}: {faults[0][1]}")
-            first = max(i for i, _ in faults) + 1
-            continue
-        if outside:
-            skipped.append(f"frames {first}-{last}: not covered by the events")
+        if found := obstacles.between(first, last):
+            why, following = found
+        elif times[first] < start or times[last] > stop:
+            why = "not covered by the events"
+            following = first + 1 if times[first] < start else last
         else:
+            why, following = "", last
             pairs.append((first, last))
-        first = first + 1 if times[first] < start else last
+        if why:
+            skipped.append(f"frames {first}-{last}: {why}")
+        first = following
     return WindowPlan(tuple(pairs), tuple(skipped))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Obstacles:
+    """What no window may cross. times: of the frames; late: (N,) intervals with frames missing;
+    silent: (M, 2) us, begin and end of gaps in the events; glitches, steps: of `faulty_frames`."""
+
+    times: np.ndarray
+    late: np.ndarray
+    silent: np.ndarray
+    glitches: dict[int, str]
+    steps: dict[int, str]
+
+    def between(self, first: int, last: int) -> tuple[str, int] | None:
+        """What is wrong between two frames, and where to go on."""
+        dropped = self.late[(self.late >= first) & (self.late < last)]
+        if len(dropped):
+            i = int(dropped[0])
+            lost_ms = (self.times[i + 1] - self.times[i]) / 1e3
+            return f"no frame for {lost_ms:.1f} ms (dropped?)", i + 1
+        begin, end = self.silent.T
+        silent = self.silent[(begin < self.times[last]) & (end > self.times[first])]
+        if len(silent):
+            return (f"no events for {np.ptp(silent[0]) / 1e3:.1f} ms (lost packets, or a scene "
+                    "that stood still?)"), last
+        faults = [(i, why) for i, why in self.glitches.items() if first <= i <= last] + [
+            (i, why) for i, why in self.steps.items() if first <= i < last]
+        if faults:
+            return faults[0][1], max(i for i, _ in faults) + 1
+        return None
+
+
+def _obstacles(recording: Recording, start: int, stop: int) -> _Obstacles:
+    times, t = recording.frame_times, recording.events.t
+    late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
+    gaps = event_gaps(t)
+    return _Obstacles(times, late, np.stack([t[gaps], t[gaps + 1]], -1),
+                      *faulty_frames(recording, start, stop))
 
 
 def iter_windows(

@@ -26,7 +26,9 @@ MEMORY_ERRORS = (0.02, 0.04, 0.07, 0.1)  # log units, of the memory where it is 
 EXPECTATIONS = 30  # steps of expectation and maximisation for the share of such pixels
 FIRST_SIGNAL = 0.8  # share of signal among pixels' first events
 SPAN_ERROR = 0.1  # log units, of the range before the first event
-NODES = 21  # of the integral over theta_on + theta_off (Gauss-Hermite)
+NODES, REACH = 21, 3.0  # of the integral over theta_on + theta_off (Gauss-Hermite); its reach in
+# standard deviations: a wider span is the path's error
+LEAST_SHARE = 0.05  # of the variance, that the nodes resolve
 LEAST_SUM = 0.02  # log units
 
 
@@ -119,7 +121,9 @@ def _moments(
     centre: jax.Array, scale: jax.Array, span: jax.Array, fired: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and variance of (theta_on + theta_off - centre) / scale, before N(0, 1)."""
-    def node(sums: jax.Array, at: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+    span = jnp.minimum(span, centre + REACH * scale)
+
+    def node(sums: jax.Array, at: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
         z, weight = at
         width = jnp.maximum(centre + z * scale, LEAST_SUM)
         margin = (width - span) / SPAN_ERROR
@@ -132,4 +136,4 @@ def _moments(
     nodes = [jnp.asarray(v, centre.dtype) for v in np.polynomial.hermite_e.hermegauss(NODES)]
     zeros = jnp.full((3, *centre.shape), jnp.finfo(centre.dtype).tiny)
     (total, first, second), _ = jax.lax.scan(node, zeros, tuple(nodes))
-    return first / total, second / total - (first / total) ** 2
+    return first / total, jnp.maximum(second / total - (first / total) ** 2, LEAST_SHARE)

@@ -1,0 +1,93 @@
+"""Frames that the events contradict: what changes from frame to frame is what a pixel's events
+add up to, a threshold each.
+
+Over a recording the change of log brightness is regressed on the ON and the OFF events of the
+same interval. What the events leave of it is alike in all intervals of a sound recording. Where
+they leave much more on both sides of a frame, and hardly go with it, that frame shows something
+else; where all pixels change by something that no events account for, the exposure did.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from evflow.types import Recording
+
+Array = np.ndarray
+
+PIXELS = 4096  # looked at, evenly spread
+DARK_DN, BRIGHT_DN = 15.0, 252.0  # beyond, the change of log brightness means little
+LEAST_PIXELS, LEAST_INTERVALS = 100, 6
+FOLLOWS = 0.4  # median correlation of change and net events: below, they cannot judge frames
+LITTLE, MUCH = 0.5, 2.0  # of the median correlation, of the median rest
+STEP, STEP_SPREAD = 0.08, 9.0  # log units; times the median deviation of an interval's mean rest
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rests:
+    """Of each interval that the events cover, arrays (K,): its number, the correlation of change
+    and net events, the rms and the mean of the change that events leave, in log units."""
+
+    interval: Array
+    correlation: Array
+    rest: Array
+    shift: Array
+
+
+def contradicted(recording: Recording, start_us: int, stop_us: int) -> tuple[list[int], list[int]]:
+    """Frames that the events contradict, and intervals i (frame i to i + 1) in which all of the
+    frame changes without events; start_us, stop_us: the time that the events cover."""
+    found = _rests(recording, start_us, stop_us)
+    if found is None or np.median(found.correlation) < FOLLOWS:
+        return [], []
+    strange = ((found.correlation < LITTLE * np.median(found.correlation))
+               & (found.rest > MUCH * np.median(found.rest)))
+    at = found.interval
+    frames = [int(i) for i in at[1:][strange[1:] & strange[:-1] & (np.diff(at) == 1)]]
+    away = np.abs(found.shift - np.median(found.shift))
+    steps = at[(away > max(STEP, STEP_SPREAD * float(np.median(away)))) & ~strange]
+    return frames, [int(i) for i in steps]
+
+
+def _rests(recording: Recording, start_us: int, stop_us: int) -> Rests | None:
+    times = recording.frame_times
+    covered = np.flatnonzero((times[:-1] >= start_us) & (times[1:] <= stop_us))
+    if len(covered) < LEAST_INTERVALS:
+        return None
+    moments = np.array([_moments(recording, int(i)) for i in covered])
+    shown = moments[:, 0] > max(LEAST_PIXELS, LITTLE * np.median(moments[:, 0]))
+    if shown.sum() < LEAST_INTERVALS:
+        return None
+    mean, second = moments[:, 1:4], moments[:, 4:].reshape(-1, 3, 3)
+    covariance = second - mean[:, :, None] * mean[:, None, :]  # of change, ON and minus OFF events
+    net = covariance @ np.array([0.0, 1.0, 1.0])
+    power = covariance[:, 0, 0] * (net[:, 1] + net[:, 2])
+    correlation = np.where(power > 0, net[:, 0] / np.sqrt(np.where(power > 0, power, 1.0)), 0.0)
+    correlation = np.where(shown, correlation, 0.0)
+    usual = covariance[correlation >= np.median(correlation)].sum(0)
+    if np.linalg.matrix_rank(usual[1:, 1:]) < 2:
+        return None
+    away = np.array([1.0, *-np.linalg.solve(usual[1:, 1:], usual[1:, 0])])
+    rest = np.sqrt(np.maximum(np.einsum("i,kij,j->k", away, covariance, away), 0.0))
+    # A frame that hides what the others show is as strange as one that shows something else.
+    return Rests(covered, correlation, np.where(shown, rest, np.inf),
+                 np.where(shown, mean @ away, np.median(mean @ away)))
+
+
+def _moments(recording: Recording, i: int) -> Array:
+    """(13,): number of pixels that frames i and i + 1 show, then mean and second moments of their
+    change of log brightness, ON events and minus OFF events."""
+    height, width = recording.frames.shape[1:]
+    stride = max(1, int(np.sqrt(height * width / PIXELS)))
+    before, after = (recording.frame_dn(j)[::stride, ::stride] for j in (i, i + 1))
+    t0, t1 = (int(t) for t in recording.frame_times[i:i + 2])
+    on, off = recording.events.slice(t0, t1).count_map()[:, ::stride, ::stride]
+    shown = (np.minimum(before, after) > DARK_DN) & (np.maximum(before, after) < BRIGHT_DN)
+    if not shown.any():
+        return np.zeros(13)
+    change = np.log(after[shown]) - np.log(before[shown])
+    values = np.stack([change, on[shown].astype(np.float64), -off[shown].astype(np.float64)])
+    second = (values[:, None] * values[None]).mean(-1)
+    return np.concatenate([[shown.sum()], values.mean(1), second.ravel()])
