@@ -55,6 +55,10 @@ class Stats:
     def __add__(self, other: Stats) -> Stats:
         return jax.tree.map(jnp.add, self, other)
 
+    def __radd__(self, other: int) -> Stats:
+        """`sum(...)` begins with 0."""
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
 
 def window_features(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
     """(..., 3): log window length, log intensity about its middle, whether it was given."""

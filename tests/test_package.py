@@ -22,7 +22,7 @@ FLOORS = (
     ("pixels", "intensity", "stillness", "rates"),
     ("voxel", "inspection", "exports"),
     ("flow", "scenes", "simulator"),
-    ("config",), ("coordinates", "dataset"),
+    ("config",), ("coordinates", "dataset", "inputs"),
     ("encoder", "summary", "refine"),
     ("network", "losses", "batch", "noise_only", "polarity"), ("pixelwise",), ("model",),
     ("weights", "checkpoint"),
