@@ -61,8 +61,8 @@ def estimate_camera(
 
     Windows run from frame to frame until at least min_window_us long. refine: "auto" simulates
     stretches of the recording with the estimate and corrects it, which takes the error of
-    theta on held-out cameras from .022 to .011, and counts the noise where nothing moves; "off"
-    leaves it to the network alone.
+    theta on held-out cameras from .022 to .011; "off" leaves it to the network alone. Where
+    nothing moves the noise is counted, and no threshold is told, either way.
     progress(done, total) is called after every window and stretch. What usually goes wrong with
     a recording is not looked for here: `check(recording).raise_if_failed()` before.
     Raises EV011 (no frames, and the scene moves), EV012, EV017 where the recording cannot tell,
@@ -73,7 +73,7 @@ def estimate_camera(
     recording = recording_or_path
     if not isinstance(recording, Recording):
         recording = io.read_recording(recording)
-    if not recording.has_frames or (refine == "auto" and stands_still(recording)):
+    if not recording.has_frames or stands_still(recording):
         return estimate_noise(recording)
     params = load_weights() if params is None else params
     plan = io.plan_windows(recording, min_window_us)

@@ -30,9 +30,9 @@ def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np
         if not isinstance(value, int | np.integer):
             raise EvflowDataError("EV003", f"{name} is {value!r}.",
                                   "Times are integer microseconds: round(seconds * 1e6).")
-    if window_us <= 0 or bins < 2:
-        raise EvflowDataError(
-            "EV020", f"window_us={window_us}, bins={bins}.", "Need a window > 0 and >= 2 bins.")
+    if window_us <= 0 or not isinstance(bins, int | np.integer) or bins < 2:
+        raise EvflowDataError("EV020", f"window_us={window_us}, bins={bins}.",
+                              "Need a window > 0 and a whole number of bins, 2 or more.")
     inside = events.slice(t0_us, t0_us + window_us)
     width, height = events.size
     position = (inside.t - t0_us) * ((bins - 1) / window_us)

@@ -8,7 +8,6 @@ a faulty frame: there the brightness path between its two frames is unknown for 
 from __future__ import annotations
 
 import dataclasses
-import operator
 from collections.abc import Iterator
 
 import numpy as np
@@ -39,8 +38,9 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     Raises EV001 (no events), EV011 (fewer than two frames), EV012 (frames and events do not
     overlap), EV020 (min_us < 1).
     """
-    if operator.index(min_us) < 1:
-        raise EvflowDataError("EV020", f"min_us={min_us}.", "A window takes 1 us or more.")
+    if not isinstance(min_us, int | np.integer) or min_us < 1:
+        raise EvflowDataError("EV020", f"min_us={min_us}.",
+                              "A window takes a whole number of microseconds, 1 or more.")
     check_overlap(recording)
     times = recording.frame_times
     start, stop = _covered(recording)

@@ -30,6 +30,7 @@ NODES, REACH = 21, 3.0  # of the integral over theta_on + theta_off (Gauss-Hermi
 # standard deviations: a wider span is the path's error
 LEAST_SHARE = 0.05  # of the variance, that the nodes resolve
 LEAST_SUM = 0.02  # log units
+DENSITY = float(1 / np.sqrt(2 * np.pi))  # of N(0, 1) at 0; a NumPy scalar would make all float64
 
 
 class Belief(NamedTuple):
@@ -127,7 +128,7 @@ def _moments(
         z, weight = at
         width = jnp.maximum(centre + z * scale, LEAST_SUM)
         margin = (width - span) / SPAN_ERROR
-        room = margin * special.ndtr(margin) + jnp.exp(-0.5 * margin**2) / np.sqrt(2 * np.pi)
+        room = margin * special.ndtr(margin) + DENSITY * jnp.exp(-0.5 * margin**2)
         silent = jnp.where(span > 0, SPAN_ERROR * room / width, 1.0)
         signal = special.ndtr(margin) / width
         likely = jnp.where(fired, FIRST_SIGNAL * signal + (1 - FIRST_SIGNAL) * silent, silent)
