@@ -58,7 +58,8 @@ def compared(rows: Rows) -> Result:
         result[label] = {}
         for name, seeds in measures.items():
             means = np.array([np.nanmean(v) for v in seeds.values()])
-            entry: dict[str, Any] = {"mean": float(means.mean()), "seeds": sorted(seeds)}
+            entry: dict[str, Any] = {
+                "mean": float(means.mean()), "seeds": list(seeds), "values": means.tolist()}
             for other in REFERENCES:
                 if other != label and other in rows and name not in CONSTANT:
                     entry[f"to {other}"] = difference(seeds, rows[other][name])

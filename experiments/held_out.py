@@ -13,6 +13,7 @@ import numpy as np
 
 from evflow.downstream import Network, normalise, run
 from evflow.metrics import PROTOCOLS, FwlConvention, frame_scores, log_map, mse, score_flow
+from evflow.metrics.flow_scores import OUTLIER_PX
 from evflow.types import Events
 from experiments.targets import Clip
 
@@ -26,6 +27,7 @@ FLOW = ("aee", "outlier_percent", "fwl", "fwl_truth")
 # thresholds); rounded to the nearest pixel it scores 1.15.
 CONVENTION = FwlConvention(splat="round")
 RISING = ("ssim", "psnr", "fwl")  # better where larger
+PROTOCOL = PROTOCOLS["evreal"]  # of images; log_mse is the mse of `log_map` of both
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,6 +40,13 @@ class Clips:
     tensors: Array
     frames: Array
     flow: np.ndarray
+
+
+def scored_by(task: str) -> dict[str, Any]:
+    """The conventions of `VIDEO` or of `FLOW`, for "flow"."""
+    if task == "flow":
+        return {"fwl": CONVENTION.as_dict(), "aee": "pixels with events", "outlier_px": OUTLIER_PX}
+    return {**dataclasses.asdict(PROTOCOL), "lpips_net": "alex v0.1"}
 
 
 def gather(clips: Iterable[Clip]) -> Clips:
@@ -64,7 +73,7 @@ def video_scores(images: Array, clips: Clips, skipped: int, lpips: Params | None
 @jax.jit
 def _video(images: Array, frames: Array, lpips: Params | None) -> dict[str, Array]:
     def clip(pair: tuple[Array, Array]) -> dict[str, Array]:
-        scores = frame_scores(*pair, PROTOCOLS["evreal"], lpips)
+        scores = frame_scores(*pair, PROTOCOL, lpips)
         scores["log_mse"] = mse(*map(log_map, pair))
         return jax.tree.map(jnp.mean, scores)
 

@@ -38,7 +38,7 @@ from evflow.downstream.train import LearningConfig
 from evflow.errors import EvflowDataError
 from evflow.progress import stoppable
 from evflow.report import plots
-from experiments import gains
+from experiments import gains, held_out
 from experiments.common import provenance, write_result
 from experiments.conditions import EVENTGAN
 from experiments.targets import CAMERAS, SCENES
@@ -191,7 +191,8 @@ def main(options: Options) -> dict[str, Any]:
     text = "\n\n".join((heading(options, setting), gains.report(
         result, options.task, runs.told(conditions), left)))
     print(text)
-    write_result(options.out / "see_better.json", {"targets": result, "missing": left},
+    write_result(options.out / "see_better.json", {"targets": result, "missing": left,
+                                               "scored_by": held_out.scored_by(options.task)},
                  as_dict(options) | {"setting": as_dict(setting)})
     (options.out / "see_better.md").write_text(text + "\n")
     gains.picture(result, options.out / "see_better.png")

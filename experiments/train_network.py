@@ -38,7 +38,7 @@ from evflow.downstream.train import LearningConfig, init_state, make_step, optim
 from evflow.errors import EvflowDataError
 from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import PROTOCOLS, frame_scores
-from evflow.metrics.lpips import load_lpips
+from evflow.metrics.perceptual import load_lpips
 from evflow.scenes import make_bank
 from experiments.common import provenance, write_result
 from experiments.loop import train

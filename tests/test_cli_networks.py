@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from event_networks import EVEN, MOTION, even, saved, steady
 from recordings import T0, make
 
-from evflow import write_events
+from evflow import write_events, write_recording
 from evflow.cli import main
 from evflow.downstream import video
 from evflow.report.flow import flow_colours, flow_image, wheel
@@ -76,6 +77,27 @@ def test_reconstruct_scores_against_the_frames(
     found = json.loads(capsys.readouterr().out)
     assert found["images"] == 21
     assert found["scores"] is None  # the images are not at the frames' times
+
+
+def test_frames_before_the_events_are_not_scored(
+    weights: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made, command = make(count=12, span=700_000), ["reconstruct", str(tmp_path / "r.npz"), "-o",
+                                                   str(tmp_path / "a.gif"), "--overwrite", "--json",
+                                                   "--weights", weights["images"]]
+    for moved, scored in ((300_000, True), (5_000_000, False)):
+        late = Events(made.events.x, made.events.y, made.events.t + moved, made.events.p,
+                      made.events.size)
+        write_recording(tmp_path / "r.npz", dataclasses.replace(made, events=late), "npz",
+                        overwrite=True)
+        assert main(command) == 0
+        scores = json.loads(capsys.readouterr().out)["scores"]
+        assert (scores is not None) == scored
+        if scores:
+            amid = made.frame_times > late.t[0]
+            assert scores["frames"] == amid.sum() - scores["warm_up"]
+            frames = made.frames[amid][scores["warm_up"]:] / 255.0
+            assert scores["mse"] == pytest.approx(((frames - EVEN) ** 2).mean(), rel=1e-4)
 
 
 def test_reconstructed_folders_are_frames_for_other_commands(
@@ -156,6 +178,8 @@ def test_colours_say_where_to_and_how_fast() -> None:
     ("EV020", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--truth", "t.npz", "--sync",
                "ms"]),
     ("EV020", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--full-px", "0"]),
+    ("EV016", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--truth", "no.npz"]),
+    ("EV020", ["reconstruct", "REC", "-o", "a.mp4", "--weights", "IMAGES", "--window-ms", "-3"]),
     ("EV020", ["estimate", "REC", "-o", "cam", "--no-plots", "--no-report", "--reconstruct"]),
     ("EV020", ["estimate", "REC", "-o", "cam", "--no-plots", "--no-report", "--protocol", "static",
                "--reconstruct"])])

@@ -30,6 +30,7 @@ from evflow.downstream import (
     E2VID_SMALL,
     EVFlowNet,
     FireNet,
+    load_network,
     load_published,
     run,
 )
@@ -123,6 +124,34 @@ def test_settings_of_the_original_e2vid_make_it_sigmoid(tmp_path: Path) -> None:
     write_legacy(path, {"model": {"num_bins": 5}, "state_dict": case_state("e2vid_plus")})
     network, _ = load_published(path)
     assert (network.output, network.padding) == ("sigmoid", "reflect")
+
+
+@pytest.mark.parametrize(("name", "settings", "expected"), [
+    ("firenet_2020", {}, True), ("firenet_plus", {}, False), ("e2vid_lightweight", {}, True),
+    ("e2vid_plus", {}, False), ("e2vid_plus", {"model": {"norm": "none"}}, True),
+    ("evflownet", {}, False)])
+def test_networks_get_tensors_as_in_their_training(
+    name: str, settings: dict, expected: bool, tmp_path: Path
+) -> None:
+    write_legacy(tmp_path / "mine.ckpt", {**settings, "state_dict": case_state(name)})
+    trained = load_network(tmp_path / "mine.ckpt")  # by its content, whatever its name
+    assert trained.how == {"normalised": expected}
+
+
+def test_weights_that_diverged_are_refused(tmp_path: Path) -> None:
+    for value in (np.nan, 1e300):
+        state = {k: v.astype(np.float64) for k, v in case_state("firenet_plus").items()}
+        state["pred.conv2d.bias"][0] = value
+        with pytest.raises(EvflowDataError, match=r"EV007.*prediction/conv/bias"):
+            to_params(FireNet(), state)
+
+
+def test_what_stands_beside_a_network_is_named() -> None:
+    state = {**case_state("e2vid_plus"), "extra.weight": np.zeros(3, np.float32)}
+    if not any(name.startswith("unetrecurrent.") for name in state):
+        state = {k if k == "extra.weight" else f"unetrecurrent.{k}": v for k, v in state.items()}
+    with pytest.raises(EvflowDataError, match=r"EV018.*extra\.weight"):
+        to_params(recognise(state), state)
 
 
 @pytest.mark.parametrize(("change", "says"), [

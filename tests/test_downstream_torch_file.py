@@ -72,6 +72,15 @@ def test_written_files_come_back(write: Any, tmp_path: Path) -> None:
     assert read_checkpoint(tmp_path / "bare.pth").arrays.keys() == state().keys()
 
 
+@pytest.mark.parametrize("kept", [4, 60, 0.5, -30])
+def test_zips_that_lack_their_end_are_damaged(kept: float, tmp_path: Path) -> None:
+    write_zip(tmp_path / "x.pth", {"state_dict": state()})
+    data = (tmp_path / "x.pth").read_bytes()
+    (tmp_path / "x.pth").write_bytes(data[:int(kept * len(data)) if kept == 0.5 else int(kept)])
+    with pytest.raises(EvflowDataError, match="EV009"):
+        read_checkpoint(tmp_path / "x.pth")
+
+
 @writers
 def test_objects_of_the_training_code_are_dropped(write: Any, tmp_path: Path) -> None:
     config = Raw(b"ccopy_reg\n_reconstructor\n(cparse_config\nConfigParser\nc__builtin__\nobject\n"

@@ -189,3 +189,41 @@ def test_scores_say_how_they_were_made() -> None:
 def test_what_cannot_be_scored_is_refused(call, code: str) -> None:
     with pytest.raises(EvflowDataError, match=code):
         call(recorded(), np.zeros((2, 2, *SIZE[::-1]), np.float32))
+
+
+def test_flow_that_is_not_finite_is_no_good_flow() -> None:
+    truth = jnp.zeros((2, 4, 4))
+    error, beyond = metrics.aee(truth * jnp.nan, truth)
+    assert np.isnan(error)
+    assert beyond == 100.0
+    events = Events(np.array([1, 2]), np.array([1, 2]), np.array([0, 5]), np.array([True, False]),
+                    (4, 4))
+    with pytest.raises(EvflowDataError, match="EV007"):
+        metrics.score_flow(events, np.array([0, 10]), np.full((1, 2, 4, 4), np.nan))
+
+
+def test_unknown_truth_is_not_scored() -> None:
+    flow, truth = jnp.full((2, 4, 4), 5.0), jnp.zeros((2, 4, 4)).at[:, :2].set(jnp.nan)
+    error, beyond = metrics.aee(flow, truth)
+    assert (float(error), float(beyond)) == (pytest.approx(np.sqrt(50)), 100.0)
+    with pytest.raises(EvflowDataError, match="EV002"):
+        metrics.aee(flow, truth, jnp.ones((1, 4), bool))
+    with pytest.raises(EvflowDataError, match="EV002"):
+        metrics.aee(jnp.moveaxis(flow, 0, -1), jnp.moveaxis(truth, 0, -1))
+
+
+def test_the_ceiling_is_of_events_whose_flow_is_known() -> None:
+    """The same flow, as an estimate and as a truth that is known on the right alone."""
+    x, y, t, p, _ = edge()
+    inside = (x >= 0) & (x < 31)
+    events = Events(x[inside].astype(int), y[inside].astype(int),
+                    (1000 * t[inside]).astype(np.int64), p[inside] > 0, SIZE)
+    flow = np.asarray(constant(12.0))[None]
+    part = flow.copy()
+    part[:, :, :, :10] = np.nan
+    right = events.x >= 10
+    known = Events(*(a[right] for a in (events.x, events.y, events.t, events.p)), SIZE)
+    edges = np.array([0, 1001])
+    found = metrics.score_flow(events, edges, flow, truth=part)
+    assert found["fwl_truth"] == pytest.approx(metrics.score_flow(known, edges, flow)["fwl"])
+    assert found["aee"] == 0.0

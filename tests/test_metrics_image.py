@@ -25,7 +25,7 @@ from skimage.metrics import (
 from evflow import metrics
 from evflow.errors import EvflowDataError
 from evflow.metrics.image_scores import PROTOCOLS, ImageProtocol
-from evflow.metrics.lpips import load_lpips, lpips
+from evflow.metrics.perceptual import load_lpips, lpips
 
 SIZES = ((40, 53), (11, 64))
 ssim = jax.jit(metrics.ssim, static_argnames="preset")
@@ -119,6 +119,9 @@ def test_metrics_are_differentiable_and_follow_the_type() -> None:
     (lambda a, b: metrics.score_images({"x": ((255 * a[None]).astype(np.uint8), b[None])}),
      "EV003"),
     (lambda a, b: metrics.score_images({"x": (a[None] * np.nan, b[None])}), "EV007"),
+    (lambda a, b: metrics.score_images({"x": (255.0 * a[None], 255.0 * b[None])}), "EV003"),
+    (lambda a, b: metrics.lpips({}, (255 * a).astype(np.uint8), b), "EV003"),
+    (lambda a, b: metrics.lpips({}, a[0], b[0]), "EV002"),
     (lambda a, b: ImageProtocol(aggregate="median"), "EV020"),
     (lambda a, b: ImageProtocol(domain="sqrt"), "EV020"),
 ])
@@ -237,8 +240,11 @@ def test_scores_with_lpips_name_the_network() -> None:
 
 def test_images_too_small_for_lpips_have_their_other_scores() -> None:
     scores = metrics.score_images({"x": pair((2, 24, 48))}, lpips_params={})
-    assert scores["lpips"] is None
+    assert (scores["lpips"], scores["lpips_net"]) == (None, None)
     assert 0 < scores["ssim"] < 1
+    tiny = metrics.score_images({"x": pair((2, 8, 10))})
+    assert tiny["ssim"] is None
+    assert tiny["mse"] > 0
 
 
 @pytest.mark.parametrize(("content", "code"), [

@@ -57,13 +57,15 @@ class Reconstruct(Windowed):
         recording = self.read(self.recording)
         times = self.times(recording)
         # Without events nothing is to be seen: only frames amid them are scored.
-        seen = np.searchsorted(times, recording.events.t[-1], "right")
-        scores = self._scores(int(seen)) if times is recording.frame_times else None
+        first = int(np.searchsorted(times, recording.events.t[0], "right"))
+        stop = int(np.searchsorted(times, recording.events.t[-1], "right"))
+        amid = range(first, stop)
+        scores = self._scores(len(amid)) if times is recording.frame_times else None
         with bar("reconstructing") as progress:
             images = reconstructions(
                 trained.network, trained.params, recording.events, times, **trained.how,
                 hold=True)
-            images = _watched(images, recording, scores, int(seen), len(times), progress)
+            images = _watched(images, recording, scores, amid, len(times), progress)
             said = (self._folder(images, times) if kind == "" else
                     self._film(images, times, recording))
         result = scores.result() if scores else None
@@ -90,7 +92,7 @@ class Reconstruct(Windowed):
         """Of so many frames by the protocol, with LPIPS where its weights are installed."""
         from evflow.downstream.video import WARM_UP, FrameScores
         from evflow.metrics.image_scores import PROTOCOLS
-        from evflow.metrics.lpips import load_lpips
+        from evflow.metrics.perceptual import load_lpips
 
         try:
             weights = load_lpips()
@@ -114,12 +116,12 @@ class Reconstruct(Windowed):
 
 
 def _watched(
-    images: Iterator[np.ndarray], recording: Recording, scores: FrameScores | None, scored: int,
+    images: Iterator[np.ndarray], recording: Recording, scores: FrameScores | None, scored: range,
     count: int, progress: Any,
 ) -> Iterator[np.ndarray]:
-    """The images on their way, the first `scored` of `count` scored against their frames."""
+    """The images on their way, those `scored` of `count` scored against their frames."""
     for i, image in enumerate(images):
-        if scores and i < scored:
+        if scores and i in scored:
             scores.add(image, recording.frame_dn(i))
         yield image
         progress(i + 1, count)

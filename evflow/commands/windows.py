@@ -7,6 +7,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from evflow.commands.options import Reading, refuse, value
+from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +21,7 @@ class Windowed(Reading):
 
     sync: Literal["auto", "frames", "events", "ms"] = "auto"
     """Where windows end: at the recording's frames, after --window-events, or every --window-ms.
-    auto: frames where there are any, else ms."""
+    auto: frames where there are two or more, else ms."""
     window_events: Annotated[int | None, value("N")] = None
     """Events a window (--sync events); without it .35 a pixel."""
     window_ms: float = 33.0
@@ -43,6 +44,8 @@ class Windowed(Reading):
         idle = {"frames": ("window_events", "window_ms"), "events": ("window_ms",),
                 "ms": ("window_events",), "auto": ("window_events",)}[self.sync]
         refuse(self, idle, f"of no use with --sync {self.sync}")
+        if not self.window_ms > 0:
+            raise EvflowDataError("EV020", f"--window-ms {self.window_ms:g}.", "It must be > 0.")
         return sync_times(recording, self.sync, count=self.window_events,
                           window_us=round(1000 * self.window_ms))
 

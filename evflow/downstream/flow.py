@@ -61,7 +61,10 @@ class FlowTruth:
 
 def load_truth(path: str | os.PathLike, size: tuple[int, int]) -> FlowTruth:
     """The true flow of an .npz for a sensor of `size`: flow, edges_us and, where not all of it is
-    known, valid. Raises EV008 (arrays missing), EV015 (another size), EV004 (edges fall)."""
+    known, valid. Raises EV016 (no such file), EV008 (arrays missing), EV015 (another size), EV004
+    (edges fall)."""
+    if not Path(path).is_file():
+        raise EvflowDataError("EV016", f"no file with the true flow at {path}.")
     data = load_npz(Path(path))
     with naming(Path(path)):
         if missing := [name for name in ("flow", "edges_us") if name not in data]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.scipy.ndimage import map_coordinates
 
 from evflow.metrics.image import ssim
-from evflow.metrics.lpips import Params, lpips
+from evflow.metrics.perceptual import Params, lpips
 
 Array = jax.Array
 

@@ -64,12 +64,27 @@ LEAVES = {"weight": "kernel", "bias": "bias", "running_mean": "mean", "running_v
 def load_published(path: str | os.PathLike) -> tuple[Network, Params]:
     """The network and params of a published PyTorch checkpoint; no PyTorch is needed.
 
-    Raises what `read_checkpoint` does, EV018 where the weights are of no known network.
+    Raises what `read_checkpoint` does, EV007 where weights are not finite, EV018 where they are
+    of no known network.
     """
+    return read_published(path)[:2]
+
+
+def read_published(path: str | os.PathLike) -> tuple[Network, Params, bool]:
+    """`load_published`, and whether the network wants its event tensors normalised."""
     checkpoint = read_checkpoint(path)
     with naming(path):
         network = recognise(checkpoint.arrays, checkpoint.settings)
-        return network, to_params(network, checkpoint.arrays)
+        params = to_params(network, checkpoint.arrays)
+        return network, params, normalised(network, checkpoint.arrays)
+
+
+def normalised(network: Network, arrays: Arrays) -> bool:
+    """E2VID of 2019 and FireNet of 2020 were trained on normalised tensors; E2VID+, FireNet+ and
+    EV-FlowNet were not. The two FireNets are one network: their names tell them apart."""
+    if isinstance(network, FireNet):
+        return any("head.recurrent_block" in name for name in arrays)
+    return isinstance(network, E2VID) and network.output == "sigmoid"
 
 
 def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network:
@@ -130,7 +145,11 @@ def to_params(network: Network, arrays: Arrays) -> Params:
         node = params
         for part in parents:
             node = node.setdefault(part, {})
-        node[leaf] = jnp.asarray(value, jnp.float32)
+        with np.errstate(over="ignore"):
+            node[leaf] = jnp.asarray(value.astype(np.float32))
+        if not np.isfinite(np.asarray(node[leaf])).all():
+            raise EvflowDataError("EV007", f"{path} is not all finite (in float32).",
+                                  "A training that diverged? Take an earlier checkpoint.")
     return params
 
 
@@ -157,9 +176,10 @@ def _renamed(network: Network, name: str, array: np.ndarray) -> tuple[str, np.nd
 
 
 def _stripped(arrays: Arrays) -> Arrays:
-    """Without the prefix that all names share."""
+    """Without the prefix of a module around the network. Names beside it stay as they are, to be
+    named as what does not belong."""
     for prefix in PREFIXES:
-        if all(name.startswith(prefix) for name in arrays):
+        if any(name.startswith(prefix) for name in arrays):
             return {name.removeprefix(prefix): array for name, array in arrays.items()}
     return arrays
 

@@ -15,14 +15,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from evflow.downstream.e2vid import E2VID
 from evflow.downstream.network import Network, Params
 from evflow.downstream.presets import KINDS
-from evflow.downstream.published import load_published
+from evflow.downstream.published import read_published
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card, save_weights, weights_path
 
-PUBLISHED = (".pth", ".pt", ".tar")
+PUBLISHED = (".pth", ".pt", ".tar")  # where there is no such file; else any but .safetensors
 RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: network
 
 
@@ -59,10 +58,8 @@ def load_network(name_or_path: str | os.PathLike) -> Trained:
     Raises EV016 (no such file), EV009 (damaged), EV018 (the file is of something else).
     """
     path = Path(name_or_path)
-    if path.suffix in PUBLISHED:
-        network, params = load_published(path)
-        # E2VID of 2019 has batch norm and normalised tensors; E2VID+ and FireNet+ have neither.
-        return Trained(network, params, isinstance(network, E2VID) and network.norm == "batch", {})
+    if path.suffix in PUBLISHED or (path.is_file() and path.suffix != ".safetensors"):
+        return Trained(*read_published(path), {})
     file = _file(name_or_path)
     card = model_card(file)
     kind = KINDS.get(str(card.get("network")))

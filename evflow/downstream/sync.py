@@ -52,6 +52,11 @@ def sync_times(
 
 def window_edges(recording: Recording, times: np.ndarray) -> np.ndarray:
     """The edges (T + 1,) int64 of the windows that end at times (T,): the first begins with the
-    first event; a time that is not after it ends no window."""
+    first event; a time that is not after it ends no window. EV012 where none is."""
     start = recording.events.t[0]
-    return np.concatenate([[start], times[times > start]])
+    after = times[times > start]
+    if not len(after):
+        raise EvflowDataError(
+            "EV012", f"the last frame is at {times[-1]:,} us, the first event at {start:,} us.",
+            "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms.")
+    return np.concatenate([[start], after])

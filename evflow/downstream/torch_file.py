@@ -22,6 +22,7 @@ from evflow import pickles
 from evflow.errors import EvflowDataError
 from evflow.io.archives import is_zip, unzipped
 
+ZIP_BEGIN = b"PK\x03\x04"
 MAGIC = 0x1950A86A20F9469CFC6C  # of the chain of pickles
 PROTOCOL = 1001
 MOST_BYTES = 2**31  # E2VID with its optimiser takes 128 MB
@@ -97,6 +98,9 @@ def _read_chain(path: Path) -> tuple[Any, dict[str, bytes]]:
         except ValueError:
             known = False
         if not known:
+            f.seek(0)
+            if f.read(len(ZIP_BEGIN)) == ZIP_BEGIN:
+                raise ValueError("it begins as a zip, and lacks its end")
             raise EvflowDataError(
                 "EV008", f"{path} is not a PyTorch checkpoint (neither a zip nor its magic "
                 "number).", "Is it still packed, or a page that was saved in its place?")

@@ -17,7 +17,7 @@ from evflow.downstream.sync import Sync, sync_times
 from evflow.downstream.tensor import reconstructions
 from evflow.errors import EvflowDataError
 from evflow.metrics.image_scores import ImageProtocol, score_images
-from evflow.metrics.lpips import Params
+from evflow.metrics.perceptual import Params
 from evflow.types import Recording
 
 FRAME_US = 30_000  # windows that the released networks were trained on

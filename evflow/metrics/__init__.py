@@ -26,7 +26,8 @@ _HOME = {
     "PROTOCOLS": "image_scores",
     "frame_scores": "image_scores",
     "score_images": "image_scores",
-    "load_lpips": "lpips",
+    "load_lpips": "perceptual",
+    "lpips": "perceptual",
 }
 
 __all__ = sorted(_HOME)

@@ -153,7 +153,8 @@ def _gaussian_blur(image: Array, sigma: float) -> Array:
 def endpoint_error(flow: Array, truth: Array) -> Array:
     """|flow - truth| of (..., 2, H, W): (..., H, W), px."""
     square = jnp.sum((flow - truth) ** 2, -3)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    still = square == 0  # where the root has no gradient; NaN stays NaN
+    return jnp.where(still, 0.0, jnp.sqrt(jnp.where(still, 1.0, square)))
 
 
 def aee(
@@ -161,11 +162,18 @@ def aee(
 ) -> tuple[Array, Array]:
     """Average endpoint error in px, and the percentage of pixels beyond `outlier_px`; of flows
     (..., 2, H, W) where mask (..., H, W) is true: by custom, pixels with events and a valid truth.
-    Both NaN where the mask is empty."""
-    if mask is None:
-        mask = jnp.ones((*flow.shape[:-3], *flow.shape[-2:]), bool)
-    # The truth may be NaN where it is unknown.
+    Where the truth is NaN it is unknown, and not scored. Both NaN where nothing is left. Raises
+    EV002."""
+    flow, truth = jnp.asarray(flow), jnp.asarray(truth)
+    if flow.ndim < 3 or flow.shape[-3] != 2 or flow.shape != truth.shape:
+        raise EvflowDataError("EV002", f"flow is {flow.shape}, truth {truth.shape}.",
+                              "Expected two of (..., 2, H, W).")
+    known = jnp.isfinite(truth).all(-3)
+    if mask is not None and jnp.shape(mask) != known.shape:
+        raise EvflowDataError("EV002", f"mask is {jnp.shape(mask)}.", f"Expected {known.shape}.")
+    mask = known if mask is None else known & mask
     error = endpoint_error(flow, jnp.where(mask[..., None, :, :], truth, flow))
     count = mask.sum((-2, -1))
-    beyond = (error > outlier_px).astype(error.dtype)
+    error = jnp.where(mask, error, 0.0)
+    beyond = (~(error <= outlier_px)).astype(error.dtype)  # NaN is no hit
     return error.sum((-2, -1)) / count, 100.0 * beyond.sum((-2, -1)) / count

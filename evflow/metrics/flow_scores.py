@@ -34,14 +34,18 @@ def score_flow(
     """Scores of flows (T, 2, H, W), px over each of the windows between edges_us (T + 1,); JSON-
     ready means over the windows that have events (None where none has).
 
-    truth: the true flows, scored at pixels with events where valid (T, H, W) bool holds.
-    Raises EV002 (shapes), EV004 (edges that do not rise).
+    truth: the true flows, scored at pixels with events where valid (T, H, W) bool holds (default:
+    where they are finite). The FWL of the truth is that of events where it is known.
+    Raises EV002 (shapes), EV004 (edges that do not rise), EV007 (flows that are not finite).
     """
     edges = np.asarray(edges_us, np.int64)
     shape = (len(edges) - 1, 2, events.size[1], events.size[0])
     for name, array in (("flows", flows), ("truth", truth)):
         if array is not None and array.shape != shape:
             raise EvflowDataError("EV002", f"{name} is {array.shape}.", f"Expected {shape}.")
+    if not np.isfinite(flows).all():
+        raise EvflowDataError("EV007", "flows hold NaN or infinite values.",
+                              "Weights that diverged?")
     if valid is not None and valid.shape != (shape[0], *shape[2:]):
         raise EvflowDataError("EV002", f"valid is {valid.shape}.", "Expected (T, H, W).")
     if len(edges) < 2 or np.any(np.diff(edges) <= 0):
@@ -84,8 +88,20 @@ def _window(
         mask = seen.reshape(height, width)
         mask = mask if valid is None else mask & valid
         scores["aee"], scores["outlier_percent"] = aee(flow, truth, mask, outlier_px=OUTLIER_PX)
-        scores["fwl_truth"] = fwl(*events, truth, convention)
+        scores["fwl_truth"] = _fwl_truth(events, truth, valid, convention)
     return scores
+
+
+def _fwl_truth(
+    events: EventArrays, truth: Array, valid: Array | None, convention: FwlConvention
+) -> Array:
+    """FWL of the true flow, by the events at pixels where it is known."""
+    known = jnp.isfinite(truth).all(0)
+    known = known if valid is None else known & valid
+    x, y, t, p, weight = events
+    told = known[y.astype(jnp.int32), x.astype(jnp.int32)]
+    weight = jnp.where(told, weight, 0.0)
+    return fwl(x, y, t, p, weight, jnp.where(known[None], truth, 0.0), convention)
 
 
 def _mean(values: list[float]) -> float | None:

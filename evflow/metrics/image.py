@@ -48,9 +48,17 @@ SSIM = {
 }
 
 
-def _check(*images: Array) -> None:
-    """EV003 for images of integers, EV002 for two of different sizes."""
+def least_side(preset: str) -> int:
+    """Pixels that each side of an image must have for SSIM by this preset."""
+    return max(len(SSIM[preset].window), 2)
+
+
+def check_images(*images: Array) -> None:
+    """EV003 for images of integers, EV002 for what is no image and for two of different sizes."""
     for image in images:
+        if image.ndim < 2:
+            raise EvflowDataError("EV002", f"an image of shape {image.shape}.",
+                                  "Expected (..., H, W).")
         if not jnp.issubdtype(image.dtype, jnp.floating):
             raise EvflowDataError("EV003", f"an image of {image.dtype}.",
                                   "Expected floats on [0, 1]: divide bytes by 255.")
@@ -63,7 +71,7 @@ def _check(*images: Array) -> None:
 def mse(image: Array, reference: Array) -> Array:
     """Mean squared error. Raises EV002 for images of two sizes and EV003 for images of integers,
     as do all that build on it."""
-    _check(image, reference)
+    check_images(image, reference)
     return jnp.mean((image - reference) ** 2, (-2, -1))
 
 
@@ -85,11 +93,11 @@ def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
     """
     if preset not in SSIM:
         raise EvflowDataError("EV020", f"SSIM preset {preset!r}.", f"Choose one of {list(SSIM)}.")
-    _check(image, reference)
+    check_images(image, reference)
     how = SSIM[preset]
-    if min(image.shape[-2:]) < max(len(how.window), 2):
+    if min(image.shape[-2:]) < least_side(preset):
         raise EvflowDataError("EV002", f"images of {image.shape[-2:]} pixels.",
-                              f"SSIM by {preset!r} needs at least {max(len(how.window), 2)}.")
+                              f"SSIM by {preset!r} needs at least {least_side(preset)}.")
     return (_ssim_windowed if how.window else _ssim_global)(image, reference, how)
 
 

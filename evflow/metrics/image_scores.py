@@ -18,13 +18,14 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.metrics import image as measures
-from evflow.metrics.lpips import LEAST_SIDE, Params, lpips
+from evflow.metrics.perceptual import LEAST_SIDE, Params, lpips
 
 Array = jax.Array
 
 BLOCK = 16  # frames at a time: VGG16 makes 11 MB of one 240x180 frame in its first layer
 AGGREGATES = ("frames", "sequences")
 DOMAINS = ("linear", "log")
+BEYOND = 1e-3  # of [0, 1], what rounding may do to references
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,22 +59,24 @@ PROTOCOLS = {
 def frame_scores(
     images: Array, references: Array, protocol: ImageProtocol, lpips_params: Params | None = None
 ) -> dict[str, Array]:
-    """mse, rmse (DN), psnr (dB), ssim and, with weights, lpips, each (...), of (..., H, W); lpips
-    of images too small for it is NaN."""
+    """mse, rmse (DN), psnr (dB), ssim and, with weights, lpips, each (...), of (..., H, W); ssim
+    and lpips of images too small for them are NaN."""
     if protocol.clip:
         images, references = (jnp.clip(a, 0.0, 1.0) for a in (images, references))
     if protocol.domain == "log":
         images, references = measures.log_map(images), measures.log_map(references)
+    side = min(images.shape[-2:])
     scores = {
         "mse": measures.mse(images, references),
         "rmse": measures.rmse(images, references),
         "psnr": measures.psnr(images, references),
-        "ssim": measures.ssim(images, references, protocol.ssim),
     }
+    unmeasured = jnp.full_like(scores["mse"], jnp.nan)
+    scores["ssim"] = (measures.ssim(images, references, protocol.ssim)
+                      if side >= measures.least_side(protocol.ssim) else unmeasured)
     if lpips_params is not None:
-        measured = min(images.shape[-2:]) >= LEAST_SIDE
-        scores["lpips"] = (lpips(lpips_params, images, references) if measured
-                           else jnp.full_like(scores["mse"], jnp.nan))
+        scores["lpips"] = (lpips(lpips_params, images, references) if side >= LEAST_SIDE
+                           else unmeasured)
     return scores
 
 
@@ -84,8 +87,9 @@ def score_images(
     """Scores of sequences {name: (images, references)}, each (T, H, W) on [0, 1]; JSON-ready.
 
     Holds "protocol", "lpips_net", "frames", the means, and "sequences" with the mean of each.
-    A mean that is not finite (PSNR of equal images, LPIPS of images too small for it) is None.
-    Raises EV001 (nothing to score), EV002 (shapes), EV007 (NaN), EV020 (unknown protocol).
+    A mean that is not finite (PSNR of equal images, SSIM or LPIPS of images too small for them)
+    is None. Raises EV001 (nothing to score), EV002 (shapes), EV003 (integers, references beyond
+    0..1), EV007 (NaN), EV020 (unknown protocol).
     """
     if isinstance(protocol, str):
         if protocol not in PROTOCOLS:
@@ -104,7 +108,8 @@ def score_images(
         means = {kind: float(np.mean([e[kind] for e in each.values()])) for kind in kinds}
     frames = {name: len(s["mse"]) for name, s in scores.items()}
     return {
-        "protocol": dataclasses.asdict(protocol), "lpips_net": _net(lpips_params),
+        "protocol": dataclasses.asdict(protocol),
+        "lpips_net": _net(lpips_params) if math.isfinite(means.get("lpips", math.nan)) else None,
         "frames": sum(frames.values()), **_finite(means),
         "sequences": {name: {"frames": frames[name], **_finite(e)} for name, e in each.items()},
     }
@@ -123,7 +128,13 @@ def _sequence(
             raise EvflowDataError("EV003", f"{name}: {kind} are {array.dtype}.",
                                   "Expected floats on [0, 1]: divide bytes by 255.")
         if not np.isfinite(array).all():
-            raise EvflowDataError("EV007", f"{name}: {kind} are not all finite.")
+            raise EvflowDataError("EV007", f"{name or 'the sequence'}: {kind} are not all finite.",
+                                  "Weights that diverged?" if kind == "images" else "")
+    low, high = references.min(), references.max()
+    if low < -BEYOND or high > 1 + BEYOND:
+        raise EvflowDataError(
+            "EV003", f"{name or 'the sequence'}: references span {low:.4g} to {high:.4g}.",
+            "Expected [0, 1]: divide DN by 255.")
     parts = []
     for i in range(0, len(images), BLOCK):
         part = [a[i:i + BLOCK].astype(np.float32) for a in (images, references)]

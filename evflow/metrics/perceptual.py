@@ -17,6 +17,7 @@ import numpy as np
 
 from evflow import pickles
 from evflow.errors import EvflowDataError
+from evflow.metrics.image import check_images
 
 Array = jax.Array
 Params = dict[str, Any]
@@ -62,8 +63,10 @@ def load_lpips(net: str = "alex", path: str | os.PathLike | None = None) -> Para
 
 def lpips(params: Params, image: Array, reference: Array, *, colour: bool = False) -> Array:
     """Distance (...) of images (..., H, W) on [0, 1], repeated to three channels; or of
-    (..., H, W, 3) RGB with colour=True. 0 for equal images. EV002 for two shapes, and for sides
-    below `LEAST_SIDE`."""
+    (..., H, W, 3) RGB with colour=True. 0 for equal images, but for rounding. EV002 for two
+    shapes, and for sides below `LEAST_SIDE`; EV003 for integers."""
+    image, reference = jnp.asarray(image), jnp.asarray(reference)
+    check_images(image, reference)
     if image.shape != reference.shape:
         raise EvflowDataError("EV002", f"images of {image.shape} and {reference.shape}.")
     if min(sides := image.shape[-3:-1] if colour else image.shape[-2:]) < LEAST_SIDE:
