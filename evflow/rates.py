@@ -68,9 +68,8 @@ def quiet_time(
 
     counts (2, H, W): ON and OFF events; dlog (H, W): change of log intensity; seen (H, W) bool:
     where the frames show what the pixel saw; rates (2,): the camera's noise in Hz, whose events
-    are no company, nor are those of hot (H, W) pixels, which are watched all of the time: what
-    they see is little beside what they send. A pixel's own events do not enter the choice, so
-    that what it sends is a fair sample.
+    are no company, nor are those of hot (H, W) pixels. A pixel's own events do not enter the
+    choice, so that what it sends is a fair sample.
     """
     change = np.ascontiguousarray(np.abs(dlog), np.float32)
     still = seen & (cv2.dilate(change, np.ones((3, 3), np.uint8)) < STILL)
@@ -80,6 +79,6 @@ def quiet_time(
         others = np.where(hot, 0, own).astype(np.float32)
         near = cv2.boxFilter(others, -1, (AROUND, AROUND), normalize=False,
                              borderType=cv2.BORDER_CONSTANT) - others
-        alone = (still & (near < max(0.5, rate * seconds * AROUND**2))) | (hot & seen)
+        alone = still & (near < max(0.5, rate * seconds * AROUND**2))
         found.append([own * alone, seconds * alone])
     return np.array(found, np.float32)

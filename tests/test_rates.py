@@ -99,8 +99,3 @@ def test_hot_pixels_are_no_company() -> None:
     on, _ = watched(counts, np.zeros(SHAPE, np.float32), hot)
     assert (on[1] == np.float32(0.05)).all()
     assert on[0, 40, 50] == 3
-    moving = np.full(SHAPE, 0.5, np.float32)
-    on, off = watched(counts, moving, hot)  # what sends all the time is counted all the time
-    assert (on[0].sum(), off[0].sum()) == (3, 3)
-    assert on[1, 40, 50] == np.float32(0.05)
-    assert (on[1] > 0).sum() == 1
