@@ -18,10 +18,9 @@ from evflow.refine.sightings import Sightings
 Array = np.ndarray
 
 NOTHING = -1.0  # log units: bounds no threshold
-# The largest of several changes exceeds the true one by its error, which is taken off. Errors of
-# the path after an event between frames; measured on simulated recordings with 25 ms frames.
-EXCESS = 0.1
-ERROR = 0.15
+# The largest of several changes exceeds the true one by its error, some of which is taken off.
+EXCESS = 0.05
+ERROR = 0.1  # of the path from after an event to a frame
 log_ndtr = jax.jit(special.log_ndtr)  # as single operations it compiles for a second
 
 

@@ -22,16 +22,16 @@ from evflow.types import Events
 
 Array = np.ndarray
 
-PRIOR_COUNT = 3.0  # events' worth of belief in PATH_ERROR, against the residuals seen
-SHARED_ERROR = 2.0  # errors of neighbouring events go together: variance is this much larger
-LEAST_VARIANCE = 0.3 * PATH_ERROR**2  # a path that misses all motion leaves no residuals
+PRIOR_COUNT = 5.0  # events' worth of belief in PATH_ERROR, against the residuals seen
+SHARED_ERROR = 2.2  # errors of neighbouring events go together: variance is this much larger
+LEAST_VARIANCE = 0.022**2  # log units squared: a path that misses all motion leaves no residuals
 PASSES = 3
 KNOWN = 0.15  # share of the prior's variance that is left
 FEW_TO_MOST = (0.5, 0.9)  # share of pixels: from where their gain is used, and fully
 GAINS = (0.7, 1.1)  # beyond, the path shows something else
 GAIN_SPREAD = 0.06  # of the gain from pixel to pixel: measured on simulated recordings of 8 s
 LEAST_SIGMA = 0.01  # log units
-START_ERROR = 0.1  # log units, of the path from the first frame to another
+START_ERROR = 0.05  # log units, of the path from the first frame to another
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ from evflow.types import Events
 
 Array = np.ndarray
 
-PATH_ERROR = 0.04  # log units: error of the path at a frame, from the frame's noise
+# This and the constants of pixels.py and bounds.py: chosen on 115 simulated recordings of .2 s.
+PATH_ERROR = 0.03  # log units: error of the path at a frame, from the frame's noise
 RANGE_ERROR = 0.2  # of the path's range in an interval: its error half-way between two frames
 TYPICAL_THETA = 0.25  # log units: turns events into a range, where the path may have missed it
 HIDDEN = 1e-9  # weight of an event whose brightness no frame shows: nothing, yet no 0 / 0
