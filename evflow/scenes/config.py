@@ -15,7 +15,8 @@ from evflow.errors import EvflowDataError
 Range = tuple[float, float]
 
 _POSITIVE = ("speed_px_s", "diameter_px", "zoom", "contrast", "gamma", "shake_hz")
-_PROBABILITIES = ("foreground_probability", "static_fraction", "shake_probability")
+_PROBABILITIES = ("foreground_probability", "static_fraction", "resting_fraction",
+                  "shake_probability")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +28,8 @@ class SceneConfig:
     diameter_px: largest extent of a cut-out in a 64-pixel frame; scales with the shorter side.
     rotation_deg_s, scale_rate_per_s: rates of the similarity motion; the scale is exp(rate t).
     zoom: background texels per sensor pixel (log).
-    static_fraction: scenes in which nothing moves at all.
+    static_fraction: scenes in which nothing moves at all; resting_fraction: others whose
+        background stands still behind what moves, as a camera at rest sees the world.
     contrast: span of a layer as a fraction of 255 DN (log); above 1 it clips.
     brightness: where that span lies between as dark (0) and as bright (1) as fits into 255 DN.
     gamma: exponent of the whole scene (log), DN = 255 x^gamma: below 1 bright, above 1 dark.
@@ -43,6 +45,7 @@ class SceneConfig:
     scale_rate_per_s: Range = (-0.3, 0.3)
     zoom: Range = (0.5, 2.0)
     static_fraction: float = 0.1
+    resting_fraction: float = 0.0
     contrast: Range = (0.1, 1.0)
     brightness: Range = (0.0, 1.0)
     gamma: Range = (0.5, 2.0)

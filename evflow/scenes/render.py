@@ -78,12 +78,13 @@ def sample_scene(
         key, (2 + (1 + config.foregrounds) * per_layer,), bank.backgrounds.dtype)
     still, gamma = units[:2]
     moving = (still >= config.static_fraction).astype(units.dtype)
+    rests = still < config.static_fraction + config.resting_fraction
     layers = units[2:].reshape(-1, per_layer)
     one = functools.partial(
         _foreground_from, bank=bank, config=config, shape=shape, moving=moving)
     foregrounds, radius, opacity = jax.vmap(one)(layers[1:])
     return Scene(
-        background=_background_from(layers[0], bank, config, shape, moving),
+        background=_background_from(layers[0], bank, config, shape, jnp.where(rests, 0.0, moving)),
         foregrounds=foregrounds,
         radius=radius,
         opacity=opacity,
