@@ -180,6 +180,23 @@ def test_sampled_motion_keeps_to_the_config() -> None:
     assert 11.9 < diameter.min() <= diameter.max() < 50.1
 
 
+def test_backgrounds_rest_behind_what_moves() -> None:
+    config = SceneConfig(static_fraction=0.1, resting_fraction=0.4, shake_probability=1.0)
+    batches = [draw(n, config) for n in range(6)]
+    scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *batches)
+    behind = np.hypot(*np.moveaxis(scenes.background.path.velocity, -1, 0)) == 0
+    before = np.hypot(*np.moveaxis(scenes.foregrounds.path.velocity, -1, 0)).max(1) == 0
+    assert 0.35 < behind.mean() < 0.65
+    assert 0.03 < before.mean() < 0.2
+    assert behind[before].all()
+    for leaf in (scenes.background.path.shake, scenes.background.path.spin):
+        assert not np.any(leaf[behind])
+    # What is drawn else does not depend on it.
+    plain = draw(0, SceneConfig(static_fraction=0.1, shake_probability=1.0))
+    np.testing.assert_array_equal(batches[0].foregrounds.texture, plain.foregrounds.texture)
+    np.testing.assert_array_equal(batches[0].gamma, plain.gamma)
+
+
 def test_static_scenes_do_not_change_and_others_do() -> None:
     scenes = draw(0, SceneConfig(static_fraction=0.25))
     still = np.asarray(jnp.abs(scenes.background.path.velocity).sum(-1) == 0)
@@ -201,6 +218,7 @@ def test_the_paper_preset_is_steady_similarity_motion() -> None:
 
 @pytest.mark.parametrize("bad", [
     {"speed_px_s": (0.0, 10.0)}, {"zoom": (2.0, 1.0)}, {"static_fraction": 1.5},
+    {"resting_fraction": -0.1},
     {"gamma": (0.5, math.inf)}, {"foregrounds": -1}, {"brightness": (0.0, 1.2)},
     {"shake_px": (-1.0, 2.0)},
 ])
