@@ -85,18 +85,23 @@ class Camera:
 
     def validate(self) -> Camera:
         """Return self, or raise EV002, EV014, EV015 (host side; skipped on traced arrays)."""
+        self.check_values()
+        if len(self.shape) < 2 and not self._traced():
+            raise EvflowDataError("EV002", f"the camera's maps have shape {self.shape}.",
+                                  "Expected (..., H, W).")
+        return self
+
+    def check_values(self) -> None:
+        """EV014, EV015 for parameters (...) of any shape; traced arrays pass."""
+        if self._traced():
+            return
         leaves = {name: getattr(self, name) for name in PARAMETERS}
-        if any(isinstance(v, jax.core.Tracer) for v in leaves.values()):
-            return self
         shapes = {name: np.shape(v) for name, v in leaves.items()}
         if len(set(shapes.values())) > 1:
             raise EvflowDataError(
                 "EV015", f"the camera's maps have different shapes: {shapes}.",
                 "All four maps must be (..., H, W) of one sensor.",
             )
-        if len(self.shape) < 2:
-            raise EvflowDataError("EV002", f"the camera's maps have shape {self.shape}.",
-                                  "Expected (..., H, W).")
         for name, value in leaves.items():
             array = np.asarray(value)
             bad = ~np.isfinite(array) | (array <= 0 if name.startswith("theta") else array < 0)
@@ -109,7 +114,9 @@ class Camera:
                     f"It must be finite and {rule}"
                     + (f"; clamp thresholds at {THETA_MIN}." if rule == "> 0" else "."),
                 )
-        return self
+
+    def _traced(self) -> bool:
+        return any(isinstance(getattr(self, name), jax.core.Tracer) for name in PARAMETERS)
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: Any) -> Path:
         """Write an .npz with the four maps, `extra` arrays beside them, and the units."""

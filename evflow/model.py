@@ -72,7 +72,8 @@ def squash(y: ArrayLike, output: Output = "log") -> Camera:
 def unsquash(camera: Camera, output: Output = "log") -> Array:
     """Camera of maps (...) -> y (..., 4); eta below 1e-3 Hz is taken as 1e-3 Hz. Raises EV014,
     EV015."""
-    return coordinates.unsquash(camera.validate(), output)
+    camera.check_values()
+    return coordinates.unsquash(camera, output)
 
 
 @jax.tree_util.register_dataclass
