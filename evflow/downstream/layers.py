@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.downstream.convolution import convolve, for_flax
+from evflow.downstream.fusing import carried, joined, parted
 
 Array = jax.Array
 
@@ -125,9 +126,9 @@ class ConvLSTM(nn.Module):
     @nn.compact
     def __call__(self, x: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         hidden, cell = state
-        gates = conv(4 * x.shape[-1], 3, name="gates")(jnp.concatenate([x, hidden], -1))
-        i, f, o, g = jnp.split(gates, 4, -1)
-        cell = nn.sigmoid(f) * cell + nn.sigmoid(i) * jnp.tanh(g)
+        gates = conv(4 * x.shape[-1], 3, name="gates")(joined(x, hidden))
+        i, f, o, g = parted(gates, 4)
+        cell = carried(nn.sigmoid(f) * cell + nn.sigmoid(i) * jnp.tanh(g))
         return nn.sigmoid(o) * jnp.tanh(cell), cell
 
 
@@ -140,10 +141,10 @@ class ConvGRU(nn.Module):
         features = x.shape[-1]
         gates = [_Weights(features, name=name)(2 * features) for name in ("update", "reset")]
         kernel, bias = (jnp.concatenate(pair, -1) for pair in zip(*gates, strict=True))
-        opened = convolve(jnp.concatenate([x, state], -1), kernel)
-        update, reset = jnp.split(nn.sigmoid(opened + _over(bias, opened)), 2, -1)
-        new = jnp.tanh(conv(features, 3, name="out")(jnp.concatenate([x, state * reset], -1)))
-        return state * (1.0 - update) + new * update
+        opened = convolve(joined(x, state), kernel)
+        update, reset = parted(nn.sigmoid(opened + _over(bias, opened)), 2)
+        new = jnp.tanh(conv(features, 3, name="out")(joined(x, state * reset)))
+        return carried(state * (1.0 - update) + new * update)
 
 
 class _Weights(nn.Module):
