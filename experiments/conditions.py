@@ -33,8 +33,12 @@ from experiments.targets import Target
 Array = jax.Array
 Shape = tuple[int, int]
 
-DEFAULT, WIDE, OURS, ORACLE, EVENTGAN = "default", "wide", "evflow", "oracle", "eventgan"
-FREE = (DEFAULT, WIDE, EVENTGAN)  # that do not depend on the target
+DEFAULT, WIDE, WIDE_LOG, EVENTGAN = "default", "wide", "wide-log", "eventgan"
+OURS, ORACLE = "evflow", "oracle"
+FREE = (DEFAULT, WIDE, WIDE_LOG, EVENTGAN)  # that do not depend on the target
+# Thresholds .1 to 1 as many at .9 as at .2, or, of the prior that serves unknown cameras, .05 to 1
+# as many at .05 to .1 as at .5 to 1.
+PRIORS = {WIDE: WidePrior(theta=(0.1, 1.0), uniform=True), WIDE_LOG: WidePrior()}
 DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
 
 
@@ -70,10 +74,10 @@ class Workshop:
         return sample_pixels(jax.random.key(1), Summary(theta, theta, none, none, sigma, sigma),
                              self.shape)
 
-    def wide(self) -> Camera:
-        """Cameras of the prior that serves unknown ones."""
+    def wide(self, name: str) -> Camera:
+        """Cameras of a wide prior."""
         keys = jax.random.split(jax.random.key(2), self.count)
-        return jax.vmap(lambda key: WidePrior().sample(key, self.shape))(keys)
+        return jax.vmap(lambda key: PRIORS[name].sample(key, self.shape))(keys)
 
     def same(self, camera: Camera) -> Camera:
         """One camera, K times."""
@@ -139,14 +143,15 @@ def conditions(
     shop: Workshop, targets: Sequence[Target], names: Sequence[str],
     estimators: dict[str, Path], cameras: dict[str, Path],
 ) -> list[Condition]:
-    """Of the names (`default`, `wide`, `evflow`, `oracle`, `eventgan`, or a compared system), of
-    estimators' weights, and of camera files; raises EV020 for an unknown name or one used twice.
-    """
+    """Of the names (`default`, `wide`, `wide-log`, `evflow`, `oracle`, `eventgan`, or a compared
+    system), of estimators' weights, and of camera files; raises EV020 for an unknown name or one
+    used twice."""
     twice = [n for n in (*estimators, *cameras) if n in {*names, *(estimators.keys() & cameras)}]
     if twice:
         raise EvflowDataError("EV020", f"two conditions are called {twice}.", "Rename one.")
     free: dict[str, Callable[[], Camera | None]] = {
-        DEFAULT: shop.default, WIDE: shop.wide, EVENTGAN: lambda: None}
+        DEFAULT: shop.default, EVENTGAN: lambda: None,
+        **{name: _bound(shop.wide, name) for name in PRIORS}}
     found = []
     for name in names:
         if name in FREE:

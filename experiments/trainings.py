@@ -34,7 +34,7 @@ from experiments.conditions import EVENTGAN, Condition, Workshop, conditions, di
 Params = dict[str, Any]
 Scores = dict[str, dict[str, dict[str, dict[int, np.ndarray]]]]  # target, label, measure, seed
 
-FOUR = ("default", "wide", "evflow", "oracle")
+SIMULATED = ("default", "wide", "wide-log", "evflow", "oracle")
 TEXTURE_SEED = 11
 
 
@@ -48,7 +48,7 @@ class Setting:
 
     network: Network
     learning: LearningConfig
-    names: tuple[str, ...] = FOUR
+    names: tuple[str, ...] = SIMULATED
     cameras: tuple[str, ...] = ("high",)
     circuits: tuple[str, ...] = ("noisy",)
     seeds: int = 5

@@ -207,6 +207,8 @@ def test_the_wide_prior_keeps_its_ranges() -> None:
     assert on.min() >= 0.05
     assert on.max() <= 1.0
     assert abs(np.median(np.log(on)) - np.log(0.05) / 2) < 0.25  # even in the logarithm
+    even = jax.jit(jax.vmap(lambda k: WidePrior(uniform=True).sample(k, (1, 1))))(keys)
+    assert abs(np.median(even.theta_on) - 0.525) < 0.06
     assert 1.4 < np.exp(np.abs(np.log(on / off))).max() <= 1.5 + 1e-5
     assert 0 <= eta.min() < 0.1
     assert 1.9 < eta.max() <= 2

@@ -24,7 +24,7 @@ from experiments import eventgan_sequences, gains, see_better, targets
 from experiments.common import slug
 from experiments.conditions import Workshop, conditions, network_maps, told
 from experiments.see_better import Options, files
-from experiments.trainings import FOUR, Trainings
+from experiments.trainings import SIMULATED, Trainings
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -92,8 +92,9 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
                              for n in ("theta_on", "theta_off", "eta_on", "eta_off")})
     found = {c.name: c for c in conditions(
         workshop(tmp_path), [target(), target(circuit="esim"), target("low")],
-        ("default", "wide", "oracle"), {}, {"plain": plain, "uncertain": uncertain})}
-    assert set(found) == {"default", "wide", "high oracle", "low oracle", "plain", "uncertain"}
+        ("default", "wide", "wide-log", "oracle"), {}, {"plain": plain, "uncertain": uncertain})}
+    assert set(found) == {"default", "wide", "wide-log", "high oracle", "low oracle", "plain",
+                          "uncertain"}
     made = {name: c.make() for name, c in found.items()}
     for camera in made.values():
         assert camera is not None
@@ -103,7 +104,9 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
     assert [t.name for t in found["high oracle"].targets] == ["high noisy", "high esim"]
     assert len(found["default"].targets) == 3
     assert told(made["default"])["sigma_on"] == pytest.approx(0.03, abs=0.003)
-    assert np.std(np.median(made["wide"].theta_on, (1, 2))) > 0.05
+    wide, low = (np.median(made[name].theta_on, (1, 2)) for name in ("wide", "wide-log"))
+    assert 0.05 < min(low) < min(wide)
+    assert min(np.std(wide), np.std(low)) > 0.05
     np.testing.assert_allclose(made["plain"].theta_on, 0.3)
     assert 0.03 < float(jnp.std(made["uncertain"].theta_on)) < 0.07
     assert found["plain"].source != found["uncertain"].source
@@ -231,9 +234,9 @@ def test_runs_are_kept_and_gone_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = see_better.main(Options(out=tmp_path, seeds=1))
-    assert set(first["high noisy"]) == set(FOUR)
+    assert set(first["high noisy"]) == set(SIMULATED)
     kept = {p: p.stat().st_mtime_ns for p in tmp_path.glob("runs/*/0/*")}
-    assert len(kept) == 2 * len(FOUR)
+    assert len(kept) == 2 * len(SIMULATED)
     second = see_better.main(Options(out=tmp_path, seeds=2))
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     assert second["high noisy"]["evflow"]["ssim"]["seeds"] == [0, 1]

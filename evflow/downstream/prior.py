@@ -1,5 +1,5 @@
 """Cameras to train event networks for, where the camera that will be used is not known: wider
-than any estimate's prior, so that one network serves them all (S2R's randomisation, and more)."""
+than any estimate's prior, so that one network serves them all."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ Array = jax.Array
 
 @dataclasses.dataclass(frozen=True)
 class WidePrior:
-    """theta: range of the ON threshold, log-uniform; ratio: theta_off lies within this factor of
-    it, either way, log-uniform. mismatch: range of the standard deviation over pixels, as a share
-    of the threshold: an absolute one of .03 would make hot pixels of half of those at .05.
-    eta: range of the noise rates in Hz, uniform, apart per polarity."""
+    """theta: range of the ON threshold, log-uniform or, if `uniform`, uniform; ratio: theta_off
+    lies within this factor of it, either way, log-uniform. mismatch: range of the standard
+    deviation over pixels, as a share of the threshold: an absolute one of .03 would make hot pixels
+    of half of those at .05. eta: range of the noise rates in Hz, uniform, apart per polarity."""
 
     theta: tuple[float, float] = (0.05, 1.0)
     ratio: float = 1.5
     mismatch: tuple[float, float] = (0.02, 0.2)
     eta: tuple[float, float] = (0.0, 2.0)
+    uniform: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("theta", THETA_MIN), ("mismatch", 0.0), ("eta", 0.0)):
@@ -39,9 +40,10 @@ class WidePrior:
     def sample(self, key: Array, shape: tuple[int, int]) -> Camera:
         """One camera of (H, W) pixels."""
         k_theta, k_ratio, k_mismatch, k_pixels, k_eta = jax.random.split(key, 5)
-        low, high = (math.log(v) for v in self.theta)
+        low, high = self.theta if self.uniform else map(math.log, self.theta)
         reach = math.log(self.ratio)
-        on = jnp.exp(jax.random.uniform(k_theta, minval=low, maxval=high))
+        on = jax.random.uniform(k_theta, minval=low, maxval=high)
+        on = on if self.uniform else jnp.exp(on)
         off = on * jnp.exp(jax.random.uniform(k_ratio, minval=-reach, maxval=reach))
         sigma = jax.random.uniform(
             k_mismatch, (2, 1, 1), minval=self.mismatch[0], maxval=self.mismatch[1])
