@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.baselines.eventgan import generate
-from evflow.downstream.simulated import SequenceConfig, Sequences, add_noise, sample_sequences
+from evflow.downstream.simulated import SequenceConfig, Sequences, sample_sequences
 from evflow.downstream.tensor import signed
 from evflow.scenes import TextureBank
 
@@ -29,10 +29,7 @@ def sample(
     events = signed(generate(generator, before, dn))
     weights = jnp.asarray(rebinning(events.shape[-1], config.bins), events.dtype)
     tensors = jnp.einsum("...b,bc->...c", events, weights)
-    tensors = tensors.at[0].set(0.0)
-    keys = jax.random.split(jax.random.fold_in(key, 1), config.sequences)
-    noisy = jax.vmap(lambda k, t: add_noise(k, t, config), (0, 1), 1)(keys, tensors)
-    return dataclasses.replace(sequences, tensors=noisy)
+    return dataclasses.replace(sequences, tensors=tensors.at[0].set(0.0))
 
 
 def rebinning(bins: int, fewer: int) -> np.ndarray:

@@ -33,7 +33,6 @@ from evflow.downstream.presets import training
 from evflow.downstream.recorded import recorded_bank, sample_recorded
 from evflow.downstream.released import load_network, save_network
 from evflow.downstream.simulated import Sequences, has_events, sample_sequences
-from evflow.downstream.tensor import normalise
 from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
 from evflow.metrics.flow import aee
@@ -188,7 +187,7 @@ def measure(
 def _image_figures(
     network: Network, params: Params, sequences: Sequences, normalised: bool, weights: Params | None
 ) -> dict[str, Array]:
-    tensors = normalise(sequences.tensors) if normalised else sequences.tensors
+    tensors = sequences.given(normalised)
     images, _ = run(network, params, tensors)
     late = len(images) // 2
     images, frames = images[late:], sequences.frames[late:]
@@ -202,7 +201,7 @@ def _image_figures(
 def _flow_figures(
     network: Network, params: Params, sequences: Sequences, normalised: bool, _: Any
 ) -> dict[str, Array]:
-    tensors = normalise(sequences.tensors) if normalised else sequences.tensors
+    tensors = sequences.given(normalised)
     flow, _ = network.apply(params, tensors)
     events, truth = has_events(sequences.tensors), sequences.flow
     # What no constant flow does better than, but for the median of vectors.

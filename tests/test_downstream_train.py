@@ -17,11 +17,12 @@ from evflow.downstream.recorded import recorded_bank, sample_recorded
 from evflow.downstream.simulated import (
     SequenceConfig,
     Sequences,
-    add_noise,
+    draw_noise,
     has_events,
     sample_sequences,
     scene_clock,
 )
+from evflow.downstream.tensor import normalise
 from evflow.downstream.train import (
     LearningConfig,
     init_state,
@@ -93,13 +94,24 @@ def test_the_scene_stands_still_in_pauses_and_time_never_falls() -> None:
 
 def test_noise_spares_the_first_window_and_hot_pixels_stay() -> None:
     config = SequenceConfig(windows=4, crop=64, noise=0.1, hot_pixels=0.0)
-    nothing, key = jnp.zeros((4, 64, 64, 5)), jax.random.key(5)
-    noisy = np.asarray(add_noise(key, nothing, config))
+    key = jax.random.key(5)
+    noisy = np.asarray(draw_noise(key, config))
     assert not noisy[0].any()
     assert abs(noisy[1:].std() - 0.1) < 0.002
-    hot = np.asarray(add_noise(key, nothing, dataclasses.replace(config, hot_pixels=1.0))) - noisy
+    hot = np.asarray(draw_noise(key, dataclasses.replace(config, hot_pixels=1.0))) - noisy
     assert 0.02 < (hot[0] != 0).any(-1).mean() < 0.98
     np.testing.assert_allclose(hot, np.broadcast_to(hot[:1, ..., :1], hot.shape), atol=1e-6)
+
+
+def test_noise_is_not_taken_for_events() -> None:
+    """Normalised tensors have deviation 1 where there are events, as they will have in use."""
+    s = sample(jax.random.key(3), bank(), dataclasses.replace(DATA, noise=0.1))
+    np.testing.assert_array_equal(s.given(False), s.tensors + s.noise)
+    assert float(jnp.std(s.noise[1:])) == pytest.approx(0.1, rel=0.05)
+    clean = np.asarray(s.given(True) - s.noise)
+    np.testing.assert_allclose(clean, normalise(s.tensors), atol=1e-6)
+    assert not clean[s.tensors == 0].any()
+    np.testing.assert_array_equal(s.tensors, sequences().tensors)
 
 
 def test_a_measured_camera_is_the_one_that_looks() -> None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.downstream.simulated import SequenceConfig, Sequences, add_noise
+from evflow.downstream.simulated import SequenceConfig, Sequences, draw_noise
 from evflow.downstream.tensor import event_tensor
 from evflow.errors import EvflowDataError
 from evflow.io import plan_windows
@@ -93,7 +93,7 @@ def sample_recorded(
     """
     keys = jax.random.split(key, config.sequences)
 
-    def one(key: Array) -> tuple[Array, Array]:
+    def one(key: Array) -> tuple[Array, Array, Array]:
         k_run, k_row, k_column, k_noise = jax.random.split(key, 4)
         runs, _, rows, columns = bank.frames.shape
         at = (jax.random.randint(k_run, (), 0, runs), 0,
@@ -102,8 +102,8 @@ def sample_recorded(
         size = (1, config.windows, config.crop, config.crop)
         frames = jax.lax.dynamic_slice(bank.frames, at, size)[0]
         tensors = jax.lax.dynamic_slice(bank.tensors, (*at, 0), (*size, config.bins))[0]
-        return add_noise(k_noise, tensors, config), frames
+        return tensors, draw_noise(k_noise, config), frames
 
-    tensors, frames = (jnp.swapaxes(a, 0, 1) for a in jax.vmap(one)(keys))
+    tensors, noise, frames = (jnp.swapaxes(a, 0, 1) for a in jax.vmap(one)(keys))
     still = jnp.zeros((*frames.shape[:2], 2, *frames.shape[2:]), frames.dtype)
-    return Sequences(tensors, frames, still, still, jnp.zeros_like(frames))
+    return Sequences(tensors, noise, frames, still, still, jnp.zeros_like(frames))

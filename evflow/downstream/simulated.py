@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from evflow.camera import Camera, CameraPrior, sample_nominal, sample_pixels
 from evflow.dataset.motion import optical_flow
 from evflow.downstream.prior import WidePrior
-from evflow.downstream.tensor import BINS, signed
+from evflow.downstream.tensor import BINS, normalise, signed
 from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log, noise_factor, normalised_intensity
 from evflow.scenes import Scene, TextureBank, render, sample_scene
@@ -73,16 +73,23 @@ class SequenceConfig:
 class Sequences:
     """T windows of B sequences, time first as the networks run.
 
-    tensors (T, B, H, W, bins): signed events of each window. frames (T, B, H, W): at its end, on
-    [0, 1]. flow (T, B, 2, H, W): (x, y) px over the window, at its start. back (T, B, 2, H, W):
-    from its end to where that point was at its start; visible (T, B, H, W): it was seen there.
+    tensors (T, B, H, W, bins): signed events of each window; noise, of the same shape: what is
+    put on them for training. frames (T, B, H, W): at its end, on [0, 1]. flow (T, B, 2, H, W):
+    (x, y) px over the window, at its start. back (T, B, 2, H, W): from its end to where that point
+    was at its start; visible (T, B, H, W): it was seen there.
     """
 
     tensors: Array
+    noise: Array
     frames: Array
     flow: Array
     back: Array
     visible: Array
+
+    def given(self, normalised: bool) -> Array:
+        """What a network gets: the noise goes on top of normalised events, as it would else be
+        taken for events and measured with them."""
+        return (normalise(self.tensors) if normalised else self.tensors) + self.noise
 
 
 def sample_sequences(
@@ -108,11 +115,11 @@ def _sequence(
     frames = render(scene, clock, shape)
     seen = (_draw(k_camera, config.prior, frames[0]) if camera is None
             else _crop(k_camera, camera, shape))
-    tensors = add_noise(k_noise, _simulate(k_sim, frames, seen, config), config)
+    tensors = _simulate(k_sim, frames, seen, config)
     edges = clock[::config.steps_per_window]
     flow, back, visible = _flows(scene, edges, shape)
     ends = frames[config.steps_per_window::config.steps_per_window]
-    return Sequences(tensors, ends / 255.0, flow, back, visible)
+    return Sequences(tensors, draw_noise(k_noise, config), ends / 255.0, flow, back, visible)
 
 
 def scene_clock(key: Array, config: SequenceConfig) -> Array:
@@ -170,20 +177,21 @@ def _simulate(key: Array, frames: Array, camera: Camera, config: SequenceConfig)
     return signed(jax.lax.scan(window, state, windows)[1])
 
 
-def add_noise(key: Array, tensors: Array, config: SequenceConfig) -> Array:
-    """Gaussian noise and hot pixels, so that a network does not trust a single event."""
+def draw_noise(key: Array, config: SequenceConfig) -> Array:
+    """Gaussian noise and hot pixels (T, H, W, bins), so that a network does not trust a single
+    event."""
     k_noise, k_share, k_where, k_value = jax.random.split(key, 4)
-    later = (jnp.arange(config.windows) > 0).astype(tensors.dtype)[:, None, None, None]
-    tensors = tensors + config.noise * later * jax.random.normal(k_noise, tensors.shape)
+    shape = (config.crop, config.crop)
+    later = (jnp.arange(config.windows) > 0)[:, None, None, None]
+    grain = later * jax.random.normal(k_noise, (config.windows, *shape, config.bins))
     share = config.hot_pixels * jax.random.uniform(k_share)
-    hot = jax.random.bernoulli(k_where, share, tensors.shape[1:3])
-    value = config.noise * hot * jax.random.normal(k_value, hot.shape)
-    return tensors + value[None, :, :, None]
+    hot = jax.random.bernoulli(k_where, share, shape)
+    value = hot * jax.random.normal(k_value, shape)
+    return config.noise * (grain + value[None, :, :, None])
 
 
 def has_events(tensors: Array) -> Array:
-    """Where (..., H, W) the tensors (..., H, W, bins) of a batch hold events: most of the noise
-    put on them is below half of one in all bins together."""
+    """Where (..., H, W) the tensors (..., H, W, bins) hold more than what a lone event leaves."""
     return jnp.abs(tensors).sum(-1) > 1.0
 
 

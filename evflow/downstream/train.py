@@ -22,7 +22,6 @@ from evflow.downstream import losses
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, State, run
 from evflow.downstream.simulated import SequenceConfig, Sequences, has_events, sample_sequences
-from evflow.downstream.tensor import normalise
 from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank
 
@@ -135,8 +134,7 @@ def sequence_loss(
 ) -> tuple[Array, dict[str, Array]]:
     """The loss of a network on sequences, and its parts: of EV-FlowNet L1 of the flow, or the
     photometric loss where it has four scales; else reconstruction and temporal consistency."""
-    tensors = sequences.tensors
-    tensors = normalise(tensors) if config.normalised else tensors
+    tensors = sequences.given(config.normalised)
     if isinstance(network, EVFlowNet):
         loss = _flow_loss(network, params, tensors, sequences, config.elsewhere)
         return loss, {"loss": loss}
