@@ -166,8 +166,10 @@ class _Machine:
         self._name(argument.replace(" ", ".", 1))
 
     def _do_stack_global(self, _: Any) -> None:
-        module, name = self._pop(2)
-        self._name(f"{module}.{name}")
+        parts = self._pop(2)
+        if not all(isinstance(part, str) for part in parts):  # a nested list would be spelled out
+            raise ValueError("the pickle names what is no string")
+        self._name(".".join(parts))
 
     def _name(self, name: str) -> None:
         if name not in self.names:

@@ -7,9 +7,10 @@
 
 Weights: released names, .safetensors files, published checkpoints. --data takes recordings of any
 format: IJRR, MVSEC, HQF, EVIMO2v2, EVREAL. The cuts are those of `experiments.recorded.CUTS`, by
-the sequence's name. Without --data: synthetic cameras behind three circuits that no training
-simulates (`experiments.targets`), and, where the environment variable EVFLOW_DATA names a folder
-with them, two real recordings and two slices of rotations, whose flow the gyroscope tells.
+the sequence's name; files called NAME_cut have theirs already. Without --data: synthetic cameras
+behind three circuits that no training simulates (`experiments.targets`), and, where the environment
+variable EVFLOW_DATA names a folder with them, two real recordings and two slices of rotations,
+whose flow the gyroscope tells.
 
 Images are scored linear and in the log domain, log(1 + 255 I) / log 256; flow of real recordings by
 FWL. Writes evaluate_network.json, .md and .png.
@@ -18,6 +19,7 @@ FWL. Writes evaluate_network.json, .md and .png.
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from pathlib import Path
 from typing import Any, Literal
@@ -31,11 +33,28 @@ from evflow.downstream import EVFlowNet, event_tensor, reconstruct
 from evflow.downstream.released import Trained, load_network
 from evflow.downstream.simulated import SequenceConfig
 from evflow.errors import EvflowDataError
-from evflow.metrics import PROTOCOLS, FwlConvention, fwl, load_lpips, score_flow, score_images
+from evflow.metrics import (
+    PROTOCOLS,
+    FwlConvention,
+    ImageProtocol,
+    fwl,
+    load_lpips,
+    score_flow,
+    score_images,
+)
 from evflow.report import plots
 from experiments import held_out, targets
 from experiments.common import write_result
-from experiments.recorded import Part, Rotation, equalised, read_part, read_rotation, stretched
+from experiments.recorded import (
+    Part,
+    Rotation,
+    cut_of,
+    equalised,
+    read_part,
+    read_rotation,
+    sequence_name,
+    stretched,
+)
 
 REAL = ("newton_cradle_davis346.aedat4", "ijrr_slider_depth")
 ROTATIONS = ("ijrr_boxes_rotation", "ijrr_dynamic_rotation")
@@ -62,8 +81,8 @@ class Options:
     out: Path = Path("out/evaluate_network")
     protocol: Literal["evreal", "etnet", "global"] = "evreal"
     """How images are scored: which SSIM, clipped or not."""
-    aggregate: Literal["frames", "sequences"] = "frames"
-    """Mean over all frames, or over the means of sequences."""
+    aggregate: Literal["frames", "sequences"] | None = None
+    """Mean over all frames, or over the means of sequences (default: the protocol's)."""
     warmup_s: float = 10.0
     """Seconds before the cut from which networks run (EVREAL: 10; ET-Net and S2R: 0)."""
     histeq: Literal["none", "global", "local", "clahe"] = "none"
@@ -89,7 +108,14 @@ def parts(options: Options) -> list[Part]:
         # Shorter than their cuts: slices of sequences.
         cut = False
         paths = [p for name in REAL if (p := Path(at_hand) / "data/recordings" / name).exists()]
+    names = [sequence_name(path) for path in paths]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise EvflowDataError("EV020", f"more than one recording is called {sorted(twice)}.",
+                              "Rename a file: it is by its name that a sequence is known.")
     for path in paths:
+        start, stop = cut_of(path) if cut else (0.0, math.inf)
+        if stop < math.inf:
+            print(f"{path}: {start:g} to {stop:g} s count (--whole for all of it)")
         try:
             found.append(read_part(path, options.warmup_s, options.window_ms, cut))
         except EvflowDataError as error:
@@ -118,6 +144,12 @@ def images_of(trained: Trained, part: Part, options: Options) -> tuple[np.ndarra
             equalised(part.frames[part.warmup:], options.histeq))
 
 
+def protocol_of(options: Options) -> ImageProtocol:
+    """How images are scored, and their scores averaged."""
+    protocol = PROTOCOLS[options.protocol]
+    return dataclasses.replace(protocol, aggregate=options.aggregate or protocol.aggregate)
+
+
 def real_video(
     trained: Trained, found: list[Part], options: Options, lpips: Any
 ) -> tuple[dict[str, Any], dict[str, tuple[np.ndarray, np.ndarray]]]:
@@ -130,7 +162,7 @@ def real_video(
             print(f"{part.name} left out: {error}")
     if not pairs:
         return {}, pairs
-    protocol = dataclasses.replace(PROTOCOLS[options.protocol], aggregate=options.aggregate)
+    protocol = protocol_of(options)
     linear = score_images(pairs, protocol, lpips)
     log = score_images(pairs, dataclasses.replace(protocol, domain="log"))
     for row, same in ((linear, log), *((linear["sequences"][n], log["sequences"][n])
@@ -149,7 +181,8 @@ def real_flow(trained: Trained, found: list[Part], slices: dict[str, Rotation]) 
             part.events, part.edges_us[part.warmup:], flows[part.warmup:])
     how = FwlConvention(reference="first")
     for name, one in slices.items():
-        tensor = jnp.asarray(event_tensor(one.events, trained.network.bins))[None, None]
+        tensor = jnp.asarray(
+            event_tensor(one.events, trained.network.bins, trained.split))[None, None]
         flow = np.asarray(held_out.outputs(
             trained.network, trained.params, tensor, trained.normalised)[0, 0])
         columns = (*one.xy.T, one.t, one.p, np.ones(len(one.t), np.float32))
@@ -183,10 +216,6 @@ class Synthetic:
             rows[name] = {k: float(np.nanmean(v)) for k, v in found.items()}
         return rows
 
-    @staticmethod
-    def conventions() -> dict[str, Any]:
-        return {task: held_out.scored_by(task) for task in ("video", "flow")}
-
 
 def main(options: Options) -> dict[str, Any]:
     plots.require()
@@ -210,8 +239,9 @@ def main(options: Options) -> dict[str, Any]:
         result[name] = row
     text = report(result, options)
     print(text)
-    conventions = {"synthetic": Synthetic.conventions()} if synthetic else {}
-    write_result(options.out / "evaluate_network.json", result | conventions, as_dict(options))
+    conventions = {task: held_out.scored_by(task, lpips is not None) for task in ("video", "flow")}
+    write_result(options.out / "evaluate_network.json",
+                 result | ({"synthetic": conventions} if synthetic else {}), as_dict(options))
     (options.out / "evaluate_network.md").write_text(text + "\n")
     if shown:
         picture(shown, options.out / "evaluate_network.png")
@@ -220,8 +250,9 @@ def main(options: Options) -> dict[str, Any]:
 
 def report(result: dict[str, Any], options: Options) -> str:
     """Markdown: real video, real flow, synthetic cameras."""
-    lines = [f"SSIM preset {options.protocol}, mean over {options.aggregate}, warm-up of up to "
-             f"{options.warmup_s:g} s where recordings are as long, histeq {options.histeq}."]
+    lines = [f"SSIM preset {options.protocol}, mean over {protocol_of(options).aggregate}, "
+             f"warm-up of up to {options.warmup_s:g} s where recordings are as long, "
+             f"histeq {options.histeq}."]
     video = [(name, where, r) for name, row in result.items() if row.get("video")
              for where, r in (("mean", row["video"]), *row["video"]["sequences"].items())]
     if video:

@@ -42,11 +42,11 @@ class Clips:
     flow: np.ndarray
 
 
-def scored_by(task: str) -> dict[str, Any]:
-    """The conventions of `VIDEO` or of `FLOW`, for "flow"."""
+def scored_by(task: str, perceptual: bool = True) -> dict[str, Any]:
+    """The conventions of `VIDEO` or of `FLOW`, for "flow"; perceptual: LPIPS was at hand."""
     if task == "flow":
         return {"fwl": CONVENTION.as_dict(), "aee": "pixels with events", "outlier_px": OUTLIER_PX}
-    return {**dataclasses.asdict(PROTOCOL), "lpips_net": "alex v0.1"}
+    return {**dataclasses.asdict(PROTOCOL), "lpips_net": "alex v0.1" if perceptual else None}
 
 
 def gather(clips: Iterable[Clip]) -> Clips:

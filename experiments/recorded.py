@@ -3,7 +3,8 @@ events make which frame, and how histograms are equalised.
 
 The clock of a sequence starts at its first event or frame, whichever is earlier (EVREAL). An image
 is made at every frame's time, from the events since the frame before; networks with a memory run
-`warmup_s` before what counts.
+`warmup_s` before what counts. EVREAL also leaves out frames farther than 1 ms from their events'
+window; here a window ends at its frame.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ CUTS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("indoor_flying1", "indoor_flying2", "indoor_flying3"), (10.0, 70.0)),
     "indoor_flying4": (10.0, 19.8), "outdoor_day1": (0.0, 60.0), "outdoor_day2": (100.0, 160.0)}
 ENDINGS = ("_data", "_cut", "_events")  # of file names, after the sequence's own
+GENERAL = ("events", "data", "recording")  # names of files in a folder that has the sequence's
 HISTEQ = ("none", "global", "local", "clahe")
 LOCAL_PX = 55  # radius of the disk of E2VID's local equalisation
 CLAHE = (2.0, (8, 8))  # clip limit, tiles
@@ -49,20 +51,29 @@ class Part:
 
 
 def sequence_name(path: Path) -> str:
-    """`indoor_flying1` of indoor_flying1_data.hdf5."""
-    name = path.name.split(".")[0]
+    """`indoor_flying1` of indoor_flying1_data.hdf5, and of indoor_flying1/events.h5."""
+    name = _stem(path)
     for ending in ENDINGS:
         name = name.removesuffix(ending)
     return name
 
 
+def cut_of(path: Path) -> tuple[float, float]:
+    """Seconds (start, stop) of a sequence that count; all of one whose file is called cut."""
+    whole = (0.0, np.inf)
+    return whole if _stem(path).endswith("_cut") else CUTS.get(sequence_name(path), whole)
+
+
+def _stem(path: Path) -> str:
+    name = path.name.split(".")[0]
+    return path.absolute().parent.name.split(".")[0] if name in GENERAL else name
+
+
 def read_part(path: Path, warmup_s: float, window_ms: float, cut: bool = True) -> Part:
     """The part of a sequence that counts, and its warm-up. window_ms: of recordings without
     frames. Raises what `read_recording` raises, and EV012 where nothing lies in the cut."""
-    recording = read_recording(path)
-    name = sequence_name(path)
-    start, stop = CUTS.get(name, (0.0, np.inf)) if cut else (0.0, np.inf)
-    return part_of(recording, name, start, stop, warmup_s, window_ms)
+    start, stop = cut_of(path) if cut else (0.0, np.inf)
+    return part_of(read_recording(path), sequence_name(path), start, stop, warmup_s, window_ms)
 
 
 def part_of(
@@ -93,8 +104,9 @@ def part_of(
     if recording.has_frames:
         kept = np.searchsorted(times, edges[1:])
         frames = np.stack([recording.frame_dn(int(i)) / np.float32(255) for i in kept])
-    # An event at an edge belongs to the frame there.
-    inside = events.slice(int(edges[0]) + 1, int(edges[-1]) + 1)
+    # An event at an edge belongs to the frame there; no frame is at a recording's first event.
+    first_us = int(edges[0]) + recording.has_frames
+    inside = events.slice(first_us, int(edges[-1]) + 1)
     return Part(name, inside, edges, frames, warmup)
 
 

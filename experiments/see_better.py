@@ -38,9 +38,10 @@ from evflow.downstream.train import LearningConfig
 from evflow.errors import EvflowDataError
 from evflow.progress import stoppable
 from evflow.report import plots
+from evflow.weights import weights_path
 from experiments import gains, held_out
 from experiments.common import provenance, write_result
-from experiments.conditions import EVENTGAN
+from experiments.conditions import EVENTGAN, digest
 from experiments.targets import CAMERAS, SCENES
 from experiments.trainings import SIMULATED, Setting, Trainings
 
@@ -176,7 +177,9 @@ def main(options: Options) -> dict[str, Any]:
     """Train and test what is missing; returns the tables' figures of all there is."""
     plots.require()
     began, setting = time.monotonic(), chosen(options)
-    same_setting(options.out, {"task": options.task, "weights": options.weights}, setting)
+    shared = {"task": options.task, "weights": options.weights,
+              "estimator": digest(weights_path(options.weights))}
+    same_setting(options.out, shared, setting)
     runs = Trainings(setting, options.out, options.weights, options.eventgan)
     conditions = runs.conditions(files(options.estimators), files(options.cameras))
     left = setting.seeds * len(conditions)
@@ -191,8 +194,9 @@ def main(options: Options) -> dict[str, Any]:
     text = "\n\n".join((heading(options, setting), gains.report(
         result, options.task, runs.told(conditions), left)))
     print(text)
-    write_result(options.out / "see_better.json", {"targets": result, "missing": left,
-                                               "scored_by": held_out.scored_by(options.task)},
+    how = held_out.scored_by(options.task, runs.lpips is not None)
+    write_result(options.out / "see_better.json",
+                 {"targets": result, "missing": left, "scored_by": how},
                  as_dict(options) | {"setting": as_dict(setting)})
     (options.out / "see_better.md").write_text(text + "\n")
     gains.picture(result, options.out / "see_better.png")

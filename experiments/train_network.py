@@ -36,6 +36,7 @@ from evflow.downstream.simulated import Sequences, has_events, sample_sequences
 from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
 from evflow.metrics.flow import aee
+from evflow.metrics.flow_scores import OUTLIER_PX
 from evflow.metrics.image_scores import PROTOCOLS, frame_scores
 from evflow.metrics.perceptual import load_lpips
 from evflow.scenes import make_bank
@@ -110,8 +111,8 @@ def main(options: Options) -> dict[str, Any]:
     step = jax.jit(make_step(network, learning, tx, sample))
     state = train(lambda state: step(state, bank, camera, loss_weights),
                   init_state(network, learning, tx, begun(config)), config, options)
-    result = measure(network, state.params, learning, camera, options.batches)
-    result = {"steps": int(state.step)} | result
+    figures = measure(network, state.params, learning, camera, options.batches)
+    result = {"steps": int(state.step), "scored_by": scored_by(network, figures), **figures}
     card = {"preset": options.preset, "steps": int(state.step), "seed": learning.seed,
             "data": ", ".join(config.recordings)
             or "procedural textures and scikit-image's photographs, simulated",
@@ -216,10 +217,18 @@ def _flow_figures(
     return rows
 
 
-def table(result: dict[str, float]) -> str:
+def scored_by(network: Network, figures: dict[str, float]) -> dict[str, Any]:
+    """The conventions of these figures."""
+    if isinstance(network, EVFlowNet):
+        return {"aee": "pixels with events", "outlier_px": OUTLIER_PX}
+    return {**dataclasses.asdict(PROTOCOLS["evreal"]),
+            "lpips_net": "alex v0.1" if "lpips" in figures else None}
+
+
+def table(result: dict[str, Any]) -> str:
     """Markdown, one row."""
-    names = list(result)
-    cells = (f"{v:.4g}" for v in result.values())
+    names = [name for name, value in result.items() if isinstance(value, int | float)]
+    cells = (f"{result[name]:.4g}" for name in names)
     return "\n".join((f"| {' | '.join(names)} |", "|" + "---|" * len(names),
                       f"| {' | '.join(cells)} |"))
 

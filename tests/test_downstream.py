@@ -150,6 +150,25 @@ def test_event_tensors_spread_each_event_over_two_bins(n: int, bins: int, seed: 
     np.testing.assert_allclose(event_tensor(events, bins), grid, atol=1e-5)
 
 
+def test_split_tensors_count_each_polarity_apart() -> None:
+    events = some_events()
+    split = event_tensor(events, 10, split=True)
+    np.testing.assert_allclose(split[..., :5] - split[..., 5:], event_tensor(events), atol=1e-5)
+    assert split.min() >= 0
+    np.testing.assert_allclose(split[..., 5:].sum((0, 1, 2)), (~events.p).sum(), rtol=1e-5)
+    assert not event_tensor(events.slice(20_000, 30_000), 10, split=True).any()
+
+
+def test_tensors_of_any_dtype_are_taken() -> None:
+    network = FireNet(base=2)
+    params = network.init(jax.random.key(0), (8, 12))
+    tensor = np.rint(3 * event_tensor(some_events()))
+    expected, _ = network.apply(params, tensor)
+    for dtype in (np.float64, np.float16, np.int8, np.int64):
+        np.testing.assert_array_equal(network.apply(params, tensor.astype(dtype))[0], expected)
+        assert run(network, params, tensor[None].astype(dtype))[0].dtype == np.float32
+
+
 def test_silence_is_a_tensor_of_zeros() -> None:
     silent = some_events().slice(20_000, 30_000)
     assert not event_tensor(silent).any()
@@ -190,6 +209,8 @@ def test_reconstruct_is_apply_window_by_window() -> None:
     for times, code in (([], "EV001"), ([5, 3], "EV004"), ([0.5, 1.0], "EV003")):
         with pytest.raises(EvflowDataError, match=code):
             reconstruct(network, params, events, np.array(times))
+    with pytest.raises(EvflowDataError, match="EV004"):
+        reconstruct(network, params, events, np.array([5, 3], np.uint64))
 
 
 def test_a_window_without_events_may_repeat_the_image() -> None:

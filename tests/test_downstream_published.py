@@ -30,12 +30,15 @@ from evflow.downstream import (
     E2VID_SMALL,
     EVFlowNet,
     FireNet,
+    event_tensor,
     load_network,
     load_published,
+    reconstruct,
     run,
 )
 from evflow.downstream.published import recognise, to_params
 from evflow.errors import EvflowDataError
+from evflow.types import Events
 from evflow.weights import load_weights
 
 DATA = Path(__file__).parent / "data"
@@ -124,6 +127,9 @@ def test_settings_of_the_original_e2vid_make_it_sigmoid(tmp_path: Path) -> None:
     write_legacy(path, {"model": {"num_bins": 5}, "state_dict": case_state("e2vid_plus")})
     network, _ = load_published(path)
     assert (network.output, network.padding) == ("sigmoid", "reflect")
+    write_legacy(path, {"model": {"final_activation": ""}, "state_dict": case_state("e2vid_plus")})
+    network, _ = load_published(path)
+    assert (network.output, network.padding) == ("linear", "reflect")
 
 
 @pytest.mark.parametrize(("name", "settings", "expected"), [
@@ -136,6 +142,20 @@ def test_networks_get_tensors_as_in_their_training(
     write_legacy(tmp_path / "mine.ckpt", {**settings, "state_dict": case_state(name)})
     trained = load_network(tmp_path / "mine.ckpt")  # by its content, whatever its name
     assert trained.how == {"normalised": expected}
+
+
+def test_ten_bins_are_five_of_each_polarity(tmp_path: Path) -> None:
+    state = case_state("firenet_plus")
+    state["head.conv2d.weight"] = np.tile(state["head.conv2d.weight"], (1, 2, 1, 1))
+    write_legacy(tmp_path / "update.pth", {"state_dict": state})
+    trained = load_network(tmp_path / "update.pth")
+    assert trained.how == {"normalised": False, "split": True}
+    times = np.array([3000, 9000])
+    events = Events([1, 2], [1, 2], [1000, 2000], [True, False], (9, 8))
+    image = reconstruct(trained.network, trained.params, events, times, **trained.how)[0]
+    tensor = event_tensor(events, 10, split=True)
+    np.testing.assert_allclose(
+        image, trained.network.apply(trained.params, tensor)[0], atol=1e-6)
 
 
 def test_weights_that_diverged_are_refused(tmp_path: Path) -> None:

@@ -188,6 +188,23 @@ def test_broken_programs_are_value_errors(program: bytes) -> None:
         pickles.load(io.BytesIO(program), {})
 
 
+def test_names_that_are_no_strings_are_refused() -> None:
+    """A list within lists of itself would be spelled out: twice as long at every level."""
+    levels = b"".join(b"]" + b"q" + bytes([i + 1]) + b"(h" + bytes([i]) + b"h" + bytes([i]) + b"e"
+                      for i in range(60))
+    program = b"\x80\x04]q\x00" + levels + b"\x8c\x01x\x93."
+    with pytest.raises(ValueError, match="no string"):
+        pickles.load(io.BytesIO(program), {})
+
+
+@pytest.mark.parametrize("content", [
+    {0: np.zeros(2, np.float32)}, {"state_dict": {0: np.zeros(2, np.float32)}}], ids=str)
+def test_weights_without_names_are_no_weights(content: dict, tmp_path: Path) -> None:
+    write_legacy(tmp_path / "x.pt", content)
+    with pytest.raises(EvflowDataError, match="EV018"):
+        read_checkpoint(tmp_path / "x.pt")
+
+
 def test_endless_programs_are_cut() -> None:
     program = b"N" * (pickles.MOST_INSTRUCTIONS + 1) + b"."
     with pytest.raises(ValueError, match="instructions"):

@@ -49,6 +49,12 @@ def test_edges_begin_with_the_first_event() -> None:
         window_edges(recording, np.array([early, early + 50])), [early + 5, early + 50])
 
 
+def test_events_of_one_instant_make_no_window() -> None:
+    at_once = Recording.of_events(Events([1, 2], [1, 2], [7, 7], [True, False], (64, 48)))
+    with pytest.raises(EvflowDataError, match=r"EV017.*all events are at 7 us"):
+        window_edges(at_once, sync_times(at_once, "events"))
+
+
 @pytest.mark.parametrize(("code", "options"), [
     ("EV011", {"sync": "frames"}), ("EV020", {"sync": "events", "count": 0}),
     ("EV020", {"sync": "ms", "window_us": 0})])
@@ -190,9 +196,13 @@ def test_true_flow_of_another_recording_is_refused(tmp_path: Path) -> None:
     truth = flow.load_truth(tmp_path / "a.npz", (64, 48))
     assert truth.valid.shape == (2, 48, 64)
     assert truth.valid.all()
-    bad = {"EV015": good | {"edges_us": np.array([0, 5])}, "EV008": {"flow": good["flow"]},
-           "EV004": good | {"edges_us": np.array([0, 5, 5])}}
-    for code, arrays in bad.items():
+    bad = [("EV015", good | {"edges_us": np.array([0, 5])}), ("EV008", {"flow": good["flow"]}),
+           ("EV015", good | {"flow": np.zeros(5)}), ("EV004", good | {"edges_us": np.array(3)}),
+           ("EV015", good | {"flow": np.full((2, 2, 48, 64), "a")}),
+           ("EV015", good | {"valid": np.ones(3)}),
+           ("EV004", good | {"edges_us": np.array([0, 5, 5])}),
+           ("EV004", good | {"edges_us": np.array([0, 5, 4], np.uint64)})]
+    for code, arrays in bad:
         np.savez(tmp_path / "b.npz", **arrays)
         with pytest.raises(EvflowDataError, match=code):
             flow.load_truth(tmp_path / "b.npz", (64, 48))

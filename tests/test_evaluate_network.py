@@ -68,6 +68,7 @@ def test_without_frames_windows_follow_each_other() -> None:
     assert part.edges_us[0] == 7_000
     assert part.warmup == 0
     assert len(part.edges_us) == 80
+    assert part.events.t[0] == part.edges_us[0]
 
 
 def test_a_recording_that_ends_before_the_cut_is_refused() -> None:
@@ -80,7 +81,7 @@ def test_a_recording_that_ends_before_the_cut_is_refused() -> None:
 @pytest.mark.parametrize(("file", "name"), [
     ("indoor_flying1_data.hdf5", "indoor_flying1"), ("slider_depth", "slider_depth"),
     ("boxes_6dof.bag", "boxes_6dof"), ("bike_bay_hdr.h5", "bike_bay_hdr"),
-    ("poster_6dof_cut.h5", "poster_6dof")])
+    ("poster_6dof_cut.h5", "poster_6dof"), ("office_zigzag/events.npz", "office_zigzag")])
 def test_sequences_are_known_by_their_files(file: str, name: str) -> None:
     assert recorded.sequence_name(Path("a.b") / file) == name
 
@@ -90,6 +91,9 @@ def test_cuts_are_those_of_the_benchmarks() -> None:
     assert recorded.CUTS["office_zigzag"] == (5.0, 12.0)
     assert recorded.CUTS["indoor_flying4"] == (10.0, 19.8)
     assert len(recorded.CUTS) == 13
+    assert recorded.cut_of(Path("slider_depth.h5")) == (1.0, 2.5)
+    assert recorded.cut_of(Path("slider_depth_cut.h5")) == (0.0, np.inf)  # it has had it
+    assert recorded.cut_of(Path("mine.npz")) == (0.0, np.inf)
     assert all(0 <= a < b for a, b in recorded.CUTS.values())
 
 
@@ -131,6 +135,12 @@ def test_video_and_flow_are_scored_and_written(
     assert cv2.imread(str(tmp_path / "out" / "evaluate_network.png")) is not None
     with pytest.raises(EvflowDataError, match="EV016"):
         evaluate_network.main(Options(weights=names, data=(tmp_path / "no",), out=tmp_path))
+    twins = (tmp_path / "a/mine.npz", tmp_path / "b/mine_cut.npz")
+    with pytest.raises(EvflowDataError, match=r"EV020.*\['mine'\]"):
+        evaluate_network.parts(Options(data=twins))
+    aggregates = {p: evaluate_network.protocol_of(Options(protocol=p)).aggregate
+                  for p in ("evreal", "etnet")}
+    assert aggregates == {"evreal": "frames", "etnet": "sequences"}
 
 
 @pytest.mark.slow

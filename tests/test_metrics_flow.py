@@ -66,6 +66,15 @@ def test_fwl_is_its_definition(how: FwlConvention) -> None:
             float(fwl(*edge(), constant(u), convention=how)), expected, rtol=rtol)
 
 
+def test_events_of_any_dtype_and_origin_score_the_same() -> None:
+    x, y, t, p, weight = (np.asarray(a, np.float64) for a in edge())
+    expected = [float(f(*edge(), constant(12.0))) for f in (metrics.fwl, metrics.rsat)]
+    flow = np.asarray(constant(12.0), np.float64)
+    for t_one, weight_one in ((t, weight), (t + 1.4e9, weight.astype(int)), (t, weight > 0)):
+        found = [float(f(x, y, t_one, p > 0, weight_one, flow)) for f in (metrics.fwl, metrics.rsat)]
+        np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
 def test_true_flow_is_the_sharpest_and_no_flow_is_1() -> None:
     values = {u: float(fwl(*edge(), constant(u))) for u in (-12.0, 0.0, 6.0, 12.0, 18.0)}
     assert max(values, key=values.__getitem__) == 12.0
@@ -146,6 +155,8 @@ def test_endpoint_errors_by_hand() -> None:
     mask = np.array([[1, 1, 1], [1, 0, 0]], bool)
     error, outliers = jax.jit(metrics.aee)(flow, truth, mask)
     np.testing.assert_allclose([error, outliers], [1.5, 25.0])
+    for other in (mask.astype(float), 2 * mask.astype(int)):
+        np.testing.assert_allclose(metrics.aee(flow, truth, other), [1.5, 25.0])
     _, outliers = metrics.aee(flow, truth, mask, outlier_px=6.0)
     assert float(outliers) == 0
     error, _ = metrics.aee(flow[None, ..., :2], truth[None, ..., :2])

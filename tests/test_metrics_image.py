@@ -120,6 +120,8 @@ def test_metrics_are_differentiable_and_follow_the_type() -> None:
      "EV003"),
     (lambda a, b: metrics.score_images({"x": (a[None] * np.nan, b[None])}), "EV007"),
     (lambda a, b: metrics.score_images({"x": (255.0 * a[None], 255.0 * b[None])}), "EV003"),
+    (lambda a, b: metrics.score_images({"x": (255.0 * a[None], b[None])}), "EV003"),
+    (lambda a, b: metrics.log_map((255 * a).astype(np.uint8)), "EV003"),
     (lambda a, b: metrics.lpips({}, (255 * a).astype(np.uint8), b), "EV003"),
     (lambda a, b: metrics.lpips({}, a[0], b[0]), "EV002"),
     (lambda a, b: ImageProtocol(aggregate="median"), "EV020"),
@@ -224,6 +226,8 @@ def test_lpips_of_grey_images_is_that_of_three_equal_channels() -> None:
         images, references)), colour=True)
     np.testing.assert_allclose(grey, colour, atol=1e-6)
     np.testing.assert_allclose(distance(params, images, images), 0, atol=1e-7)
+    halves = distance(params, images.astype(np.float16), references.astype(np.float16))
+    np.testing.assert_allclose(halves, grey, rtol=1e-2)
     gradient = jax.jit(jax.grad(lambda a, b: lpips(params, a, b)))
     slope = gradient(images[0, 0], references[0, 0])
     assert bool(jnp.isfinite(slope).all())
@@ -251,7 +255,8 @@ def test_images_too_small_for_lpips_have_their_other_scores() -> None:
     (pickle.dumps({"AlexNet_0": np.zeros(3, np.float32)}, 2), "EV009|EV018"),
     (pickle.dumps(np.save), "EV009"), (b"", "EV009"),
     (pickle.dumps({"AlexNet_0": 3}), "EV009"), (b"}.", "EV018"),
-], ids=["other", "code", "empty", "number", "nothing"])
+    (pickle.dumps({"AlexNet_0": None, **{f"NetLinLayer_{i}": None for i in range(5)}}), "EV018"),
+], ids=["other", "code", "empty", "number", "nothing", "hollow"])
 def test_files_that_are_no_lpips_weights_are_refused(content: bytes, code, tmp_path: Path) -> None:
     (tmp_path / "alexnet.ckpt").write_bytes(content)
     with pytest.raises(EvflowDataError, match=code):

@@ -135,4 +135,4 @@ def _described(result: dict[str, Any]) -> list[str]:
         return []
     how = ", ".join(f"{k} {v}" for k, v in result["convention"].items())
     return [f"{', '.join(numbers)} over {result['windows']} windows of "
-            f"{result['window_ms']:.1f} ms ({how})"]
+            f"{result['window_ms']:.1f} ms and {result['events_per_window']:.0f} events ({how})"]

@@ -70,16 +70,21 @@ def load_truth(path: str | os.PathLike, size: tuple[int, int]) -> FlowTruth:
         if missing := [name for name in ("flow", "edges_us") if name not in data]:
             raise EvflowDataError("EV008", f"it holds {sorted(data)} but not {missing}.",
                                   "Expected flow (T, 2, H, W) and edges_us (T + 1,).")
-        flow, edges = np.asarray(data["flow"], np.float32), np.asarray(data["edges_us"])
-        shape = (len(edges) - 1, 2, size[1], size[0])
-        valid = np.asarray(data.get("valid", np.isfinite(flow).all(1)), bool)
-        if flow.shape != shape or valid.shape != (shape[0], *shape[2:]):
-            raise EvflowDataError("EV015", f"flow is {flow.shape}, valid {valid.shape}, with "
-                                  f"{len(edges)} edges.", f"Expected flow of {shape}.")
-        if edges.dtype.kind not in "iu" or len(edges) < 2 or np.any(np.diff(edges) <= 0):
+        flow, edges = data["flow"], data["edges_us"]
+        if edges.dtype.kind not in "iu" or edges.ndim != 1 or len(edges) < 2 or np.any(
+                np.diff(edges := edges.astype(np.int64)) <= 0):
             raise EvflowDataError("EV004", "edges_us are no rising integers.",
                                   "Give T + 1 instants in microseconds.")
-    return FlowTruth(flow, edges.astype(np.int64), valid)
+        shape = (len(edges) - 1, 2, size[1], size[0])
+        if flow.dtype.kind not in "fiu" or flow.shape != shape:
+            raise EvflowDataError("EV015", f"flow is {flow.dtype} {flow.shape}, with {len(edges)} "
+                                  "edges.", f"Expected numbers {shape}.")
+        flow = flow.astype(np.float32)
+        valid = np.asarray(data.get("valid", np.isfinite(flow).all(1)), bool)
+        if valid.shape != (shape[0], *shape[2:]):
+            raise EvflowDataError("EV015", f"valid is {valid.shape}.",
+                                  f"Expected {(shape[0], *shape[2:])}.")
+    return FlowTruth(flow, edges, valid)
 
 
 class FlowScores:

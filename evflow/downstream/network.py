@@ -75,6 +75,7 @@ class Network:
 
         state: None before the first tensor. Raises EV002 where the channels are not `bins`.
         """
+        voxels = as_floats(voxels, params)
         if voxels.ndim < 3 or voxels.shape[-1] != self.bins:
             raise EvflowDataError("EV002", f"the event tensor is {voxels.shape}.",
                                   f"Expected (..., H, W, {self.bins}).")
@@ -97,6 +98,11 @@ class Network:
         return jnp.pad(x, widths, mode=PADDINGS[self.padding]), (before[0], before[1])
 
 
+def as_floats(voxels: Any, params: Params) -> Array:
+    """On the device, of the dtype that the network's numbers will have."""
+    return jnp.asarray(voxels, jnp.result_type(voxels, *jax.tree.leaves(params)))
+
+
 def require(network: Any, name: str, good: bool, rule: str) -> None:
     """EV020 unless `good`: network.name must follow `rule`."""
     if not good:
@@ -113,6 +119,7 @@ def run(
     17 times slower than outside of one, so there the sequence is unrolled; elsewhere each step
     is recomputed in the backward pass, which keeps the memory of one.
     """
+    voxels = as_floats(voxels, params)
     if state is None:
         state = network.start(voxels.shape[1:-1], voxels.dtype)
 

@@ -23,6 +23,7 @@ from evflow.errors import EvflowDataError, naming
 
 Arrays = dict[str, np.ndarray]
 
+SPLIT_BINS = 10  # S2R's later models: five of ON events, then five of OFF
 PREFIXES = ("unetrecurrent.", "unet.", "net.")
 # Published module -> ours, by the first pattern that fits the whole name.
 RULES: dict[str, tuple[tuple[str, str], ...]] = {
@@ -91,7 +92,8 @@ def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network
     """The structure behind a state dict; EV018 where it is of no known network.
 
     The output's activation and the padding are not in the weights: E2VID's own files, which
-    have settings under "model" or batch norm, are sigmoid and mirrored, S2R's linear and zeros.
+    have settings under "model" or batch norm, are sigmoid (if "final_activation" there is no
+    other) and mirrored, S2R's linear and zeros.
     """
     arrays = _stripped(arrays)
     names = " ".join(arrays)
@@ -102,7 +104,9 @@ def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network
     if "recurrent_block.Gates" in names:
         base, bins = _conv_sizes(arrays, "head.conv2d.weight")
         batch = "running_mean" in names
-        original = batch or "model" in (settings or {})
+        told = (settings or {}).get("model")
+        original = batch or told is not None
+        last = told.get("final_activation", "sigmoid") if isinstance(told, dict) else "sigmoid"
         return E2VID(
             bins=bins, base=base,
             encoders=count(r"encoders\.\d\.recurrent_block\.Gates\.weight"),
@@ -110,7 +114,7 @@ def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network
             decoder="transposed" if "transposed_conv2d" in names else "upsample",
             norm="batch" if batch else "none",
             skip="sum" if _conv_sizes(arrays, "pred.conv2d.weight")[1] == base else "concat",
-            output="sigmoid" if original else "linear",
+            output="sigmoid" if original and last == "sigmoid" else "linear",
             padding="reflect" if original else "zeros")
     if "update_gate" in names:
         legacy = "head.conv.conv2d.weight"

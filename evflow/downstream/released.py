@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from evflow.downstream.network import Network, Params
 from evflow.downstream.presets import KINDS
-from evflow.downstream.published import read_published
+from evflow.downstream.published import SPLIT_BINS, read_published
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card, save_weights, weights_path
 
@@ -27,18 +27,19 @@ RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: net
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A network with its params. normalised: whether its event tensors are; card: who made it of
-    what, empty for a published checkpoint."""
+    """A network with its params. normalised, split: whether its event tensors are; card: who made
+    it of what, empty for a published checkpoint."""
 
     network: Network
     params: Params
     normalised: bool
     card: dict[str, Any]
+    split: bool = False
 
     @property
     def how(self) -> dict[str, bool]:
         """The options that `reconstruct` needs."""
-        return {"normalised": self.normalised}
+        return {"normalised": self.normalised} | ({"split": True} if self.split else {})
 
 
 def save_network(
@@ -59,7 +60,8 @@ def load_network(name_or_path: str | os.PathLike) -> Trained:
     """
     path = Path(name_or_path)
     if path.suffix in PUBLISHED or (path.is_file() and path.suffix != ".safetensors"):
-        return Trained(*read_published(path), {})
+        network, params, normalised = read_published(path)
+        return Trained(network, params, normalised, {}, split=network.bins == SPLIT_BINS)
     file = _file(name_or_path)
     card = model_card(file)
     kind = KINDS.get(str(card.get("network")))

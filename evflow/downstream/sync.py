@@ -52,9 +52,13 @@ def sync_times(
 
 def window_edges(recording: Recording, times: np.ndarray) -> np.ndarray:
     """The edges (T + 1,) int64 of the windows that end at times (T,): the first begins with the
-    first event; a time that is not after it ends no window. EV012 where none is."""
+    first event; a time that is not after it ends no window. Where none is, EV012 of frames and
+    EV017 of events."""
     start = recording.events.t[0]
     after = times[times > start]
+    if not len(after) and times is not recording.frame_times:
+        raise EvflowDataError("EV017", f"all events are at {start:,} us.",
+                              "A window needs a length: take a longer recording.")
     if not len(after):
         raise EvflowDataError(
             "EV012", f"the last frame is at {times[-1]:,} us, the first event at {start:,} us.",

@@ -23,20 +23,23 @@ Array = jax.Array
 BINS = 5
 
 
-def event_tensor(events: Events, bins: int = BINS) -> np.ndarray:
-    """Events of one window -> float32 (H, W, bins); zeros where there are none."""
+def event_tensor(events: Events, bins: int = BINS, split: bool = False) -> np.ndarray:
+    """Events of one window -> float32 (H, W, bins); zeros where there are none. split: ON events
+    are counted in the first half of the bins, OFF events in the other."""
     width, height = events.size
     if not len(events):
         return np.zeros((height, width, bins), np.float32)
     span = max(int(events.t[-1] - events.t[0]), 1)
-    position = (events.t - events.t[0]) * ((bins - 1) / span)
+    steps = bins // 2 if split else bins
+    position = (events.t - events.t[0]) * ((steps - 1) / span)
     low = np.floor(position).astype(np.int64)
     index = (events.y.astype(np.int64) * width + events.x) * bins + low
-    sign = np.where(events.p, 1.0, -1.0)
+    index += np.where(events.p, 0, steps) if split else 0
+    sign = np.where(events.p | split, 1.0, -1.0)
     late = position - low
     size = height * width * bins
     grid = np.bincount(index, sign * (1.0 - late), size)
-    inside = low < bins - 1  # the last event falls on the last bin: nothing is left for a next
+    inside = low < steps - 1  # the last event falls on the last bin: nothing is left for a next
     grid += np.bincount(index[inside] + 1, (sign * late)[inside], size)
     return grid.astype(np.float32).reshape(height, width, bins)
 
@@ -74,7 +77,7 @@ def _step(
 
 def reconstructions(
     network: Network, params: Params, events: Events, frame_times_us: np.ndarray, *,
-    normalised: bool = False, hold: bool = False,
+    normalised: bool = False, split: bool = False, hold: bool = False,
 ) -> Iterator[np.ndarray]:
     """What `reconstruct` stacks, one at a time: images (H, W), or flow (2, H, W).
 
@@ -88,6 +91,7 @@ def reconstructions(
     if times.dtype.kind not in "iu":
         raise EvflowDataError("EV003", f"frame_times_us has dtype {times.dtype}.",
                               "Times are integer microseconds: np.rint(t * 1e6).astype(np.int64).")
+    times = times.astype(np.int64)  # differences of unsigned ones never fall
     if np.any(np.diff(times) < 0):
         raise EvflowDataError("EV004", "frame_times_us falls.", "Pass them in order.")
 
@@ -100,7 +104,7 @@ def reconstructions(
                 continue
             part = Events.unchecked(events.x[window], events.y[window], events.t[window],
                                     events.p[window], events.size)
-            tensor = event_tensor(part, network.bins)
+            tensor = event_tensor(part, network.bins, split)
             made, state = _step(network, params, tensor, state, normalised)
             image = np.asarray(made)
             yield image
@@ -110,13 +114,14 @@ def reconstructions(
 
 def reconstruct(
     network: Network, params: Params, events: Events, frame_times_us: np.ndarray, *,
-    normalised: bool = False,
+    normalised: bool = False, split: bool = False,
 ) -> np.ndarray:
     """Output of a network at each of the T frame times, from the events between them: images
     (T, H, W) of E2VID and FireNet, about 0..1 and not clipped, or flow (T, 2, H, W).
 
-    normalised: True for E2VID and FireNet, False for E2VID+, FireNet+ and EV-FlowNet.
+    normalised: True for E2VID and FireNet, False for E2VID+, FireNet+ and EV-FlowNet; split: True
+    for S2R's later models of ten bins, see `event_tensor`.
     Raises EV001 without frame times, EV004 where they fall.
     """
     return np.stack(list(reconstructions(
-        network, params, events, frame_times_us, normalised=normalised)))
+        network, params, events, frame_times_us, normalised=normalised, split=split)))

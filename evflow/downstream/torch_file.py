@@ -116,7 +116,8 @@ def _read_chain(path: Path) -> tuple[Any, dict[str, bytes]]:
 
 
 def _read_storages(f: IO[bytes], keys: Any, needed: dict[str, _Storage]) -> dict[str, bytes]:
-    if not isinstance(keys, list) or set(keys) != set(needed):
+    strings = isinstance(keys, list) and all(isinstance(key, str) for key in keys)
+    if not strings or set(keys) != set(needed):
         raise ValueError("its list of storages is not that of its tensors")
     found = {}
     for key in keys:
@@ -212,7 +213,8 @@ def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpo
     content = content if isinstance(content, dict) else {}
     state = content.get("state_dict", content)
     tensors = {name.removeprefix("module."): value for name, value in state.items()
-               if isinstance(value, _Tensor)} if isinstance(state, dict) else {}
+               if isinstance(name, str) and isinstance(value, _Tensor)
+               } if isinstance(state, dict) else {}
     if not tensors:
         raise EvflowDataError(
             "EV018", f"{path} holds no weights, but {sorted(map(str, content))[:8]}.",

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.ndimage import map_coordinates
 
 from evflow.errors import EvflowDataError
@@ -62,11 +63,12 @@ def fwl(
     """Flow warp loss Var(I(flow)) / Var(I(0)) of one window; above 1 where the flow is better
     than none (Stoffregen et al., ECCV 2020). NaN where the events give an even image, or none.
 
-    x, y, t: (N,) float, also between pixels; p: (N,) bool or sign; weight: (N,) 1, or 0 for
-    padding; flow: (2, H, W) px per unit of t.
+    x, y, t: (N,), also between pixels, of any dtype and origin; p: (N,) bool or sign; weight: (N,)
+    1, or 0 for padding; flow: (2, H, W) px per unit of t.
     """
-    warped = warped_image(x, y, t, p, weight, flow, convention)
-    still = warped_image(x, y, t, p, weight, jnp.zeros_like(flow), convention)
+    columns = _columns(x, y, t, p, weight)
+    warped = warped_image(*columns, flow, convention)
+    still = warped_image(*columns, jnp.zeros_like(flow), convention)
     return jnp.var(warped) / jnp.var(still)
 
 
@@ -76,6 +78,8 @@ def warped_image(
 ) -> Array:
     """Image (H, W) of the events transported along the flow at their pixels, read bilinearly:
     x' = x + (t_ref - t) v(x, y). What leaves the image is lost. Arguments as of `fwl`."""
+    x, y, t, p, weight = _columns(x, y, t, p, weight)
+    flow = jnp.asarray(flow)
     warped_x, warped_y, _ = _transported(x, y, t, weight, flow, convention.reference)
     if convention.polarity == "signed":
         weight = weight * jnp.where(p > 0, 1.0, -1.0).astype(weight.dtype)
@@ -88,8 +92,26 @@ def rsat(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Array) -> 
     """Ratio of the squared average timestamps, warped to unwarped, per polarity and active pixel;
     below 1 where the flow is better than none (Hagenaars et al., NeurIPS 2021). Arguments as of
     `fwl`; unlike it, it is not won by flow that collapses all events."""
-    return _timestamps(x, y, t, p, weight, flow) / _timestamps(
-        x, y, t, p, weight, jnp.zeros_like(flow))
+    columns, flow = _columns(x, y, t, p, weight), jnp.asarray(flow)
+    return _timestamps(*columns, flow) / _timestamps(*columns, jnp.zeros_like(flow))
+
+
+def _columns(
+    x: Any, y: Any, t: Any, p: Any, weight: Any
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Events as floats, but for p. Times of NumPy count from the first event: an epoch's seconds
+    would be rounded to minutes."""
+    if isinstance(t, np.ndarray) and t.size:
+        real = np.asarray(weight, bool) if isinstance(weight, np.ndarray) else np.ones(len(t), bool)
+        t = t - t[real].min() if real.any() else t
+    x, y, t, weight = (a if jnp.issubdtype(a.dtype, jnp.floating) else a.astype(float)
+                       for a in map(_on_device, (x, y, t, weight)))
+    return x, y, t, jnp.asarray(p), weight
+
+
+def _on_device(a: Any) -> Array:
+    """NumPy's doubles quietly become floats where JAX has no doubles."""
+    return jnp.asarray(a, jnp.result_type(a))
 
 
 def _timestamps(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Array) -> Array:
@@ -161,7 +183,7 @@ def aee(
     flow: Array, truth: Array, mask: Array | None = None, *, outlier_px: float = 3.0
 ) -> tuple[Array, Array]:
     """Average endpoint error in px, and the percentage of pixels beyond `outlier_px`; of flows
-    (..., 2, H, W) where mask (..., H, W) is true: by custom, pixels with events and a valid truth.
+    (..., 2, H, W) where mask (..., H, W) is not 0: by custom, pixels with events and a valid truth.
     Where the truth is NaN it is unknown, and not scored. Both NaN where nothing is left. Raises
     EV002."""
     flow, truth = jnp.asarray(flow), jnp.asarray(truth)
@@ -171,7 +193,7 @@ def aee(
     known = jnp.isfinite(truth).all(-3)
     if mask is not None and jnp.shape(mask) != known.shape:
         raise EvflowDataError("EV002", f"mask is {jnp.shape(mask)}.", f"Expected {known.shape}.")
-    mask = known if mask is None else known & mask
+    mask = known if mask is None else known & (jnp.asarray(mask) != 0)
     error = endpoint_error(flow, jnp.where(mask[..., None, :, :], truth, flow))
     count = mask.sum((-2, -1))
     error = jnp.where(mask, error, 0.0)

@@ -59,13 +59,18 @@ def check_images(*images: Array) -> None:
         if image.ndim < 2:
             raise EvflowDataError("EV002", f"an image of shape {image.shape}.",
                                   "Expected (..., H, W).")
-        if not jnp.issubdtype(image.dtype, jnp.floating):
-            raise EvflowDataError("EV003", f"an image of {image.dtype}.",
-                                  "Expected floats on [0, 1]: divide bytes by 255.")
+        check_floats(image)
     if len({image.shape[-2:] for image in images}) > 1:
         raise EvflowDataError(
             "EV002", f"images of different shapes: {', '.join(str(i.shape) for i in images)}.",
             "Expected (..., H, W) of one size; resize one of them.")
+
+
+def check_floats(image: Array) -> None:
+    """EV003 for integers."""
+    if not jnp.issubdtype(image.dtype, jnp.floating):
+        raise EvflowDataError("EV003", f"an image of {image.dtype}.",
+                              "Expected floats on [0, 1]: divide bytes by 255.")
 
 
 def mse(image: Array, reference: Array) -> Array:
@@ -157,7 +162,9 @@ def _banded(size: int, window: tuple[float, ...]) -> np.ndarray:
 
 
 def log_map(image: Array) -> Array:
-    """[0, 1] -> [0, 1] by log(1 + 255 I) / log 256: the log domain of these metrics."""
+    """[0, 1] -> [0, 1] by log(1 + 255 I) / log 256: the log domain of these metrics. EV003 for
+    integers."""
+    check_floats(image)
     return jnp.log1p(FULL_SCALE * jnp.clip(image, 0.0, 1.0)) / math.log(1.0 + FULL_SCALE)
 
 

@@ -26,6 +26,7 @@ BLOCK = 16  # frames at a time: VGG16 makes 11 MB of one 240x180 frame in its fi
 AGGREGATES = ("frames", "sequences")
 DOMAINS = ("linear", "log")
 BEYOND = 1e-3  # of [0, 1], what rounding may do to references
+FAR_BEYOND = 5.0  # mean size that no image of a network is expected to have
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,6 +131,10 @@ def _sequence(
         if not np.isfinite(array).all():
             raise EvflowDataError("EV007", f"{name or 'the sequence'}: {kind} are not all finite.",
                                   "Weights that diverged?" if kind == "images" else "")
+    if (size := np.abs(images).mean()) > FAR_BEYOND:
+        raise EvflowDataError(
+            "EV003", f"{name or 'the sequence'}: images are {size:.4g} on average.",
+            "Expected about [0, 1]: divide DN by 255. Or weights that diverged?")
     low, high = references.min(), references.max()
     if low < -BEYOND or high > 1 + BEYOND:
         raise EvflowDataError(

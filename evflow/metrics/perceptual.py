@@ -56,9 +56,18 @@ def load_lpips(net: str = "alex", path: str | os.PathLike | None = None) -> Para
     except (ValueError, AttributeError, RecursionError) as e:
         raise EvflowDataError("EV009", f"{path}: {e}.", "Install or copy it again.") from e
     rooms = {ROOMS[net], *(f"NetLinLayer_{i}" for i in range(HEADS))}
-    if not isinstance(arrays, dict) or set(arrays) != rooms:
+    if not isinstance(arrays, dict) or set(arrays) != rooms or not _complete(arrays):
         raise EvflowDataError("EV018", f"{path} holds no weights of LPIPS by {net!r}.")
     return arrays
+
+
+def _complete(params: Params) -> bool:
+    """Whether all layers are there and fit together."""
+    image = jnp.zeros((LEAST_SIDE, LEAST_SIDE))
+    try:
+        return jax.eval_shape(lpips, params, image, image).shape == ()
+    except (TypeError, KeyError, ValueError, AttributeError, IndexError):
+        return False
 
 
 def lpips(params: Params, image: Array, reference: Array, *, colour: bool = False) -> Array:
@@ -72,8 +81,9 @@ def lpips(params: Params, image: Array, reference: Array, *, colour: bool = Fals
     if min(sides := image.shape[-3:-1] if colour else image.shape[-2:]) < LEAST_SIDE:
         raise EvflowDataError("EV002", f"images of {sides} pixels.",
                               f"LPIPS needs at least {LEAST_SIDE} on each side.")
-    features = []
+    features, dtype = [], params["NetLinLayer_0"]["Conv_0"]["kernel"].dtype
     for x in (image, reference):
+        x = x.astype(dtype)
         x = x if colour else jnp.broadcast_to(x[..., None], (*x.shape, 3))
         lead = x.shape[:-3]
         x = (2.0 * x - 1.0).reshape(-1, *x.shape[-3:])
