@@ -1,6 +1,6 @@
 """`python -m evflow`, the same as `evflow`."""
 
-from evflow.cli import main
+from evflow.cli import run
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run()

@@ -1,13 +1,13 @@
 """The command line: parse, run, exit. Results go to stdout, progress and errors to stderr.
 
-Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory.
+Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory, 130 interrupted.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated, Union
+from typing import Annotated, NoReturn, Union
 
 import tyro
 
@@ -29,6 +29,7 @@ from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
 from evflow.progress import stoppable
 
+INTERRUPTED = 130
 EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
 
 Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these annotations
@@ -73,9 +74,20 @@ def main(argv: list[str] | None = None) -> int:
         return 3
     except KeyboardInterrupt:
         print("interrupted; no half-written file is left.", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     return 0
 
 
+def run() -> NoReturn:
+    """The process `evflow`: `main`, and its exit code. After Ctrl-C nothing is waited for, as a
+    compilation in another thread does not survive the usual end of a process."""
+    code = main()
+    if code == INTERRUPTED:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

@@ -157,6 +157,22 @@ class TrainConfig:
     ema: float = 0.998
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        group = min(self.cameras, len(self.sensors))
+        rules = {
+            f"of {PARTS}": ("parts", bool(self.parts) and set(self.parts) <= set(PARTS)),
+            "0 or more": ("steps", self.steps >= 0),
+            "1 or more, and a multiple of the sensors in a step":
+                ("cameras", group >= 1 and self.cameras % group == 0),
+            "a multiple of the cameras": ("sensors", group >= 1 and len(self.sensors) % group == 0),
+            f"a multiple of the model's {self.model.changes} changes":
+                ("steps_per_window", self.steps_per_window % self.model.changes == 0)}
+        for rule, (name, good) in rules.items():
+            if not good:
+                value = len(self.sensors) if name == "sensors" else getattr(self, name)
+                raise EvflowDataError("EV020", f"TrainConfig: {name} {value!r}.",
+                                      f"It must be {rule}.")
+
 
 PAPER_MODEL = ModelConfig(
     flow=FlowConfig(condition=96, injector=False, asinh=False), piece=6, pool=False,

@@ -5,10 +5,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
+
+
+def aside(path: Path, ending: str) -> Path:
+    """A hidden name beside `path` that no other process has, on whatever machine it runs."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{ending}")
 
 
 @contextlib.contextmanager
@@ -25,13 +31,15 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise EvflowDataError(
             "EV013", f"{path} is a device or a pipe.", "It is never replaced: choose a file.")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = aside(path, "tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
     except OSError as e:
-        reasons = {errno.ENOSPC: "no space left", errno.EACCES: "permission denied",
+        reasons = {errno.ENOSPC: "no space left", errno.EDQUOT: "the quota is used up",
+                   errno.EFBIG: "larger than the file system takes", errno.EIO: "the disk failed",
+                   errno.EPERM: "not permitted", errno.EACCES: "permission denied",
                    errno.EROFS: "read-only file system", errno.ENOENT: "no such folder",
                    errno.ENOTDIR: "its folder is a file", errno.EEXIST: "its folder is a file",
                    errno.EISDIR: "it is a folder", errno.ENAMETOOLONG: "the name is too long"}

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.files import aside, atomic_write
 
 
 @contextlib.contextmanager
@@ -27,21 +27,21 @@ def atomic_folder(
     if foreign := [name for name in old if name not in names]:
         raise EvflowDataError(
             "EV013", f"{path} is a folder that holds {foreign[:5]}.", "Choose another output.")
-    aside = path.with_name(f".{path.name}.{os.getpid()}.old")
+    before = aside(path, "old")
     temporary: Path | None = None
     try:
         with atomic_write(path, overwrite=overwrite) as temporary:
             temporary.mkdir()
             yield temporary
             if path.is_dir():
-                os.replace(path, aside)
+                os.replace(path, before)
     except BaseException:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
-        if aside.exists():
-            os.replace(aside, path)
+        if before.exists():
+            os.replace(before, path)
         raise
-    shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(before, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -58,7 +58,7 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     if not overwrite and (old := [name for name in names if (folder / name).exists()]):
         raise EvflowDataError("EV013", f"{folder} holds {', '.join(old)}.",
                               "Pass --overwrite (overwrite=True).")
-    stage = folder / f".{os.getpid()}.tmp"
+    stage = aside(folder / "stage", "tmp")
     new = not folder.exists()
     try:
         with atomic_write(folder / ".probe", overwrite=True) as probe:  # before any long work

@@ -16,6 +16,8 @@ from jax.typing import ArrayLike
 
 from evflow.errors import EvflowDataError
 
+DEPTHS = (np.dtype(np.uint8), np.dtype(np.uint16))  # whose whole range is an image's
+
 Array = jax.Array
 Values = Any  # jax.Array or np.ndarray, and what comes in comes out
 
@@ -115,23 +117,39 @@ def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
     uint8, floats on 0..255, or uint16 on 0..65535 (`to_dn` for fewer bits). Raises EV002 (shape,
     colour), EV003 (range), EV007 (NaN).
     """
-    for name, frame in (("frame0", frame0), ("frame1", frame1)):
+    before, after = _native(frame0), _native(frame1)
+    for name, frame in (("frame0", before), ("frame1", after)):
         _check_frame(name, frame)
-    if np.shape(frame0) != np.shape(frame1):
+    if before.shape != after.shape:
         raise EvflowDataError(
-            "EV002", f"the frames differ in shape: {np.shape(frame0)} and {np.shape(frame1)}.")
-    return to_log(frame1) - to_log(frame0)
+            "EV002", f"the frames differ in shape: {before.shape} and {after.shape}.")
+    if len({f.dtype for f in (before, after) if f.dtype in DEPTHS}) > 1:
+        raise EvflowDataError("EV003", f"the frames are {before.dtype} and {after.dtype}.",
+                              "They are on different scales: intensity.to_dn for each.")
+    return to_log(after) - to_log(before)
 
 
-def _check_frame(name: str, frame: ArrayLike) -> None:
-    shape = np.shape(frame)
+def _native(frame: ArrayLike) -> Any:
+    """An array in this machine's byte order."""
+    if isinstance(frame, jax.Array):
+        return frame
+    frame = np.asarray(frame)
+    return frame.astype(frame.dtype.newbyteorder("="), copy=False)
+
+
+def _check_frame(name: str, frame: Any) -> None:
+    shape = frame.shape
     if len(shape) < 2:
         raise EvflowDataError("EV002", f"{name} has shape {shape}.", "Expected (..., H, W).")
     if len(shape) > 2 and shape[-1] in (3, 4) and shape[-2] > 16:
         raise EvflowDataError("EV002", f"{name} has shape {shape}: colour?",
                               "Expected gray frames (..., H, W): evflow.types.luma(frame).")
-    if isinstance(frame, jax.core.Tracer) or np.asarray(frame).dtype.kind != "f":
+    if frame.dtype in DEPTHS or isinstance(frame, jax.core.Tracer):
         return
+    if not jnp.issubdtype(frame.dtype, jnp.integer) and not jnp.issubdtype(
+            frame.dtype, jnp.floating):
+        raise EvflowDataError("EV003", f"{name} is {frame.dtype}.",
+                              "Expected uint8, uint16 or DN on 0..255.")
     low, high = float(np.min(frame, initial=0.0)), float(np.max(frame, initial=0.0))
     if not np.isfinite([low, high]).all():
         raise EvflowDataError("EV007", f"{name} holds NaN or infinite values.")

@@ -33,6 +33,7 @@ def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np
     if window_us <= 0 or not isinstance(bins, int | np.integer) or bins < 2:
         raise EvflowDataError("EV020", f"window_us={window_us}, bins={bins}.",
                               "Need a window > 0 and a whole number of bins, 2 or more.")
+    t0_us, window_us = int(t0_us), int(window_us)  # a sum of small integers would overflow
     inside = events.slice(t0_us, t0_us + window_us)
     width, height = events.size
     position = (inside.t - t0_us) * ((bins - 1) / window_us)

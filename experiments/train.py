@@ -125,6 +125,8 @@ def configuration(options: Options, devices: int) -> TrainConfig:
     changes = {k: getattr(options, k) for k in ("seed", "steps", "scenes", "parts")}
     config = dataclasses.replace(
         preset(options.preset), **{k: v for k, v in changes.items() if v is not None})
+    if options.save_every < 1:
+        raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
     if config.scenes < 1:
         raise EvflowDataError("EV020", f"scenes={config.scenes}.", "A step takes one or more.")
     if config.scenes % devices:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from networks import hidden
 
-from evflow import Camera, Recording, read_events, write_events
+from evflow import Camera, Recording, cli, read_events, write_events
 from evflow.cli import main
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -125,3 +125,33 @@ def test_help_loads_no_jax() -> None:
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["version"]) == 0
     assert "evflow 0.1.0" in capsys.readouterr().out
+    assert main(["version", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["evflow"] == "0.1.0"
+
+
+@pytest.mark.parametrize("line", ["voxel -o {}/v.npz", "render -o {}/r.png"])
+def test_facts_for_programs(
+    line: str, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, *rest = line.format(tmp_path).split()
+    assert main([verb, str(flight), *rest, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert Path(facts["out"]).is_file()
+
+
+def test_an_interrupted_process_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While XLA compiles in another thread, the usual end is a segmentation fault."""
+    def end(code: int) -> None:
+        raise SystemExit(f"at once: {code}")
+
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os._exit", end)
+    monkeypatch.setattr("sys.argv", ["evflow", "version"])
+    with pytest.raises(SystemExit) as usual:
+        cli.run()
+    assert usual.value.code == 0
+    monkeypatch.setattr("evflow.commands.version.Version.run", interrupted)
+    with pytest.raises(SystemExit, match="at once: 130"):
+        cli.run()

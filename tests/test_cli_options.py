@@ -74,7 +74,9 @@ def test_options_without_effect_are_told(folder: Path, capsys: pytest.CaptureFix
     "compare flight.npz flight.npz -o a.html", "estimate flight.npz -o a.npz",
     "export camera.npz --to v2e -o a.zip", "convert flight.npz a.npz --format event_utils",
     "convert flight.npz a.h5 --format npz", "simulate flight.npz -o a.aedat4 --format dsec",
-    "simulate flight.npz -o a.mp4"])
+    "simulate flight.npz -o a.mp4", "convert flight.npz -", "estimate flight.npz -o -",
+    "voxel flight.npz -o a.npz --window-ms 1e16", "info flight.npz --frames-offset-ms 1e18",
+    "info flight.npz --frames flight.npz --frames-fps 1e-12"])
 def test_contradictions_and_wrong_names_are_refused(
     folder: Path, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

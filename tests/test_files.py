@@ -72,7 +72,8 @@ def test_failure_leaves_things_as_they_were(
     assert (path.read_text() if before else None) == before
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES, errno.EROFS])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES, errno.EROFS,
+                                    errno.EDQUOT, errno.EIO, errno.EFBIG])
 def test_full_disk_is_ev019_and_leaves_nothing(tmp_path: Path, number: int) -> None:
     path = tmp_path / "out.txt"
 
@@ -94,6 +95,15 @@ def test_impossible_paths_are_ev019(tmp_path: Path, parts: tuple[str, ...]) -> N
     error = refusal(tmp_path.joinpath(*parts))
     assert error.code == "EV019"
     assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path: Path) -> None:
+    """Process ids repeat in containers and on the hosts of a shared disk."""
+    path = tmp_path / "out.txt"
+    with atomic_write(path) as first, atomic_write(path) as second:
+        assert first != second
+        first.touch()
+        second.touch()
 
 
 def test_a_folder_is_never_replaced(tmp_path: Path) -> None:

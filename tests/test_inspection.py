@@ -241,6 +241,13 @@ def test_frames_and_events_of_different_times(sound: Recording) -> None:
     assert codes(shifted(sound, 10_000_000)) == ["EV012"]
 
 
+def test_events_that_begin_at_the_end_leave_no_window(sound: Recording) -> None:
+    end = int(sound.frame_times[-1])
+    late = dataclasses.replace(sound.events, t=sound.events.t - sound.events.t[0] + end - 10_000)
+    found = check(dataclasses.replace(sound, events=late))
+    assert "EV017" in [f.code for f in found.errors]
+
+
 @pytest.mark.parametrize("side", ["horizontal", "vertical", "both"])
 def test_mirrored_frames(sound: Recording, side: str) -> None:
     (error,) = check(flipped(sound, side)).errors

@@ -136,6 +136,20 @@ def test_delta_log_intensity_mixes_bytes_and_floats() -> None:
     assert LINLOG_KNEE == 20.0
 
 
+def test_delta_log_intensity_takes_whole_numbers_of_any_kind() -> None:
+    a, b = np.array([[0, 10]]), np.array([[3, 255]])
+    expected = delta_log_intensity(a.astype(np.uint8), b.astype(np.uint8))
+    for dtype in (np.int16, np.int64, np.uint32, np.float64):
+        np.testing.assert_allclose(delta_log_intensity(a.astype(dtype), b.astype(dtype)), expected,
+                                   atol=1e-6)
+    deep = [257 * f for f in (a, b)]
+    for dtype in ("<u2", ">u2"):
+        np.testing.assert_allclose(
+            delta_log_intensity(*(f.astype(dtype) for f in deep)), expected, atol=1e-5)
+    assert code_of(lambda: delta_log_intensity(a.astype(np.uint8), deep[1].astype("<u2"))) == (
+        "EV003")  # two scales
+
+
 @pytest.mark.parametrize(("a", "b"), [
     (np.zeros(4), np.zeros((2, 2))), (np.zeros((2, 2)), np.zeros(4)),
     (np.zeros((2, 3)), np.zeros((3, 2))), (np.zeros((1, 2, 3)), np.zeros((2, 3)))])
@@ -146,6 +160,8 @@ def test_delta_log_intensity_refuses_wrong_shapes(a: np.ndarray, b: np.ndarray) 
 @pytest.mark.parametrize(("frame", "code"), [
     (np.full((24, 32, 3), 100, np.uint8), "EV002"), (np.full((2, 3), 0.5), "EV003"),
     (np.full((2, 3), -1.0), "EV003"), (np.full((2, 3), 300.0), "EV003"),
-    (np.full((2, 3), np.nan), "EV007")])
+    (np.full((2, 3), np.nan), "EV007"), (np.full((2, 3), -100, np.int16), "EV003"),
+    (np.full((2, 3), 4000, np.int32), "EV003"), (np.ones((2, 3), bool), "EV003"),
+    (np.full((2, 3), 10 + 1j), "EV003")])
 def test_delta_log_intensity_refuses_what_is_no_gray_dn(frame: np.ndarray, code: str) -> None:
     assert code_of(lambda: delta_log_intensity(frame, frame)) == code

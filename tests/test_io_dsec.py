@@ -13,7 +13,7 @@ import pytest
 from recordings import SIZE, T0, equal, make, refused
 
 from evflow.errors import EvflowDataError
-from evflow.io import DsecWriter, read_events, write_events
+from evflow.io import DsecWriter, read_events, read_recording, write_events
 from evflow.io.hdf5 import Disk
 from evflow.types import Events
 
@@ -95,6 +95,18 @@ def test_dsec_without_attributes_is_640x480(tmp_path: Path) -> None:
         del f.attrs["width"], f.attrs["height"]
     assert read_events(tmp_path / "a.h5").size == (640, 480)
     assert read_events(tmp_path / "a.h5", size=SIZE).size == SIZE
+
+
+def test_dsec_folders_have_a_rectify_map_that_is_told(tmp_path: Path) -> None:
+    events = make().events
+    write_events(tmp_path / "events.h5", events)
+    assert read_recording(tmp_path).notes == ()
+    with h5py.File(tmp_path / "rectify_map.h5", "w") as f:
+        f["rectify_map"] = np.zeros((480, 640, 2), np.float32)
+    for path in (tmp_path, tmp_path / "events.h5"):
+        recording = read_recording(path)
+        np.testing.assert_array_equal(recording.events.t, events.t)
+        assert "rectify_map.h5 is not applied" in recording.notes[0]
 
 
 def test_blosc_needs_hdf5plugin_which_loads_by_itself(

@@ -26,6 +26,15 @@ def test_ijrr_text_in_microseconds_is_read_when_told(tmp_path: Path) -> None:
     (tmp_path / "events.txt").write_text("".join(f"{7 * i} 1 2 1\n" for i in range(20)))
     got = read_events(tmp_path, size=SIZE, time_unit="us")
     assert got.t.tolist() == list(range(0, 140, 7))
+    equal(read_events(tmp_path / "events.txt", size=SIZE, time_unit="us"), got)
+
+
+@pytest.mark.parametrize("row", ["0.001\t1\t2\t1", "0.001  1 2 1 ", "1e-3 1 2 1"])
+def test_ijrr_files_are_read_as_their_folders(row: str, tmp_path: Path) -> None:
+    (tmp_path / "events.txt").write_text(f"{row}\n0.002 3 4 0\n")
+    got = read_events(tmp_path, size=SIZE)
+    assert got.t.tolist() == [1000, 2000]
+    equal(read_events(tmp_path / "events.txt", size=SIZE), got)
 
 
 def test_ijrr_blocks_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

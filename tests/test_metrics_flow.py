@@ -70,8 +70,8 @@ def test_events_of_any_dtype_and_origin_score_the_same() -> None:
     x, y, t, p, weight = (np.asarray(a, np.float64) for a in edge())
     expected = [float(f(*edge(), constant(12.0))) for f in (metrics.fwl, metrics.rsat)]
     flow = np.asarray(constant(12.0), np.float64)
-    for t_one, weight_one in ((t, weight), (t + 1.4e9, weight.astype(int)), (t, weight > 0)):
-        found = [float(f(x, y, t_one, p > 0, weight_one, flow)) for f in (metrics.fwl, metrics.rsat)]
+    for t_one, weights in ((t, weight), (t + 1.4e9, weight.astype(int)), (t, weight > 0)):
+        found = [float(f(x, y, t_one, p > 0, weights, flow)) for f in (metrics.fwl, metrics.rsat)]
         np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 

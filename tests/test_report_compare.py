@@ -140,8 +140,19 @@ def test_streams_of_other_clocks_are_laid_at_their_beginnings() -> None:
     assert numbers["duration_s"] == pytest.approx(0.6, abs=0.01)
 
 
+def test_streams_that_touch_are_of_other_clocks() -> None:
+    events = noise(8)
+    after = dataclasses.replace(events, t=events.t - events.t[0] + events.t[-1])
+    numbers = evflow.compare(events, after)
+    assert numbers["aligned_at"] == "beginnings"
+    assert numbers["events"]["real"] == numbers["events"]["synthetic"] == len(events)
+
+
 def test_what_cannot_be_compared() -> None:
     events = noise(9)
+    for span in ((100, 100), (100, 50)):
+        with pytest.raises(EvflowDataError, match="EV020"):
+            evflow.compare(events, events, span_us=span)
     other = dataclasses.replace(events, size=(40, 24))
     silent = events.slice(0, 0)
     for code, pair in (("EV015", (events, other)), ("EV001", (events, silent))):

@@ -114,6 +114,17 @@ def test_bad_input(log: jax.Array, options: dict[str, Any], code: str) -> None:
     assert code_of(lambda: simulate_counts(KEY, log, QUIET, frame_dt_s=1e-3, **options)) == code
 
 
+@pytest.mark.parametrize("smooth", [0.0, 1.0])
+def test_cameras_of_double_precision(smooth: float) -> None:
+    log = to_log(drifting(8).astype(np.float32))
+    camera = Camera.sample(jax.random.key(2), log.shape[1:])
+    expected = simulate_counts(jax.random.key(1), log, camera, frame_dt_s=1e-3, smooth=smooth)
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda m: jnp.asarray(np.asarray(m), jnp.float64), camera)
+        found = simulate_counts(jax.random.key(1), log, double, frame_dt_s=1e-3, smooth=smooth)
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
 def test_bytes_pass_through_the_log_map() -> None:
     raw = FRAMES.clip(0, 255).astype(np.uint8)
     counts = simulate_counts(KEY, raw, QUIET, frame_dt_s=1e-3)

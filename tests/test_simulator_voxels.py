@@ -173,6 +173,14 @@ def test_sums_of_hat_weights_are_those_of_the_single_events(
     np.testing.assert_allclose(np.stack(sums), expected, atol=2e-5)
 
 
+def test_the_interval_may_be_traced() -> None:
+    frames = jnp.asarray(FRAMES, jnp.float32)
+    made = jax.jit(simulate_voxels)(KEY, to_log(frames), QUIET, frame_dt_s=1e-3)
+    plain = simulate_voxels(KEY, to_log(frames), QUIET, frame_dt_s=1e-3)
+    np.testing.assert_allclose(made, plain, atol=1e-4)
+    assert float(plain.sum()) > 100
+
+
 def test_bytes_in_double_precision_mode_too() -> None:
     frames = FRAMES.astype(np.uint8)
     single = simulate_voxels(KEY, frames, QUIET, frame_dt_s=1e-3)

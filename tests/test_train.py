@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -108,3 +109,13 @@ def test_the_paper_preset_steps(bank: TextureBank) -> None:
 def test_unknown_preset() -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         configs.preset("best")
+
+
+@pytest.mark.parametrize("change", [
+    {"parts": ("summary", "foo")}, {"parts": ()}, {"steps": -5}, {"cameras": 0}, {"cameras": 5},
+    {"sensors": configs.TrainConfig.sensors[:3]}, {"sensors": ()}, {"steps_per_window": 10}],
+    ids=str)
+def test_impossible_configurations_are_refused(change: dict[str, Any]) -> None:
+    name, = change
+    with pytest.raises(EvflowDataError, match=f"EV020.*{name}"):
+        configs.TrainConfig(**change)

@@ -163,6 +163,12 @@ def test_impossible_windows_are_refused(window: int, bins: int) -> None:
     assert code_of(lambda: voxelize(random_events(3), T0, window, bins)) == "EV020"
 
 
+def test_windows_may_be_small_integers() -> None:
+    t0, length = np.int32(2_147_480_000), np.int32(50_000)
+    events = Events([1, 2], [1, 2], [int(t0) + 10, int(t0) + 40_000], [True, False], SIZE)
+    assert voxelize(events, t0, length).sum() == 2
+
+
 @pytest.mark.parametrize("window", [(0.0, 1000), (0, 1e3)])
 def test_times_in_seconds_are_refused(window: tuple[Any, Any]) -> None:
     assert code_of(lambda: voxelize(random_events(10), *window)) == "EV003"

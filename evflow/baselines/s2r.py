@@ -50,7 +50,8 @@ class S2r(System):
             scene = scene_of(recording, "flow", quiet=False)
             rows = camera_rows(scene, np.stack([GRID] * 2, 1), 0.0)
             made = scene.simulate(jax.random.key(self.seed), rows, 1.0)[:, 0]  # starts afresh
-            seen, made = scene.seen[0] / scene.seen[PIXELS], made / scene.seen[PIXELS]
+            pixels = np.maximum(scene.seen[PIXELS], 1)  # none, where all frames are black
+            seen, made = scene.seen[0] / pixels, made / pixels
         else:
             made, seen = generic_rates(self.count, self.seed), event_rate(recording)
         if not self.per_polarity:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,6 +28,8 @@ class Export:
     """Folder for maps.npz, README.txt and the script."""
     overwrite: bool = False
     """Replace the folder where it holds an export and nothing else."""
+    json: bool = False
+    """Print JSON."""
 
     def run(self) -> None:
         from evflow.camera import Camera
@@ -37,6 +40,7 @@ class Export:
         camera, std = Camera.load_with_std(self.camera)
         export, maps = export_camera(camera, self.to, std)
         write_export(self.out, export, maps, overwrite=self.overwrite)
-        print(export.text)
-        print(f"written to {self.out}/: {', '.join(sorted([*export.scripts, *export.arrays]))}, "
-              "maps.npz, README.txt")
+        files = [*sorted([*export.scripts, *export.arrays]), "maps.npz", "README.txt"]
+        facts = {"out": str(self.out), "to": self.to, "files": files, "text": export.text}
+        print(json.dumps(facts) if self.json else
+              f"{export.text}\nwritten to {self.out}/: {', '.join(files)}")

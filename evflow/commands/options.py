@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from evflow.types import Recording
 
 T = TypeVar("T")
+
+LARGEST = 1e12  # of any number: as milliseconds still some 30 years, and whole microseconds
 
 ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # of --frames
 CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer")  # of any frames
@@ -157,14 +158,15 @@ def refuse(options: Any, names: Iterable[str], why: str) -> None:
 
 
 def check_finite(options: Any) -> None:
-    """EV020 where a number among the options is NaN, infinite or, of a seed, beyond 64 bits."""
+    """EV020 where a number among the options is NaN, infinite, larger than whole microseconds
+    can be told or, of a seed, beyond 64 bits."""
     for field in dataclasses.fields(options):
         number = getattr(options, field.name)
         if field.name == "seed" and not -2**63 <= number < 2**63:
             raise EvflowDataError("EV020", f"--seed {number}.", "Give one of at most 64 bits.")
-        if isinstance(number, float) and not math.isfinite(number):
+        if isinstance(number, float) and not abs(number) <= LARGEST:
             raise EvflowDataError("EV020", f"{flag(field.name)} {number}.",
-                                  "Give a finite number.")
+                                  f"Give a number of at most {LARGEST:g}.")
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

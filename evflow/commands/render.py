@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -40,6 +41,8 @@ class Render(Reading):
     """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
     overwrite: bool = False
     """Replace the output where it exists."""
+    json: bool = False
+    """Print JSON."""
 
     def run(self) -> None:
         from evflow.progress import bar
@@ -62,4 +65,7 @@ class Render(Reading):
             with bar("rendering") as progress:
                 said = write_film(self.out, recording, film, overwrite=self.overwrite,
                                   progress=progress)
-        print(f"{said} -> {self.out}", file=sys.stderr)
+        if self.json:
+            print(json.dumps({"out": str(self.out), "said": said, "notes": list(recording.notes)}))
+        else:
+            print(f"{said} -> {self.out}", file=sys.stderr)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -12,11 +13,15 @@ class Version:
     Example: evflow version
     """
 
+    json: bool = False
+    """Print JSON."""
+
     def run(self) -> None:
         import importlib.metadata
 
         import evflow
 
-        print(f"evflow {evflow.__version__}")
-        for name in ("jax", "jaxlib", "numpy"):
-            print(f"{name} {importlib.metadata.version(name)}")
+        found = {"evflow": evflow.__version__} | {
+            name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy")}
+        print(json.dumps(found) if self.json else
+              "\n".join(f"{name} {version}" for name, version in found.items()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -43,6 +44,8 @@ class Voxel(Reading):
     """Shortest window where there are frames, the length of every window where there are none."""
     overwrite: bool = False
     """Replace the output where it exists."""
+    json: bool = False
+    """Print JSON."""
 
     def run(self) -> None:
         from evflow.files import atomic_write
@@ -75,8 +78,12 @@ class Voxel(Reading):
                 _store(archive, "dlogI", shape[:3], np.float32, _changes(recording, pairs))
         for note in (*recording.notes, *notes):
             print(f"note: {note}", file=sys.stderr)
-        print(f"{len(starts)} windows, {width}x{height}, {self.bins} bins "
-              f"({4e-9 * np.prod(shape, dtype=float):.3g} GB in memory) -> {self.out}")
+        gigabytes = 4e-9 * np.prod(shape, dtype=float)
+        facts = {"out": str(self.out), "windows": len(starts), "size": [width, height],
+                 "bins": self.bins, "gigabytes": gigabytes, "notes": [*recording.notes, *notes]}
+        print(json.dumps(facts) if self.json else
+              f"{len(starts)} windows, {width}x{height}, {self.bins} bins "
+              f"({gigabytes:.3g} GB in memory) -> {self.out}")
 
 
 def _windows(

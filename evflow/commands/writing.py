@@ -21,6 +21,7 @@ def named(format: Format, out: Path) -> str | None:
     extension stands for another one."""
     from evflow.io.base import WRITTEN
 
+    refuse_stdout(out)
     suffix = out.suffix.lower()
     stands_for = KINDS.get(suffix, (WRITTEN[suffix],) if WRITTEN.get(suffix) and suffix else ())
     if format != "auto" and stands_for and format not in stands_for:
@@ -32,6 +33,13 @@ def named(format: Format, out: Path) -> str | None:
     return None if format == "auto" else format
 
 
+def refuse_stdout(out: Path) -> None:
+    """EV020 for `-`, by which others mean the standard output."""
+    if str(out) == "-":
+        raise EvflowDataError("EV020", "the output is called -.",
+                              "Nothing is written to standard output: name a file or folder.")
+
+
 def need_suffix(out: Path, suffix: str) -> None:
     """EV020 where a file that is always of one kind is to be named as another."""
     if out.suffix.lower() != suffix:
@@ -41,6 +49,7 @@ def need_suffix(out: Path, suffix: str) -> None:
 
 def need_folder(out: Path) -> None:
     """EV020 where the name of a folder to be made is that of a file."""
+    refuse_stdout(out)
     if out.suffix.lower() in FILES and not out.is_dir():
         raise EvflowDataError("EV020", f"{out} has the name of a file, but a folder is written.",
                               f"Name a folder: -o {out.with_suffix('')}/.")

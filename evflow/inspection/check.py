@@ -13,7 +13,7 @@ from evflow.inspection.clocks import clocks
 from evflow.inspection.contents import contents
 from evflow.inspection.findings import Finding, Report
 from evflow.inspection.images import images
-from evflow.io.windows import check_overlap
+from evflow.io.windows import check_overlap, iter_windows
 from evflow.stillness import stands_still
 from evflow.types import Recording
 
@@ -25,10 +25,11 @@ def check(recording_or_path: Recording | str | os.PathLike, **hints: Any) -> Rep
     recording without frames is checked for what can be told from events alone. Never raises
     about the data; `report.raise_if_failed()` does.
 
-    Codes: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events, EV021 polarity
-    inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned, EV025 gaps, EV026
-    clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029 mirrored frames,
-    EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034 unrelated frames.
+    Codes: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events or no window, EV021
+    polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned, EV025 gaps,
+    EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029 mirrored
+    frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034 unrelated
+    frames.
     """
     if not isinstance(recording_or_path, Recording):
         try:
@@ -49,6 +50,10 @@ def _findings(recording: Recording) -> list[Finding]:
             check_overlap(recording)
         except EvflowDataError as error:
             return [*found, Finding.of(error)]
-        # Where nothing moves, noise agrees with nothing, as it should.
-        found += [] if stands_still(recording) else agreement(recording)
+        if not stands_still(recording):  # else noise agrees with nothing, as it should
+            try:
+                iter_windows(recording)
+            except EvflowDataError as error:
+                found.append(Finding.of(error))
+            found += agreement(recording)
     return sorted(found, key=lambda f: ("error", "warning", "note").index(f.severity))

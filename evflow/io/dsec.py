@@ -24,8 +24,11 @@ from evflow.io.stream import Chunk, gather
 from evflow.types import Events, Recording
 
 NAME = "dsec"
-EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
+EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5", "")
 
+EVENTS = "events.h5"
+RECTIFY = ("rectify_map.h5 is not applied: events stay at the sensor's own pixels, which have the "
+           "thresholds")
 DSEC_SIZE = (640, 480)
 FLUSH = 1 << 20  # events rewritten at a time where t widens
 INDEX_MS = 1 << 20  # milliseconds indexed at a time: 8 MiB, however long the camera was silent
@@ -33,6 +36,8 @@ MAX_MS = 10**8  # 28 hours; beyond that two clocks were joined and ms_to_idx wou
 
 
 def sniff(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return (path / EVENTS).is_file()
     if not head.startswith(MAGIC):
         return False
     try:
@@ -43,11 +48,14 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Only the part between start_s and stop_s is read.
+    """Only the part between start_s and stop_s is read. Of a folder its events.h5; a rectify map
+    beside them is not applied.
 
     Raises EV008 (a data set is missing), EV009 (damaged), EV010 (h5py or a filter is missing), and
     what `stream.gather` and `Recording` raise.
     """
+    path = path / EVENTS if path.is_dir() else path
+    notes = (RECTIFY,) if path.with_name("rectify_map.h5").is_file() else ()
     with tables.opened(path) as f:
         columns = _columns(path, f)
         size = DSEC_SIZE
@@ -56,11 +64,11 @@ def read(path: Path, hints: Hints) -> Recording:
         offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
         events, span = gather(path, _chunks(columns, hints), hints, size, "us", offset)
         if "frames" not in f:
-            return Recording.of_events(events)
+            return Recording.of_events(events, notes)
         frames = tables.dataset(path, f, "frames", (None, None, None))
         times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
         return tables.with_frames(path, events, span, hints.microseconds(times, "us"),
-                                  lambda keep: tables.stored_frames(frames, keep), ())
+                                  lambda keep: tables.stored_frames(frames, keep), notes)
 
 
 class DsecWriter(Hdf5Writer):

@@ -74,8 +74,9 @@ class FrameHints:
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise EvflowDataError("EV020", f"{name}={value}.", "It must be > 0.")
-        if self.fps is not None and self.fps > 1e6:
-            raise EvflowDataError("EV020", f"fps={self.fps:g}.", "Times are whole microseconds.")
+        if self.fps is not None and not 1e-6 <= self.fps <= 1e6:
+            raise EvflowDataError("EV020", f"fps={self.fps:g}.", "Times are whole microseconds: "
+                                  "give 1e-6 to 1e6.")
         if self.fps is not None and self.timestamps is not None:
             raise EvflowDataError(
                 "EV020", f"fps={self.fps:g} and timestamps={self.timestamps} contradict.",

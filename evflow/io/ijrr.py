@@ -41,8 +41,10 @@ def sniff(path: Path, head: bytes) -> bool:
         except DAMAGE:
             return path.suffix.lower() == ".zip"  # cut off: the extension decides
     lines = [line for line in head.split(b"\n") if line and not line.startswith(b"#")]
+    # Of a file with that name any number may be a time; `text` says what is wrong with it.
+    time = rb"[\d.eE+-]+" if path.name == EVENTS else rb"\d+\.\d+"
     return bool(lines) and re.fullmatch(
-        rb"\d+\.\d+ \d+ \d+ -?[01]\r?", lines[0]) is not None
+        time + rb"[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?", lines[0]) is not None
 
 
 def read(path: Path, hints: Hints) -> Recording:

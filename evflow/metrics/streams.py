@@ -18,6 +18,7 @@ from evflow.types import Events
 CURVE_STEPS = 120  # about as many points as a rate curve has
 CURVE_STEP_US = 1_000  # the shortest step of one
 LOG_EDGES = np.linspace(-6.0, 2.0, 65)  # log10 s: 1 us to 100 s, eight bins a decade
+TOUCHING = 0.01  # share of the shorter stream: who has no more in common is on another clock
 ALONE_US = 5_000  # no neighbour fired for this long: what a background-activity filter takes away
 NET_CELL, NET_US, NET_STEPS = 8, 20_000, 2_000  # pixels; us; most steps: memory
 NEIGHBOURS = tuple((dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy)
@@ -31,8 +32,8 @@ def compare(
 
     span_us: (t0, t1), the time [t0, t1) that is compared; without it, what both streams cover.
 
-    size, duration_s, span_us, aligned_at ("clock", or "beginnings" where the streams share no
-    time and the synthetic one was moved to begin with the real one), events;
+    size, duration_s, span_us, aligned_at ("clock", or "beginnings" where the streams share
+    hardly any time and the synthetic one was moved to begin with the real one), events;
     rate_hz: events per second and pixel, per polarity, and their ratio synthetic / real;
     on_off: ON events per OFF event; curve: the rates over time and their correlation r;
     counts: correlation r of the events per pixel; net_r: of ON less OFF events over cells of 8x8
@@ -43,8 +44,10 @@ def compare(
     Both have ks (Kolmogorov-Smirnov, 0..1), wasserstein_decades (of log10 time), median_s and
     a histogram; same_polarity: share of a pixel's events that repeat the polarity before.
 
-    Raises EV001 (a stream is empty), EV015 (different sizes).
+    Raises EV001 (a stream is empty), EV015 (different sizes), EV020 (an empty span).
     """
+    if span_us is not None and span_us[1] <= span_us[0]:
+        raise EvflowDataError("EV020", f"span_us={span_us}.", "It must end after it begins.")
     moved, shift = _aligned(real, synthetic, move=span_us is None)
     t0, t1 = span_us or (int(max(real.t[0], moved.t[0])), int(min(real.t[-1], moved.t[-1])) + 1)
     sides = {"real": real.slice(t0, t1), "synthetic": moved.slice(t0, t1)}
@@ -81,7 +84,9 @@ def _aligned(real: Events, synthetic: Events, *, move: bool) -> tuple[Events, in
         if not len(events):
             raise EvflowDataError("EV001", f"the {name} stream has no events.",
                                   "There is nothing to compare it by.")
-    if not move or (synthetic.t[0] <= real.t[-1] and real.t[0] <= synthetic.t[-1]):
+    common = min(real.t[-1], synthetic.t[-1]) - max(real.t[0], synthetic.t[0])
+    shorter = min(real.t[-1] - real.t[0], synthetic.t[-1] - synthetic.t[0])
+    if not move or common > TOUCHING * shorter or common == shorter:
         return synthetic, None
     shift = int(real.t[0] - synthetic.t[0])
     return dataclasses.replace(synthetic, t=synthetic.t + shift), shift

@@ -88,7 +88,7 @@ def _tiled(
 
 
 def simulate_voxels(
-    key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: float,
+    key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: Array | float,
     model: SensorModel | None = None, bins: int = BINS,
 ) -> Array:
     """Voxel grid of a video seen by a camera, on the device (Eq. 2).
@@ -99,7 +99,8 @@ def simulate_voxels(
     maps (H, W), or (..., H, W) with the same leading axes. Returns float32 (..., H, W, 2*bins).
     One key serves all leading axes, split among them. Without leading axes the grid equals
     `simulate` followed by `voxelize` (same key, noise included) up to the microsecond rounding of
-    event times.
+    event times; it also holds the few events that round to the last instant itself, where the
+    half-open window of `voxelize` ends. frame_dt_s may be traced.
     """
     model = model or SensorModel()
     log_frames = jnp.asarray(log_frames)
@@ -108,7 +109,8 @@ def simulate_voxels(
     if log_frames.ndim < 3 or log_frames.shape[-3] < 2:
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
                               "Expected (..., T, H, W) with at least two frames.")
-    if not 0 < frame_dt_s < math.inf or bins < 2:
+    timed = not isinstance(frame_dt_s, jax.core.Tracer)
+    if bins < 2 or (timed and not 0 < float(frame_dt_s) < math.inf):
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}, bins={bins}.",
                               "Need frame_dt_s > 0 and bins >= 2.")
     if log_frames.dtype != jnp.uint8:
@@ -123,13 +125,13 @@ def simulate_voxels(
             "Give one camera (H, W) or one for each video.")
     camera.validate()
     camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), camera)
-    if _by_blocks(key, model, log_frames, camera):
+    if timed and _by_blocks(key, model, log_frames, camera):
         return _in_blocks(key, np.asarray(log_frames), camera, float(frame_dt_s), model, bins)
     nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
-    if nominal is not None:
-        noise.check_rate(noise.most_rate(model, camera, nominal), frame_dt_s)
-    return _voxels(key, log_frames, camera, nominal, frame_dt_s=float(frame_dt_s), model=model,
-                   bins=bins, lead=lead)
+    if nominal is not None and timed:
+        noise.check_rate(noise.most_rate(model, camera, nominal), float(frame_dt_s))
+    return _voxels(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32),
+                   model=model, bins=bins, lead=lead)
 
 
 def _by_blocks(key: Array, model: SensorModel, frames: Array, camera: Camera) -> bool:
@@ -166,22 +168,21 @@ def _in_blocks(
     return grid
 
 
-@partial(jax.jit, static_argnames=("frame_dt_s", "model", "bins", "lead"))
+@partial(jax.jit, static_argnames=("model", "bins", "lead"))
 def _voxels(
-    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, *, frame_dt_s: float,
+    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array, *,
     model: SensorModel, bins: int, lead: tuple[int, ...],
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
         if model.kind != "voltmeter":
             first = as_log(model, frames[0])
             whole, state = sensor.start(key, first, camera, model, nominal)
-            return simulate_window(model, whole, state, frames[1:], frame_dt_s, bins)[1]
+            return simulate_window(model, whole, state, frames[1:], dt, bins)[1]
         key, signal = jax.random.split(key)
         frames = as_log(model, frames)
         whole, state = sensor.start(key, frames[0], camera, model, nominal)
         steps, *shape = frames.shape
         salts = noise.salts(state.key, jnp.arange(steps - 1))
-        dt = jnp.asarray(frame_dt_s, jnp.float32)
         grid = scan_brownian(signal, model, whole, frames.reshape(steps, -1), salts, dt, bins)
         return grid.reshape(*shape, 2 * bins)
 
