@@ -138,7 +138,7 @@ def few(frames: np.ndarray) -> Recording:
 
 FLAT = np.full((8, 16, 20), 100, np.uint8)
 CASES = {"no events": silent(FLAT), "no frames": Recording.of_events(few(FLAT).events),
-         "no change": few(FLAT),
+         "no change": few(FLAT), "black": few(0 * FLAT),
          "one frame": Recording(few(FLAT).events, FLAT[:1], np.zeros(1, int))}
 
 
