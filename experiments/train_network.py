@@ -55,7 +55,7 @@ class Options:
     out: Path
     """Folder of the run."""
     network: Literal["e2vid", "firenet", "evflownet"] = "e2vid"
-    preset: Literal["small", "steady", "debug", "published", "original"] = "small"
+    preset: Literal["small", "debug", "published", "original"] = "small"
     steps: int | None = None
     """Number of steps, over which the rate falls (default: the preset's)."""
     rate: float | None = None

@@ -1,6 +1,6 @@
 """What the event networks are and learn from, by name: `small` trains on two cores and fits into
-2 MB, `steady` goes on from it for cameras at rest, `published` is the setting of the papers for one
-GPU, `original` EV-FlowNet's first one, which needs no true flow, `debug` takes seconds.
+2 MB, `published` is the setting of the papers for one GPU, `original` EV-FlowNet's first one, which
+needs no true flow, `debug` takes seconds.
 
     network, learning = training("e2vid", "small")
 """
@@ -31,17 +31,12 @@ _FLOW = dataclasses.replace(
 # seconds: most of the windows pass before those learnt from.
 _LONG = dataclasses.replace(
     WIDE, sequences=3, windows=96, scene=dataclasses.replace(WIDE.scene, resting_fraction=0.4))
-# Far from the borders, whose zeros hold a memory still, that of an empty scene may ripple.
-_EMPTY = dataclasses.replace(_LONG, sequences=1, crop=128, scene=dataclasses.replace(
-    _LONG.scene, static_fraction=0.2, resting_fraction=0.5))
 _TINY = dataclasses.replace(WIDE, sequences=2, windows=4, crop=16, steps_per_window=2)
 _LARGE = dataclasses.replace(WIDE, sequences=4, windows=40, crop=128)
 
 TRAININGS: dict[tuple[str, str], tuple[Network, LearningConfig]] = {
     ("e2vid", "small"): (E2VID_SMALL, LearningConfig(
         _LONG, steps=3000, warmup=50, before=64)),
-    ("e2vid", "steady"): (E2VID_SMALL, LearningConfig(
-        _EMPTY, steps=400, warmup=20, rate=1e-3, before=64)),
     ("firenet", "small"): (FireNet(), LearningConfig(
         dataclasses.replace(WIDE, sequences=4), steps=3000, warmup=50)),
     # Three encoders leave the first, which sees the motion, 16 features; 0.22 M parameters.
