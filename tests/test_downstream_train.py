@@ -12,7 +12,6 @@ import pytest
 
 from evflow.camera import Camera
 from evflow.downstream import E2VID, EVFlowNet, losses
-from evflow.downstream.network import run
 from evflow.downstream.recorded import recorded_bank, sample_recorded
 from evflow.downstream.simulated import (
     SequenceConfig,
@@ -23,13 +22,7 @@ from evflow.downstream.simulated import (
     scene_clock,
 )
 from evflow.downstream.tensor import normalise
-from evflow.downstream.train import (
-    LearningConfig,
-    init_state,
-    make_step,
-    optimiser,
-    sequence_loss,
-)
+from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank, make_bank
 from evflow.sensors import SensorModel
@@ -244,34 +237,10 @@ def test_steps_learn_a_batch_and_repeat_themselves(network) -> None:
     jax.tree.map(np.testing.assert_array_equal, again.params, second.params)
 
 
-def test_windows_before_bring_every_other_sequence_to_its_age() -> None:
-    config = LearningConfig(data=DATA, skip=0, before=2)
-    params = SMALL.init(jax.random.key(0), (16, 16))
-    tensors, rest = sequences().tensors, jax.tree.map(lambda a: a[2:], sequences())
-    loss = jax.jit(jax.value_and_grad(
-        lambda params, tensors: sequence_loss(
-            SMALL, params, dataclasses.replace(sequences(), tensors=tensors), config)[0]))
-
-    old = run(SMALL, params, tensors[:2])[1]  # by hand, as constants
-    state = jax.tree.map(lambda old: old * jnp.array([1.0, 0, 1, 0])[:, None, None, None], old)
-
-    def by_hand(params):
-        images, _ = run(SMALL, params, rest.tensors, state, train=True)
-        steady = losses.temporal(images, rest.frames, rest.back, rest.visible, 0)
-        return losses.reconstruction(images, rest.frames, None) + config.temporal * steady
-
-    found, expected = loss(params, tensors), jax.value_and_grad(by_hand)(params)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6),
-                 found, expected)
-    unseen = loss(params, tensors.at[:2, 1::2].add(1.0))
-    assert float(unseen[0]) == float(found[0])
-    assert float(loss(params, tensors.at[:2, ::2].add(1.0))[0]) != float(found[0])
-
-
 @pytest.mark.parametrize("make", [
     lambda: SequenceConfig(windows=1), lambda: SequenceConfig(pause=2.0),
     lambda: SequenceConfig(window_s=0.0), lambda: LearningConfig(rate=-1.0),
-    lambda: LearningConfig(data=DATA, skip=3), lambda: LearningConfig(data=DATA, before=1),
+    lambda: LearningConfig(data=DATA, skip=3),
     lambda: make_step(EVFlowNet(base=2, scales=4), LearningConfig(SequenceConfig(crop=24)),
                       optimiser(LearningConfig())),
     lambda: make_step(E2VID(bins=4), LearningConfig(), optimiser(LearningConfig()))])

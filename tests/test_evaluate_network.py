@@ -179,5 +179,5 @@ def test_flow_of_a_rotation_is_made_of_the_tensors_that_the_network_learned_from
     assert trained.normalised
     rows = [evaluate_network.real_flow(t, [], {"boxes": one})["boxes"]["fwl"]
             for t in (trained, dataclasses.replace(trained, normalised=False))]
-    assert rows[0] == pytest.approx(1.51, abs=0.01)  # as the model card says
+    assert rows[0] == pytest.approx(1.53, abs=0.01)  # as the model card says
     assert rows[1] < rows[0] - 0.02

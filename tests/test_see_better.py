@@ -159,7 +159,8 @@ def test_eventgan_keeps_the_scenes_and_all_of_its_events(monkeypatch: pytest.Mon
     np.testing.assert_allclose(weights[-1], [0, 0, 0, 0, 1])
     config = SequenceConfig(sequences=2, windows=3, crop=16, noise=0.0)
     frames = jax.random.uniform(jax.random.key(0), (3, 2, 16, 16))
-    given = Sequences(jnp.ones((3, 2, 16, 16, 5)), frames, frames, frames, frames)
+    ones = jnp.ones((3, 2, 16, 16, 5))
+    given = Sequences(ones, 0 * ones, frames, frames, frames, frames)
     monkeypatch.setattr(eventgan_sequences, "sample_sequences", lambda *_: given)
     seen: list[tuple[np.ndarray, np.ndarray]] = []
 

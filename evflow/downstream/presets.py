@@ -27,16 +27,14 @@ _FLOW = dataclasses.replace(
     WIDE, sequences=16, windows=2, crop=64, noise=0.0, prior=WidePrior(theta=(0.05, 0.5)),
     scene=dataclasses.replace(WIDE.scene, contrast=(0.5, 1.0), speed_px_s=(10.0, 350.0)))
 # Long enough to see scenes stand still: a memory of fewer windows fades. And many as a camera at
-# rest sees them: where little happens for long, noise must not grow into shapes, which takes
-# seconds: most of the windows pass before those learnt from.
+# rest sees them: where little happens for long, noise must not grow into shapes.
 _LONG = dataclasses.replace(
-    WIDE, sequences=3, windows=96, scene=dataclasses.replace(WIDE.scene, resting_fraction=0.4))
+    WIDE, sequences=3, windows=40, scene=dataclasses.replace(WIDE.scene, resting_fraction=0.4))
 _TINY = dataclasses.replace(WIDE, sequences=2, windows=4, crop=16, steps_per_window=2)
 _LARGE = dataclasses.replace(WIDE, sequences=4, windows=40, crop=128)
 
 TRAININGS: dict[tuple[str, str], tuple[Network, LearningConfig]] = {
-    ("e2vid", "small"): (E2VID_SMALL, LearningConfig(
-        _LONG, steps=3000, warmup=50, before=64)),
+    ("e2vid", "small"): (E2VID_SMALL, LearningConfig(_LONG, steps=3000, warmup=50)),
     ("firenet", "small"): (FireNet(), LearningConfig(
         dataclasses.replace(WIDE, sequences=4), steps=3000, warmup=50)),
     # Three encoders leave the first, which sees the motion, 16 features; 0.22 M parameters.

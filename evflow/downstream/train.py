@@ -20,7 +20,7 @@ import optax
 from evflow.camera import Camera
 from evflow.downstream import losses
 from evflow.downstream.evflownet import EVFlowNet
-from evflow.downstream.network import Network, Params, State, run
+from evflow.downstream.network import Network, Params, run
 from evflow.downstream.simulated import SequenceConfig, Sequences, has_events, sample_sequences
 from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank
@@ -32,11 +32,9 @@ Array = jax.Array
 class LearningConfig:
     """data: the sequences. steps, warmup, rate, clip: Adam whose rate rises for `warmup` steps
     and falls as a cosine, gradients clipped to a norm. temporal: weight of temporal consistency,
-    after the first `skip` images. before: windows of each sequence that pass before those learnt
-    from: a recurrent network is then at an age that no gradient could reach back from, in every
-    other sequence; the rest begin there. elsewhere: weight, in the L1 of flow, of pixels without
-    events. normalised: event tensors of deviation 1, which hides the scale of the camera's
-    thresholds. seed: of params and data."""
+    after the first `skip` images. elsewhere: weight, in the L1 of flow, of pixels without events.
+    normalised: event tensors of deviation 1, which hides the scale of the camera's thresholds.
+    seed: of params and data."""
 
     data: SequenceConfig = dataclasses.field(default_factory=SequenceConfig)
     steps: int = 300
@@ -45,22 +43,20 @@ class LearningConfig:
     clip: float = 1.0
     temporal: float = 0.2
     skip: int = 2
-    before: int = 0
     elsewhere: float = 1.0
     normalised: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
         least = {"steps": 1, "warmup": 0, "rate": 0.0, "clip": 0.0, "temporal": 0.0, "skip": 0,
-                 "before": 0, "elsewhere": 0.0}
+                 "elsewhere": 0.0}
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise EvflowDataError("EV020", f"LearningConfig({name}={getattr(self, name)!r}).",
                                       f"It must be >= {bound}.")
-        if self.before + self.skip + 2 > self.data.windows:
-            raise EvflowDataError("EV020", f"before={self.before} and skip={self.skip} of "
-                                  f"{self.data.windows} windows.",
-                                  "Temporal consistency needs two images after them.")
+        if self.skip + 2 > self.data.windows:
+            raise EvflowDataError("EV020", f"skip={self.skip} of {self.data.windows} windows.",
+                                  "Temporal consistency needs two images after those skipped.")
 
 
 @jax.tree_util.register_dataclass
@@ -138,27 +134,12 @@ def sequence_loss(
     if isinstance(network, EVFlowNet):
         loss = _flow_loss(network, params, tensors, sequences, config.elsewhere)
         return loss, {"loss": loss}
-    state = _aged(network, params, tensors[:config.before]) if config.before else None
-    tensors, sequences = jax.tree.map(lambda a: a[config.before:], (tensors, sequences))
-    images, _ = run(network, params, tensors, state, train=True)
+    images, _ = run(network, params, tensors, train=True)
     seen = losses.reconstruction(images, sequences.frames, lpips_params)
     steady = losses.temporal(
         images, sequences.frames, sequences.back, sequences.visible, config.skip)
     total = seen + config.temporal * steady
     return total, {"loss": total, "reconstruction": seen, "temporal": steady}
-
-
-def _aged(network: Network, params: Params, tensors: Array) -> State:
-    """The state after tensors (T, B, H, W, bins) of every other sequence, beginning with the
-    first; the start of the rest. No gradient passes."""
-    batch = tensors.shape[1:-1]
-    _, old = run(network, jax.lax.stop_gradient(params), tensors)
-    aged = jnp.arange(batch[0]) % 2 == 0
-
-    def of_both(old: Array, fresh: Array) -> Array:
-        return jnp.where(aged.reshape(-1, *(1,) * (old.ndim - 1)), old, fresh)
-
-    return jax.tree.map(of_both, jax.lax.stop_gradient(old), network.start(batch, tensors.dtype))
 
 
 def _flow_loss(
