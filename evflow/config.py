@@ -158,18 +158,20 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        group = min(self.cameras, len(self.sensors))
-        rules = {
-            f"of {PARTS}": ("parts", bool(self.parts) and set(self.parts) <= set(PARTS)),
-            "0 or more": ("steps", self.steps >= 0),
-            "1 or more, and a multiple of the sensors in a step":
-                ("cameras", group >= 1 and self.cameras % group == 0),
-            "a multiple of the cameras": ("sensors", group >= 1 and len(self.sensors) % group == 0),
-            f"a multiple of the model's {self.model.changes} changes":
-                ("steps_per_window", self.steps_per_window % self.model.changes == 0)}
-        for rule, (name, good) in rules.items():
+        models, changes = len(self.sensors), self.model.changes
+        group = max(1, min(self.cameras, models))
+        for name, value, good, rule in (
+            ("parts", self.parts, bool(self.parts) and set(self.parts) <= set(PARTS),
+             f"some of {PARTS}"),
+            ("steps", self.steps, self.steps >= 0, ">= 0"),
+            ("sensors", models, models > 0 and models % group == 0,
+             "as many as the cameras, or a multiple"),
+            ("cameras", self.cameras, self.cameras > 0 and self.cameras % group == 0,
+             "as many as the sensors of a step, or a multiple"),
+            ("steps_per_window", self.steps_per_window, self.steps_per_window % changes == 0,
+             f"a multiple of the model's {changes} changes"),
+        ):
             if not good:
-                value = len(self.sensors) if name == "sensors" else getattr(self, name)
                 raise EvflowDataError("EV020", f"TrainConfig: {name} {value!r}.",
                                       f"It must be {rule}.")
 

@@ -26,6 +26,7 @@ FLOW = ("aee", "outlier_percent", "fwl", "fwl_truth")
 # Bilinear votes blur: over 30 ms of few events even the true flow then scores .87 (64 px, high
 # thresholds); rounded to the nearest pixel it scores 1.15.
 CONVENTION = FwlConvention(splat="round")
+ENDPOINTS = {"aee": "pixels with events", "outlier_px": OUTLIER_PX}
 RISING = ("ssim", "psnr", "fwl")  # better where larger
 PROTOCOL = PROTOCOLS["evreal"]  # of images; log_mse is the mse of `log_map` of both
 
@@ -45,7 +46,7 @@ class Clips:
 def scored_by(task: str, perceptual: bool = True) -> dict[str, Any]:
     """The conventions of `VIDEO` or of `FLOW`, for "flow"; perceptual: LPIPS was at hand."""
     if task == "flow":
-        return {"fwl": CONVENTION.as_dict(), "aee": "pixels with events", "outlier_px": OUTLIER_PX}
+        return {"fwl": CONVENTION.as_dict(), **ENDPOINTS}
     return {**dataclasses.asdict(PROTOCOL), "lpips_net": "alex v0.1" if perceptual else None}
 
 

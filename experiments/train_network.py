@@ -36,11 +36,11 @@ from evflow.downstream.simulated import Sequences, has_events, sample_sequences
 from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
 from evflow.metrics.flow import aee
-from evflow.metrics.flow_scores import OUTLIER_PX
-from evflow.metrics.image_scores import PROTOCOLS, frame_scores
+from evflow.metrics.image_scores import frame_scores
 from evflow.metrics.perceptual import load_lpips
 from evflow.scenes import make_bank
 from experiments.common import provenance, write_result
+from experiments.held_out import ENDPOINTS, PROTOCOL, scored_by
 from experiments.loop import train
 
 Array = jax.Array
@@ -112,7 +112,9 @@ def main(options: Options) -> dict[str, Any]:
     state = train(lambda state: step(state, bank, camera, loss_weights),
                   init_state(network, learning, tx, begun(config)), config, options)
     figures = measure(network, state.params, learning, camera, options.batches)
-    result = {"steps": int(state.step), "scored_by": scored_by(network, figures), **figures}
+    conventions = ENDPOINTS if isinstance(network, EVFlowNet) else scored_by(
+        "video", "lpips" in figures)
+    result = {"steps": int(state.step), "scored_by": conventions, **figures}
     card = {"preset": options.preset, "steps": int(state.step), "seed": learning.seed,
             "data": ", ".join(config.recordings)
             or "procedural textures and scikit-image's photographs, simulated",
@@ -192,7 +194,7 @@ def _image_figures(
     images, _ = run(network, params, tensors)
     late = len(images) // 2
     images, frames = images[late:], sequences.frames[late:]
-    seen, grey = (frame_scores(a, frames, PROTOCOLS["evreal"], weights)
+    seen, grey = (frame_scores(a, frames, PROTOCOL, weights)
                   for a in (images, jnp.full_like(frames, 0.5)))
     return {name: jnp.mean(seen[name]) for name in seen} | {
         f"grey_{name}": jnp.mean(grey[name]) for name in seen}
@@ -215,14 +217,6 @@ def _flow_figures(
         error, beyond = aee(guess, truth, events)
         rows |= {f"{name}aee": jnp.nanmean(error), f"{name}outlier_percent": jnp.nanmean(beyond)}
     return rows
-
-
-def scored_by(network: Network, figures: dict[str, float]) -> dict[str, Any]:
-    """The conventions of these figures."""
-    if isinstance(network, EVFlowNet):
-        return {"aee": "pixels with events", "outlier_px": OUTLIER_PX}
-    return {**dataclasses.asdict(PROTOCOLS["evreal"]),
-            "lpips_net": "alex v0.1" if "lpips" in figures else None}
 
 
 def table(result: dict[str, Any]) -> str:

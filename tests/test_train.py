@@ -117,5 +117,5 @@ def test_unknown_preset() -> None:
     ids=str)
 def test_impossible_configurations_are_refused(change: dict[str, Any]) -> None:
     name, = change
-    with pytest.raises(EvflowDataError, match=f"EV020.*{name}"):
+    with pytest.raises(EvflowDataError, match=f"EV020.*TrainConfig: {name}"):
         configs.TrainConfig(**change)

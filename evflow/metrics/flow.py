@@ -66,9 +66,8 @@ def fwl(
     x, y, t: (N,), also between pixels, of any dtype and origin; p: (N,) bool or sign; weight: (N,)
     1, or 0 for padding; flow: (2, H, W) px per unit of t.
     """
-    columns = _columns(x, y, t, p, weight)
-    warped = warped_image(*columns, flow, convention)
-    still = warped_image(*columns, jnp.zeros_like(flow), convention)
+    warped = warped_image(x, y, t, p, weight, flow, convention)
+    still = warped_image(x, y, t, p, weight, jnp.zeros_like(flow), convention)
     return jnp.var(warped) / jnp.var(still)
 
 
