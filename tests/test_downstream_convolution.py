@@ -12,10 +12,11 @@ from evflow.downstream import convolution
 from evflow.downstream.convolution import convolve, for_flax
 
 # (..., H, W, C), k, F: one strip and several, rows and images that do not fill the last block,
-# no batch and two of them, more pixels than a block in one row, one pixel; and no neighbours.
+# no batch and two of them, more pixels than a block in one row, one pixel, a product of fewer
+# pixels; and no neighbours.
 SHAPES = [((2, 5, 7, 8), 3, 4), ((3, 23, 29, 8), 3, 6), ((7, 9, 9, 9), 5, 3), ((19, 13, 8), 5, 8),
           ((2, 3, 8, 11, 8), 3, 5), ((1, 3, 300, 8), 3, 2), ((150, 1, 1, 8), 3, 31),
-          ((2, 5, 7, 8), 1, 4)]
+          ((2, 7, 20, 64), 3, 31), ((2, 5, 7, 8), 1, 4)]
 
 
 def plain(x: jax.Array, kernel: jax.Array) -> jax.Array:

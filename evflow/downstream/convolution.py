@@ -17,7 +17,9 @@ from jax import lax
 
 Array = jax.Array
 
-PIXELS = 256  # of one product: at 48x48, 32 to 16 features, 1024 of them take 1.3 times as long
+PIXELS = 256  # of one product: at 48x48, 32 to 16 features, 1024 of them take 1.3 times as long...
+PRODUCT = 32 * 144 * PIXELS  # ...and multiplications: XLA lets two cores share one of twice as
+# many, which takes 1.8 times as long as one core alone (32 to 32 features at 128x128)
 FEW = 32  # output features, from which on XLA's gradient keeps up (67 to 95 GFLOP/s)...
 LARGE = 1 << 14  # ...on a batch of at most so many pixels (30 GFLOP/s at four of 128x128)
 
@@ -78,8 +80,9 @@ def _kernel_gradient(x: Array, kernel: Array, cotangent: Array) -> Array:
     size, _, channels, features = kernel.shape
     wide = size * size * features
     batch, height, width, _ = x.shape
-    rows = max(1, min(height, PIXELS // width))
-    images = max(1, min(batch, PIXELS // (height * width)))
+    pixels = min(PIXELS, PRODUCT // (channels * wide))
+    rows = max(1, min(height, pixels // width))
+    images = max(1, min(batch, pixels // (height * width)))
     images, more = (images, -batch % images) if rows == height else (1, 0)
     below, around = -height % rows, size // 2
     x = jnp.pad(x, ((0, more), (0, below), (0, 0), (0, 0)))  # what is added counts nothing
