@@ -71,6 +71,23 @@ def test_scanned_unrolled_and_stepped_sequences_agree(network: Network) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), rest, end)
 
 
+@tiny
+def test_sequences_and_states_that_do_not_fit_are_refused(network: Network) -> None:
+    params = network.init(jax.random.key(0), (16, 16))
+    x = jnp.asarray(case_input())[:, :16, :16]
+    for train in (False, True):
+        images, state = run(network, params, x[:0, None], train=train)  # of no window, no image
+        assert len(images) == 0
+        jax.tree.map(np.testing.assert_array_equal, state, network.start((1, 16, 16)))
+    with pytest.raises(EvflowDataError, match="EV002"):
+        run(network, params, x[0])
+    if not isinstance(network, EVFlowNet):
+        with pytest.raises(EvflowDataError, match="begin another size"):
+            network.apply(params, x[0, :8], network.start((16, 16)))
+        with pytest.raises(EvflowDataError, match="begin another size"):
+            run(network, params, x[:, None], network.start((16, 16)))
+
+
 def test_double_precision_follows_the_input() -> None:
     network = TINY[0]
     with jax.enable_x64(True):

@@ -73,7 +73,8 @@ class Network:
     def apply(self, params: Params, voxels: Array, state: State = None) -> tuple[Array, State]:
         """Event tensor (..., H, W, bins) -> image (..., H, W) and the next state.
 
-        state: None before the first tensor. Raises EV002 where the channels are not `bins`.
+        state: None before the first tensor. Raises EV002 where the channels are not `bins`, or the
+        state is not one of such a tensor.
         """
         voxels = as_floats(voxels, params)
         if voxels.ndim < 3 or voxels.shape[-1] != self.bins:
@@ -81,10 +82,22 @@ class Network:
                                   f"Expected (..., H, W, {self.bins}).")
         if state is None:
             state = self.start(voxels.shape[:-1], voxels.dtype)
+        else:
+            self._require_state(state, voxels)
         x, (top, left) = self._pad(voxels)
         image, state = self.module().apply({"params": params}, x, state)
         height, width = voxels.shape[-3:-1]
         return self._finish(image[..., top:top + height, left:left + width, :]), state
+
+    def _require_state(self, state: State, voxels: Array) -> None:
+        """EV002 unless the state's arrays are those before a tensor like `voxels`."""
+        wanted = jax.tree.leaves(jax.eval_shape(lambda: self.start(voxels.shape[:-1])))
+        have, fitting = ([jnp.shape(a) for a in leaves]
+                         for leaves in (jax.tree.leaves(state), wanted))
+        if have != fitting:
+            raise EvflowDataError(
+                "EV002", f"the state's arrays are {have}, the event tensor is {voxels.shape}.",
+                f"It follows a state of {fitting}; begin another size or batch with state=None.")
 
     def _pad(self, x: Array) -> tuple[Array, tuple[int, int]]:
         """x with more rows and columns, of an odd number one more at the top and left, as the
@@ -117,9 +130,13 @@ def run(
 
     train: that gradients will be taken. XLA:CPU runs the gradient of a convolution inside a loop
     17 times slower than outside of one, so there the sequence is unrolled; elsewhere each step
-    is recomputed in the backward pass, which keeps the memory of one.
+    is recomputed in the backward pass, which keeps the memory of one. Raises EV002 where the
+    shapes do not fit.
     """
     voxels = as_floats(voxels, params)
+    if voxels.ndim < 4:
+        raise EvflowDataError("EV002", f"the event tensors are {voxels.shape}.",
+                              f"Expected (T, ..., H, W, {network.bins}).")
     if state is None:
         state = network.start(voxels.shape[1:-1], voxels.dtype)
 
@@ -127,12 +144,12 @@ def run(
         image, state = network.apply(params, x, state)
         return state, image
 
-    images: Any = []
-    if train and jax.default_backend() == "cpu":
+    if train and jax.default_backend() == "cpu" and len(voxels):
+        made = []
         for x in voxels:
             state, image = step(state, x)
-            images.append(image)
-        return jnp.stack(images), state
+            made.append(image)
+        return jnp.stack(made), state
     body: Any = jax.checkpoint(step) if train else step
     state, images = jax.lax.scan(body, state, voxels)
     return images, state
