@@ -29,6 +29,7 @@ from evflow.checks import (
 from evflow.errors import EvflowDataError
 
 BIT_DEPTHS = (8, 10, 12, 14, 16)  # of the converters in image sensors; 16-bit files hold any
+MADE = "made from the events by"  # in the note on frames that a network made of the events
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709 weights of R, G, B
 
 
@@ -155,6 +156,11 @@ class Recording:
         width, height = events.size
         return Recording(
             events, np.zeros((0, height, width), np.uint8), np.zeros(0, np.int64), notes)
+
+    @property
+    def frames_were_made(self) -> bool:
+        """Whether a network made the frames of the events, as a note on them says."""
+        return any(MADE in note for note in self.notes)
 
     def __repr__(self) -> str:
         return f"{self.events!r}, {len(self.frames)} frames ({self.frames.dtype})"

@@ -12,10 +12,12 @@ import pytest
 from event_networks import EVEN, MOTION, even, saved, steady
 from recordings import T0, make
 
-from evflow import write_events, write_recording
+from evflow import read_recording, write_events, write_recording
 from evflow.cli import main
 from evflow.downstream import video
+from evflow.io.adjust import with_frames
 from evflow.report.flow import flow_colours, flow_image, wheel
+from evflow.report.video import enlarged, write_video
 from evflow.types import Events
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -85,19 +87,23 @@ def test_frames_before_the_events_are_not_scored(
     made, command = make(count=12, span=700_000), ["reconstruct", str(tmp_path / "r.npz"), "-o",
                                                    str(tmp_path / "a.gif"), "--overwrite", "--json",
                                                    "--weights", weights["images"]]
-    for moved, scored in ((300_000, True), (5_000_000, False)):
+    for moved in (300_000, 5_000_000):
         late = Events(made.events.x, made.events.y, made.events.t + moved, made.events.p,
                       made.events.size)
         write_recording(tmp_path / "r.npz", dataclasses.replace(made, events=late), "npz",
                         overwrite=True)
+        amid = made.frame_times > late.t[0]
+        if not amid.any():
+            assert main(command) == 1
+            assert "EV012" in capsys.readouterr().err
+            continue
         assert main(command) == 0
-        scores = json.loads(capsys.readouterr().out)["scores"]
-        assert (scores is not None) == scored
-        if scores:
-            amid = made.frame_times > late.t[0]
-            assert scores["frames"] == amid.sum() - scores["warm_up"]
-            frames = made.frames[amid][scores["warm_up"]:] / 255.0
-            assert scores["mse"] == pytest.approx(((frames - EVEN) ** 2).mean(), rel=1e-4)
+        found = json.loads(capsys.readouterr().out)
+        scores = found["scores"]
+        assert scores["frames"] == amid.sum() - scores["warm_up"]
+        assert any(f"{(~amid).sum()} of 12 frames" in note for note in found["notes"])
+        frames = made.frames[amid][scores["warm_up"]:] / 255.0
+        assert scores["mse"] == pytest.approx(((frames - EVEN) ** 2).mean(), rel=1e-4)
 
 
 def test_reconstructed_folders_are_frames_for_other_commands(
@@ -112,6 +118,10 @@ def test_reconstructed_folders_are_frames_for_other_commands(
     capsys.readouterr()
     assert main(["info", str(flight), "--frames", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 13
+    seen = read_recording(flight)
+    assert not seen.frames_were_made
+    assert with_frames(seen, out).frames_were_made
+    assert with_frames(seen, out, timestamps=out / "timestamps.txt").frames_were_made
     (out / "mine.txt").touch()
     assert main([*command, "--overwrite"]) == 1
     assert "EV013" in capsys.readouterr().err
@@ -136,6 +146,12 @@ def test_flow_films_and_scores(
     assert scores["aee"] == pytest.approx(np.hypot(*MOTION), rel=1e-4)
     assert scores["windows"] == 2
     assert scores["fwl_truth"] == pytest.approx(1.0)
+    np.savez(truth, flow=np.full((2, 2, 48, 64), np.nan, np.float32), edges_us=edges)
+    assert main([*command, "--overwrite", "--truth", str(truth)]) == 0
+    assert "no known flow" in json.loads(capsys.readouterr().out)["notes"][-1]
+    np.savez(truth, flow=np.zeros((2, 2, 48, 64), np.float32), edges_us=edges + 10**9)
+    assert main([*command, "--overwrite", "--truth", str(truth)]) == 1
+    assert "EV012" in capsys.readouterr().err
 
 
 def test_flow_needs_no_weights_of_ones_own(
@@ -180,6 +196,10 @@ def test_colours_say_where_to_and_how_fast() -> None:
     ("EV020", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--full-px", "0"]),
     ("EV016", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--truth", "no.npz"]),
     ("EV020", ["reconstruct", "REC", "-o", "a.mp4", "--weights", "IMAGES", "--window-ms", "-3"]),
+    ("EV020", ["reconstruct", "REC", "-o", "a.mp4", "--weights", "IMAGES", "--scale", "-3"]),
+    ("EV020", ["reconstruct", "REC", "-o", "a.mp4", "--weights", "IMAGES", "--scale", "1000"]),
+    ("EV020", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--scale", "0"]),
+    ("EV020", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--fps", "0"]),
     ("EV020", ["estimate", "REC", "-o", "cam", "--no-plots", "--no-report", "--reconstruct"]),
     ("EV020", ["estimate", "REC", "-o", "cam", "--no-plots", "--no-report", "--protocol", "static",
                "--reconstruct"])])
@@ -192,6 +212,13 @@ def test_what_is_refused_leaves_nothing(
     assert main([known.get(word, word) for word in command]) in (1, 2)
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_narrow_sensors_are_not_enlarged_beyond_what_codecs_take(tmp_path: Path) -> None:
+    for shape in ((29, 1, 3), (300, 10, 3)):
+        picture = enlarged(np.zeros(shape))
+        assert 3000 < picture.shape[0] <= 4096
+        write_video(tmp_path / f"{shape[1]}.mp4", iter([picture, picture]), 2, fps=10.0)
 
 
 @pytest.mark.slow

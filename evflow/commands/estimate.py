@@ -128,7 +128,7 @@ class Estimate(Reading):
         with bar("estimating") as progress:
             found = estimate_camera(
                 recording, params, min_window_us=round(self.window_ms * 1000), progress=progress)
-        if self.reconstruct:
+        if recording.frames_were_made:
             from evflow.downstream.video import doubted
 
             found = doubted(found)

@@ -60,9 +60,13 @@ class Flow(Windowed):
             said = self._film(_watched(flows, scores, len(edges) - 1, progress), recording, edges,
                               full_px)
         result = scores.result()
+        notes = list(recording.notes)
+        if truth is not None and result.get("aee") is None:
+            notes.append(f"{self.truth} has no known flow at a pixel with events: nothing was "
+                         "measured against it")
         facts = {"out": str(self.out), "weights": self.weights, "full_px": full_px,
-                 "scores": result, "notes": list(recording.notes)}
-        for note in recording.notes:
+                 "scores": result, "notes": notes}
+        for note in notes:
             print(f"note: {note}", file=sys.stderr)
         print(json.dumps(facts) if self.json else "\n".join(
             (f"{said}, full colour at {full_px:.1f} px a window -> {self.out}",
@@ -72,6 +76,7 @@ class Flow(Windowed):
         """EV013, EV020 before any long work."""
         from evflow.report.video import SUFFIXES
 
+        self.check_film()
         kind = self.out.suffix.lower()
         if kind not in SUFFIXES:
             raise EvflowDataError("EV020", f"{self.out.name} is none of {', '.join(SUFFIXES)}.",
@@ -95,6 +100,7 @@ class Flow(Windowed):
         recording = self.read(self.recording, with_frames=seen)
         if self.truth is not None:
             truth = load_truth(self.truth, recording.events.size)
+            _require_overlap(recording, truth.edges_us, self.truth)
             return recording, truth.edges_us, truth
         return recording, window_edges(recording, self.times(recording)), None
 
@@ -113,6 +119,16 @@ class Flow(Windowed):
         fps = lasting(count, int(edges[-1] - edges[0])) if self.fps is None else self.fps
         return write_video(self.out, pictures(), count, fps=fps, codec=self.codec,
                            overwrite=self.overwrite)
+
+
+def _require_overlap(recording: Recording, edges: np.ndarray, truth: Path) -> None:
+    """EV012 unless some event lies within the windows of the true flow."""
+    t = recording.events.t
+    if not len(recording.events.slice(int(edges[0]), int(edges[-1]))):
+        covered = f"events cover {t[0]:,}..{t[-1]:,} us" if len(t) else "there are no events"
+        raise EvflowDataError(
+            "EV012", f"{covered}, but the windows of {truth} {edges[0]:,}..{edges[-1]:,} us.",
+            "edges_us are microseconds of the events' clock: is it another one, or another unit?")
 
 
 def _watched(

@@ -43,24 +43,22 @@ class Reconstruct(Windowed):
     """How images are scored: which SSIM, clipped or not."""
 
     def run(self) -> None:
-        import numpy as np
-
         from evflow.downstream.released import load_network
         from evflow.downstream.tensor import reconstructions
         from evflow.downstream.video import images_of
         from evflow.progress import bar
 
         check_finite(self)
+        self.check_film()
         kind = self._kind()
         need_absent(self.out, self.overwrite)
         trained = images_of(load_network(self.weights))
         recording = self.read(self.recording)
         times = self.times(recording)
-        # Without events nothing is to be seen: only frames amid them are scored.
-        first = int(np.searchsorted(times, recording.events.t[0], "right"))
-        stop = int(np.searchsorted(times, recording.events.t[-1], "right"))
-        amid = range(first, stop)
-        scores = self._scores(len(amid)) if times is recording.frame_times else None
+        seen = times is recording.frame_times
+        amid, notes = _amid(recording, times) if seen else (range(0), [])
+        notes = [*recording.notes, *notes]
+        scores = self._scores(len(amid)) if seen else None
         with bar("reconstructing") as progress:
             images = reconstructions(
                 trained.network, trained.params, recording.events, times, **trained.how,
@@ -70,8 +68,8 @@ class Reconstruct(Windowed):
                     self._film(images, times, recording))
         result = scores.result() if scores else None
         facts = {"out": str(self.out), "weights": self.weights, "images": len(times),
-                 "scores": result, "notes": list(recording.notes)}
-        for note in recording.notes:
+                 "scores": result, "notes": notes}
+        for note in notes:
             print(f"note: {note}", file=sys.stderr)
         print(json.dumps(facts) if self.json else "\n".join(
             (f"{said} -> {self.out}", *_described(result))))
@@ -111,8 +109,29 @@ class Reconstruct(Windowed):
 
     def _folder(self, images: Iterator[np.ndarray], times: np.ndarray) -> str:
         from evflow.report.video import write_images
+        from evflow.types import MADE
 
-        return write_images(self.out, images, times, overwrite=self.overwrite)
+        return write_images(self.out, images, times, overwrite=self.overwrite,
+                            remark=f"images were {MADE} {Path(self.weights).name}")
+
+
+def _amid(recording: Recording, times: np.ndarray) -> tuple[range, list[str]]:
+    """The frames that lie amid the events: only those are scored, as without events nothing is to
+    be seen; and a note where others do not. EV012 where none does."""
+    import numpy as np
+
+    t = recording.events.t
+    first, stop = (int(np.searchsorted(times, end, "right")) for end in (t[0], t[-1]))
+    if first == stop:
+        raise EvflowDataError(
+            "EV012", f"events cover {t[0]:,}..{t[-1]:,} us, but the frames "
+            f"{times[0]:,}..{times[-1]:,} us.",
+            "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms; or "
+            "pass --sync ms, which does not look at the frames.")
+    outside = len(times) - (stop - first)
+    return range(first, stop), [
+        f"{outside} of {len(times)} frames lie outside the events and are not scored"
+    ] if outside else []
 
 
 def _watched(

@@ -18,7 +18,7 @@ from evflow.downstream.tensor import reconstructions
 from evflow.errors import EvflowDataError
 from evflow.metrics.image_scores import ImageProtocol, score_images
 from evflow.metrics.perceptual import Params
-from evflow.types import Recording
+from evflow.types import MADE, Recording
 
 FRAME_US = 30_000  # windows that the released networks were trained on
 WARM_UP = 5  # images until a network's memory holds the scene: .15 s
@@ -67,7 +67,7 @@ def with_reconstructed_frames(
             frames[i - warm_up] = 255.0 * np.clip(image, 0.0, 1.0)
         if progress:
             progress(i + 1, len(times))
-    note = f"{len(frames)} frames were made from the events by {name}"
+    note = f"{len(frames)} frames were {MADE} {name}"
     return Recording(recording.events, frames, times[warm_up:], (*recording.notes, note))
 
 

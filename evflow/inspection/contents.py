@@ -26,8 +26,8 @@ def contents(recording: Recording) -> list[Finding]:
     found = [] if recording.has_frames else [Finding(
         "EV011", "warning", "the recording has events but no frames: thresholds cannot be "
         "measured without intensity.",
-        "Give frames, --frames DIR --timestamps FILE; of a static scene the noise alone can be "
-        "estimated.")]
+        "Give frames, --frames DIR --timestamps FILE, or let a network guess them (evflow estimate "
+        "--reconstruct); of a static scene the noise alone can be estimated.")]
     return [*found, *_one_polarity(counts), *_few(counts), *_hot(counts.sum(0))]
 
 

@@ -15,6 +15,7 @@ from evflow.io.frames import FrameHints, Image
 from evflow.io.limits import check_expansion
 from evflow.io.pictures import claimed_bytes
 from evflow.io.times import read_times
+from evflow.types import MADE
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 TIMES = ("timestamps.txt", "images.txt", "image_timestamps.txt", "timestamp.txt", "times.txt",
@@ -59,7 +60,8 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
             f"{len(set(names)) if names else len(us)}.",
             "Images lost, or of another recording? Give each image one time, or pass --fps.")
     files = [by_name[name] for name in names] if names else files
-    return ImageFolder(tuple(files), us, (note,) if note else ())
+    notes = (note, _remark(source))
+    return ImageFolder(tuple(files), us, tuple(n for n in notes if n))
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -122,6 +124,15 @@ def _find(root: Path) -> tuple[Path, list[Path]]:
             f"holds no image ({', '.join(s[1:] for s in SUFFIXES)}): "
             f"{sorted(p.name for p in root.iterdir())[:5]}")
     raise EvflowDataError("EV008", f"{root} {seen}.", "Pass the one folder that has the frames.")
+
+
+def _remark(source: Path) -> str:
+    """The first line of a file of times, where it says that the images were made from events."""
+    if source.suffix == ".npy":
+        return ""
+    with source.open(encoding="utf-8", errors="replace") as lines:
+        first = lines.readline(1000).lstrip("# ").strip()
+    return first if MADE in first else ""
 
 
 def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:

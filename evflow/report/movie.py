@@ -19,7 +19,7 @@ from evflow.files import atomic_write
 from evflow.recording import Progress
 from evflow.report.plots import event_image
 from evflow.report.resimulate import busiest_instant
-from evflow.report.video import CODECS, FPS, Codec, enlarged, write_video
+from evflow.report.video import CODECS, FPS, SCALES, Codec, enlarged, write_video
 from evflow.types import Recording
 
 SUFFIXES = (".mp4", ".gif", ".png")
@@ -43,7 +43,7 @@ class Film:
 
     def __post_init__(self) -> None:
         for name, low, high in (("fps", *FPS), ("window_us", 1, 10**9),
-                                ("slow", 1e-3, 1e6), ("scale", 1, 32)):
+                                ("slow", 1e-3, 1e6), ("scale", *SCALES)):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise EvflowDataError(

@@ -27,7 +27,9 @@ CODECS: tuple[Codec, ...] = ("mpeg4", "vp9")
 SUFFIXES = (".mp4", ".avi", ".gif")
 TIMES = "timestamps.txt"
 FPS = (0.1, 240.0)
-WIDTH = 640  # screen pixels that a small sensor is enlarged to
+WIDTH = 640  # screen pixels that a small sensor is enlarged to...
+HEIGHT = 4096  # ...if it is not so narrow that more rows are made than codecs take
+SCALES = (1, 32)
 GIF_TICK_S = 0.01  # GIF counts time in hundredths of a second
 GIF_FRAMES = 600  # a GIF is held in memory and grows large: more are refused
 
@@ -58,10 +60,10 @@ def write_video(
 
 def write_images(
     folder: str | os.PathLike, images: Iterator[np.ndarray], times_us: np.ndarray, *,
-    overwrite: bool = False,
+    remark: str = "", overwrite: bool = False,
 ) -> str:
     """Write grey images (H, W) on 0..1 as 8-bit .png, with their times (T,) in timestamps.txt, as
-    readers of image folders take them; returns what was written, in words.
+    readers of image folders take them, a remark at its head; returns what was written, in words.
 
     Raises EV013 (the folder exists, or holds other things), EV019.
     """
@@ -73,14 +75,16 @@ def write_images(
             pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
             Image.fromarray(pixels).save(temporary / name)
         lines = (f"{time} {name}\n" for time, name in zip(times_us, names, strict=False))
-        (temporary / TIMES).write_text("# timestamp_us image\n" + "".join(lines))
+        head = f"# {remark}\n" if remark else ""
+        (temporary / TIMES).write_text(f"{head}# timestamp_us image\n" + "".join(lines))
     return f"{len(times_us)} images"
 
 
 def enlarged(image: np.ndarray, scale: int | None = None) -> np.ndarray:
     """(H, W, 3) floats 0..1 as uint8, each pixel scale x scale (None: as many as make it 640
-    wide), the sides even: codecs store colour at half the resolution."""
-    scale = scale or max(1, round(WIDTH / image.shape[1]))
+    wide, but at most 4096 high), the sides even: codecs store colour at half the resolution."""
+    if scale is None:
+        scale = max(1, min(round(WIDTH / image.shape[1]), HEIGHT // image.shape[0]))
     pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8).repeat(scale, 0).repeat(scale, 1)
     height, width = pixels.shape[:2]
     return np.pad(pixels, [(0, height % 2), (0, width % 2), (0, 0)], mode="edge")
@@ -94,8 +98,9 @@ def _write_film(
     writer = cv2.VideoWriter(
         str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*FOURCC[codec]), fps, size)
     if not writer.isOpened():
-        raise EvflowDataError("EV019", f"OpenCV {cv2.__version__} does not write {codec}.",
-                              "Try the other codec, or write a .gif.")
+        raise EvflowDataError(
+            "EV019", f"OpenCV {cv2.__version__} does not write {codec} of {size[0]}x{size[1]}.",
+            "Try a smaller --scale, the other codec, or a .gif.")
     try:
         writer.write(first[..., ::-1])
         for picture in pictures:
