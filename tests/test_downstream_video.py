@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -85,6 +86,14 @@ def test_other_files_are_no_networks(tmp_path: Path) -> None:
     wrong = {**trained.params, "prediction": {"conv": {"bias": jnp.zeros(3)}}}
     path = released.save_network(tmp_path / "w.safetensors", trained.network, wrong, {})
     with pytest.raises(EvflowDataError, match="EV018"):
+        load_network(path)
+
+
+def test_weights_that_are_not_finite_are_no_network(tmp_path: Path) -> None:
+    trained = even()
+    broken = jax.tree.map(lambda leaf: leaf.at[..., 0].set(jnp.nan), trained.params)
+    path = saved(tmp_path, dataclasses.replace(trained, params=broken))
+    with pytest.raises(EvflowDataError, match=r"EV007.*is not all finite"):
         load_network(path)
 
 

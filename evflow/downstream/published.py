@@ -130,7 +130,7 @@ def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network
 
 def to_params(network: Network, arrays: Arrays) -> Params:
     """The state dict as params of `network`; EV018 where a name or a shape does not fit."""
-    expected = {_join(keys): leaf.shape for keys, leaf in jax.tree_util.tree_leaves_with_path(
+    expected = {join(keys): leaf.shape for keys, leaf in jax.tree_util.tree_leaves_with_path(
         jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16))))}
     found = {}
     for name, array in _stripped(arrays).items():
@@ -199,5 +199,6 @@ def _called(network: Network) -> str:
     return type(network).__name__
 
 
-def _join(keys: Any) -> str:
+def join(keys: Any) -> str:
+    """The path of a leaf of params."""
     return "/".join(str(k.key) for k in keys)
