@@ -194,6 +194,9 @@ def test_scores_say_how_they_were_made() -> None:
     (lambda e, f: metrics.score_flow(e, np.array([0, 5, 5]), f), "EV004"),
     (lambda e, f: metrics.score_flow(e, np.array([0, 5, 9]), f, truth=f[:1]), "EV002"),
     (lambda e, f: metrics.score_flow(e, np.array([0, 5, 9]), f, valid=f > 0), "EV002"),
+    (lambda e, f: metrics.endpoint_error(f, f[..., :-1]), "EV002"),
+    (lambda e, f: metrics.endpoint_error(f, f[[0, 0, 0]]), "EV002"),
+    (lambda e, f: metrics.endpoint_error(f[0, 0], f[0, 0]), "EV002"),
     (lambda e, f: FwlConvention(splat="cubic"), "EV020"),
     (lambda e, f: FwlConvention(blur=-1.0), "EV020"),
 ])

@@ -17,6 +17,7 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 
 from evflow.errors import EvflowDataError
+from evflow.metrics.image import as_array, pair_up
 
 Array = jax.Array
 
@@ -172,7 +173,12 @@ def _gaussian_blur(image: Array, sigma: float) -> Array:
 
 
 def endpoint_error(flow: Array, truth: Array) -> Array:
-    """|flow - truth| of (..., 2, H, W): (..., H, W), px."""
+    """|flow - truth| of (..., 2, H, W): (..., H, W), px. Raises EV002."""
+    flow, truth = as_array(flow), as_array(truth)
+    if flow.ndim < 3 or flow.shape[-3] != 2 or flow.shape[-3:] != truth.shape[-3:] or not pair_up(
+            flow, truth):
+        raise EvflowDataError("EV002", f"flow is {flow.shape}, truth {truth.shape}.",
+                              "Expected two of (..., 2, H, W).")
     square = jnp.sum((flow - truth) ** 2, -3)
     still = square == 0  # where the root has no gradient; NaN stays NaN
     return jnp.where(still, 0.0, jnp.sqrt(jnp.where(still, 1.0, square)))
