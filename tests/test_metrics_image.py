@@ -135,6 +135,11 @@ def test_metrics_are_differentiable_and_follow_the_type() -> None:
     (lambda a, b: metrics.lpips({}, a, b, colour=True), "EV002"),
     (lambda a, b: ImageProtocol(aggregate="median"), "EV020"),
     (lambda a, b: ImageProtocol(domain="sqrt"), "EV020"),
+    (lambda a, b: ImageProtocol(domain="log", clip=False), "EV020"),
+    (lambda a, b: ImageProtocol(clip="no"), "EV020"),
+    (lambda a, b: metrics.frame_scores((255 * a).astype(np.uint8), b, PROTOCOLS["evreal"]),
+     "EV003"),
+    (lambda a, b: metrics.frame_scores(a, b, "mine"), "EV020"),
 ])
 def test_what_cannot_be_scored_is_refused(call, code: str) -> None:
     with pytest.raises(EvflowDataError, match=code):
@@ -189,6 +194,9 @@ def test_protocols_clip_or_not_and_map_or_not() -> None:
     np.testing.assert_allclose(log["mse"], float(mapped.mean()), rtol=1e-5)
     same = metrics.score_images({"x": (reference, reference)})
     assert same["psnr"] is None
+    by_name = metrics.frame_scores(image, reference, "etnet")
+    np.testing.assert_array_equal(
+        by_name["ssim"], metrics.frame_scores(image, reference, PROTOCOLS["etnet"])["ssim"])
     assert PROTOCOLS["etnet"].aggregate == "sequences"
 
 
