@@ -189,6 +189,15 @@ def test_scores_say_how_they_were_made() -> None:
     np.testing.assert_allclose([off["aee"], off["outlier_percent"]], [6.0, 100.0], rtol=1e-5)
 
 
+def test_windows_without_events_have_no_score() -> None:
+    flow = np.zeros((1, 2, *SIZE[::-1]), np.float32)
+    silence = metrics.score_flow(recorded(), np.array([60_000, 70_000]), flow, truth=flow)
+    assert silence["windows"] == 0
+    for name in ("fwl", "rsat", "aee", "outlier_percent", "fwl_truth"):
+        assert silence[name] is None
+    assert "aee" not in metrics.score_flow(recorded(), np.array([60_000, 70_000]), flow)
+
+
 @pytest.mark.parametrize(("call", "code"), [
     (lambda e, f: metrics.score_flow(e, np.array([0, 1]), f), "EV002"),
     (lambda e, f: metrics.score_flow(e, np.array([0, 5, 5]), f), "EV004"),
