@@ -95,6 +95,25 @@ def test_padding_weighs_nothing() -> None:
                                metrics.rsat(*edge(), constant(9.0)), rtol=1e-5)
 
 
+@pytest.mark.parametrize("score", [metrics.fwl, metrics.rsat, metrics.warped_image])
+def test_events_and_flow_that_do_not_fit_are_refused(score: Callable) -> None:
+    x, y, t, p, weight = edge(n=50)
+    flow = constant(3.0)
+    for columns, of in (((x, y, t, p, weight), jnp.moveaxis(flow, 0, -1)),
+                        ((x, y, t, p, weight), flow[0]), ((x[:-1], y, t, p, weight), flow),
+                        ((x, y, t, p[:1], weight), flow), ((x, y, t[None], p, weight), flow)):
+        with pytest.raises(EvflowDataError, match="EV002"):
+            score(*columns, of)
+    as_lists = score(*(column.tolist() for column in (x, y, t, p, weight)), flow.tolist())
+    np.testing.assert_allclose(as_lists, score(x, y, t, p, weight, flow), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("score", [metrics.fwl, metrics.warped_image])
+def test_a_convention_is_no_word(score: Callable) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*'round'"):
+        score(*edge(n=50), constant(3.0), "round")
+
+
 def test_votes_are_kept_inside_and_lost_outside() -> None:
     rng = np.random.default_rng(1)
     x, y = (jnp.asarray(rng.uniform(0, n - 1, 300), jnp.float32) for n in SIZE)
