@@ -74,6 +74,29 @@ def test_written_files_come_back(write: Any, tmp_path: Path) -> None:
     assert read_checkpoint(tmp_path / "bare.pth").arrays.keys() == state().keys()
 
 
+@writers
+@pytest.mark.parametrize("key", ["model", "model_state_dict", "net", "params"])
+def test_the_one_nested_state_is_taken(write: Any, key: str, tmp_path: Path) -> None:
+    optimiser = {"state": {0: {"exp_avg": np.zeros(2, np.float32)}}}
+    whole = {"rng": np.zeros(9, np.uint8), "epoch": 3, "optimizer": optimiser, key: state()}
+    write(tmp_path / "x.pth", whole)
+    checkpoint = read_checkpoint(tmp_path / "x.pth")
+    assert checkpoint.arrays.keys() == state().keys()
+    assert key not in checkpoint.settings
+    write(tmp_path / "x.pth", {key: state(), "ema": state()})
+    with pytest.raises(EvflowDataError, match=r"EV018.*'ema'"):
+        read_checkpoint(tmp_path / "x.pth")
+
+
+@writers
+@pytest.mark.parametrize("prefix", ["model.", "module.", "module.model."])
+def test_prefixes_of_wrappers_are_cut(write: Any, prefix: str, tmp_path: Path) -> None:
+    write(tmp_path / "x.pth", {prefix + name: array for name, array in state().items()})
+    assert read_checkpoint(tmp_path / "x.pth").arrays.keys() == state().keys()
+    write(tmp_path / "x.pth", {"model.a": state()["a.bias"], "b": state()["a.bias"]})
+    assert read_checkpoint(tmp_path / "x.pth").arrays.keys() == {"model.a", "b"}
+
+
 @pytest.mark.parametrize("kept", [4, 60, 0.5, -30])
 def test_zips_that_lack_their_end_are_damaged(kept: float, tmp_path: Path) -> None:
     write_zip(tmp_path / "x.pth", {"state_dict": state()})

@@ -77,7 +77,8 @@ class Checkpoint:
 
 
 def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
-    """Weights from a file of torch.save: its "state_dict", or the dict itself.
+    """Weights from a file of torch.save: its "state_dict", else the one dict in it that holds
+    tensors, else the dict itself. Prefixes "module." and, where all have it, "model." are cut.
 
     Raises EV016 (no file), EV008 (not a PyTorch file), EV009 (damaged, or it holds what no
     checkpoint needs), EV018 (no weights in it), EV020 (larger than 2 GiB).
@@ -226,20 +227,28 @@ def _bytes_of(storage: _Storage) -> int:
 
 def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpoint:
     content = content if isinstance(content, dict) else {}
-    state = content.get("state_dict", content)
-    tensors = {name.removeprefix("module."): value for name, value in state.items()
-               if isinstance(name, str) and isinstance(value, _Tensor)
-               } if isinstance(state, dict) else {}
+    nested = [key for key, value in content.items() if _tensors(value)]
+    key = "state_dict" if "state_dict" in content or len(nested) != 1 else nested[0]
+    tensors = _tensors(content.get(key, content))
+    if tensors and all(name.startswith("model.") for name in tensors):
+        tensors = {name.removeprefix("model."): value for name, value in tensors.items()}
     if not tensors:
         raise EvflowDataError(
             "EV018", f"{path} holds no weights, but {sorted(map(str, content))[:8]}.",
-            "Expected a state dict, or a dict with one under 'state_dict'.")
+            "Expected a state dict, or a dict with one under 'state_dict'; or with only one.")
     if sum(8 * math.prod(t.shape) for t in tensors.values()) > 2 * MOST_BYTES:
         raise ValueError("its tensors are more than its storages")
     arrays = {name: _array(tensor, storages[tensor.storage.key])
               for name, tensor in tensors.items()}
-    settings = {key: _plain(value) for key, value in content.items() if key != "state_dict"}
+    settings = {k: _plain(value) for k, value in content.items() if k != key}
     return Checkpoint(arrays, {str(k): v for k, v in settings.items() if v is not None})
+
+
+def _tensors(value: Any) -> dict[str, _Tensor]:
+    """The named tensors of a dict."""
+    return {name.removeprefix("module."): tensor for name, tensor in value.items()
+            if isinstance(name, str) and isinstance(tensor, _Tensor)
+            } if isinstance(value, dict) else {}
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
