@@ -26,6 +26,10 @@ _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 _MARK = object()
 
 
+class Refused(ValueError):
+    """The pickle is as its writer left it, perhaps, but asks for what is not to be done."""
+
+
 class Named:
     """A name the pickle mentions, with the builder that stands for it."""
 
@@ -40,13 +44,17 @@ class Inert:
         pass
 
 
+_FLAT = (str, int, float, bytes, type(None), Named, Inert)
+
+
 def load(
     file: IO[bytes], names: Mapping[str, Builder], persistent: Builder | None = None
 ) -> Any:
     """The object of the pickle at the file's position, which moves behind it.
 
     names: "module.name" -> what is called in its place. persistent: called with each persistent
-    id. Raises ValueError for other names, unknown instructions and every kind of damage.
+    id. Raises Refused, a ValueError, for other names and unknown instructions, and ValueError for
+    every kind of damage.
     """
     machine = _Machine(names, persistent)
     try:
@@ -59,6 +67,12 @@ def load(
     except (IndexError, KeyError, TypeError, AttributeError, OverflowError, MemoryError) as e:
         raise ValueError(f"the pickle is damaged ({type(e).__name__}: {e})") from e
     raise ValueError("the pickle does not end")
+
+
+def _is_key(value: Any) -> bool:
+    """Tuples in tuples could be nested so deep that hashing them overflows the stack."""
+    return isinstance(value, _FLAT) or (
+        type(value) is tuple and all(isinstance(part, _FLAT) for part in value))
 
 
 class _Machine:
@@ -97,7 +111,7 @@ class _Machine:
 
     def _refuse(self, name: str) -> Builder:
         def refused(_: Any) -> None:
-            raise ValueError(f"the pickle has the instruction {name}, which no weights need")
+            raise Refused(f"the pickle has the instruction {name}, which no weights need")
         return refused
 
     def _pop(self, count: int) -> list[Any]:
@@ -155,9 +169,10 @@ class _Machine:
         target = self.stack[-1]
         if isinstance(target, Inert):
             return
-        # Keys of other kinds could be nested so deep that hashing them overflows the stack.
-        if type(target) is not dict or not all(isinstance(k, str | int) for k in items[::2]):
+        if type(target) is not dict:
             raise ValueError("the pickle sets items of what is no plain dict")
+        if not all(map(_is_key, items[::2])):
+            raise Refused("the pickle has a dict with keys of a kind that no weights need")
         if len(items) % 2:
             raise ValueError("the pickle has a key without a value")
         target.update(zip(items[::2], items[1::2], strict=True))
@@ -173,7 +188,7 @@ class _Machine:
 
     def _name(self, name: str) -> None:
         if name not in self.names:
-            raise ValueError(f"the pickle names {name[:80]!r}, which no weights need: refused")
+            raise Refused(f"the pickle names {name[:80]!r}, which no weights need: refused")
         self.stack.append(Named(name, self.names[name]))
 
     def _do_reduce(self, _: Any) -> None:

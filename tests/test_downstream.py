@@ -176,6 +176,13 @@ def test_split_tensors_count_each_polarity_apart() -> None:
     assert not event_tensor(events.slice(20_000, 30_000), 10, split=True).any()
 
 
+@pytest.mark.parametrize(("bins", "split"), [(0, False), (5.0, False), (1, True), (5, True)])
+def test_bins_that_cannot_be_are_refused(bins, split: bool) -> None:
+    for events in (some_events(), some_events().slice(0, 0)):
+        with pytest.raises(EvflowDataError, match="EV020"):
+            event_tensor(events, bins, split)
+
+
 def test_tensors_of_any_dtype_are_taken() -> None:
     network = FireNet(base=2)
     params = network.init(jax.random.key(0), (8, 12))
@@ -207,6 +214,15 @@ def test_normalised_tensors_have_mean_0_and_deviation_1_where_not_0() -> None:
         some = was != 0
         np.testing.assert_allclose([one[some].mean(), one[some].std()], [0, 1], atol=1e-5)
         assert not one[~some].any()
+
+
+def test_normalised_tensors_have_gradients_without_events_and_of_one() -> None:
+    lone = np.zeros((3, 8, 12, 5), np.float32)
+    lone[1, 2, 3, 4] = 1.0
+    lone[2] = event_tensor(some_events())
+    gradient = jax.grad(lambda tensor: (normalise(tensor) ** 3).sum())(jnp.asarray(lone))
+    assert bool(jnp.isfinite(gradient).all())
+    assert bool(gradient[2].any())
 
 
 def test_each_frame_sees_the_events_since_the_one_before() -> None:

@@ -36,7 +36,7 @@ from evflow.downstream import (
     reconstruct,
     run,
 )
-from evflow.downstream.published import recognise, to_params
+from evflow.downstream.published import _published, join, recognise, to_params
 from evflow.errors import EvflowDataError
 from evflow.types import Events
 from evflow.weights import load_weights
@@ -174,14 +174,26 @@ def test_what_stands_beside_a_network_is_named() -> None:
         to_params(recognise(state), state)
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_all_weights_have_a_published_name(name: str) -> None:
+    state = case_state(name)
+    network = recognise(state)
+    leaves = jax.tree_util.tree_leaves_with_path(to_params(network, state))
+    known = " ".join(state)
+    for path in (join(keys) for keys, _ in leaves):
+        assert any(theirs in known for theirs in _published(network, path).split(" or ")), path
+
+
 @pytest.mark.parametrize(("change", "says"), [
-    (lambda s: s.pop("head.conv2d.bias"), "lack"),
-    (lambda s: s.update({"head.conv2d.bias": np.zeros(3, np.float32)}), "head/conv/bias"),
+    (lambda s: s.pop("head.conv2d.bias"), r"lack head/conv/bias \(head.*head\.conv2d\.bias"),
+    (lambda s: s.pop("G2.out_gate.weight"), r"lack gru_1/out/kernel \(G2\.out_gate\.weight or "),
+    (lambda s: s.update({"head.conv2d.bias": np.zeros(3, np.float32)}),
+     r"head/conv/bias \(head\.conv2d\.bias of \(3,\)"),
     (lambda s: s.update({"extra.weight": np.zeros(3, np.float32)}), "extra.weight"),
     (lambda s: s.update({"G1.reset_gate.running_mean": np.zeros(16, np.float32)}), "no such layer"),
     (lambda s: s.update({"head.conv2d.weight": np.zeros(3, np.float32)}), "kernel"),
     (lambda s: s.clear() or s.update(other=np.zeros(2)), "no known network"),
-], ids=["missing", "shape", "name", "layer", "axes", "foreign"])
+], ids=["missing", "gate", "shape", "name", "layer", "axes", "foreign"])
 def test_weights_that_do_not_fit_are_refused(change, says: str) -> None:
     state = case_state("firenet_plus")
     change(state)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import collections
 import contextlib
 import functools
 import io
@@ -72,6 +74,29 @@ def test_written_files_come_back(write: Any, tmp_path: Path) -> None:
     assert read_checkpoint(tmp_path / "bare.pth").arrays.keys() == state().keys()
 
 
+@writers
+@pytest.mark.parametrize("key", ["model", "model_state_dict", "net", "params"])
+def test_the_one_nested_state_is_taken(write: Any, key: str, tmp_path: Path) -> None:
+    optimiser = {"state": {0: {"exp_avg": np.zeros(2, np.float32)}}}
+    whole = {"rng": np.zeros(9, np.uint8), "epoch": 3, "optimizer": optimiser, key: state()}
+    write(tmp_path / "x.pth", whole)
+    checkpoint = read_checkpoint(tmp_path / "x.pth")
+    assert checkpoint.arrays.keys() == state().keys()
+    assert key not in checkpoint.settings
+    write(tmp_path / "x.pth", {key: state(), "ema": state()})
+    with pytest.raises(EvflowDataError, match=r"EV018.*'ema'"):
+        read_checkpoint(tmp_path / "x.pth")
+
+
+@writers
+@pytest.mark.parametrize("prefix", ["model.", "module.", "module.model."])
+def test_prefixes_of_wrappers_are_cut(write: Any, prefix: str, tmp_path: Path) -> None:
+    write(tmp_path / "x.pth", {prefix + name: array for name, array in state().items()})
+    assert read_checkpoint(tmp_path / "x.pth").arrays.keys() == state().keys()
+    write(tmp_path / "x.pth", {"model.a": state()["a.bias"], "b": state()["a.bias"]})
+    assert read_checkpoint(tmp_path / "x.pth").arrays.keys() == {"model.a", "b"}
+
+
 @pytest.mark.parametrize("kept", [4, 60, 0.5, -30])
 def test_zips_that_lack_their_end_are_damaged(kept: float, tmp_path: Path) -> None:
     write_zip(tmp_path / "x.pth", {"state_dict": state()})
@@ -89,6 +114,29 @@ def test_objects_of_the_training_code_are_dropped(write: Any, tmp_path: Path) ->
     checkpoint = read_checkpoint(tmp_path / "x.pth")
     assert "config" not in checkpoint.settings
     assert len(checkpoint.arrays) == 3
+
+
+@writers
+@pytest.mark.parametrize("beside", [
+    argparse.Namespace(a=1), np.arange(3.0), np.random.RandomState(0).get_state(), np.float64(3.0),
+    {1, 2}, frozenset("ab"), collections.Counter("aba"), collections.defaultdict(list, a=[1]),
+    {0.5: 1, None: 2, (1, "a"): 3, b"c": 4}, 1j], ids=lambda value: type(value).__name__)
+def test_values_beside_weights_are_no_hindrance(write: Any, beside: Any, tmp_path: Path) -> None:
+    as_torch_pickles = Raw(pickle.dumps(beside, 2)[2:-1])
+    write(tmp_path / "x.pth", {"state_dict": state(), "extra": as_torch_pickles,
+                               "dtypes": [Raw(b"ctorch\nfloat32\n"), Raw(b"ctorch\nbfloat16\n")]})
+    assert read_checkpoint(tmp_path / "x.pth").arrays.keys() == state().keys()
+
+
+@writers
+@pytest.mark.parametrize("beside", [
+    Raw(b"ctorch.nn.modules.conv\nConv2d\n)\x81"), Raw(b"}(K\x01\x85\x85K\x01u"), Raw(b"\x8f")],
+    ids=["module", "keys", "instruction"])
+def test_what_is_not_read_is_no_damage(write: Any, beside: Raw, tmp_path: Path) -> None:
+    write(tmp_path / "x.pth", {"state_dict": state(), "extra": beside})
+    with pytest.raises(EvflowDataError, match=r"EV009.*model\.state_dict\(\)") as e:
+        read_checkpoint(tmp_path / "x.pth")
+    assert "again" not in str(e.value)
 
 
 @writers
@@ -115,6 +163,21 @@ def tensor(
                + f"I{count}\ntQI{offset}\n({shape}t({strides}tI00\nNtR".encode())
 
 
+def write_by_hand(path: Path, value: Raw) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a/data.pkl", pickled({"w": value}, [], legacy=False))
+        archive.writestr("a/data/0", np.arange(4, dtype=np.float32).tobytes())
+
+
+@pytest.mark.parametrize(("value", "expected"), [
+    (tensor("I3\nI4\n", "I0\nI1\n"), [[0, 1, 2, 3]] * 3),
+    (tensor("I6\n", "I0\n", offset=2), [2] * 6),
+    (tensor("I3\nI2\n", "I1\nI1\n"), [[0, 1], [1, 2], [2, 3]])], ids=["rows", "one", "windows"])
+def test_tensors_may_show_an_element_repeatedly(value: Raw, expected: list, tmp_path: Path) -> None:
+    write_by_hand(tmp_path / "x.pt", value)
+    np.testing.assert_array_equal(read_checkpoint(tmp_path / "x.pt").arrays["w"], expected)
+
+
 @pytest.mark.parametrize("bad", [
     tensor("I5\n", "I1\n"), tensor("I4\n", "I2\n"), tensor("I4\n", "I1\n", offset=1),
     tensor("I-1\n", "I1\n"), tensor("I2\n", "I-1\n", offset=2), tensor("I4\n", "I1\nI1\n"),
@@ -123,9 +186,7 @@ def tensor(
 ], ids=["long", "strides", "offset", "negative", "backwards", "axes", "expanded", "deep", "claim",
         "kind"])
 def test_tensors_outside_of_their_storage_are_refused(bad: Raw, tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "x.pt", "w") as archive:
-        archive.writestr("a/data.pkl", pickled({"w": bad}, [], legacy=False))
-        archive.writestr("a/data/0", np.zeros(4, np.float32).tobytes())
+    write_by_hand(tmp_path / "x.pt", bad)
     with pytest.raises(EvflowDataError) as e:
         read_checkpoint(tmp_path / "x.pt")
     assert e.value.code == "EV009"

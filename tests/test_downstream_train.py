@@ -240,6 +240,7 @@ def test_steps_learn_a_batch_and_repeat_themselves(network) -> None:
 @pytest.mark.parametrize("make", [
     lambda: SequenceConfig(windows=1), lambda: SequenceConfig(pause=2.0),
     lambda: SequenceConfig(window_s=0.0), lambda: LearningConfig(rate=-1.0),
+    lambda: LearningConfig(rate=np.nan), lambda: LearningConfig(clip=np.inf),
     lambda: LearningConfig(data=DATA, skip=3),
     lambda: make_step(EVFlowNet(base=2, scales=4), LearningConfig(SequenceConfig(crop=24)),
                       optimiser(LearningConfig())),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -57,13 +58,26 @@ def test_events_of_one_instant_make_no_window() -> None:
 
 @pytest.mark.parametrize(("code", "options"), [
     ("EV011", {"sync": "frames"}), ("EV020", {"sync": "events", "count": 0}),
-    ("EV020", {"sync": "ms", "window_us": 0})])
+    ("EV020", {"sync": "ms", "window_us": 0}), ("EV020", {"sync": "often"}),
+    ("EV020", {"sync": "ms", "window_us": 33_000.0}),
+    ("EV020", {"sync": "ms", "window_us": np.nan}), ("EV020", {"sync": "events", "count": 100.0})])
 def test_windows_that_cannot_be_are_refused(code: str, options: dict) -> None:
     bare = Recording.of_events(make().events)
     with pytest.raises(EvflowDataError, match=code):
         sync_times(bare, **options)
     with pytest.raises(EvflowDataError, match="EV001"):
         sync_times(Recording.of_events(bare.events.slice(0, 0)))
+    with pytest.raises(EvflowDataError, match="EV001"):
+        window_edges(Recording.of_events(bare.events.slice(0, 0)), np.array([1]))
+    with pytest.raises(EvflowDataError, match="EV001"):
+        window_edges(bare, np.zeros(0, np.int64))
+
+
+def test_a_clock_that_jumps_takes_no_memory() -> None:
+    unix = 1_700_000_000_000_000
+    jump = Events([1, 2], [1, 2], [0, unix], [True, False], (64, 48))
+    with pytest.raises(EvflowDataError, match=r"EV026.*1,700,000,000,000,000 us.*33,000 us"):
+        sync_times(Recording.of_events(jump))
 
 
 def test_a_saved_network_comes_back_whole(tmp_path: Path) -> None:
@@ -85,6 +99,14 @@ def test_other_files_are_no_networks(tmp_path: Path) -> None:
     wrong = {**trained.params, "prediction": {"conv": {"bias": jnp.zeros(3)}}}
     path = released.save_network(tmp_path / "w.safetensors", trained.network, wrong, {})
     with pytest.raises(EvflowDataError, match="EV018"):
+        load_network(path)
+
+
+def test_weights_that_are_not_finite_are_no_network(tmp_path: Path) -> None:
+    trained = even()
+    broken = jax.tree.map(lambda leaf: leaf.at[..., 0].set(jnp.nan), trained.params)
+    path = saved(tmp_path, dataclasses.replace(trained, params=broken))
+    with pytest.raises(EvflowDataError, match=r"EV007.*is not all finite"):
         load_network(path)
 
 

@@ -95,6 +95,25 @@ def test_padding_weighs_nothing() -> None:
                                metrics.rsat(*edge(), constant(9.0)), rtol=1e-5)
 
 
+@pytest.mark.parametrize("score", [metrics.fwl, metrics.rsat, metrics.warped_image])
+def test_events_and_flow_that_do_not_fit_are_refused(score: Callable) -> None:
+    x, y, t, p, weight = edge(n=50)
+    flow = constant(3.0)
+    for columns, of in (((x, y, t, p, weight), jnp.moveaxis(flow, 0, -1)),
+                        ((x, y, t, p, weight), flow[0]), ((x[:-1], y, t, p, weight), flow),
+                        ((x, y, t, p[:1], weight), flow), ((x, y, t[None], p, weight), flow)):
+        with pytest.raises(EvflowDataError, match="EV002"):
+            score(*columns, of)
+    as_lists = score(*(column.tolist() for column in (x, y, t, p, weight)), flow.tolist())
+    np.testing.assert_allclose(as_lists, score(x, y, t, p, weight, flow), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("score", [metrics.fwl, metrics.warped_image])
+def test_a_convention_is_no_word(score: Callable) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*'round'"):
+        score(*edge(n=50), constant(3.0), "round")
+
+
 def test_votes_are_kept_inside_and_lost_outside() -> None:
     rng = np.random.default_rng(1)
     x, y = (jnp.asarray(rng.uniform(0, n - 1, 300), jnp.float32) for n in SIZE)
@@ -189,11 +208,23 @@ def test_scores_say_how_they_were_made() -> None:
     np.testing.assert_allclose([off["aee"], off["outlier_percent"]], [6.0, 100.0], rtol=1e-5)
 
 
+def test_windows_without_events_have_no_score() -> None:
+    flow = np.zeros((1, 2, *SIZE[::-1]), np.float32)
+    silence = metrics.score_flow(recorded(), np.array([60_000, 70_000]), flow, truth=flow)
+    assert silence["windows"] == 0
+    for name in ("fwl", "rsat", "aee", "outlier_percent", "fwl_truth"):
+        assert silence[name] is None
+    assert "aee" not in metrics.score_flow(recorded(), np.array([60_000, 70_000]), flow)
+
+
 @pytest.mark.parametrize(("call", "code"), [
     (lambda e, f: metrics.score_flow(e, np.array([0, 1]), f), "EV002"),
     (lambda e, f: metrics.score_flow(e, np.array([0, 5, 5]), f), "EV004"),
     (lambda e, f: metrics.score_flow(e, np.array([0, 5, 9]), f, truth=f[:1]), "EV002"),
     (lambda e, f: metrics.score_flow(e, np.array([0, 5, 9]), f, valid=f > 0), "EV002"),
+    (lambda e, f: metrics.endpoint_error(f, f[..., :-1]), "EV002"),
+    (lambda e, f: metrics.endpoint_error(f, f[[0, 0, 0]]), "EV002"),
+    (lambda e, f: metrics.endpoint_error(f[0, 0], f[0, 0]), "EV002"),
     (lambda e, f: FwlConvention(splat="cubic"), "EV020"),
     (lambda e, f: FwlConvention(blur=-1.0), "EV020"),
 ])

@@ -124,12 +124,35 @@ def test_metrics_are_differentiable_and_follow_the_type() -> None:
     (lambda a, b: metrics.log_map((255 * a).astype(np.uint8)), "EV003"),
     (lambda a, b: metrics.lpips({}, (255 * a).astype(np.uint8), b), "EV003"),
     (lambda a, b: metrics.lpips({}, a[0], b[0]), "EV002"),
+    (lambda a, b: metrics.mse(np.stack([a] * 3), np.stack([b] * 4)), "EV002"),
+    (lambda a, b: metrics.psnr(np.stack([a] * 3), np.stack([b] * 4)), "EV002"),
+    (lambda a, b: metrics.ssim(np.stack([a] * 3), np.stack([b] * 4)), "EV002"),
+    (lambda a, b: metrics.mse([[0.5], [0.5, 0.5]], b), "EV002"),
+    (lambda a, b: metrics.mse([[1, 2]], b), "EV003"),
+    (lambda a, b: metrics.mae_intensity_change(a, b[:, :-1]), "EV002"),
+    (lambda a, b: metrics.lpips({}, np.stack([a] * 4, -1), np.stack([b] * 4, -1), colour=True),
+     "EV002"),
+    (lambda a, b: metrics.lpips({}, a, b, colour=True), "EV002"),
     (lambda a, b: ImageProtocol(aggregate="median"), "EV020"),
     (lambda a, b: ImageProtocol(domain="sqrt"), "EV020"),
+    (lambda a, b: ImageProtocol(domain="log", clip=False), "EV020"),
+    (lambda a, b: ImageProtocol(clip="no"), "EV020"),
+    (lambda a, b: metrics.frame_scores((255 * a).astype(np.uint8), b, PROTOCOLS["evreal"]),
+     "EV003"),
+    (lambda a, b: metrics.frame_scores(a, b, "mine"), "EV020"),
 ])
 def test_what_cannot_be_scored_is_refused(call, code: str) -> None:
     with pytest.raises(EvflowDataError, match=code):
         call(*pair())
+
+
+def test_lists_are_images_and_one_reference_serves_several() -> None:
+    image, reference = pair((3, 40, 53))
+    for measure in (metrics.mse, metrics.ssim, metrics.mae_intensity_change):
+        np.testing.assert_allclose(measure(image.tolist(), reference.tolist()),
+                                   measure(image, reference), rtol=1e-5)
+        np.testing.assert_allclose(measure(image, reference[:1])[0],
+                                   measure(image[0], reference[0]), rtol=1e-5)
 
 
 def test_log_map_goes_from_0_to_1_and_lifts_the_dark() -> None:
@@ -171,6 +194,9 @@ def test_protocols_clip_or_not_and_map_or_not() -> None:
     np.testing.assert_allclose(log["mse"], float(mapped.mean()), rtol=1e-5)
     same = metrics.score_images({"x": (reference, reference)})
     assert same["psnr"] is None
+    by_name = metrics.frame_scores(image, reference, "etnet")
+    np.testing.assert_array_equal(
+        by_name["ssim"], metrics.frame_scores(image, reference, PROTOCOLS["etnet"])["ssim"])
     assert PROTOCOLS["etnet"].aggregate == "sequences"
 
 

@@ -6,8 +6,10 @@ skips) is read off the arrays, so that networks of other sizes trained by the sa
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -130,21 +132,23 @@ def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network
 
 def to_params(network: Network, arrays: Arrays) -> Params:
     """The state dict as params of `network`; EV018 where a name or a shape does not fit."""
-    expected = {_join(keys): leaf.shape for keys, leaf in jax.tree_util.tree_leaves_with_path(
+    expected = {join(keys): leaf.shape for keys, leaf in jax.tree_util.tree_leaves_with_path(
         jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16))))}
-    found = {}
+    found, own = {}, {}
     for name, array in _stripped(arrays).items():
         if not name.endswith(".num_batches_tracked"):
             path, value = _renamed(network, name, array)
             found[path] = value
+            own[path] = next(p + name for p in ("", *PREFIXES) if p + name in arrays)
     if missing := sorted(expected.keys() - found.keys()):
-        raise EvflowDataError("EV018", f"the weights of {_called(network)} lack {missing[:3]}.")
+        said = ", ".join(f"{path} ({_published(network, path)})" for path in missing[:3])
+        raise EvflowDataError("EV018", f"the weights of {_called(network)} lack {said}.")
     params: Params = {}
     for path, value in found.items():
         if expected.get(path) != value.shape:
             raise EvflowDataError(
-                "EV018", f"{path} is {value.shape}; {_called(network)} has "
-                f"{expected.get(path, 'no such layer')}.")
+                "EV018", f"{path} ({own[path]} of {arrays[own[path]].shape}) is {value.shape}; "
+                f"{_called(network)} has {expected.get(path, 'no such layer')}.")
         *parents, leaf = path.split("/")
         node = params
         for part in parents:
@@ -160,16 +164,9 @@ def to_params(network: Network, arrays: Arrays) -> Params:
 def _renamed(network: Network, name: str, array: np.ndarray) -> tuple[str, np.ndarray]:
     """Our path and layout of one published array."""
     module, _, leaf = name.rpartition(".")
-    for pattern, ours in RULES[_called(network)]:
-        match = re.fullmatch(pattern, module)
-        if match and leaf in LEAVES:
-            path = match.expand(ours).replace("half1", "first").replace("half2", "second")
-            break
-    else:
+    path = _layer(network, module)
+    if path is None or leaf not in LEAVES:
         raise EvflowDataError("EV018", f"{_called(network)} has nothing called {name[:80]!r}.")
-    if path.startswith("decoder") and path.endswith("/norm"):
-        path = path if getattr(network, "decoder", "") == "transposed" else path.replace(
-            "/norm", "/layer/norm")
     if leaf == "weight" and array.ndim == 1:
         return f"{path}/scale", array
     if leaf == "weight" and array.ndim == 4:
@@ -177,6 +174,41 @@ def _renamed(network: Network, name: str, array: np.ndarray) -> tuple[str, np.nd
             return f"{path}/kernel", array[:, :, ::-1, ::-1].transpose(2, 3, 0, 1)
         return f"{path}/kernel", array.transpose(2, 3, 1, 0)
     return f"{path}/{LEAVES[leaf]}", array
+
+
+def _layer(network: Network, module: str) -> str | None:
+    """Our path of a published module; None where there is none."""
+    for pattern, ours in RULES[_called(network)]:
+        if match := re.fullmatch(pattern, module):
+            path = match.expand(ours).replace("half1", "first").replace("half2", "second")
+            if path.startswith("decoder") and path.endswith("/norm"):
+                path = path if getattr(network, "decoder", "") == "transposed" else path.replace(
+                    "/norm", "/layer/norm")
+            return path
+    return None
+
+
+def _published(network: Network, path: str) -> str:
+    """What published files call the weights at our path."""
+    layer, _, ours = path.rpartition("/")
+    leaf = next((theirs for theirs, name in LEAVES.items() if name == ours), "weight")
+    modules = [module for pattern, _ in RULES[_called(network)] for module in _spelled(pattern)
+               if _layer(network, module) == layer]
+    return " or ".join(f"{module}.{leaf}" for module in modules)
+
+
+def _spelled(pattern: str) -> list[str]:
+    """All names that the pattern of a rule fits: its groups are digits, or words to choose from."""
+    choices: list[Iterable[str]] = []
+    for part in re.split(r"(\(.*?\)\??)", pattern):
+        if part.endswith(")?"):
+            choices.append((part[3:-2], ""))
+        elif part.startswith("("):
+            words = {r"\d": "0|1|2|3|4|5|6|7|8|9", "[12]": "1|2"}.get(part[1:-1], part[1:-1])
+            choices.append(words.split("|"))
+        else:
+            choices.append([part])
+    return ["".join(chosen).replace("\\", "") for chosen in itertools.product(*choices)]
 
 
 def _stripped(arrays: Arrays) -> Arrays:
@@ -199,5 +231,6 @@ def _called(network: Network) -> str:
     return type(network).__name__
 
 
-def _join(keys: Any) -> str:
+def join(keys: Any) -> str:
+    """The path of a leaf of params."""
     return "/".join(str(k.key) for k in keys)

@@ -14,10 +14,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from evflow.downstream.network import Network, Params
 from evflow.downstream.presets import KINDS
-from evflow.downstream.published import SPLIT_BINS, read_published
+from evflow.downstream.published import SPLIT_BINS, join, read_published
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card, save_weights, weights_path
 
@@ -56,7 +57,8 @@ def save_network(
 def load_network(name_or_path: str | os.PathLike) -> Trained:
     """A released network by name, one of `save_network`, or a published checkpoint by path.
 
-    Raises EV016 (no such file), EV009 (damaged), EV018 (the file is of something else).
+    Raises EV016 (no such file), EV009 (damaged), EV018 (the file is of something else), EV007
+    (weights that are not finite).
     """
     path = Path(name_or_path)
     if path.suffix in PUBLISHED or (path.is_file() and path.suffix != ".safetensors"):
@@ -77,6 +79,10 @@ def load_network(name_or_path: str | os.PathLike) -> Trained:
     expected = jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16)))
     if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
         raise EvflowDataError("EV018", f"{file}: the parameters are not those of {network}.")
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not np.isfinite(np.asarray(leaf)).all():
+            raise EvflowDataError("EV007", f"{file}: {join(keys)} is not all finite.",
+                                  "A training that diverged? Take an earlier checkpoint.")
     return Trained(network, params, bool(card.get("normalised")), card)
 
 

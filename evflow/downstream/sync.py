@@ -3,7 +3,7 @@ equal intervals."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -14,6 +14,7 @@ Sync = Literal["auto", "frames", "events", "ms"]
 
 PER_PIXEL = 0.35  # events a pixel in a window, what E2VID was published with
 WINDOW_US = 33_000
+MOST_WINDOWS = 10_000_000  # four days of them; a clock that jumps to Unix time makes 5e10
 
 
 def sync_times(
@@ -25,8 +26,11 @@ def sync_times(
     the end and fills no window is left out, but one window there always is.
 
     auto: the frames, where there are two or more, else equal intervals.
-    Raises EV001 (no events), EV011 (no frames to follow), EV020.
+    Raises EV001 (no events), EV011 (no frames to follow), EV020 (another sync, a count or length
+    that is no whole number of 1 or more), EV026 (more than 10 million windows of equal length).
     """
+    if sync not in (choices := get_args(Sync)):
+        raise EvflowDataError("EV020", f"sync {sync!r}.", f"Choose one of {choices}.")
     t = recording.events.t
     if not len(t):
         raise EvflowDataError("EV001", "the recording has no events.")
@@ -40,20 +44,35 @@ def sync_times(
     if sync == "events":
         width, height = recording.events.size
         count = max(1, round(PER_PIXEL * width * height)) if count is None else count
-        if count < 1:
-            raise EvflowDataError("EV020", f"{count} events a window.", "Give one or more.")
+        if not _counts(count):
+            raise EvflowDataError("EV020", f"{count!r} events a window.",
+                                  "Give a whole number, one or more.")
         # Two windows can end within one microsecond: they are one.
         return np.unique(t[count - 1::count] if count <= len(t) else t[-1:])
-    if window_us < 1:
-        raise EvflowDataError("EV020", f"windows of {window_us} us.", "Give 1 us or more.")
-    windows = max(1, int(t[-1] - t[0]) // window_us)
+    if not _counts(window_us):
+        raise EvflowDataError("EV020", f"windows of {window_us!r} us.",
+                              "Give whole microseconds, 1 or more.")
+    span = int(t[-1]) - int(t[0])
+    windows = max(1, span // window_us)
+    if windows > MOST_WINDOWS:
+        raise EvflowDataError(
+            "EV026", f"events from {t[0]:,} to {t[-1]:,} us, {windows:,} windows of "
+            f"{window_us:,} us.", "Does the clock jump (read the parts alone: --start, --stop), or "
+            "is the time unit wrong (--time-unit)?")
     return t[0] + window_us * np.arange(1, windows + 1)
+
+
+def _counts(value: object) -> bool:
+    return isinstance(value, int | np.integer) and int(value) >= 1
 
 
 def window_edges(recording: Recording, times: np.ndarray) -> np.ndarray:
     """The edges (T + 1,) int64 of the windows that end at times (T,): the first begins with the
     first event; a time that is not after it ends no window. Where none is, EV012 of frames and
-    EV017 of events."""
+    EV017 of events; EV001 without events or times."""
+    if not len(recording.events) or not len(times):
+        what = "times to end windows" if len(recording.events) else "events"
+        raise EvflowDataError("EV001", f"there are no {what}.")
     start = recording.events.t[0]
     after = times[times > start]
     if not len(after) and times is not recording.frame_times:

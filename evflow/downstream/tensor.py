@@ -25,7 +25,13 @@ BINS = 5
 
 def event_tensor(events: Events, bins: int = BINS, split: bool = False) -> np.ndarray:
     """Events of one window -> float32 (H, W, bins); zeros where there are none. split: ON events
-    are counted in the first half of the bins, OFF events in the other."""
+    are counted in the first half of the bins, OFF events in the other.
+
+    Raises EV020 for fewer bins than 1, or with split for bins that have no halves."""
+    if not isinstance(bins, int | np.integer) or bins < 1 or (split and bins % 2):
+        raise EvflowDataError("EV020", f"{bins!r} bins{' to split' if split else ''}.",
+                              "Give an even number, 2 or more." if split
+                              else "Give a whole number, 1 or more.")
     width, height = events.size
     if not len(events):
         return np.zeros((height, width, bins), np.float32)
@@ -58,7 +64,9 @@ def normalise(tensor: Array) -> Array:
     count = jnp.maximum(some.sum(axes, keepdims=True), 1.0)
     off_mean = some * (tensor - tensor.sum(axes, keepdims=True) / count)
     variance = (off_mean**2).sum(axes, keepdims=True) / count
-    return off_mean * jnp.where(variance > 0, jax.lax.rsqrt(jnp.maximum(variance, 1e-30)), 0.0)
+    varies = variance > 1e-30
+    # The root is taken of 1 where it is not used: its gradient at 0 would make all of them NaN.
+    return off_mean * jnp.where(varies, jax.lax.rsqrt(jnp.where(varies, variance, 1.0)), 0.0)
 
 
 def windows_between(times_us: np.ndarray, frame_times_us: np.ndarray) -> list[slice]:

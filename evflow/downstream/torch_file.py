@@ -27,6 +27,7 @@ MAGIC = 0x1950A86A20F9469CFC6C  # of the chain of pickles
 PROTOCOL = 1001
 MOST_BYTES = 2**31  # E2VID with its optimiser takes 128 MB
 MOST_AXES = 8
+MOST_EXPANDED = 1 << 24  # elements of a tensor that shows those of its storage repeatedly
 STORAGES = {
     "Float": "<f4", "Double": "<f8", "Half": "<f2", "Long": "<i8", "Int": "<i4", "Short": "<i2",
     "Char": "i1", "Byte": "u1", "Bool": "?", "BFloat16": "<u2",
@@ -35,8 +36,15 @@ STORAGES = {
 DROPPED = (
     "parse_config.ConfigParser", "pathlib.PosixPath", "pathlib.PurePosixPath",
     "pathlib.WindowsPath", "pathlib.PureWindowsPath", "pathlib._local.PosixPath",
-    "builtins.object", "__builtin__.object", "torch.device", "torch.Size", "_codecs.encode",
-    "numpy.dtype", "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar",
+    "torch.device", "torch.Size", "_codecs.encode", "argparse.Namespace",
+    "collections.Counter", "collections.defaultdict", "numpy.ndarray", "numpy.dtype",
+    *(f"numpy.{core}.multiarray.{name}" for core in ("core", "_core")
+      for name in ("scalar", "_reconstruct")),
+    *(f"{module}.{name}" for module in ("builtins", "__builtin__")
+      for name in ("object", "set", "frozenset", "list", "dict", "int", "float", "complex")),
+    *(f"torch.{name}" for name in (
+        "float16", "bfloat16", "float32", "float64", "complex64", "complex128", "bool", "uint8",
+        "int8", "int16", "int32", "int64")),
 )
 
 
@@ -69,7 +77,8 @@ class Checkpoint:
 
 
 def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
-    """Weights from a file of torch.save: its "state_dict", or the dict itself.
+    """Weights from a file of torch.save: its "state_dict", else the one dict in it that holds
+    tensors, else the dict itself. Prefixes "module." and, where all have it, "model." are cut.
 
     Raises EV016 (no file), EV008 (not a PyTorch file), EV009 (damaged, or it holds what no
     checkpoint needs), EV018 (no weights in it), EV020 (larger than 2 GiB).
@@ -84,6 +93,10 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
         read = _read_zip if is_zip(path) else _read_chain
         content, storages = read(path)
         return _checkpoint(path, content, storages)
+    except pickles.Refused as e:
+        raise EvflowDataError(
+            "EV009", f"{path}: {e}.", "Nothing but weights is read. Where the file does load, save "
+            "them alone: torch.save(model.state_dict(), 'weights.pth').") from e
     except (ValueError, struct.error) as e:
         raise EvflowDataError(
             "EV009", f"{path}: {e}.",
@@ -130,25 +143,26 @@ def _read_storages(f: IO[bytes], keys: Any, needed: dict[str, _Storage]) -> dict
 
 
 def _read_zip(path: Path) -> tuple[Any, dict[str, bytes]]:
-    """The members data.pkl and data/<key> of the archive's one folder."""
+    """The members data.pkl and data/<key> of the archive's one folder. What the pickle asks for is
+    judged outside of `unzipped`, to which all that is wrong is damage."""
     with unzipped(path) as archive:
-        members = {info.filename: info for info in archive.infolist()}
+        members = set(archive.namelist())
         roots = [n.removesuffix("data.pkl") for n in members if n.endswith("/data.pkl")]
         if len(roots) != 1:
             raise EvflowDataError("EV008", f"{path} is a zip, but not one of torch.save.")
         root = roots[0]
-        order = root + "byteorder"
-        if order in members and archive.read(order) != b"little":
-            raise ValueError("it was written on a big-endian machine")
-        needed: dict[str, _Storage] = {}
         pickle = io.BytesIO(archive.read(root + "data.pkl"))
-        content = pickles.load(pickle, _names(), functools.partial(_refer, needed))
-        names = {key: f"{root}data/{key}" for key in needed}
-        missing = [name for name in names.values() if name not in members]
-        if missing:
-            raise ValueError(f"it lacks {missing[0][:80]}")
-        found = {key: archive.read(members[name]) for key, name in names.items()}
-    return content, found
+        order = archive.read(root + "byteorder") if root + "byteorder" in members else b"little"
+    if order != b"little":
+        raise ValueError("it was written on a big-endian machine")
+    needed: dict[str, _Storage] = {}
+    content = pickles.load(pickle, _names(), functools.partial(_refer, needed))
+    names = {key: f"{root}data/{key}" for key in needed}
+    missing = [name for name in names.values() if name not in members]
+    if missing:
+        raise ValueError(f"it lacks {missing[0][:80]}")
+    with unzipped(path) as archive:
+        return content, {key: archive.read(name) for key, name in names.items()}
 
 
 def _names() -> dict[str, pickles.Builder]:
@@ -196,8 +210,10 @@ def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Te
         raise ValueError("a tensor is described in an unknown way")
     last = offset + sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
     size = math.prod(shape)
-    if size > storage.count or (size and last >= storage.count):
+    if size and last >= storage.count:
         raise ValueError(f"a tensor {shape} lies outside of its storage of {storage.count}")
+    if size > max(storage.count, MOST_EXPANDED):  # a few bytes would fill the memory
+        raise ValueError(f"a tensor {shape} repeats a storage of {storage.count}")
     return _Tensor(storage, offset, shape, strides)
 
 
@@ -211,20 +227,28 @@ def _bytes_of(storage: _Storage) -> int:
 
 def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpoint:
     content = content if isinstance(content, dict) else {}
-    state = content.get("state_dict", content)
-    tensors = {name.removeprefix("module."): value for name, value in state.items()
-               if isinstance(name, str) and isinstance(value, _Tensor)
-               } if isinstance(state, dict) else {}
+    nested = [key for key, value in content.items() if _tensors(value)]
+    key = "state_dict" if "state_dict" in content or len(nested) != 1 else nested[0]
+    tensors = _tensors(content.get(key, content))
+    if tensors and all(name.startswith("model.") for name in tensors):
+        tensors = {name.removeprefix("model."): value for name, value in tensors.items()}
     if not tensors:
         raise EvflowDataError(
             "EV018", f"{path} holds no weights, but {sorted(map(str, content))[:8]}.",
-            "Expected a state dict, or a dict with one under 'state_dict'.")
+            "Expected a state dict, or a dict with one under 'state_dict'; or with only one.")
     if sum(8 * math.prod(t.shape) for t in tensors.values()) > 2 * MOST_BYTES:
         raise ValueError("its tensors are more than its storages")
     arrays = {name: _array(tensor, storages[tensor.storage.key])
               for name, tensor in tensors.items()}
-    settings = {key: _plain(value) for key, value in content.items() if key != "state_dict"}
+    settings = {k: _plain(value) for k, value in content.items() if k != key}
     return Checkpoint(arrays, {str(k): v for k, v in settings.items() if v is not None})
+
+
+def _tensors(value: Any) -> dict[str, _Tensor]:
+    """The named tensors of a dict."""
+    return {name.removeprefix("module."): tensor for name, tensor in value.items()
+            if isinstance(name, str) and isinstance(tensor, _Tensor)
+            } if isinstance(value, dict) else {}
 
 
 def _plain(value: Any, depth: int = 0) -> Any:

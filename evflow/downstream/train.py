@@ -10,6 +10,7 @@ uninterrupted one. Nothing touches the disk.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -51,9 +52,9 @@ class LearningConfig:
         least = {"steps": 1, "warmup": 0, "rate": 0.0, "clip": 0.0, "temporal": 0.0, "skip": 0,
                  "elsewhere": 0.0}
         for name, bound in least.items():
-            if getattr(self, name) < bound:
+            if not bound <= getattr(self, name) < math.inf:  # NaN is below nothing
                 raise EvflowDataError("EV020", f"LearningConfig({name}={getattr(self, name)!r}).",
-                                      f"It must be >= {bound}.")
+                                      f"It must be >= {bound}, and finite.")
         if self.skip + 2 > self.data.windows:
             raise EvflowDataError("EV020", f"skip={self.skip} of {self.data.windows} windows.",
                                   "Temporal consistency needs two images after those skipped.")

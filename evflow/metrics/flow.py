@@ -17,6 +17,7 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 
 from evflow.errors import EvflowDataError
+from evflow.metrics.image import as_array, pair_up
 
 Array = jax.Array
 
@@ -65,7 +66,9 @@ def fwl(
 
     x, y, t: (N,), also between pixels, of any dtype and origin; p: (N,) bool or sign; weight: (N,)
     1, or 0 for padding; flow: (2, H, W) px per unit of t.
+    Raises EV002 (shapes), EV020 (a convention that is none), as `warped_image` and `rsat` do.
     """
+    flow = _flow(flow)
     warped = warped_image(x, y, t, p, weight, flow, convention)
     still = warped_image(x, y, t, p, weight, jnp.zeros_like(flow), convention)
     return jnp.var(warped) / jnp.var(still)
@@ -77,8 +80,10 @@ def warped_image(
 ) -> Array:
     """Image (H, W) of the events transported along the flow at their pixels, read bilinearly:
     x' = x + (t_ref - t) v(x, y). What leaves the image is lost. Arguments as of `fwl`."""
+    if not isinstance(convention, FwlConvention):
+        raise EvflowDataError("EV020", f"convention {convention!r}.", "Give an FwlConvention.")
     x, y, t, p, weight = _columns(x, y, t, p, weight)
-    flow = jnp.asarray(flow)
+    flow = _flow(flow)
     warped_x, warped_y, _ = _transported(x, y, t, weight, flow, convention.reference)
     if convention.polarity == "signed":
         weight = weight * jnp.where(p > 0, 1.0, -1.0).astype(weight.dtype)
@@ -91,8 +96,16 @@ def rsat(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Array) -> 
     """Ratio of the squared average timestamps, warped to unwarped, per polarity and active pixel;
     below 1 where the flow is better than none (Hagenaars et al., NeurIPS 2021). Arguments as of
     `fwl`; unlike it, it is not won by flow that collapses all events."""
-    columns, flow = _columns(x, y, t, p, weight), jnp.asarray(flow)
+    columns, flow = _columns(x, y, t, p, weight), _flow(flow)
     return _timestamps(*columns, flow) / _timestamps(*columns, jnp.zeros_like(flow))
+
+
+def _flow(flow: Any) -> Array:
+    flow = jnp.asarray(as_array(flow))
+    if flow.ndim != 3 or flow.shape[0] != 2:
+        raise EvflowDataError("EV002", f"flow is {flow.shape}.",
+                              "Expected (2, H, W); vmap takes several.")
+    return flow
 
 
 def _columns(
@@ -100,6 +113,11 @@ def _columns(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Events as floats, but for p. Times of NumPy count from the first event: an epoch's seconds
     would be rounded to minutes."""
+    x, y, t, p, weight = map(as_array, (x, y, t, p, weight))
+    shapes = [a.shape for a in (x, y, t, p, weight)]
+    if t.ndim != 1 or len(set(shapes)) > 1:
+        raise EvflowDataError("EV002", f"x, y, t, p, weight are {', '.join(map(str, shapes))}.",
+                              "Expected five of (N,); vmap takes several windows.")
     if isinstance(t, np.ndarray) and t.size:
         real = np.asarray(weight, bool) if isinstance(weight, np.ndarray) else np.ones(len(t), bool)
         t = t - t[real].min() if real.any() else t
@@ -172,7 +190,12 @@ def _gaussian_blur(image: Array, sigma: float) -> Array:
 
 
 def endpoint_error(flow: Array, truth: Array) -> Array:
-    """|flow - truth| of (..., 2, H, W): (..., H, W), px."""
+    """|flow - truth| of (..., 2, H, W): (..., H, W), px. Raises EV002."""
+    flow, truth = as_array(flow), as_array(truth)
+    if flow.ndim < 3 or flow.shape[-3] != 2 or flow.shape[-3:] != truth.shape[-3:] or not pair_up(
+            flow, truth):
+        raise EvflowDataError("EV002", f"flow is {flow.shape}, truth {truth.shape}.",
+                              "Expected two of (..., 2, H, W).")
     square = jnp.sum((flow - truth) ** 2, -3)
     still = square == 0  # where the root has no gradient; NaN stays NaN
     return jnp.where(still, 0.0, jnp.sqrt(jnp.where(still, 1.0, square)))

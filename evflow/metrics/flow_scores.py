@@ -24,6 +24,7 @@ Array = jax.Array
 EventArrays = tuple[Array, Array, Array, Array, Array]  # x, y, t, p, weight; (N,) each
 
 OUTLIER_PX = 3.0
+NAMES, OF_TRUTH = ("fwl", "rsat"), ("aee", "outlier_percent", "fwl_truth")
 
 
 def score_flow(
@@ -58,7 +59,7 @@ def score_flow(
             arrays = _padded(part, int(edges[i]), int(edges[i + 1]), length)
             rows.append(_window(arrays, flows[i], None if truth is None else truth[i],
                                 None if valid is None else valid[i], convention))
-    names = rows[0].keys() if rows else ()
+    names = NAMES if truth is None else NAMES + OF_TRUTH  # a silent recording has them too
     means = {name: _mean([float(row[name]) for row in rows]) for name in names}
     return {"convention": convention.as_dict(), "outlier_px": OUTLIER_PX, "windows": len(rows),
             "window_ms": float(np.diff(edges).mean() * 1e-3),

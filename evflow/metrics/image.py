@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -53,30 +54,53 @@ def least_side(preset: str) -> int:
     return max(len(SSIM[preset].window), 2)
 
 
-def check_images(*images: Array) -> None:
-    """EV003 for images of integers, EV002 for what is no image and for two of different sizes."""
-    for image in images:
+def check_images(*images: Any) -> list[Array]:
+    """The images as arrays; EV003 for those of integers, EV002 for what is no image and for two of
+    different sizes, or of numbers that cannot be paired."""
+    arrays = [check_floats(image) for image in images]
+    for image in arrays:
         if image.ndim < 2:
             raise EvflowDataError("EV002", f"an image of shape {image.shape}.",
                                   "Expected (..., H, W).")
-        check_floats(image)
-    if len({image.shape[-2:] for image in images}) > 1:
+    if len({image.shape[-2:] for image in arrays}) > 1 or not pair_up(*arrays):
         raise EvflowDataError(
-            "EV002", f"images of different shapes: {', '.join(str(i.shape) for i in images)}.",
-            "Expected (..., H, W) of one size; resize one of them.")
+            "EV002", f"images of different shapes: {', '.join(str(i.shape) for i in arrays)}.",
+            "Expected (..., H, W) of one size and one number; resize or repeat one of them.")
+    return arrays
 
 
-def check_floats(image: Array) -> None:
-    """EV003 for integers."""
+def check_floats(image: Any) -> Array:
+    """A list as an array, an array as it is; EV003 for integers, EV002 for ragged lists."""
+    image = as_array(image)
     if not jnp.issubdtype(image.dtype, jnp.floating):
         raise EvflowDataError("EV003", f"an image of {image.dtype}.",
                               "Expected floats on [0, 1]: divide bytes by 255.")
+    return image
+
+
+def as_array(values: Any) -> Array:
+    """Arrays of JAX and NumPy as they are, with their precision; EV002 for what is none."""
+    if hasattr(values, "dtype"):
+        return values
+    try:
+        return jnp.asarray(values)
+    except (TypeError, ValueError) as e:
+        raise EvflowDataError("EV002", f"a {type(values).__name__} that is no array ({e}).") from e
+
+
+def pair_up(*arrays: Array) -> bool:
+    """Whether arrays can be taken element by element: `check_images` compares the sizes first."""
+    try:
+        np.broadcast_shapes(*(a.shape for a in arrays))
+    except ValueError:
+        return False
+    return True
 
 
 def mse(image: Array, reference: Array) -> Array:
     """Mean squared error. Raises EV002 for images of two sizes and EV003 for images of integers,
     as do all that build on it."""
-    check_images(image, reference)
+    image, reference = check_images(image, reference)
     return jnp.mean((image - reference) ** 2, (-2, -1))
 
 
@@ -98,7 +122,7 @@ def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
     """
     if preset not in SSIM:
         raise EvflowDataError("EV020", f"SSIM preset {preset!r}.", f"Choose one of {list(SSIM)}.")
-    check_images(image, reference)
+    image, reference = check_images(image, reference)
     how = SSIM[preset]
     if min(image.shape[-2:]) < least_side(preset):
         raise EvflowDataError("EV002", f"images of {image.shape[-2:]} pixels.",
@@ -164,13 +188,15 @@ def _banded(size: int, window: tuple[float, ...]) -> np.ndarray:
 def log_map(image: Array) -> Array:
     """[0, 1] -> [0, 1] by log(1 + 255 I) / log 256: the log domain of these metrics. EV003 for
     integers."""
-    check_floats(image)
+    image = check_floats(image)
     return jnp.log1p(FULL_SCALE * jnp.clip(image, 0.0, 1.0)) / math.log(1.0 + FULL_SCALE)
 
 
 def mae_intensity_change(change: Array, reference: Array, *, magnitude: bool = False) -> Array:
     """Mean absolute error of changes of log intensity (..., H, W), natural log, in units of
-    ln 255 (Table XI). magnitude: of their absolute values, limited to 0..1, as the paper's."""
+    ln 255 (Table XI). magnitude: of their absolute values, limited to 0..1, as the paper's.
+    Raises EV002 for two sizes, EV003 for integers."""
+    change, reference = check_images(change, reference)
     x, y = change / math.log(FULL_SCALE), reference / math.log(FULL_SCALE)
     if magnitude:
         x, y = jnp.clip(jnp.abs(x), 0.0, 1.0), jnp.clip(jnp.abs(y), 0.0, 1.0)

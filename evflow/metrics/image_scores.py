@@ -46,6 +46,10 @@ class ImageProtocol:
             if getattr(self, name) not in choices:
                 raise EvflowDataError("EV020", f"ImageProtocol({name}={getattr(self, name)!r}).",
                                       f"Choose one of {choices}.")
+        if not isinstance(self.clip, bool) or (self.domain == "log" and not self.clip):
+            raise EvflowDataError(
+                "EV020", f"ImageProtocol(clip={self.clip!r}, domain={self.domain!r}).",
+                "Give True or False; the log domain always clips: True.")
 
 
 # As EVREAL, and as ET-Net and S2R, score; `global` is ECC's SSIM. All in the linear domain.
@@ -58,10 +62,16 @@ PROTOCOLS = {
 
 @functools.partial(jax.jit, static_argnames="protocol")
 def frame_scores(
-    images: Array, references: Array, protocol: ImageProtocol, lpips_params: Params | None = None
+    images: Array, references: Array, protocol: ImageProtocol | str,
+    lpips_params: Params | None = None,
 ) -> dict[str, Array]:
     """mse, rmse (DN), psnr (dB), ssim and, with weights, lpips, each (...), of (..., H, W); ssim
-    and lpips of images too small for them are NaN."""
+    and lpips of images too small for them are NaN.
+
+    Raises EV002 (shapes), EV003 (integers), EV020 (unknown protocol).
+    """
+    protocol = _protocol(protocol)
+    images, references = measures.check_images(images, references)  # clipped bytes would be 0 and 1
     if protocol.clip:
         images, references = (jnp.clip(a, 0.0, 1.0) for a in (images, references))
     if protocol.domain == "log":
@@ -92,11 +102,7 @@ def score_images(
     is None. Raises EV001 (nothing to score), EV002 (shapes), EV003 (integers, references beyond
     0..1), EV007 (NaN), EV020 (unknown protocol).
     """
-    if isinstance(protocol, str):
-        if protocol not in PROTOCOLS:
-            raise EvflowDataError("EV020", f"protocol {protocol!r}.",
-                                  f"Choose one of {list(PROTOCOLS)}, or an ImageProtocol.")
-        protocol = PROTOCOLS[protocol]
+    protocol = _protocol(protocol)
     if not sequences:
         raise EvflowDataError("EV001", "there are no sequences to score.")
     scores = {name: _sequence(name, *pair, protocol, lpips_params)
@@ -114,6 +120,15 @@ def score_images(
         "frames": sum(frames.values()), **_finite(means),
         "sequences": {name: {"frames": frames[name], **_finite(e)} for name, e in each.items()},
     }
+
+
+def _protocol(protocol: ImageProtocol | str) -> ImageProtocol:
+    if isinstance(protocol, ImageProtocol):
+        return protocol
+    if protocol not in PROTOCOLS:
+        raise EvflowDataError("EV020", f"protocol {protocol!r}.",
+                              f"Choose one of {list(PROTOCOLS)}, or an ImageProtocol.")
+    return PROTOCOLS[protocol]
 
 
 def _sequence(

@@ -73,9 +73,11 @@ def _complete(params: Params) -> bool:
 def lpips(params: Params, image: Array, reference: Array, *, colour: bool = False) -> Array:
     """Distance (...) of images (..., H, W) on [0, 1], repeated to three channels; or of
     (..., H, W, 3) RGB with colour=True. 0 for equal images, but for rounding. EV002 for two
-    shapes, and for sides below `LEAST_SIDE`; EV003 for integers."""
-    image, reference = jnp.asarray(image), jnp.asarray(reference)
-    check_images(image, reference)
+    shapes, other channels, and for sides below `LEAST_SIDE`; EV003 for integers."""
+    image, reference = map(jnp.asarray, check_images(image, reference))
+    if colour and (image.ndim < 3 or image.shape[-1] != 3):
+        raise EvflowDataError("EV002", f"a colour image of shape {image.shape}.",
+                              "Expected (..., H, W, 3); grey images go without colour=True.")
     if image.shape != reference.shape:
         raise EvflowDataError("EV002", f"images of {image.shape} and {reference.shape}.")
     if min(sides := image.shape[-3:-1] if colour else image.shape[-2:]) < LEAST_SIDE:
