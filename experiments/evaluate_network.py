@@ -26,7 +26,6 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow.config import as_dict
 from evflow.downstream import EVFlowNet, event_tensor, reconstruct
@@ -44,7 +43,7 @@ from evflow.metrics import (
 )
 from evflow.report import plots
 from experiments import held_out, targets
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.recorded import (
     Part,
     Rotation,
@@ -303,7 +302,4 @@ def picture(shown: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

@@ -29,18 +29,15 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
 from evflow.config import as_dict
 from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet
 from evflow.downstream.simulated import SequenceConfig
 from evflow.downstream.train import LearningConfig
 from evflow.errors import EvflowDataError
-from evflow.progress import stoppable
 from evflow.report import plots
 from evflow.weights import weights_path
 from experiments import gains, held_out
-from experiments.common import provenance, write_result
+from experiments.common import provenance, run_script, write_result
 from experiments.conditions import EVENTGAN, digest
 from experiments.targets import CAMERAS, SCENES
 from experiments.trainings import SIMULATED, Setting, Trainings
@@ -207,8 +204,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        with stoppable():
-            main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

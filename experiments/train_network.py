@@ -22,7 +22,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow import read_recording
 from evflow.camera import Camera
@@ -39,7 +38,7 @@ from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import frame_scores
 from evflow.metrics.perceptual import load_lpips
 from evflow.scenes import make_bank
-from experiments.common import provenance, write_result
+from experiments.common import provenance, run_script, write_result
 from experiments.held_out import ENDPOINTS, PROTOCOL, scored_by
 from experiments.loop import train
 
@@ -228,7 +227,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)
