@@ -26,7 +26,7 @@ from evflow.progress import bar
 from evflow.scenes import make_bank
 from evflow.weights import save_weights
 from experiments import generate as inverse
-from experiments.common import provenance, run_script, write_result
+from experiments.common import at_least, provenance, run_script, write_result
 from experiments.loop import train
 
 HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
@@ -55,6 +55,7 @@ class Options:
 
 def main(options: Options) -> dict[str, Any]:
     """One run; returns the figures on held-out scenes."""
+    at_least(1, scenes=options.scenes, steps=options.steps, save_every=options.save_every)
     config = dataclasses.replace(GANS[options.preset], seed=options.seed)
     if options.steps is not None:
         config = dataclasses.replace(config, steps=options.steps)

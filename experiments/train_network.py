@@ -38,7 +38,7 @@ from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import frame_scores
 from evflow.metrics.perceptual import load_lpips
 from evflow.scenes import make_bank
-from experiments.common import provenance, run_script, write_result
+from experiments.common import at_least, provenance, run_script, write_result
 from experiments.held_out import ENDPOINTS, PROTOCOL, scored_by
 from experiments.loop import train
 
@@ -100,6 +100,7 @@ class Run:
 
 def main(options: Options) -> dict[str, Any]:
     """One run; returns the figures on held-out sequences."""
+    at_least(1, batches=options.batches, save_every=options.save_every)
     config = configuration(options)
     network, learning = config.network, config.learning
     camera = None if options.camera is None else Camera.load(options.camera)
