@@ -187,10 +187,12 @@ def _paper(task: str, labels: set[str]) -> list[str]:
 
 def picture(result: dict[str, Result], path: Path) -> None:
     """Paired differences to default with their intervals; a row for every target, a panel for
-    every measure; the dashed line is the oracle's."""
+    every measure; the dashed line is the oracle's. Of no measures there is none."""
     measures = [n for n in (*VIDEO, *FLOW) if n not in CONSTANT and any(
         n in m for rows in result.values() for m in rows.values())]
-    figure = plots.new_figure(3.4 * max(len(measures), 1), 1.2 + 2.2 * max(len(result), 1))
+    if not measures:
+        return
+    figure = plots.new_figure(3.4 * len(measures), 1.2 + 2.2 * len(result))
     axes = figure.subplots(len(result), len(measures), squeeze=False)
     for line, (target, rows) in zip(axes, result.items(), strict=True):
         labels = [k for k in rows if k != DEFAULT][::-1]
