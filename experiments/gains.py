@@ -8,6 +8,7 @@ Student's over seeds. The bootstrap resamples clips, or seeds and clips for the 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +128,7 @@ def report(
     for target, rows in result.items():
         lines += [f"## {target}", "", *_measures(rows, task), ""]
     lines += ["## Cameras trained on (medians)", "", *_cameras(cameras), "", "## The paper", "",
-              *_paper(task, {label for rows in result.values() for label in rows})]
+              *paper(task, {label for rows in result.values() for label in rows})]
     return "\n".join(lines)
 
 
@@ -169,15 +170,18 @@ def _cameras(cameras: dict[str, dict[str, float]]) -> list[str]:
                     for label, row in cameras.items()]
 
 
-def _paper(task: str, labels: set[str]) -> list[str]:
+def paper(task: str, labels: Collection[str] = ()) -> list[str]:
     """What the paper reports, on real recordings: other scenes, other cameras, to be compared by
-    order and size of the gains alone."""
+    order and size of the gains alone. labels: of the conditions here, named beside the paper's."""
     table, what = (TABLE_V, "MSE/SSIM/LPIPS") if task == "video" else (TABLE_VI, "FWL")
     number = "V" if task == "video" else "VI"
-    lines = [f"Table {number}, {what}:", "", "| here | paper | IJRR | MVSEC | EVIMO2v2 |",
-             "|" + "---|" * 5]
-    lines += [f"| {label if label in labels else ''} | {name} | {' | '.join(cells)} |"
-              for label, (name, cells) in table.items()]
+    rows: list[tuple[str, ...]] = [("paper", "IJRR", "MVSEC", "EVIMO2v2")]
+    rows += [(name, *cells) for name, cells in table.values()]
+    if labels:
+        here = ("here", *(label if label in labels else "" for label in table))
+        rows = [(label, *row) for label, row in zip(here, rows, strict=True)]
+    head, *body = (f"| {' | '.join(row)} |" for row in rows)
+    lines = [f"Table {number}, {what}:", "", head, "|" + "---|" * len(rows[0]), *body]
     ours = {label: row for label, row in ABLATIONS.items() if label in labels}
     if ours:
         lines += ["", "| here | table | MSE/SSIM/LPIPS/FWL, IJRR |", "|" + "---|" * 3]
