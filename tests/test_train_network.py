@@ -147,13 +147,36 @@ def test_a_preset_may_ask_for_normalised_tensors() -> None:
 
 def test_a_run_goes_on_from_weights_of_its_own_network() -> None:
     asked = command.Options(out=Path(), network="e2vid", start="e2vid-small")
-    begun = command.begun(command.configuration(asked))
+    begun = command.begun(asked.start, command.configuration(asked))
     jax.tree.map(np.testing.assert_array_equal, begun, load_network("e2vid-small").params)
-    assert command.begun(command.configuration(command.Options(out=Path()))) is None
+    assert command.begun(None, command.configuration(command.Options(out=Path()))) is None
     for other in ({"network": "firenet"}, {"normalised": True}):
         config = command.configuration(dataclasses.replace(asked, **other))
         with pytest.raises(EvflowDataError, match=r"EV018 .*e2vid-small"):
-            command.begun(config)
+            command.begun(asked.start, config)
+
+
+def test_files_of_a_run_are_known_by_what_they_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "camera.npz"
+    path.write_bytes(b"one")
+
+    def run(**files: object) -> command.Run:
+        return command.configuration(command.Options(out=Path(), **files))
+
+    for name, kind in (("camera", Path), ("start", str), ("lpips", str)):
+        first, same = run(**{name: kind(path)}), run(**{name: kind("camera.npz")})
+        assert first == same != run()
+        path.write_bytes(path.read_bytes() + b"another")
+        assert run(**{name: kind(path)}) != first
+        with pytest.raises(EvflowDataError, match="EV016"):
+            run(**{name: kind("absent.npz")})
+    original = {"network": "evflownet", "preset": "original"}
+    for recording in (path, tmp_path):  # a file, a folder
+        assert run(recordings=(recording,), **original) == run(
+            recordings=(recording.relative_to(tmp_path),), **original)
 
 
 @pytest.mark.slow
