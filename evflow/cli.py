@@ -27,9 +27,8 @@ from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
-from evflow.progress import stoppable
+from evflow.progress import INTERRUPTED, leave, stoppable
 
-INTERRUPTED = 130
 EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
 
 Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these annotations
@@ -79,13 +78,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def run() -> NoReturn:
-    """The process `evflow`: `main`, and its exit code. After Ctrl-C nothing is waited for, as a
-    compilation in another thread does not survive the usual end of a process."""
+    """The process `evflow`: `main`, and its exit code."""
     code = main()
     if code == INTERRUPTED:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        leave(code)
     sys.exit(code)
 
 

@@ -9,10 +9,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+INTERRUPTED = 130  # the shell's exit code of Ctrl-C
 
 
 @contextlib.contextmanager
@@ -54,3 +56,11 @@ def stoppable() -> Iterator[None]:
             timer.cancel()
         sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
+
+
+def leave(code: int) -> NoReturn:
+    """End the process after Ctrl-C: nothing is waited for, as a compilation in another thread does
+    not survive the usual end."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

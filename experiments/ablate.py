@@ -34,7 +34,7 @@ from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank
 from evflow.train import cut_block, init_state, make_run_step, optimiser
 from evflow.weights import load_weights, save_weights
-from experiments.common import provenance, slug, write_result
+from experiments.common import at_least, provenance, run_script, slug, write_result
 
 Array = jax.Array
 Study = Literal["losses", "steps", "networks"]
@@ -143,6 +143,8 @@ def score(
 
 
 def main(options: Options) -> dict[str, Any]:
+    """Train and score the variants; returns the figures of each."""
+    at_least(1, steps=options.steps, batches=options.batches)
     small = options.preset == "debug"
     base = dataclasses.replace(
         PRESETS["pixels"], seed=options.seed, steps=options.steps or (4 if small else 400))
@@ -195,4 +197,4 @@ def table(result: dict[str, Any], steps: int) -> str:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -27,6 +27,7 @@ from evflow.progress import bar
 from evflow.scenes import make_bank
 from evflow.train import cut_block
 from evflow.weights import load_weights, model_card, save_weights
+from experiments.common import run_script
 
 Array = jax.Array
 
@@ -92,4 +93,4 @@ def main(options: Options) -> float:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

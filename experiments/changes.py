@@ -23,7 +23,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow import Recording, encode, load_weights, read_recording
 from evflow.batch import Batch, sample_batch
@@ -35,7 +34,7 @@ from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
 from experiments import change_systems as systems
 from experiments.cameras import Protocol, hidden_recording
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.images import mean_ci
 
 Array = jax.Array
@@ -218,4 +217,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -25,6 +25,7 @@ import tyro
 from evflow import load_weights
 from evflow.errors import EvflowDataError
 from evflow.weights import model_card, save_weights
+from experiments.common import run_script
 
 PIXELS = ("encoder", "flow", "spread")
 AFTER_SUMMARY = ("fusion", "signal")  # fitted to what the summary says
@@ -80,4 +81,4 @@ def cards(weights: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -1,4 +1,5 @@
-"""What every experiment shares: provenance of a result, where results go, names of files."""
+"""What every experiment shares: provenance of a result, where results go, names of files, how a
+script runs and ends."""
 
 from __future__ import annotations
 
@@ -8,13 +9,17 @@ import json
 import os
 import platform
 import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
+import tyro
 
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
+from evflow.progress import INTERRUPTED, leave, stoppable
 from evflow.report.provenance import weights_hash
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -52,3 +57,31 @@ def hashes(config: dict[str, Any]) -> dict[str, str]:
 def slug(name: str) -> str:
     """A name that is a file name everywhere."""
     return re.sub(r"[^A-Za-z0-9.+-]+", "_", name)
+
+
+def at_least(least: int, **options: int | None) -> None:
+    """EV020 where an option that is given is less; by its name: `save_every` is --save-every."""
+    for name, value in options.items():
+        if value is not None and value < least:
+            raise EvflowDataError("EV020", f"--{name.replace('_', '-')} {value}.",
+                                  f"Give {least} or more.")
+
+
+def run_script(main: Callable[[Any], object], options: type, doc: str | None) -> NoReturn:
+    """The process of an experiment: `main` of the options on its command line."""
+    end_with(lambda: main(tyro.cli(options, description=doc)))
+
+
+def end_with(work: Callable[[], object]) -> NoReturn:
+    """Do the work and end the process: by the number that it returns, or 0; by one line and 1 on
+    an error about the data; on Ctrl-C or SIGTERM by one line, that of the exception if it says
+    anything, and 130."""
+    try:
+        with stoppable():
+            code = work()
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None
+    except KeyboardInterrupt as e:
+        print(str(e) or "interrupted; no half-written file is left.", file=sys.stderr)
+        leave(INTERRUPTED)
+    raise SystemExit(code if isinstance(code, int) else 0)

@@ -29,7 +29,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import tyro
 
 from evflow import Recording, estimate_camera, load_weights, read_recording
 from evflow.baselines import SYSTEMS, Fitted, Lgan, Match, System
@@ -38,7 +37,7 @@ from evflow.camera import Camera
 from evflow.errors import EvflowDataError
 from evflow.report import plots
 from experiments.cameras import Hidden, Protocol
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.evaluate import ENOUGH, protocols
 from experiments.many import Setup, scores
 
@@ -281,4 +280,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

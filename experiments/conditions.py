@@ -191,7 +191,8 @@ def digest(path: Path) -> str:
     """Of a file's content; EV016 without the file."""
     if not path.is_file():
         raise EvflowDataError("EV016", f"no file at {path}.")
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def told(camera: Camera) -> dict[str, float]:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 from jax.scipy.stats import norm
 
 from evflow import estimate_camera
@@ -26,7 +25,7 @@ from evflow.camera import PARAMETERS
 from evflow.report import plots
 from evflow.report.plots import TITLES
 from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.many import Setup, scores
 
 LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
@@ -160,4 +159,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

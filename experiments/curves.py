@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 
 from evflow import estimate_camera, finish
 from evflow.camera import CameraPrior
 from evflow.recording import pool_recording
 from evflow.report import plots
 from experiments.cameras import Hidden, Protocol
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.evaluate import ENOUGH
 from experiments.many import Setup, scores
 
@@ -145,4 +144,4 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 
 from evflow import estimate_camera, finish
 from evflow.camera import CameraPrior
 from evflow.recording import pool_recording
 from evflow.sensors import SensorModel
 from experiments.cameras import Hidden, Protocol
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.many import Setup, scores
 
 NAMES = ("theta_on", "theta_off", "eta_on", "eta_off")
@@ -144,4 +143,4 @@ def main(options: Options) -> dict[str, dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

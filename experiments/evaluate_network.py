@@ -26,8 +26,8 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
+from evflow.commands.options import parse_size
 from evflow.config import as_dict
 from evflow.downstream import EVFlowNet, event_tensor, reconstruct
 from evflow.downstream.released import Trained, load_network
@@ -43,8 +43,8 @@ from evflow.metrics import (
     score_images,
 )
 from evflow.report import plots
-from experiments import held_out, targets
-from experiments.common import write_result
+from experiments import gains, held_out, targets
+from experiments.common import run_script, write_result
 from experiments.recorded import (
     Part,
     Rotation,
@@ -91,6 +91,8 @@ class Options:
     """Stretch images between their percentiles 1 and 99, as EVREAL does for E2VID."""
     whole: bool = False
     """Without cuts."""
+    size: str | None = None
+    """Sensor size (346x260) of --data, where the files do not tell it or are wrong."""
     window_ms: float = 33.0
     """Of recordings without frames."""
     scenes: int = 12
@@ -108,6 +110,7 @@ def parts(options: Options) -> list[Part]:
         # Shorter than their cuts: slices of sequences.
         cut = False
         paths = [p for name in REAL if (p := Path(at_hand) / "data/recordings" / name).exists()]
+    size = parse_size(options.size) if options.data else None
     names = [sequence_name(path) for path in paths]
     if twice := {name for name in names if names.count(name) > 1}:
         raise EvflowDataError("EV020", f"more than one recording is called {sorted(twice)}.",
@@ -117,7 +120,7 @@ def parts(options: Options) -> list[Part]:
         if stop < math.inf:
             print(f"{path}: {start:g} to {stop:g} s count (--whole for all of it)")
         try:
-            found.append(read_part(path, options.warmup_s, options.window_ms, cut))
+            found.append(read_part(path, options.warmup_s, options.window_ms, cut, size))
         except EvflowDataError as error:
             if options.data and path == paths[-1] and not found:
                 raise
@@ -235,8 +238,12 @@ def main(options: Options) -> dict[str, Any]:
             row["flow"] = real_flow(trained, found, slices)
         else:
             row["video"], pairs = real_video(trained, found, options, lpips)
-            shown |= {f"{part}, {Path(name).stem}": pair for part, pair in pairs.items()}
+            shown |= {f"{part}, {name}": pair for part, pair in pairs.items()}
         result[name] = row
+    if options.data and not any(row.get("video") or row.get("flow") for row in result.values()):
+        raise EvflowDataError(
+            "EV011", f"nothing of {', '.join(map(str, options.data))} could be scored.",
+            "Give recordings with frames, or weights of an EV-FlowNet, which needs none.")
     text = report(result, options)
     print(text)
     conventions = {task: held_out.scored_by(task, lpips is not None) for task in ("video", "flow")}
@@ -249,7 +256,7 @@ def main(options: Options) -> dict[str, Any]:
 
 
 def report(result: dict[str, Any], options: Options) -> str:
-    """Markdown: real video, real flow, synthetic cameras."""
+    """Markdown: real video, real flow, synthetic cameras, the paper's figures."""
     lines = [f"SSIM preset {options.protocol}, mean over {protocol_of(options).aggregate}, "
              f"warm-up of up to {options.warmup_s:g} s where recordings are as long, "
              f"histeq {options.histeq}."]
@@ -276,6 +283,10 @@ def report(result: dict[str, Any], options: Options) -> str:
             lines += ["", _row(name, *kinds), _row(*["---"] * (1 + len(kinds)))]
             lines += [_row(camera, *(_cell(r[k]) for k in kinds))
                       for camera, r in row["synthetic"].items()]
+    seen = [task for task in ("video", "flow") if any(task in row for row in result.values())]
+    lines += ["", "## The paper"]
+    for task in seen:
+        lines += ["", *gains.paper(task)]
     return "\n".join(lines)
 
 
@@ -303,7 +314,4 @@ def picture(shown: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

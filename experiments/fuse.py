@@ -32,6 +32,7 @@ from evflow.refine.fit import FusionNet
 from evflow.report.provenance import weights_hash
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
+from experiments.common import run_script
 from experiments.many import Setup, scores
 
 Array = jax.Array
@@ -202,7 +203,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

@@ -8,6 +8,7 @@ Student's over seeds. The bootstrap resamples clips, or seeds and clips for the 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +128,7 @@ def report(
     for target, rows in result.items():
         lines += [f"## {target}", "", *_measures(rows, task), ""]
     lines += ["## Cameras trained on (medians)", "", *_cameras(cameras), "", "## The paper", "",
-              *_paper(task, {label for rows in result.values() for label in rows})]
+              *paper(task, {label for rows in result.values() for label in rows})]
     return "\n".join(lines)
 
 
@@ -169,15 +170,18 @@ def _cameras(cameras: dict[str, dict[str, float]]) -> list[str]:
                     for label, row in cameras.items()]
 
 
-def _paper(task: str, labels: set[str]) -> list[str]:
+def paper(task: str, labels: Collection[str] = ()) -> list[str]:
     """What the paper reports, on real recordings: other scenes, other cameras, to be compared by
-    order and size of the gains alone."""
+    order and size of the gains alone. labels: of the conditions here, named beside the paper's."""
     table, what = (TABLE_V, "MSE/SSIM/LPIPS") if task == "video" else (TABLE_VI, "FWL")
     number = "V" if task == "video" else "VI"
-    lines = [f"Table {number}, {what}:", "", "| here | paper | IJRR | MVSEC | EVIMO2v2 |",
-             "|" + "---|" * 5]
-    lines += [f"| {label if label in labels else ''} | {name} | {' | '.join(cells)} |"
-              for label, (name, cells) in table.items()]
+    rows: list[tuple[str, ...]] = [("paper", "IJRR", "MVSEC", "EVIMO2v2")]
+    rows += [(name, *cells) for name, cells in table.values()]
+    if labels:
+        here = ("here", *(label if label in labels else "" for label in table))
+        rows = [(label, *row) for label, row in zip(here, rows, strict=True)]
+    head, *body = (f"| {' | '.join(row)} |" for row in rows)
+    lines = [f"Table {number}, {what}:", "", head, "|" + "---|" * len(rows[0]), *body]
     ours = {label: row for label, row in ABLATIONS.items() if label in labels}
     if ours:
         lines += ["", "| here | table | MSE/SSIM/LPIPS/FWL, IJRR |", "|" + "---|" * 3]
@@ -187,10 +191,12 @@ def _paper(task: str, labels: set[str]) -> list[str]:
 
 def picture(result: dict[str, Result], path: Path) -> None:
     """Paired differences to default with their intervals; a row for every target, a panel for
-    every measure; the dashed line is the oracle's."""
+    every measure; the dashed line is the oracle's. Of no measures there is none."""
     measures = [n for n in (*VIDEO, *FLOW) if n not in CONSTANT and any(
         n in m for rows in result.values() for m in rows.values())]
-    figure = plots.new_figure(3.4 * max(len(measures), 1), 1.2 + 2.2 * max(len(result), 1))
+    if not measures:
+        return
+    figure = plots.new_figure(3.4 * len(measures), 1.2 + 2.2 * len(result))
     axes = figure.subplots(len(result), len(measures), squeeze=False)
     for line, (target, rows) in zip(axes, result.items(), strict=True):
         labels = [k for k in rows if k != DEFAULT][::-1]

@@ -26,7 +26,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow import Camera, code_from_video, generate, load_weights, log_prob
 from evflow.camera import THETA_MIN, CameraPrior, sample_nominal, sample_pixels
@@ -38,7 +37,7 @@ from evflow.scenes.config import SceneConfig
 from evflow.sensors import SensorModel
 from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 
 Array = jax.Array
 Row = dict[str, np.ndarray]
@@ -226,4 +225,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

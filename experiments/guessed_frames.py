@@ -16,17 +16,15 @@ from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
 from evflow import Recording, read_recording
 from evflow.downstream import Trained, load_network, with_reconstructed_frames
-from evflow.errors import EvflowDataError
 from evflow.progress import bar
 from evflow.recording import estimate_camera
 from evflow.scenes import make_bank
 from evflow.scenes.config import SceneConfig
 from experiments.cameras import Protocol, hidden_recording
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 
 THETAS = ("theta_on", "theta_off")
 PROTOCOL = Protocol(
@@ -111,7 +109,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

@@ -23,7 +23,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-import tyro
 
 from evflow import Recording, estimate_camera, load_weights, read_recording
 from evflow.baselines import SYSTEMS
@@ -36,7 +35,7 @@ from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
 from experiments.cameras import Protocol, hidden_recording
 from experiments.change_systems import cut
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.images import SCORES, mean_ci, score
 
 HORIZONS = {"1 frame": 1, "5 frames": 5, "10 frames": 10, "1e5 events": 100_000,
@@ -271,4 +270,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -22,7 +22,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-import tyro
 
 from evflow import estimate_camera, finish, io
 from evflow.camera import Summary
@@ -34,7 +33,7 @@ from evflow.refine.pixels import evidence_of
 from evflow.refine.sightings import sight
 from evflow.refine.signal import told_apart
 from experiments.cameras import Hidden, Protocol
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.evaluate import ENOUGH, protocols
 from experiments.many import Setup, scores
 
@@ -166,4 +165,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -4,6 +4,7 @@ time limit or a signal. One process; `experiments.train` has the loop for many."
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from evflow.checkpoint import Checkpoints
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
 from evflow.progress import bar
+from experiments.common import at_least
 from experiments.train import Resume, goes_on, lines_until, stop_requests
 
 State = TypeVar("State", bound="Counted")
@@ -45,8 +47,11 @@ def train(advance: Advance, fresh: State, config: Any, options: Options) -> Stat
     """The state after config.steps calls of `advance`, from `fresh` or the run in options.out.
 
     config: a dataclass that says what the run is; one in the folder must be the same. The state
-    has `step`; every one is logged, and the last is saved, also where time or a signal ends it.
+    has `step`; every one is logged, and the last is saved, also where time ends it, or a signal,
+    after which this raises KeyboardInterrupt. Raises EV007 where a metric is no longer finite: that
+    state is not saved.
     """
+    at_least(1, save_every=options.save_every)
     if options.resume == "must" and not options.out.is_dir():  # before a folder is made
         raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
                               "Check --out, or pass --resume auto.")
@@ -55,13 +60,22 @@ def train(advance: Advance, fresh: State, config: Any, options: Options) -> Stat
         resumed = goes_on(checkpoints, config, options.out, options.resume)
         if resumed and checkpoints.latest is not None:
             state = checkpoints.restore(state)
-        return _run(advance, state, config.steps, options, checkpoints, requests)
+        state, lost = _run(advance, state, config.steps, options, checkpoints, requests)
+    # Raised out here, where checkpoints are written.
+    if lost:
+        raise EvflowDataError("EV007", f"{', '.join(lost)} after step {int(state.step)}.",
+                              f"Checkpoints before it are in {options.out}; train at a lower rate.")
+    if requests:
+        raise KeyboardInterrupt(f"stopped after step {int(state.step)} of {config.steps}; a "
+                                "checkpoint is saved, and the same command goes on.")
+    return state
 
 
 def _run(
     advance: Advance, state: State, steps: int, options: Options, checkpoints: Checkpoints,
     requests: list[int],
-) -> State:
+) -> tuple[State, list[str]]:
+    """The last state, and its metrics that are not finite, if any."""
     started, step = time.monotonic(), int(state.step)
     path = options.out / "metrics.jsonl"
     kept = "".join(f"{line}\n" for line in lines_until(path, step))
@@ -76,7 +90,9 @@ def _run(
             seconds = time.monotonic() - started
             log.write(json.dumps({"step": step, "time": seconds, **values}) + "\n")
             progress(step, steps)
+            if lost := [f"{k} = {v}" for k, v in values.items() if not math.isfinite(v)]:
+                return state, lost
             if step % options.save_every == 0:
                 checkpoints.save(step, state)
     checkpoints.save(step, state)
-    return state
+    return state, []

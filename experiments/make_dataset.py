@@ -20,16 +20,12 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
 from evflow.dataset.config import PRESETS, DatasetConfig
 from evflow.dataset.manifest import MERGED, verify
 from evflow.dataset.shards import build
 from evflow.errors import EvflowDataError
-from evflow.progress import bar, stoppable
-from experiments.common import provenance
-
-STOPPED = 130  # the shell's exit code of Ctrl-C
+from evflow.progress import bar
+from experiments.common import provenance, run_script
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +68,7 @@ def main(options: Options) -> int:
         print(f"{options.out}: {len(faults)} faults; --only-missing makes them good." if faults
               else f"{options.out}: whole.")
         return 1 if faults else 0
-    with bar("sequences") as progress, stoppable():
+    with bar("sequences") as progress:
         made = build(
             options.out, configuration(options), options.seed, shard=shard,
             workers=options.workers, format=options.format, only_missing=options.only_missing,
@@ -108,10 +104,4 @@ def maker() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        raise SystemExit(main(tyro.cli(Options, description=__doc__)))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on.")
-        raise SystemExit(STOPPED) from None
+    run_script(main, Options, __doc__)

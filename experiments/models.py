@@ -19,7 +19,6 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow import simulate
 from evflow.camera import Summary, noise_of_threshold, sample_pixels
@@ -28,7 +27,7 @@ from evflow.report import pages, plots
 from evflow.scenes.photos import load_photos
 from evflow.sensors import SENSORS, KnownSensor
 from evflow.types import Events
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.sources import density, gaps
 
 FPS, SHOWN_US, RATE_US = 1000, 8_000, 5_000
@@ -143,4 +142,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

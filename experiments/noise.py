@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-import tyro
 
 from evflow import simulate
 from evflow.camera import Camera, Summary, noise_of_threshold, sample_pixels
@@ -26,7 +25,7 @@ from evflow.progress import bar
 from evflow.report import pages, plots
 from evflow.sensors import SENSORS, SensorModel
 from experiments import laws
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.sources import figure_four, sources
 
 MODELS = ("noisy", "v2e", "paper", "dvs346", "dvs240")
@@ -289,4 +288,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -21,7 +21,6 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow import Recording, load_weights, simulate
 from evflow.baselines import v2e_noise, voltmeter_noise
@@ -30,7 +29,7 @@ from evflow.intensity import noise_factor, normalised_intensity
 from evflow.progress import bar
 from evflow.report import plots
 from evflow.sensors import SENSORS, SensorModel
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.images import mean_ci
 from experiments.measured_noise import SIDES, Rates, measured, measured_page, ours
 from experiments.noise import LUX, MIDDLE, SCP
@@ -292,4 +291,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 
 from evflow import estimate_camera, finish
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.recording import pool_recording
 from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 from experiments.many import Setup, scores
 
 CASES: dict[str, dict[str, Any]] = {
@@ -127,4 +126,4 @@ def main(options: Options) -> dict[str, dict[str, float]]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

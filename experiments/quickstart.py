@@ -27,7 +27,7 @@ from evflow.scenes import SceneConfig, make_bank, render, sample_scene
 from evflow.sensors import SensorModel
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import unzip, upsample
-from experiments.common import write_result
+from experiments.common import run_script, write_result
 
 FPS, FRAME_EVERY = 1000, 25  # rendered frames per second; one in 25 is given to the estimator
 
@@ -130,4 +130,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

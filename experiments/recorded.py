@@ -69,11 +69,16 @@ def _stem(path: Path) -> str:
     return path.absolute().parent.name.split(".")[0] if name in GENERAL else name
 
 
-def read_part(path: Path, warmup_s: float, window_ms: float, cut: bool = True) -> Part:
+def read_part(
+    path: Path, warmup_s: float, window_ms: float, cut: bool = True,
+    size: tuple[int, int] | None = None,
+) -> Part:
     """The part of a sequence that counts, and its warm-up. window_ms: of recordings without
-    frames. Raises what `read_recording` raises, and EV012 where nothing lies in the cut."""
+    frames; size: (width, height) of the sensor, where the file does not tell it. Raises what
+    `read_recording` raises, and EV012 where nothing lies in the cut."""
     start, stop = cut_of(path) if cut else (0.0, np.inf)
-    return part_of(read_recording(path), sequence_name(path), start, stop, warmup_s, window_ms)
+    recording = read_recording(path, size=size)
+    return part_of(recording, sequence_name(path), start, stop, warmup_s, window_ms)
 
 
 def part_of(

@@ -15,7 +15,8 @@ later windows of held-out scenes, clipped to [0, 1]: SSIM (preset evreal), MSE, 
 its weights are installed, and MSE of log(1 + 255 I) / log 256; flow by its error at pixels with
 events, and FWL (votes rounded to the nearest pixel) beside that of the true flow.
 
-A finished training stays in --out with its scores: the same command goes on with what is missing.
+A finished training stays in --out with its scores: the same command goes on with what is missing,
+and one that asks for more adds to it. One that asks for less than the tables there have is refused.
 Tables VII and IX: weights that `experiments.ablate` keeps, as --estimators "8 steps=PATH" ...; any
 camera file is a condition by --cameras NAME=PATH. Writes see_better.json, .md, .png and _clips.png.
 """
@@ -26,22 +27,20 @@ import dataclasses
 import json
 import math
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
-
-import tyro
 
 from evflow.config import as_dict
 from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet
 from evflow.downstream.simulated import SequenceConfig
 from evflow.downstream.train import LearningConfig
 from evflow.errors import EvflowDataError
-from evflow.progress import stoppable
 from evflow.report import plots
 from evflow.weights import weights_path
 from experiments import gains, held_out
-from experiments.common import provenance, write_result
-from experiments.conditions import EVENTGAN, digest
+from experiments.common import at_least, provenance, run_script, write_result
+from experiments.conditions import EVENTGAN, Condition, digest
 from experiments.targets import CAMERAS, SCENES
 from experiments.trainings import SIMULATED, Setting, Trainings
 
@@ -110,13 +109,17 @@ class Options:
     weights: str = "default"
     """Of evflow's estimator."""
     eventgan: Path | None = None
-    """EventGAN's generator.safetensors; the condition is left out without it."""
+    """EventGAN's generator.safetensors; adds the condition, which is left out without it."""
     max_seconds: float = math.inf
     """Begin no other training after this long."""
 
 
 def chosen(options: Options) -> Setting:
-    """The preset with what the options change."""
+    """The preset with what the options change; EV020 where they contradict each other."""
+    at_least(1, seeds=options.seeds, steps=options.steps)
+    if EVENTGAN in options.names and options.eventgan is None:
+        raise EvflowDataError("EV020", f"--names {EVENTGAN} without its weights.",
+                              "Pass --eventgan PATH, of experiments.train_eventgan.")
     setting = preset_of(options.task, options.preset)
     learning = setting.learning
     if options.normalised:
@@ -127,10 +130,10 @@ def chosen(options: Options) -> Setting:
                              "circuits": options.circuits, "seeds": options.seeds}
     setting = dataclasses.replace(
         setting, learning=learning, **{k: v for k, v in given.items() if v})
-    if options.eventgan is None:
-        names = tuple(n for n in setting.names if n != EVENTGAN)
-        setting = dataclasses.replace(setting, names=names)
-    return setting
+    names = tuple(n for n in setting.names if n != EVENTGAN)
+    if options.eventgan is not None:
+        names = setting.names if EVENTGAN in setting.names else (*names, EVENTGAN)
+    return dataclasses.replace(setting, names=names)
 
 
 def same_setting(out: Path, shared: dict[str, Any], setting: Setting) -> None:
@@ -148,6 +151,26 @@ def same_setting(out: Path, shared: dict[str, Any], setting: Setting) -> None:
                                   "Choose another --out.")
         return
     write_result(path, {}, wanted)
+
+
+def nothing_lost(out: Path, conditions: Iterable[Condition], seeds: int) -> None:
+    """EV013 where the tables in `out` have targets, conditions or seeds that these leave out."""
+    path = out / "see_better.json"
+    if not path.is_file():
+        return
+    made = {(t.name, c.label) for c in conditions for t in c.targets}
+    targets, lost = {target for target, _ in made}, set()
+    for target, rows in json.loads(path.read_text())["result"]["targets"].items():
+        if target not in targets:
+            lost.add(target)
+            continue
+        lost |= {label for label in rows if (target, label) not in made}
+        lost |= {f"seed {seed}" for measures in rows.values() for entry in measures.values()
+                 for seed in entry["seeds"] if seed >= seeds}
+    if lost:
+        raise EvflowDataError(
+            "EV013", f"{path} has {', '.join(sorted(lost))}, which this command leaves out.",
+            "Give all --names, --targets and other conditions that it has, or another --out.")
 
 
 def files(given: tuple[str, ...]) -> dict[str, Path]:
@@ -182,6 +205,7 @@ def main(options: Options) -> dict[str, Any]:
     same_setting(options.out, shared, setting)
     runs = Trainings(setting, options.out, options.weights, options.eventgan)
     conditions = runs.conditions(files(options.estimators), files(options.cameras))
+    nothing_lost(options.out, conditions, setting.seeds)
     left = setting.seeds * len(conditions)
     for seed in range(setting.seeds):
         for condition in conditions:
@@ -207,8 +231,4 @@ def main(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        with stoppable():
-            main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

@@ -31,6 +31,7 @@ from evflow.refine.points import Points, chunk_points
 from evflow.refine.signal import joined, log_intensity, rate_at
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
+from experiments.common import run_script
 from experiments.fuse import COVERED, before_refinement
 from experiments.many import Setup, scores
 
@@ -160,4 +161,4 @@ def _some(made: list[list[Row]], held_out: bool) -> list[Row]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_script(main, Options, __doc__)

@@ -38,7 +38,7 @@ from evflow.files import atomic_write
 from evflow.scenes import TextureBank, make_bank
 from evflow.train import TrainState, init_state, make_run_step, optimiser
 from evflow.weights import load_weights, save_weights
-from experiments.common import provenance
+from experiments.common import end_with, provenance
 
 Resume = Literal["auto", "never", "must"]
 
@@ -256,7 +256,4 @@ def command(arguments: Sequence[str], prog: str) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        command(sys.argv[1:], "python -m experiments.train")
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    end_with(lambda: command(sys.argv[1:], "python -m experiments.train"))

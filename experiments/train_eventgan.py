@@ -18,17 +18,15 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow.baselines.eventgan import GANS, GanConfig, generate, init_state, run_step
 from evflow.config import as_dict
-from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log_inverse
 from evflow.progress import bar
 from evflow.scenes import make_bank
 from evflow.weights import save_weights
 from experiments import generate as inverse
-from experiments.common import provenance, write_result
+from experiments.common import at_least, provenance, run_script, write_result
 from experiments.loop import train
 
 HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
@@ -57,6 +55,7 @@ class Options:
 
 def main(options: Options) -> dict[str, Any]:
     """One run; returns the figures on held-out scenes."""
+    at_least(1, scenes=options.scenes, steps=options.steps, save_every=options.save_every)
     config = dataclasses.replace(GANS[options.preset], seed=options.seed)
     if options.steps is not None:
         config = dataclasses.replace(config, steps=options.steps)
@@ -107,7 +106,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

@@ -22,7 +22,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from evflow import read_recording
 from evflow.camera import Camera
@@ -39,7 +38,9 @@ from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import frame_scores
 from evflow.metrics.perceptual import load_lpips
 from evflow.scenes import make_bank
-from experiments.common import provenance, write_result
+from evflow.weights import weights_path
+from experiments.common import at_least, provenance, run_script, write_result
+from experiments.conditions import digest
 from experiments.held_out import ENDPOINTS, PROTOCOL, scored_by
 from experiments.loop import train
 
@@ -85,7 +86,8 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What a run is; another one does not go on in its folder."""
+    """What a run is; another one does not go on in its folder. Files are told by what they hold:
+    the same one by another path is the same, another one by the same path is not."""
 
     network: Network
     learning: LearningConfig
@@ -101,6 +103,7 @@ class Run:
 
 def main(options: Options) -> dict[str, Any]:
     """One run; returns the figures on held-out sequences."""
+    at_least(1, batches=options.batches, save_every=options.save_every)
     config = configuration(options)
     network, learning = config.network, config.learning
     camera = None if options.camera is None else Camera.load(options.camera)
@@ -110,15 +113,16 @@ def main(options: Options) -> dict[str, Any]:
     tx = optimiser(learning)
     step = jax.jit(make_step(network, learning, tx, sample))
     state = train(lambda state: step(state, bank, camera, loss_weights),
-                  init_state(network, learning, tx, begun(config)), config, options)
+                  init_state(network, learning, tx, begun(options.start, config)), config, options)
     figures = measure(network, state.params, learning, camera, options.batches)
     conventions = ENDPOINTS if isinstance(network, EVFlowNet) else scored_by(
         "video", "lpips" in figures)
     result = {"steps": int(state.step), "scored_by": conventions, **figures}
     card = {"preset": options.preset, "steps": int(state.step), "seed": learning.seed,
-            "data": ", ".join(config.recordings)
+            "data": ", ".join(map(str, options.recordings))
             or "procedural textures and scikit-image's photographs, simulated",
-            "held_out": result, "config": as_dict(config), **provenance()}
+            "held_out": result, "config": as_dict(config), "files": named(options),
+            **provenance()}
     save_network(options.out / f"{options.network}.safetensors", network, state.params, card,
                  normalised=learning.normalised, overwrite=True)
     write_result(options.out / f"{options.network}.json", result, as_dict(config))
@@ -134,14 +138,20 @@ def source(recordings: tuple[Path, ...], learning: LearningConfig) -> tuple[Any,
     return make_bank(jax.random.fold_in(jax.random.key(learning.seed), 7)), sample_sequences
 
 
-def begun(config: Run) -> Params | None:
+def named(options: Options) -> dict[str, str]:
+    """The files whose content `Run` tells, as they were given."""
+    names = ("lpips", "camera", "start")
+    return {k: str(v) for k in names if (v := getattr(options, k)) is not None}
+
+
+def begun(start: str | None, config: Run) -> Params | None:
     """Params to go on from, None for fresh ones; EV018 where they are another network's."""
-    if config.start is None:
+    if start is None:
         return None
-    trained = load_network(config.start)
+    trained = load_network(start)
     if (trained.network, trained.normalised) != (config.network, config.learning.normalised):
         raise EvflowDataError(
-            "EV018", f"{config.start} is {trained.network}, normalised={trained.normalised}; "
+            "EV018", f"{start} is {trained.network}, normalised={trained.normalised}; "
             f"this run trains {config.network}, normalised={config.learning.normalised}.",
             "Start from weights of the same network and preset, or leave --start out.")
     return trained.params
@@ -160,9 +170,14 @@ def configuration(options: Options) -> Run:
     if options.recordings and options.camera:
         raise EvflowDataError("EV020", "--camera with --recordings, which have their own.",
                               "Leave one out.")
-    camera = None if options.camera is None else str(options.camera)
-    recordings = tuple(map(str, options.recordings))
-    return Run(network, learning, options.lpips, camera, recordings, options.start)
+    lpips = options.lpips if options.lpips in (None, "auto") else digest(Path(options.lpips))
+    camera = None if options.camera is None else digest(options.camera)
+    # A folder's content may be hours of images: it is known by its place.
+    recordings = tuple(str(path.resolve()) if path.is_dir() else digest(path)
+                       for path in options.recordings)
+    start = None if options.start is None else digest(
+        path if (path := Path(options.start)).is_file() else weights_path(path))
+    return Run(network, learning, lpips, camera, recordings, start)
 
 
 def measure(
@@ -228,7 +243,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except EvflowDataError as e:
-        raise SystemExit(str(e)) from None
+    run_script(main, Options, __doc__)

@@ -15,7 +15,7 @@ from processes import PATIENCE_S, Processes
 
 from evflow.dataset import verify
 from evflow.dataset.manifest import Manifests
-from experiments import make_dataset
+from evflow.progress import INTERRUPTED
 
 COMMAND = ("-m", "experiments.make_dataset", "--preset", "debug")
 
@@ -80,7 +80,7 @@ def test_signals_leave_nothing_half_done(
     family = children(process.pid)
     assert (len(family) >= 2) == (workers == 2)
     process.send_signal(number)
-    assert process.wait(PATIENCE_S) == (-9 if number == signal.SIGKILL else make_dataset.STOPPED)
+    assert process.wait(PATIENCE_S) == (-9 if number == signal.SIGKILL else INTERRUPTED)
     if number != signal.SIGKILL:
         assert_tidy(folder)
     give_up = time.monotonic() + 30

@@ -206,3 +206,13 @@ def test_every_format_is_listed_with_what_it_can() -> None:
         assert (read, write) == ("yes", "yes" if writer else "no")
         assert ("written" in frames) == bool(writer and writer.DEPTHS)
         assert ("uint8 only" in frames) == bool(writer and writer.DEPTHS == ("uint8",))
+
+
+def test_what_is_said_of_the_experiments_presets_is_so() -> None:
+    scripts = {p.stem: p.read_text() for p in (ROOT / "experiments").glob("*.py")}
+    without = {name for name, text in scripts.items()
+               if "__main__" in text and "    preset: " not in text}
+    making = {"calibrate", "combine", "fuse", "tell_apart"}
+    assert without == {"quickstart", "evaluate_network", "guessed_frames", *making}
+    text = (ROOT / "docs/experiments.md").read_text("utf-8")
+    assert all(f"`{name}`" in text.partition("| script")[0] for name in without - making)

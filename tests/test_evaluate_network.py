@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -117,12 +118,16 @@ def test_histograms_are_equalised() -> None:
 
 
 def test_video_and_flow_are_scored_and_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "mine.npz"
     write_recording(path, recording(), "npz")
     names = (saved(tmp_path, E2VID(base=4, encoders=1, blocks=0)),
              saved(tmp_path, EVFlowNet(base=2)))
+    shown: list[str] = []
+    picture = evaluate_network.picture
+    monkeypatch.setattr(evaluate_network, "picture",
+                        lambda pairs, path: (shown.extend(pairs), picture(pairs, path)))
     result = evaluate_network.main(Options(
         weights=names, data=(path,), out=tmp_path / "out", aggregate="sequences", histeq="global"))
     video = result[names[0]]["video"]
@@ -130,7 +135,11 @@ def test_video_and_flow_are_scored_and_written(
     assert video["protocol"]["aggregate"] == "sequences"
     assert np.isfinite([video["mse"], video["log_mse"], video["sequences"]["mine"]["ssim"]]).all()
     assert result[names[1]]["flow"]["mine"]["windows"] == 39
-    assert "| mine |" in capsys.readouterr().out
+    assert shown == [f"mine, {names[0]}"]  # weights of one name in two folders are two
+    told = capsys.readouterr().out
+    assert "| mine |" in told
+    assert "| GE (Ours) | .052/.704/.266 |" in told
+    assert "| GE (Ours) | 1.66 |" in told
     stored = json.loads((tmp_path / "out" / "evaluate_network.json").read_text())
     assert stored["config"]["histeq"] == "global"
     assert cv2.imread(str(tmp_path / "out" / "evaluate_network.png")) is not None
@@ -142,6 +151,26 @@ def test_video_and_flow_are_scored_and_written(
     aggregates = {p: evaluate_network.protocol_of(Options(protocol=p)).aggregate
                   for p in ("evreal", "etnet")}
     assert aggregates == {"evreal": "frames", "etnet": "sequences"}
+
+
+def test_recordings_that_give_nothing_are_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+
+    def read(_: Path, **hints: object) -> Recording:
+        asked.append(hints)
+        return Recording.of_events(recording().events)
+
+    monkeypatch.setattr(recorded, "read_recording", read)
+    options = Options(weights=(saved(tmp_path, E2VID(base=4, encoders=1, blocks=0)),),
+                      data=(tmp_path / "mine.txt",), out=tmp_path / "out", size="32x24")
+    with pytest.raises(EvflowDataError, match=r"EV011.*mine\.txt could be scored"):
+        evaluate_network.main(options)
+    assert asked == [{"size": SIZE}]
+    assert not options.out.exists()
+    with pytest.raises(EvflowDataError, match=r"EV020.*WxH"):
+        evaluate_network.parts(dataclasses.replace(options, size="32"))
 
 
 @pytest.mark.slow

@@ -214,6 +214,43 @@ def test_less_error_is_better_and_nothing_is_claimed_of_a_single_seed() -> None:
     assert ".052/.704/.266" in text  # Table V
 
 
+def test_a_table_is_never_replaced_by_a_narrower_one(tmp_path: Path) -> None:
+    path = tmp_path / "see_better.json"
+    both = [target(), target("low")]
+    full, fewer = (conditions(workshop(tmp_path), both, names, {}, {})
+                   for names in (("default", "wide", "oracle"), ("wide",)))
+    see_better.nothing_lost(tmp_path, fewer, 1)  # there is none
+    rows = {name: {"ssim": scores([0.1, 0.2])} for name in ("default", "wide", "oracle")}
+    found = {t.name: gains.compared(rows) for t in both}
+    path.write_text(json.dumps({"result": {"targets": found}}))
+    see_better.nothing_lost(tmp_path, full, 2)
+    alone = conditions(workshop(tmp_path), both[:1], ("default", "wide", "oracle"), {}, {})
+    for given, seeds, lost in ((fewer, 3, "default, oracle,"), (full, 1, "seed 1,"),
+                               (alone, 2, "low noisy,")):
+        with pytest.raises(EvflowDataError, match=f"EV013.* has {lost} which"):
+            see_better.nothing_lost(tmp_path, given, seeds)
+
+
+def test_eventgan_goes_with_its_weights(tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*--eventgan PATH"):
+        see_better.chosen(Options(names=("default", "eventgan")))
+    weights = tmp_path / "absent.safetensors"
+    for preset in ("debug", "full"):
+        assert see_better.chosen(Options(preset=preset, eventgan=weights)).names[-1] == "eventgan"
+    setting = see_better.chosen(Options(names=("default",), eventgan=weights))
+    assert setting.names == ("default", "eventgan")
+    with pytest.raises(EvflowDataError, match=r"EV016.*absent"):
+        Trainings(setting, tmp_path, eventgan=weights).conditions({}, {})
+    for wrong in ({"seeds": 0}, {"steps": 0}):
+        with pytest.raises(EvflowDataError, match=r"EV020.*Give 1 or more"):
+            see_better.chosen(Options(**wrong))
+
+
+def test_of_nothing_there_is_no_picture(tmp_path: Path) -> None:
+    gains.picture({"high noisy": {}}, tmp_path / "none.png")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_seeds_without_a_partner_are_left_out() -> None:
     some = {k: v for k, v in scores([0.2, 0.4, 0.9]).items() if k != 1}
     change = gains.difference(some, scores([0.1, 5.0]))

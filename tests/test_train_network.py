@@ -21,7 +21,7 @@ from evflow.downstream.presets import KINDS, TRAININGS, training
 from evflow.downstream.train import make_step, optimiser
 from evflow.errors import EvflowDataError
 from evflow.weights import model_card
-from experiments import loop
+from experiments import ablate, loop, train_eventgan
 from experiments import train_network as command
 
 MOST_BYTES = 2_000_000  # of released weights
@@ -67,8 +67,9 @@ def test_the_loop_goes_on_where_it_stopped(tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
         return advance(state)
 
-    half = loop.train(told_to_stop, start(), Plan(), Given(tmp_path / "b"))
-    assert int(half.step) == 5
+    with pytest.raises(KeyboardInterrupt, match=r"stopped after step 5 of 7.*goes on"):
+        loop.train(told_to_stop, start(), Plan(), Given(tmp_path / "b"))
+    assert [p.name for p in (tmp_path / "b/steps").iterdir()] == ["3", "5"]
     with (tmp_path / "b" / "metrics.jsonl").open("a") as log:  # a crash after the checkpoint
         log.write('{"step": 6, "time": 1.0, "at": 0.0}\n{"step": 7, "ti')
     again = loop.train(advance, start(), Plan(), Given(tmp_path / "b", resume="must"))
@@ -91,6 +92,30 @@ def test_the_loop_stops_in_time_and_keeps_runs_apart(tmp_path: Path) -> None:
     with pytest.raises(EvflowDataError, match="EV016"):
         loop.train(advance, start(), Plan(), Given(tmp_path / "none", resume="must"))
     assert not (tmp_path / "none").exists()
+
+
+def test_the_loop_ends_where_it_diverges(tmp_path: Path) -> None:
+    def diverges(state: Walk) -> tuple[Walk, dict[str, jax.Array]]:
+        state, metrics = advance(state)
+        return (Walk(state.step, state.at * jnp.nan), {"at": state.at * jnp.nan}
+                ) if int(state.step) == 5 else (state, metrics)
+
+    with pytest.raises(EvflowDataError, match=r"EV007.*at = nan after step 5"):
+        loop.train(diverges, start(), Plan(), Given(tmp_path))
+    assert [p.name for p in (tmp_path / "steps").iterdir()] == ["3"]
+
+
+def test_numbers_that_leave_nothing_to_do_are_refused_at_once(tmp_path: Path) -> None:
+    for wrong in ({"batches": 0}, {"batches": -1}, {"save_every": 0}):
+        with pytest.raises(EvflowDataError, match=r"EV020.*Give 1 or more"):
+            command.main(command.Options(out=tmp_path / "run", **wrong))
+    for wrong in ({"scenes": 0}, {"steps": 0}):
+        with pytest.raises(EvflowDataError, match=r"EV020.*Give 1 or more"):
+            train_eventgan.main(train_eventgan.Options(out=tmp_path / "run", **wrong))
+    for wrong in ({"batches": 0}, {"steps": 0}):
+        with pytest.raises(EvflowDataError, match=r"EV020.*Give 1 or more"):
+            ablate.main(ablate.Options("steps", out=tmp_path / "run", **wrong))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(("kind", "preset"), TRAININGS)
@@ -122,13 +147,36 @@ def test_a_preset_may_ask_for_normalised_tensors() -> None:
 
 def test_a_run_goes_on_from_weights_of_its_own_network() -> None:
     asked = command.Options(out=Path(), network="e2vid", start="e2vid-small")
-    begun = command.begun(command.configuration(asked))
+    begun = command.begun(asked.start, command.configuration(asked))
     jax.tree.map(np.testing.assert_array_equal, begun, load_network("e2vid-small").params)
-    assert command.begun(command.configuration(command.Options(out=Path()))) is None
+    assert command.begun(None, command.configuration(command.Options(out=Path()))) is None
     for other in ({"network": "firenet"}, {"normalised": True}):
         config = command.configuration(dataclasses.replace(asked, **other))
         with pytest.raises(EvflowDataError, match=r"EV018 .*e2vid-small"):
-            command.begun(config)
+            command.begun(asked.start, config)
+
+
+def test_files_of_a_run_are_known_by_what_they_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "camera.npz"
+    path.write_bytes(b"one")
+
+    def run(**files: object) -> command.Run:
+        return command.configuration(command.Options(out=Path(), **files))
+
+    for name, kind in (("camera", Path), ("start", str), ("lpips", str)):
+        first, same = run(**{name: kind(path)}), run(**{name: kind("camera.npz")})
+        assert first == same != run()
+        path.write_bytes(path.read_bytes() + b"another")
+        assert run(**{name: kind(path)}) != first
+        with pytest.raises(EvflowDataError, match="EV016"):
+            run(**{name: kind("absent.npz")})
+    original = {"network": "evflownet", "preset": "original"}
+    for recording in (path, tmp_path):  # a file, a folder
+        assert run(recordings=(recording,), **original) == run(
+            recordings=(recording.relative_to(tmp_path),), **original)
 
 
 @pytest.mark.slow
@@ -136,7 +184,7 @@ def test_a_run_goes_on_from_weights_of_its_own_network() -> None:
 def test_the_command_trains_resumes_and_measures(tmp_path: Path, kind: str) -> None:
     straight = command.Options(out=tmp_path / "a", network=kind, preset="debug", batches=1)
     result = command.main(straight)
-    assert np.isfinite(list(result.values())).all()
+    assert np.isfinite([v for v in result.values() if isinstance(v, float)]).all()
     halves = dataclasses.replace(straight, out=tmp_path / "b")
     for resume, seconds in (("never", 0.0), ("must", math.inf)):
         command.main(dataclasses.replace(halves, resume=resume, max_seconds=seconds))
