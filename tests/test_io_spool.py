@@ -129,5 +129,6 @@ def test_windows_of_a_file_larger_than_memory(tmp_path: Path, kind: str) -> None
             capture_output=True, text=True, timeout=120)
         if fits:
             assert done.stdout.split() == [str(EVENTS)] * 2, done.stderr
-        else:
-            assert "memory" in done.stderr.lower()
+        else:  # a library may die of it instead of saying so
+            assert done.returncode < 0 or "memory" in done.stderr.lower()
+            assert not done.stdout
