@@ -122,6 +122,7 @@ def test_reconstructed_folders_are_frames_for_other_commands(
     assert not seen.frames_were_made
     assert with_frames(seen, out).frames_were_made
     assert with_frames(seen, out, timestamps=out / "timestamps.txt").frames_were_made
+    assert with_frames(seen, out, fps=30.0, offset_us=T0).frames_were_made
     (out / "mine.txt").touch()
     assert main([*command, "--overwrite"]) == 1
     assert "EV013" in capsys.readouterr().err

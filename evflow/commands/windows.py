@@ -39,13 +39,10 @@ class Windowed(Reading):
 
     def check_film(self) -> None:
         """EV020 where no film can be made so, before any long work."""
-        from evflow.report.video import FPS, SCALES
+        from evflow.report.video import FPS, SCALES, check_within
 
-        for name, (low, high) in (("scale", SCALES), ("fps", FPS)):
-            given = getattr(self, name)
-            if given is not None and not low <= given <= high:
-                raise EvflowDataError(
-                    "EV020", f"--{name} {given:g}.", f"Give a value from {low:g} to {high:g}.")
+        check_within(SCALES, "scale", self.scale)
+        check_within(FPS, "fps", self.fps)
 
     def times(self, recording: Recording) -> np.ndarray:
         """The ends (T,) of the windows; EV020 where options contradict each other."""

@@ -43,9 +43,10 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     times), and what `read_times` raises.
     """
     folder, files = _find(root)
+    made = _remark(folder)
     if hints.fps is not None:
         times = np.array([hints.at_rate(i) for i in range(len(files))], np.int64)
-        return ImageFolder(tuple(files), times, ())
+        return ImageFolder(tuple(files), times, made)
     source = _times_file(root, folder, hints)
     by_name = {file.name: file for file in files}
     us, names, note = read_times(source, hints.time_unit, by_name)
@@ -60,8 +61,7 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
             f"{len(set(names)) if names else len(us)}.",
             "Images lost, or of another recording? Give each image one time, or pass --fps.")
     files = [by_name[name] for name in names] if names else files
-    notes = (note, _remark(source))
-    return ImageFolder(tuple(files), us, tuple(n for n in notes if n))
+    return ImageFolder(tuple(files), us, ((note,) if note else ()) + made)
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -126,13 +126,18 @@ def _find(root: Path) -> tuple[Path, list[Path]]:
     raise EvflowDataError("EV008", f"{root} {seen}.", "Pass the one folder that has the frames.")
 
 
-def _remark(source: Path) -> str:
-    """The first line of a file of times, where it says that the images were made from events."""
-    if source.suffix == ".npy":
-        return ""
-    with source.open(encoding="utf-8", errors="replace") as lines:
-        first = lines.readline(1000).lstrip("# ").strip()
-    return first if MADE in first else ""
+def _remark(folder: Path) -> tuple[str, ...]:
+    """What the file of times that `evflow reconstruct` writes says at its head, wherever the times
+    are taken from: that the images were made from events."""
+    path = folder / TIMES[0]
+    if not path.is_file():  # a pipe has no end
+        return ()
+    try:
+        with path.open(encoding="utf-8", errors="replace") as lines:
+            first = lines.readline(1000).lstrip("# ").strip()
+    except OSError:
+        return ()
+    return (first,) if MADE in first else ()
 
 
 def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:

@@ -19,7 +19,15 @@ from evflow.files import atomic_write
 from evflow.recording import Progress
 from evflow.report.plots import event_image
 from evflow.report.resimulate import busiest_instant
-from evflow.report.video import CODECS, FPS, SCALES, Codec, enlarged, write_video
+from evflow.report.video import (
+    CODECS,
+    FPS,
+    SCALES,
+    Codec,
+    check_within,
+    enlarged,
+    write_video,
+)
 from evflow.types import Recording
 
 SUFFIXES = (".mp4", ".gif", ".png")
@@ -42,12 +50,9 @@ class Film:
     codec: Codec = "mpeg4"
 
     def __post_init__(self) -> None:
-        for name, low, high in (("fps", *FPS), ("window_us", 1, 10**9),
-                                ("slow", 1e-3, 1e6), ("scale", *SCALES)):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise EvflowDataError(
-                    "EV020", f"{name}={value}.", f"Give a value from {low:g} to {high:g}.")
+        for name, bounds in (("fps", FPS), ("window_us", (1, 10**9)), ("slow", (1e-3, 1e6)),
+                             ("scale", SCALES)):
+            check_within(bounds, name, getattr(self, name))
         if self.codec not in CODECS:
             raise EvflowDataError("EV020", f"codec={self.codec!r}.", f"Choose {CODECS}.")
 

@@ -45,8 +45,7 @@ def write_video(
     """
     path = Path(path)
     kind = path.suffix.lower()
-    if not FPS[0] <= fps <= FPS[1]:
-        raise EvflowDataError("EV020", f"fps={fps}.", f"Give a value from {FPS[0]} to {FPS[1]:g}.")
+    check_within(FPS, "fps", fps)
     with atomic_write(path, overwrite=overwrite) as temporary, \
             tempfile.TemporaryDirectory(dir=temporary.parent, prefix=".render") as folder:
         made = Path(folder) / f"film{kind}"
@@ -56,6 +55,14 @@ def write_video(
             said = _write_film(made, pictures, count, fps, "mjpeg" if kind == ".avi" else codec)
         os.replace(made, temporary)
     return f"{count} pictures, {count / fps:.1f} s, {said}"
+
+
+def check_within(bounds: tuple[float, float], name: str, value: float | None) -> None:
+    """EV020 for a value that is given and not between the bounds."""
+    low, high = bounds
+    if value is not None and not low <= value <= high:
+        raise EvflowDataError("EV020", f"{name}={value:g}.",
+                              f"Give a value from {low:g} to {high:g}.")
 
 
 def write_images(
