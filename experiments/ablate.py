@@ -34,7 +34,14 @@ from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank
 from evflow.train import cut_block, init_state, make_run_step, optimiser
 from evflow.weights import load_weights, save_weights
-from experiments.common import at_least, provenance, run_script, slug, write_result
+from experiments.common import (
+    at_least,
+    compiled_quickly,
+    provenance,
+    run_script,
+    slug,
+    write_result,
+)
 
 Array = jax.Array
 Study = Literal["losses", "steps", "networks"]
@@ -159,8 +166,9 @@ def main(options: Options) -> dict[str, Any]:
     out = options.out / options.study
     result: dict[str, Any] = {}
     for name, config in chosen.items():
-        params, seconds = train(config, bank, name)
-        result[name] = {**score(params, config, held, options), "seconds": seconds}
+        with compiled_quickly(small):
+            params, seconds = train(config, bank, name)
+            result[name] = {**score(params, config, held, options), "seconds": seconds}
         save_estimator(out / f"{slug(name)}.safetensors", params, config)
     text = table(result, base.steps)
     print(text)
