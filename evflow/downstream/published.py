@@ -6,10 +6,8 @@ skips) is read off the arrays, so that networks of other sizes trained by the sa
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
-from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -20,48 +18,13 @@ from evflow.downstream.e2vid import E2VID
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.firenet import FireNet
 from evflow.downstream.network import Network, Params
+from evflow.downstream.published_names import LEAVES, PREFIXES, modules, published
 from evflow.downstream.torch_file import read_checkpoint
 from evflow.errors import EvflowDataError, naming
 
 Arrays = dict[str, np.ndarray]
 
 SPLIT_BINS = 10  # S2R's later models: five of ON events, then five of OFF
-PREFIXES = ("unetrecurrent.", "unet.", "net.")
-# Published module -> ours, by the first pattern that fits the whole name.
-RULES: dict[str, tuple[tuple[str, str], ...]] = {
-    "E2VID": (
-        (r"head\.conv2d", "head/conv"),
-        (r"encoders\.(\d)\.conv\.conv2d", r"encoder_\1/conv"),
-        (r"encoders\.(\d)\.conv\.norm_layer", r"encoder_\1/norm"),
-        (r"encoders\.(\d)\.recurrent_block\.Gates", r"lstm_\1/gates"),
-        (r"resblocks\.(\d)\.conv([12])", r"block_\1/half\2/conv"),
-        (r"resblocks\.(\d)\.bn([12])", r"block_\1/half\2/norm"),
-        (r"decoders\.(\d)\.conv2d", r"decoder_\1/layer/conv"),
-        (r"decoders\.(\d)\.transposed_conv2d", r"decoder_\1"),
-        (r"decoders\.(\d)\.norm_layer", r"decoder_\1/norm"),
-        (r"pred\.conv2d", "prediction/conv"),
-        (r"pred\.norm_layer", "prediction/norm"),
-    ),
-    "FireNet": (
-        (r"head(?:\.conv)?\.conv2d", "head/conv"),
-        (r"G1\.(reset|update|out)_gate", r"gru_0/\1"),
-        (r"G2\.(reset|update|out)_gate", r"gru_1/\1"),
-        (r"R1\.conv([12])", r"block_0/half\1/conv"),
-        (r"R2\.conv([12])", r"block_1/half\1/conv"),
-        (r"head\.recurrent_block\.(reset|update|out)_gate", r"gru_0/\1"),
-        (r"resblocks\.0\.recurrent_block\.(reset|update|out)_gate", r"gru_1/\1"),
-        (r"resblocks\.0\.conv\.conv([12])", r"block_0/half\1/conv"),
-        (r"resblocks\.1\.conv([12])", r"block_1/half\1/conv"),
-        (r"pred\.conv2d", "prediction/conv"),
-    ),
-    "EVFlowNet": (
-        (r"encoders\.(\d)\.conv2d", r"encoder_\1/conv"),
-        (r"resblocks\.(\d)\.conv([12])", r"block_\1/half\2/conv"),
-        (r"decoders\.(\d)\.conv2d", r"decoder_\1/conv"),
-        (r"pred\.conv2d", "prediction/conv"),
-    ),
-}
-LEAVES = {"weight": "kernel", "bias": "bias", "running_mean": "mean", "running_var": "var"}
 
 
 def load_published(path: str | os.PathLike) -> tuple[Network, Params]:
@@ -134,14 +97,18 @@ def to_params(network: Network, arrays: Arrays) -> Params:
     """The state dict as params of `network`; EV018 where a name or a shape does not fit."""
     expected = {join(keys): leaf.shape for keys, leaf in jax.tree_util.tree_leaves_with_path(
         jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16))))}
-    found, own = {}, {}
+    layers, found, own = modules(network), {}, {}
     for name, array in _stripped(arrays).items():
         if not name.endswith(".num_batches_tracked"):
-            path, value = _renamed(network, name, array)
+            module, _, leaf = name.rpartition(".")
+            if module not in layers or leaf not in LEAVES:
+                raise EvflowDataError(
+                    "EV018", f"{_called(network)} has nothing called {name[:80]!r}.")
+            path, value = _ours(layers[module], leaf, array, "transposed" in module)
             found[path] = value
             own[path] = next(p + name for p in ("", *PREFIXES) if p + name in arrays)
     if missing := sorted(expected.keys() - found.keys()):
-        said = ", ".join(f"{path} ({_published(network, path)})" for path in missing[:3])
+        said = ", ".join(f"{path} ({published(network, path)})" for path in missing[:3])
         raise EvflowDataError("EV018", f"the weights of {_called(network)} lack {said}.")
     params: Params = {}
     for path, value in found.items():
@@ -161,54 +128,15 @@ def to_params(network: Network, arrays: Arrays) -> Params:
     return params
 
 
-def _renamed(network: Network, name: str, array: np.ndarray) -> tuple[str, np.ndarray]:
+def _ours(layer: str, leaf: str, array: np.ndarray, transposed: bool) -> tuple[str, np.ndarray]:
     """Our path and layout of one published array."""
-    module, _, leaf = name.rpartition(".")
-    path = _layer(network, module)
-    if path is None or leaf not in LEAVES:
-        raise EvflowDataError("EV018", f"{_called(network)} has nothing called {name[:80]!r}.")
     if leaf == "weight" and array.ndim == 1:
-        return f"{path}/scale", array
+        return f"{layer}/scale", array
     if leaf == "weight" and array.ndim == 4:
-        if "transposed" in module:  # (in, out, h, w), of which a convolution takes the mirror image
-            return f"{path}/kernel", array[:, :, ::-1, ::-1].transpose(2, 3, 0, 1)
-        return f"{path}/kernel", array.transpose(2, 3, 1, 0)
-    return f"{path}/{LEAVES[leaf]}", array
-
-
-def _layer(network: Network, module: str) -> str | None:
-    """Our path of a published module; None where there is none."""
-    for pattern, ours in RULES[_called(network)]:
-        if match := re.fullmatch(pattern, module):
-            path = match.expand(ours).replace("half1", "first").replace("half2", "second")
-            if path.startswith("decoder") and path.endswith("/norm"):
-                path = path if getattr(network, "decoder", "") == "transposed" else path.replace(
-                    "/norm", "/layer/norm")
-            return path
-    return None
-
-
-def _published(network: Network, path: str) -> str:
-    """What published files call the weights at our path."""
-    layer, _, ours = path.rpartition("/")
-    leaf = next((theirs for theirs, name in LEAVES.items() if name == ours), "weight")
-    modules = [module for pattern, _ in RULES[_called(network)] for module in _spelled(pattern)
-               if _layer(network, module) == layer]
-    return " or ".join(f"{module}.{leaf}" for module in modules)
-
-
-def _spelled(pattern: str) -> list[str]:
-    """All names that the pattern of a rule fits: its groups are digits, or words to choose from."""
-    choices: list[Iterable[str]] = []
-    for part in re.split(r"(\(.*?\)\??)", pattern):
-        if part.endswith(")?"):
-            choices.append((part[3:-2], ""))
-        elif part.startswith("("):
-            words = {r"\d": "0|1|2|3|4|5|6|7|8|9", "[12]": "1|2"}.get(part[1:-1], part[1:-1])
-            choices.append(words.split("|"))
-        else:
-            choices.append([part])
-    return ["".join(chosen).replace("\\", "") for chosen in itertools.product(*choices)]
+        if transposed:  # (in, out, h, w), of which a convolution takes the mirror image
+            return f"{layer}/kernel", array[:, :, ::-1, ::-1].transpose(2, 3, 0, 1)
+        return f"{layer}/kernel", array.transpose(2, 3, 1, 0)
+    return f"{layer}/{LEAVES[leaf]}", array
 
 
 def _stripped(arrays: Arrays) -> Arrays:
