@@ -180,7 +180,7 @@ def coco(folder: Path, case: str) -> Sample:
     return made
 
 
-# ------------------------------------------------------------------------------------- ROS 1 bags
+# --------------------------------------------------------------------------------------- ROS bags
 
 if "rosbag" in SAMPLES:
     @hostile
@@ -198,3 +198,15 @@ if "rosbag" in SAMPLES:
             connection = writer.add_connection(topic, kind, msgdef="uint8 x\n", md5sum="0" * 32)
             writer.write(connection, ns, long)
         return sample(path)
+
+    @hostile
+    def bag2_bomb(folder: Path) -> Sample:
+        """A message of zeros in a chunk of some 12 kB."""
+        import numpy as np
+        import test_io_rosbag2
+
+        store = test_io_rosbag2.Store.new()
+        kind, ns, packet = store.packets(make(50).events, "mono")[0]
+        packet.events = np.zeros(1 << 27, np.uint8)
+        return sample(store.write(folder / "bag", {"/events": [(kind, ns, packet)]}, "MCAP",
+                                  "STORAGE"))

@@ -113,6 +113,20 @@ def bag(folder: Path, encoding: str, lz4: bool) -> Sample:
     return sample(test_io_rosbag.write(folder / "a.bag", messages, lz4), counted=True)
 
 
+def bag2(folder: Path, storage: str, encoding: str, compression: str | None) -> Sample:
+    """A folder; its metadata have the ends of time and the counts, which nothing is read by."""
+    import test_io_rosbag2
+
+    recording, store = make(N, FRAMES), test_io_rosbag2.Store.new()
+    events = (store.packets(recording.events, encoding) if encoding else
+              store.arrays(recording.events))
+    path = store.write(folder / "bag", {
+        "/cam/events": events, "/cam/image_raw": store.images(recording)}, storage, compression)
+    metadata = path / "metadata.yaml"
+    file, = (p for p in path.iterdir() if p != metadata)
+    return sample(path, file, metadata)
+
+
 def aedat4(folder: Path) -> Sample:
     """Uncompressed, so that damage reaches the tables behind the decompression."""
     recording = make(N, FRAMES)
@@ -256,6 +270,9 @@ if importlib.util.find_spec("rosbags") is not None:
     SAMPLES["rosbag"] = partial(bag, encoding="", lz4=False)
     SAMPLES["rosbag-lz4"] = partial(bag, encoding="libcaer", lz4=True)
     SAMPLES["rosbag-evt3"] = partial(bag, encoding="evt3", lz4=False)
+    SAMPLES["rosbag2"] = partial(bag2, storage="SQLITE3", encoding="", compression=None)
+    SAMPLES["rosbag2-mcap"] = partial(bag2, storage="MCAP", encoding="libcaer", compression=None)
+    SAMPLES["rosbag2-zstd"] = partial(bag2, storage="MCAP", encoding="evt3", compression="STORAGE")
 SAMPLES |= {f"{kind}-partial": partial(forgiving, kind=kind)
             for kind in ("evt2", "evt3", "v2e-text", "e2vid", "ijrr", "v2e", "aedat4", "rosbag")
             if kind in SAMPLES}

@@ -171,6 +171,18 @@ def test_what_is_no_message_of_ros_2_is_said(tmp_path: Path) -> None:
     assert "message 2: it begins with 0000" in str(error)
 
 
+def test_a_database_that_is_cut_off_is_refused(tmp_path: Path) -> None:
+    """SQLite reads rows from what is left, in whatever order."""
+    store, want = Store.new(), make()
+    folder = store.write(tmp_path / "bag", {"/dvs/events": store.arrays(want.events)})
+    file, = folder.glob("*.db3")
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-4096])
+    error = refused(file)
+    assert error.code == "EV009"
+    assert f"has {len(whole) - 4096:,} of {len(whole):,} bytes" in str(error)
+
+
 @pytest.mark.parametrize("storage", SUFFIX)
 def test_damaged_copies_only_raise_data_errors(tmp_path: Path, storage: str) -> None:
     store, want = Store.new(), make(300, 2)

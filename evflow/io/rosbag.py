@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import bz2
-import io
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from evflow.io.bag import Bag, read_bag
+from evflow.io.bounded import BoundedPath
 from evflow.io.hints import Hints
 from evflow.io.limits import RATIO
 from evflow.types import Recording
@@ -33,8 +32,7 @@ def read(path: Path, hints: Hints) -> Recording:
 def _open(path: Path) -> Any:
     from rosbags.rosbag1 import Reader
 
-    bounded: Any = _Bounded(path)  # what `Reader` uses of a path
-    reader = Reader(bounded)
+    reader = Reader(BoundedPath(path))
     reader.open()
     for place, chunk in reader.chunks.items():  # bombs are unpacked no further
         reader.chunks[place] = chunk._replace(decompressor=_bounded(chunk.decompressor))
@@ -58,22 +56,3 @@ def _bounded(unpack: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
         return out
 
     return bounded
-
-
-class _Bounded:
-    """A path whose open file never takes memory for more bytes than it has left."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def exists(self) -> bool:
-        return self.path.exists()
-
-    def open(self, mode: str) -> io.BufferedReader:
-        return _BoundedFile(io.FileIO(self.path, "r"))
-
-
-class _BoundedFile(io.BufferedReader):
-    def read(self, size: int | None = -1, /) -> bytes:
-        left = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
-        return super().read(left if size is None or size < 0 else min(size, left))
