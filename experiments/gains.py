@@ -21,6 +21,7 @@ from experiments.images import mean_ci
 
 Rows = dict[str, dict[str, dict[int, np.ndarray]]]  # label, measure, seed -> (N,) clips
 Result = dict[str, dict[str, dict[str, Any]]]  # label, measure -> figures
+Means = dict[str, dict[str, float]]  # label, measure
 
 RESAMPLES = 2000
 SHOWN = 10  # clips in the picture of examples
@@ -121,12 +122,16 @@ def share(
 
 
 def report(
-    result: dict[str, Result], task: str, cameras: dict[str, dict[str, float]], left: int
+    result: dict[str, Result], task: str, cameras: Means, left: int,
+    untrained: dict[str, Means] | None = None,
 ) -> str:
-    """Markdown: a table for every target, the cameras trained on, the paper's tables."""
+    """Markdown: a table for every target, below it what needs no network, the cameras trained on,
+    the paper's tables."""
     lines = [f"{left} trainings are missing.", ""] if left else []
     for target, rows in result.items():
         lines += [f"## {target}", "", *_measures(rows, task), ""]
+        if untrained:
+            lines += [*_untrained(untrained[target]), ""]
     lines += ["## Cameras trained on (medians)", "", *_cameras(cameras), "", "## The paper", "",
               *paper(task, {label for rows in result.values() for label in rows})]
     return "\n".join(lines)
@@ -152,6 +157,14 @@ def _measures(rows: Result, task: str) -> list[str]:
     return lines
 
 
+def _untrained(rows: Means) -> list[str]:
+    names = list(next(iter(rows.values())))
+    return [f"| without a network | {' | '.join(TITLES[n] for n in names)} |",
+            "|" + "---|" * (1 + len(names)),
+            *(f"| {label} | {' | '.join(f'{row[n]:.4f}' for n in names)} |"
+              for label, row in rows.items())]
+
+
 def _interval(name: str, change: dict[str, Any] | None) -> str:
     """Bold where it lies on the better side of 0."""
     if not change:
@@ -162,7 +175,7 @@ def _interval(name: str, change: dict[str, Any] | None) -> str:
     return f"**{text}**" if better(name, change) else text
 
 
-def _cameras(cameras: dict[str, dict[str, float]]) -> list[str]:
+def _cameras(cameras: Means) -> list[str]:
     names = ("theta_on", "theta_off", "eta_on", "eta_off", "sigma_on", "sigma_off")
     lines = ["| condition | θ ON | θ OFF | η ON [Hz] | η OFF [Hz] | spread ON | OFF |",
              "|" + "---|" * 7]

@@ -82,7 +82,7 @@ def _video(images: Array, frames: Array, lpips: Params | None) -> dict[str, Arra
     return jax.lax.map(clip, tuple(jnp.swapaxes(a, 0, 1) for a in (images, frames)))
 
 
-def flow_scores(flows: Array, clips: Clips, skipped: int) -> Scores:
+def flow_scores(flows: Array | np.ndarray, clips: Clips, skipped: int) -> Scores:
     """`FLOW` of the windows after those skipped; NaN where a clip has no events in them."""
     made = np.asarray(flows)
     rows = [score_flow(events, edges[skipped:], made[skipped:, i],
@@ -90,3 +90,15 @@ def flow_scores(flows: Array, clips: Clips, skipped: int) -> Scores:
             for i, (events, edges) in enumerate(zip(clips.events, clips.edges_us, strict=True))]
     return {name: np.array([np.nan if r.get(name) is None else r[name] for r in rows])
             for name in FLOW}
+
+
+def without_network(task: str, clips: Clips, skipped: int, lpips: Params | None
+                    ) -> dict[str, Scores]:
+    """The same scores of what needs no network: images of even grey; for "flow" none, and the mean
+    of each clip's true flow, which is not known to a network."""
+    if task == "video":
+        return {"even grey": video_scores(jnp.full_like(clips.frames, 0.5), clips, skipped, lpips)}
+    mean = np.nanmean(clips.flow[skipped:], (0, 3, 4), keepdims=True)
+    guesses = {"no flow": 0.0, "mean flow of the clip": mean}
+    return {name: flow_scores(np.broadcast_to(guess, clips.flow.shape), clips, skipped)
+            for name, guess in guesses.items()}

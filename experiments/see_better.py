@@ -215,12 +215,14 @@ def main(options: Options) -> dict[str, Any]:
             left -= 1
     scores = runs.scores(conditions)
     result = {target: gains.compared(of_target) for target, of_target in scores.items()}
+    untrained = runs.untrained(options.task)
     text = "\n\n".join((heading(options, setting), gains.report(
-        result, options.task, runs.told(conditions), left)))
+        result, options.task, runs.told(conditions), left, untrained)))
     print(text)
     how = held_out.scored_by(options.task, runs.lpips is not None)
     write_result(options.out / "see_better.json",
-                 {"targets": result, "missing": left, "scored_by": how},
+                 {"targets": result, "without_network": untrained, "missing": left,
+                  "scored_by": how},
                  as_dict(options) | {"setting": as_dict(setting)})
     (options.out / "see_better.md").write_text(text + "\n")
     gains.picture(result, options.out / "see_better.png")

@@ -27,7 +27,7 @@ from evflow.metrics import load_lpips
 from evflow.progress import bar
 from evflow.scenes import TextureBank, make_bank
 from evflow.weights import model_card
-from experiments import eventgan_sequences, held_out, targets
+from experiments import eventgan_sequences, gains, held_out, targets
 from experiments.common import provenance, slug, write_result
 from experiments.conditions import EVENTGAN, Condition, Workshop, conditions, digest, told
 
@@ -208,6 +208,13 @@ class Trainings:
                         for name, values in scores.items():
                             row.setdefault(name, {})[seed] = np.array(values, np.float64)
         return found
+
+    def untrained(self, task: str) -> dict[str, gains.Means]:
+        """Means of what needs no network, by target."""
+        return {t.name: {label: {name: float(np.nanmean(v)) for name, v in scores.items()}
+                         for label, scores in held_out.without_network(
+                             task, self.clips(t), self.setting.skipped, self.lpips).items()}
+                for t in self.targets}
 
     def told(self, wanted: list[Condition]) -> dict[str, dict[str, float]]:
         """What is known of the cameras that each condition was trained on, and the truth."""

@@ -20,7 +20,7 @@ from evflow.downstream.simulated import SequenceConfig, Sequences, _crop
 from evflow.errors import EvflowDataError
 from evflow.scenes import make_bank
 from evflow.types import Events
-from experiments import eventgan_sequences, gains, see_better, targets
+from experiments import eventgan_sequences, gains, held_out, see_better, targets
 from experiments.common import slug
 from experiments.conditions import Workshop, conditions, network_maps, told
 from experiments.see_better import Options, files
@@ -82,6 +82,24 @@ def test_clips_are_scenes_that_events_follow_and_repeat_themselves() -> None:
     some = np.abs(change) > 0.15
     assert some.sum() > 100
     assert np.corrcoef(change[some], events[some])[0, 1] > 0.5
+
+
+def test_scores_stand_beside_those_of_no_network() -> None:
+    """Two clips of two windows, of which the first is not scored: flow (3, 4) px in one of them."""
+    edges = np.array([0, 1000, 2000])
+    events = [Events([3, 4], [3, 4], [1, 1500], [True, True], (32, 24))] * 2
+    frames = jnp.stack([jnp.zeros((2, *SHAPE)), jnp.full((2, *SHAPE), 0.9)])
+    flow = np.zeros((2, 2, 2, *SHAPE), np.float32)
+    flow[1, 0] = np.array([3.0, 4.0])[:, None, None]
+    clips = held_out.Clips(events, [edges] * 2, jnp.zeros((2, 2, *SHAPE, 5)), frames, flow)
+    found = held_out.without_network("flow", clips, 1, None)
+    np.testing.assert_allclose(found["no flow"]["aee"], [5.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(found["mean flow of the clip"]["aee"], 0.0, atol=1e-5)
+    grey = held_out.without_network("video", clips, 1, None)["even grey"]
+    np.testing.assert_allclose(grey["mse"], 0.4**2, rtol=1e-4)
+    rows = {"high noisy": {k: {n: float(np.nanmean(x)) for n, x in v.items()}
+                           for k, v in found.items()}}
+    assert "| no flow | 2.5000 |" in gains.report({"high noisy": {}}, "flow", {}, 0, rows)
 
 
 def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
@@ -289,6 +307,7 @@ def test_runs_are_kept_and_gone_on_with(
     assert f"{len(SIMULATED)} trainings are missing" in capsys.readouterr().out
     saved = json.loads((tmp_path / "see_better.json").read_text())
     assert saved["result"]["missing"] == len(SIMULATED)
+    assert saved["result"]["without_network"]["high noisy"]["even grey"]["mse"] > 0
     for name in ("see_better.png", "see_better_clips.png"):
         assert cv2.imread(str(tmp_path / name)) is not None
     with pytest.raises(EvflowDataError, match="EV013"):
