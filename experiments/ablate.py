@@ -200,7 +200,7 @@ def table(result: dict[str, Any], steps: int) -> str:
             f"| {name} | {pair(row, 'sequence', 'theta')} | {on:.3f} / {off:.3f} | "
             f"{pair(row, 'sequence', 'eta')} | {eta_on:.3f} / {eta_off:.3f} | "
             f"{pair(row, 'pixel', 'theta')} | {pair(row, 'fired', 'theta')} | "
-            f"{row['events']:.2f} | {row['log p(z)']:.1f} | {row['seconds']:.0f} |")
+            f"{row['events']:.3g} | {row['log p(z)']:.1f} | {row['seconds']:.0f} |")
     return "\n".join(lines).replace("nan / nan", "–")
 
 

@@ -271,7 +271,8 @@ if importlib.util.find_spec("rosbags") is not None:
     SAMPLES["rosbag-lz4"] = partial(bag, encoding="libcaer", lz4=True)
     SAMPLES["rosbag-evt3"] = partial(bag, encoding="evt3", lz4=False)
     SAMPLES["rosbag2"] = partial(bag2, storage="SQLITE3", encoding="", compression=None)
-    SAMPLES["rosbag2-mcap"] = partial(bag2, storage="MCAP", encoding="libcaer", compression=None)
+    SAMPLES["rosbag2-mcap"] = partial(bag2, storage="MCAP", encoding="libcaer_cmp",
+                                      compression=None)
     SAMPLES["rosbag2-zstd"] = partial(bag2, storage="MCAP", encoding="evt3", compression="STORAGE")
 SAMPLES |= {f"{kind}-partial": partial(forgiving, kind=kind)
             for kind in ("evt2", "evt3", "v2e-text", "e2vid", "ijrr", "v2e", "aedat4", "rosbag")

@@ -14,7 +14,9 @@ import pytest
 from recordings import SIZE, damage, equal, make, refused
 from test_io_stream import evt3, survives
 
-from evflow.io import read_events, read_recording
+from evflow.io import libcaer_words, read_events, read_recording
+from evflow.io.messages import Packet
+from evflow.io.stream import Damage
 from evflow.types import Events, Recording
 
 ARRAY, PACKET, IMAGE = ("dvs_msgs/msg/EventArray", "event_camera_msgs/msg/EventPacket",
@@ -50,6 +52,29 @@ def array_messages(events: Events, topic: str = "/dvs/events") -> Messages:
     return out
 
 
+def compressed(events: Events, start: int) -> bytes:
+    """Words of libcaer_cmp, times since start: neighbours of a column in one vector."""
+    words, left = [], rows(events)
+    high = low = column = -1
+    while left:
+        x, y, t, p = left.pop(0)
+        if (t - start) >> 12 != high:
+            high = (t - start) >> 12
+            words.append(high)
+        if (t - start) & 0xFFF != low:
+            low = (t - start) & 0xFFF
+            words.append(0x1000 | low)
+        if x != column:
+            column = x
+            words.append(0x2000 | x)
+        mask, top = 1, y
+        while left and left[0][0] == x and left[0][2:] == (t, p) and top < left[0][1] < y + 8:
+            top = left.pop(0)[1]
+            mask |= 1 << (top - y)
+        words += [0x3000 | p << 11 | y] if mask == 1 else [0x4000 | p << 11 | y, 0x5000 | mask]
+    return struct.pack(f"<{len(words)}H", *words)
+
+
 def packet_messages(events: Events, encoding: str) -> Messages:
     out: Messages = []
     payload = evt3(events, b"")
@@ -61,6 +86,8 @@ def packet_messages(events: Events, encoding: str) -> Messages:
         elif encoding == "mono":
             data = b"".join(struct.pack("<Q", p << 63 | y << 48 | x << 32 | (t * 1000 - base))
                             for x, y, t, p in rows(part))
+        elif encoding == "libcaer_cmp":
+            data = compressed(part, base // 1000)
         else:
             start = 2**31 - 10_000  # wraps inside the packet
             data = b"".join(struct.pack(
@@ -118,7 +145,7 @@ def test_event_arrays_and_images(tmp_path: Path, lz4: bool) -> None:
 
 
 @needs_rosbags
-@pytest.mark.parametrize("encoding", ["evt3", "mono", "libcaer"])
+@pytest.mark.parametrize("encoding", ["evt3", "mono", "libcaer", "libcaer_cmp"])
 def test_event_packets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
 ) -> None:
@@ -132,7 +159,24 @@ def test_event_packets(
         if encoding == "evt3" and (np.diff(t) < 0).any():
             t = t + 2**24 * np.cumsum(np.diff(t, prepend=t[0]) < 0)
         equal(got.events, Events(want.x, want.y, t, want.p, SIZE))
-        assert got.has_frames == (encoding == "libcaer")
+        assert got.has_frames == encoding.startswith("libcaer")
+
+
+def test_words_of_libcaer_cmp_change_a_state() -> None:
+    """Column, time and base hold from word to word, column and base from message to message."""
+    words = [0x2005, 0x3803, 0x0002, 0x1007, 0x4010, 0x5003, 0x5080, 0x1009, 0x300C, 0x4820]
+    decoder = libcaer_words.Decoder()
+    x, y, t, p = decoder.decode(Packet(0, "", None, 10**9, struct.pack("<10H", *words)))
+    late = 10**9 + 1000 * (2 << 12 | 7)
+    assert x.tolist() == [5] * 5
+    assert y.tolist() == [3, 16, 17, 31, 12]
+    assert t.tolist() == [10**9, late, late, late, late + 2000]
+    assert p.tolist() == [True, False, False, False, False]
+    assert [len(c) for c in decoder.decode(Packet(1, "", None, 0, b""))] == [0] * 4
+    x, y, t, p = decoder.decode(Packet(2, "", None, 7000, struct.pack("<H", 0x5001)))
+    assert (x.tolist(), y.tolist(), t.tolist(), p.tolist()) == ([5], [32], [7000], [True])
+    with pytest.raises(Damage, match="0x6001"):
+        decoder.decode(Packet(3, "", None, 0, struct.pack("<H", 0x6001)))
 
 
 @needs_rosbags

@@ -65,8 +65,6 @@ class Bag:
             raise EvflowDataError(
                 "EV010", f"reading {path} needs the package 'rosbags'.",
                 'pip install "evflow-jax[ros]"') from e
-        except EvflowDataError:
-            raise
         except Exception as e:
             raise self._damaged(e) from e
 

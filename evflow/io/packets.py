@@ -2,8 +2,8 @@
 
 dvs_msgs/EventArray (uzh-rpg/rpg_dvs_ros; prophesee_event_msgs has the same bytes): 13-byte events
 on ROS time. event_camera_msgs/EventPacket: `evt3` (the sensor's clock), `mono` (64-bit words: ns
-since time_base, x, y, polarity) and `libcaer` (32-bit words x, y, polarity; us, wrapping at 31
-bits, on time_base).
+since time_base, x, y, polarity), `libcaer` (32-bit words x, y, polarity; us, wrapping at 31 bits,
+on time_base) and `libcaer_cmp` (see `libcaer_words`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io import evt3, stream
+from evflow.io import evt3, libcaer_words, stream
 from evflow.io.messages import EVENT, Packet
 from evflow.io.stream import Chunk, Clock, Damage
 
@@ -28,11 +28,12 @@ def decoder(
     """Chunks of the encoding of the first packet, and the unit of their times."""
     if first.encoding == "evt3":
         return evt3.Decoder("payload byte").chunks(_words(packets)), "us"
-    known = {"": _event_array, "mono": _mono, "libcaer": _libcaer}
+    known = {"": _event_array, "mono": _mono, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp}
     if first.encoding not in known:
         raise EvflowDataError(
             "EV008", f"{path}: events are encoded as {first.encoding[:20]!r}.",
-            "Known encodings: evt3, mono, libcaer; convert the bag with event_camera_tools.")
+            f"Known encodings: evt3, {', '.join(filter(None, known))}; convert the bag with "
+            "event_camera_tools.")
     return _counted(known[first.encoding](packets)), "ns"
 
 
@@ -79,3 +80,7 @@ def _libcaer(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, ...]]:
         data = table["data"]
         us = Clock(31).unwrap(table["t"] & 0x7FFFFFFF)
         yield (data >> 17, (data >> 2) & 0x7FFF, packet.base_ns() + us * 1000, data & 2 != 0)
+
+
+def _libcaer_cmp(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, ...]]:
+    return map(libcaer_words.Decoder().decode, packets)
