@@ -17,7 +17,7 @@ import numpy as np
 from evflow.io import prophesee
 from evflow.io.evt2 import leftovers
 from evflow.io.hints import Hints
-from evflow.io.stream import Chunk, Clock, collect, typed, words
+from evflow.io.stream import Chunk, Clock, collect, hold, typed, words
 from evflow.types import Recording
 
 NAME = "evt3"
@@ -96,7 +96,7 @@ class Decoder:
         time = (high << 12) + np.where(last < 0, low, np.where(is_high, 0, value)[last])
         if known is None:
             time[turn == 0] = NEVER
-        out = _hold(self.time, time, before[marks], n)
+        out = hold(self.time, time, before[marks], n)
         self.time = int(time[-1]) if len(time) else self.time
         return out
 
@@ -104,7 +104,7 @@ class Decoder:
         """y (n,) int32 of each emitting word."""
         marks = np.flatnonzero(kind == ROW)
         row = (table[marks] & 0x7FF).astype(np.int32)
-        out = _hold(self.row, row, before[marks], n)
+        out = hold(self.row, row, before[marks], n)
         self.row = int(row[-1]) if len(row) else self.row
         return out
 
@@ -118,8 +118,8 @@ class Decoder:
         passed = np.append(0, reached).astype(np.int32)
         base = (table[marks] & 0x7FF).astype(np.int32) - passed[before[marks]]
         on = (table[marks] & 0x800) != 0
-        x = _hold(self.base, base, before[marks], len(kind_of)) + passed[:-1]
-        p = _hold(self.on, on, before[marks], len(kind_of))
+        x = hold(self.base, base, before[marks], len(kind_of)) + passed[:-1]
+        p = hold(self.on, on, before[marks], len(kind_of))
         if len(marks):
             self.base, self.on = int(base[-1]), bool(on[-1])
         if self.base != UNKNOWN:
@@ -145,10 +145,3 @@ class Decoder:
 
     def notes(self) -> tuple[str, ...]:
         return leftovers(self.stateless, self.triggers)
-
-
-def _hold(carried: int, values: np.ndarray, at: np.ndarray, n: int) -> np.ndarray:
-    """(n,): `carried`, and from entry at[k] on values[k], until the next."""
-    held = np.empty(len(values) + 1, values.dtype)
-    held[0], held[1:] = carried, values
-    return np.repeat(held, np.diff(at, prepend=0, append=n))

@@ -13,7 +13,7 @@ import dataclasses
 import numpy as np
 
 from evflow.io.messages import Packet
-from evflow.io.stream import Damage
+from evflow.io.stream import Damage, hold
 
 HIGH, LOW, COLUMN, SINGLE, BASE, VECTOR = range(6)
 ROWS = 8  # of a vector
@@ -37,8 +37,8 @@ class Decoder:
                          "message")
         if not len(words):
             return (np.empty(0, np.int64),) * 4
-        time = (_held(kind == HIGH, value, 0) << 12) | _held(kind == LOW, value, 0)
-        x = _held(kind == COLUMN, value & PLACE, self.x)
+        time = (_told(kind == HIGH, value, 0) << 12) | _told(kind == LOW, value, 0)
+        x = _told(kind == COLUMN, value & PLACE, self.x)
         base, on = self._bases(kind, value)
         vectors = np.flatnonzero(kind == VECTOR)
         which, bit = np.nonzero((value[vectors, None] >> np.arange(ROWS)) & 1)
@@ -55,13 +55,13 @@ class Decoder:
         """Row of bit 0 and polarity of each vector word (at the others: of no meaning)."""
         is_base = kind == BASE
         advanced = ROWS * np.cumsum(kind == VECTOR)
-        base = _held(is_base, (value & PLACE) - advanced, self.base) + advanced
-        on = _held(is_base, value & ON, ON * self.on) != 0
+        base = _told(is_base, (value & PLACE) - advanced, self.base) + advanced
+        on = _told(is_base, value & ON, ON * self.on) != 0
         self.base, self.on = int(base[-1]), bool(on[-1])
         return base - ROWS, on
 
 
-def _held(tells: np.ndarray, values: np.ndarray, before: int) -> np.ndarray:
-    """The value of the last word that tells it, this one included; `before` where none has."""
-    last = np.maximum.accumulate(np.where(tells, np.arange(len(tells)), -1))
-    return np.where(last < 0, before, values[last])
+def _told(tells: np.ndarray, values: np.ndarray, before: int) -> np.ndarray:
+    """For each word the value of the last one that tells it; `before` where none has."""
+    marks = np.flatnonzero(tells)
+    return hold(before, values[marks], marks, len(values))

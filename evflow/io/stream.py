@@ -296,3 +296,10 @@ class _Gathered:
 def _place(path: Path, unit: str, number: int) -> str:
     total = f" of {os.path.getsize(path):,}" if unit == "byte" else ""
     return f"{unit} {number:,}{total}"
+
+
+def hold(carried: int, values: np.ndarray, at: np.ndarray, n: int) -> np.ndarray:
+    """(n,): `carried`, and from entry at[k] on values[k], until the next."""
+    held = np.empty(len(values) + 1, values.dtype)
+    held[0], held[1:] = carried, values
+    return np.repeat(held, np.diff(at, prepend=0, append=n))
