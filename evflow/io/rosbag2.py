@@ -42,13 +42,21 @@ def _open(path: Path) -> Any:
             _whole(file)
     reader = Reader(BoundedPath(path))
     reader.open()
-    storage: Any = reader.storage
+    try:
+        _check_chunks(reader.storage)
+    except ValueError:
+        reader.close()
+        raise
+    return reader
+
+
+def _check_chunks(storage: Any) -> None:
+    """ValueError where a chunk claims to expand beyond what recordings do."""
     for part in getattr(storage, "storages", (storage,)):
         for chunk in getattr(part, "chunks", ()):
             if chunk.uncompressed_size > LARGEST_CHUNK + RATIO * chunk.compressed_size:
                 raise ValueError(f"a chunk of {chunk.compressed_size:,} bytes claims "
                                  f"{chunk.uncompressed_size:,}")
-    return reader
 
 
 def _whole(path: Path) -> None:
