@@ -5,7 +5,6 @@ Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory, 130 i
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import Annotated, NoReturn, Union
 
@@ -27,7 +26,7 @@ from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
-from evflow.progress import INTERRUPTED, leave, stoppable
+from evflow.progress import INTERRUPTED, leave, stoppable, unread
 
 EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
 
@@ -65,8 +64,8 @@ def main(argv: list[str] | None = None) -> int:
     except MemoryError as e:
         print(f"out of memory: {e}", file=sys.stderr)
         return 3
-    except BrokenPipeError:  # `evflow info ... | head`: nobody reads on, and nothing is wrong
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        unread()
         return 0
     except OSError as e:
         print(f"the output cannot be written: {e}", file=sys.stderr)

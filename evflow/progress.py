@@ -1,5 +1,5 @@
-"""Long work: a bar with an estimate of the time left, silent where stderr is no terminal, and one
-way to stop."""
+"""Long work: a bar with an estimate of the time left, silent where stderr is no terminal; one way
+to stop; and where nobody reads on."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any, NoReturn
 
 from rich.console import Console
@@ -31,22 +32,29 @@ def bar(title: str) -> Iterator[Callable[[int, int], None]]:
 def stoppable() -> Iterator[None]:
     """SIGTERM, as schedulers send it, ends the block as Ctrl-C does: through every `finally`, so
     that nothing half-written is left. A signal that comes while Python collects garbage, where
-    exceptions are ignored, comes again."""
+    exceptions are ignored, or imports a module, which compiled ones do not survive or swallow,
+    comes again."""
     if threading.current_thread() is not threading.main_thread():
         yield  # handlers belong to the main thread
         return
 
-    def stop(*_: Any) -> None:
+    def later() -> None:
+        again.append(threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)))
+        again[-1].start()
+
+    def stop(_: int, frame: FrameType | None) -> None:
+        if _imports(frame) > outside:
+            return later()
         raise KeyboardInterrupt
 
     def ignored(lost: Any) -> None:
         if isinstance(lost.exc_value, KeyboardInterrupt):
-            again.append(threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)))
-            again[-1].start()
+            later()
         else:
             hook(lost)
 
     again: list[threading.Timer] = []
+    outside = _imports(sys._getframe())  # of the module that the block itself is run by
     before, hook = signal.signal(signal.SIGTERM, stop), sys.unraisablehook
     sys.unraisablehook = ignored
     try:
@@ -56,6 +64,20 @@ def stoppable() -> Iterator[None]:
             timer.cancel()
         sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
+
+
+def _imports(frame: FrameType | None) -> int:
+    """How many frames of the stack are of the machinery that imports."""
+    count = 0
+    while frame is not None:
+        count += frame.f_code.co_filename.startswith("<frozen importlib")
+        frame = frame.f_back
+    return count
+
+
+def unread() -> None:
+    """After BrokenPipeError (`evflow info ... | head`): nobody reads on, and nothing is wrong."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def leave(code: int) -> NoReturn:

@@ -19,7 +19,7 @@ import tyro
 
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
-from evflow.progress import INTERRUPTED, leave, stoppable
+from evflow.progress import INTERRUPTED, leave, stoppable, unread
 from evflow.report.provenance import weights_hash
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -70,7 +70,7 @@ def compiled_quickly(wanted: bool) -> Iterator[None]:
         jax.config.update("jax_disable_most_optimizations", False)
 
 
-def at_least(least: int, **options: int | None) -> None:
+def at_least(least: float, **options: float | None) -> None:
     """EV020 where an option that is given is less; by its name: `save_every` is --save-every."""
     for name, value in options.items():
         if value is not None and value < least:
@@ -90,9 +90,13 @@ def end_with(work: Callable[[], object]) -> NoReturn:
     try:
         with stoppable():
             code = work()
+            sys.stdout.flush()
     except EvflowDataError as e:
         raise SystemExit(str(e)) from None
     except KeyboardInterrupt as e:
         print(str(e) or "interrupted; no half-written file is left.", file=sys.stderr)
         leave(INTERRUPTED)
+    except BrokenPipeError:
+        unread()
+        code = 0
     raise SystemExit(code if isinstance(code, int) else 0)

@@ -218,7 +218,6 @@ def main(options: Options) -> dict[str, Any]:
     untrained = runs.untrained(options.task)
     text = "\n\n".join((heading(options, setting), gains.report(
         result, options.task, runs.told(conditions), left, untrained)))
-    print(text)
     how = held_out.scored_by(options.task, runs.lpips is not None)
     write_result(options.out / "see_better.json",
                  {"targets": result, "without_network": untrained, "missing": left,
@@ -229,6 +228,7 @@ def main(options: Options) -> dict[str, Any]:
     if options.task == "video":
         gains.examples(runs.examples(conditions, runs.targets[0]),
                        options.out / "see_better_clips.png")
+    print(text)
     return result
 
 

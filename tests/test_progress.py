@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -44,6 +46,39 @@ def test_a_signal_where_exceptions_are_ignored_comes_again() -> None:
     with pytest.raises(KeyboardInterrupt), stoppable():
         endless()
     assert (sys.unraisablehook, signal.getsignal(signal.SIGTERM)) == (hook, handler)
+
+
+def test_a_signal_amid_an_import_waits_for_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "interrupted_import.py").write_text(
+        "import signal\nsignal.raise_signal(signal.SIGTERM)\nwhole = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def work() -> None:
+        import interrupted_import
+
+        assert interrupted_import.whole
+        time.sleep(10)
+
+    with pytest.raises(KeyboardInterrupt), stoppable():
+        work()
+    # Of a block that is itself run by an import, no end of that import is waited for.
+    (tmp_path / "running_import.py").write_text(
+        "import signal, time\nfrom evflow.progress import stoppable\n"
+        "with stoppable():\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(10)\n")
+    with pytest.raises(KeyboardInterrupt):
+        import running_import  # noqa: F401
+
+
+def test_scripts_whose_output_nobody_reads_end_quietly(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("from experiments import common\n"
+                      "common.end_with(lambda: print('line\\n' * 100_000))\n")
+    run = subprocess.run(f"{sys.executable} {script} | head -n 1", shell=True, timeout=60,
+                         capture_output=True, text=True, cwd=Path(common.__file__).parents[1],
+                         env=os.environ | {"PYTHONPATH": str(Path(common.__file__).parents[1])})
+    assert (run.stdout, run.stderr) == ("line\n", "")
 
 
 def test_scripts_end_with_one_line(
