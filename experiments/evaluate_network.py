@@ -6,11 +6,11 @@
     python -m experiments.evaluate_network --weights runs/flow/evflownet.safetensors
 
 Weights: released names, .safetensors files, published checkpoints. --data takes recordings of any
-format: IJRR, MVSEC, HQF, EVIMO2v2, EVREAL. The cuts are those of `experiments.recorded.CUTS`, by
-the sequence's name; files called NAME_cut have theirs already. Without --data: synthetic cameras
-behind three circuits that no training simulates (`experiments.targets`), and, where the environment
-variable EVFLOW_DATA names a folder with them, two real recordings and two slices of rotations,
-whose flow the gyroscope tells.
+format: IJRR, MVSEC, HQF, EVIMO2v2 (flow alone: its event cameras have no frames), EVREAL. The cuts
+are those of `experiments.recorded.CUTS`, by the sequence's name; files called NAME_cut have theirs
+already. Without --data: synthetic cameras behind three circuits that no training simulates
+(`experiments.targets`), and, where the environment variable EVFLOW_DATA names a folder with them,
+two real recordings and two slices of rotations, whose flow the gyroscope tells.
 
 Images are scored linear and in the log domain, log(1 + 255 I) / log 256; flow of real recordings by
 FWL. Writes evaluate_network.json, .md and .png.
@@ -27,7 +27,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.commands.options import parse_size
+from evflow.commands.options import check_finite, parse_size
 from evflow.config import as_dict
 from evflow.downstream import EVFlowNet, event_tensor, reconstruct
 from evflow.downstream.released import Trained, load_network
@@ -44,7 +44,7 @@ from evflow.metrics import (
 )
 from evflow.report import plots
 from experiments import held_out, targets
-from experiments.common import run_script, write_result
+from experiments.common import at_least, run_script, write_result
 from experiments.network_scores import picture, report
 from experiments.recorded import (
     Part,
@@ -60,6 +60,7 @@ from experiments.recorded import (
 REAL = ("newton_cradle_davis346.aedat4", "ijrr_slider_depth")
 ROTATIONS = ("ijrr_boxes_rotation", "ijrr_dynamic_rotation")
 SKIPPED, WINDOWS = 6, 20  # of synthetic clips
+LEAST_SIDE, LEAST_MS = 32, 1  # in fewer pixels the high thresholds of a target see no event
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +167,7 @@ def real_video(
         return {}, pairs
     protocol = protocol_of(options)
     linear = score_images(pairs, protocol, lpips)
-    log = score_images(pairs, dataclasses.replace(protocol, domain="log"))
+    log = score_images(pairs, dataclasses.replace(protocol, domain="log", clip=True))
     for row, same in ((linear, log), *((linear["sequences"][n], log["sequences"][n])
                                        for n in pairs)):
         row["log_mse"] = same["mse"]
@@ -206,7 +207,7 @@ class Synthetic:
             t, bank, SequenceConfig(scene=targets.SCENES), options.scenes, WINDOWS))
             for t in seen}
 
-    def scores(self, trained: Trained, lpips: Any) -> dict[str, dict[str, float]]:
+    def scores(self, trained: Trained, lpips: Any) -> dict[str, dict[str, float | None]]:
         """Means over clips, of every camera."""
         rows = {}
         for name, clips in self.clips.items():
@@ -215,12 +216,24 @@ class Synthetic:
             found = (held_out.flow_scores(made, clips, SKIPPED)
                      if isinstance(trained.network, EVFlowNet)
                      else held_out.video_scores(made, clips, SKIPPED, lpips))
-            rows[name] = {k: float(np.nanmean(v)) for k, v in found.items()}
+            rows[name] = {k: _mean(v) for k, v in found.items()}
         return rows
 
 
+def _mean(scores: np.ndarray) -> float | None:
+    """Of the clips that have a score; None where none has."""
+    known = scores[np.isfinite(scores)]
+    return float(known.mean()) if known.size else None
+
+
 def main(options: Options) -> dict[str, Any]:
+    """Score every network on everything that it can see; returns what is written."""
     plots.require()
+    check_finite(options)
+    at_least(0, warmup_s=options.warmup_s)
+    at_least(1, scenes=options.scenes)
+    at_least(LEAST_MS, window_ms=options.window_ms)
+    at_least(LEAST_SIDE, side=options.side)
     networks = {name: load_network(name) for name in options.weights}
     try:
         lpips = load_lpips()
@@ -244,13 +257,13 @@ def main(options: Options) -> dict[str, Any]:
             "EV011", f"nothing of {', '.join(map(str, options.data))} could be scored.",
             "Give recordings with frames, or weights of an EV-FlowNet, which needs none.")
     text = report(result, scored_how(options))
-    print(text)
     conventions = {task: held_out.scored_by(task, lpips is not None) for task in ("video", "flow")}
     write_result(options.out / "evaluate_network.json",
                  result | ({"synthetic": conventions} if synthetic else {}), as_dict(options))
     (options.out / "evaluate_network.md").write_text(text + "\n")
     if shown:
         picture(shown, options.out / "evaluate_network.png")
+    print(text)
     return result
 
 

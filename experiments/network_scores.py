@@ -41,7 +41,7 @@ def report(result: dict[str, Any], how: str) -> str:
                       "weights", "sequence", "FWL", "FWL of the reference", "events a window"),
                   _row(*["---"] * 5)]
         lines += [_row(name, where, _cell(r["fwl"]), _cell(r.get("fwl_truth")),
-                       f"{r['events_per_window']:.0f}") for name, where, r in flow]
+                       _cell(r["events_per_window"], 0)) for name, where, r in flow]
     for name, row in result.items():
         if row["synthetic"]:
             kinds = list(next(iter(row["synthetic"].values())))
@@ -59,8 +59,8 @@ def _row(*cells: Any) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def _cell(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"
+def _cell(value: float | None, digits: int = 4) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
 
 
 def picture(shown: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:

@@ -10,6 +10,7 @@ window; here a window ends at its frame.
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 
 import cv2
@@ -61,12 +62,13 @@ def sequence_name(path: Path) -> str:
 def cut_of(path: Path) -> tuple[float, float]:
     """Seconds (start, stop) of a sequence that count; all of one whose file is called cut."""
     whole = (0.0, np.inf)
-    return whole if _stem(path).endswith("_cut") else CUTS.get(sequence_name(path), whole)
+    return whole if _stem(path).endswith("_cut") else CUTS.get(sequence_name(path).lower(), whole)
 
 
 def _stem(path: Path) -> str:
+    path = Path(os.path.abspath(path))  # "." has no name; a link keeps its own
     name = path.name.split(".")[0]
-    return path.absolute().parent.name.split(".")[0] if name in GENERAL else name
+    return path.parent.name.split(".")[0] if name in GENERAL else name
 
 
 def read_part(
@@ -102,8 +104,9 @@ def part_of(
         edges = np.arange(warm, end + 1, round(1e3 * window_ms), dtype=np.int64)
     warmup = int(np.searchsorted(edges[1:], begin))
     if len(edges) - 1 <= warmup:
+        what = "frame" if recording.has_frames else f"window of {window_ms:g} ms"
         raise EvflowDataError(
-            "EV012", f"{name}: no frame between {start_s} and {stop_s} s with events before it; "
+            "EV012", f"{name}: no {what} between {start_s} and {stop_s} s with events before it; "
             f"it lasts {1e-6 * (last - zero):.2f} s.", "Is it the sequence that its name says?")
     frames = None
     if recording.has_frames:

@@ -196,6 +196,7 @@ def test_colours_say_where_to_and_how_fast() -> None:
                "ms"]),
     ("EV020", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--full-px", "0"]),
     ("EV016", ["flow", "REC", "-o", "a.mp4", "--weights", "FLOW", "--truth", "no.npz"]),
+    ("EV020", ["reconstruct", "REC", "-o", "-", "--weights", "IMAGES"]),
     ("EV020", ["reconstruct", "REC", "-o", "a.mp4", "--weights", "IMAGES", "--window-ms", "-3"]),
     ("EV020", ["reconstruct", "REC", "-o", "a.mp4", "--weights", "IMAGES", "--scale", "-3"]),
     ("EV020", ["reconstruct", "REC", "-o", "a.mp4", "--weights", "IMAGES", "--scale", "1000"]),
@@ -213,6 +214,35 @@ def test_what_is_refused_leaves_nothing(
     assert main([known.get(word, word) for word in command]) in (1, 2)
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("fps", [1e3 / 7, 1e6 / 9001, 146.259, 119.88, 23.976, 240.0, 0.1])
+def test_films_of_any_rate_are_written(fps: float, tmp_path: Path) -> None:
+    picture = np.zeros((32, 32, 3), np.uint8)
+    write_video(tmp_path / "a.mp4", iter([picture] * 3), 3, fps=fps)
+    capture = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=1e-4)
+    capture.release()
+
+
+def test_frames_after_all_events_are_told(
+    weights: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = make(count=12, span=700_000)
+    t = made.events.t
+    for shift, code in ((0, 0), (int(t[-1] - made.frame_times[0]) + 1, 1)):
+        path, out = tmp_path / f"{shift}.npz", tmp_path / f"{shift}.mp4"
+        moved = dataclasses.replace(made, frame_times=made.frame_times + shift)
+        write_recording(path, moved, "npz")
+        assert main(["flow", str(path), "-o", str(out), "--weights", weights["flow"]]) == code
+        assert ("EV012" in capsys.readouterr().err) == bool(code)
+    # All events lie between two frames: the second is made of them.
+    between = dataclasses.replace(
+        made, frames=made.frames[:2], frame_times=np.array([t[0] - 1, t[-1] + 1]))
+    write_recording(tmp_path / "two.npz", between, "npz")
+    assert main(["reconstruct", str(tmp_path / "two.npz"), "-o", str(tmp_path / "two.mp4"),
+                 "--weights", weights["images"], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["scores"]["frames"] == 1
 
 
 def test_narrow_sensors_are_not_enlarged_beyond_what_codecs_take(tmp_path: Path) -> None:

@@ -89,7 +89,8 @@ def test_the_one_nested_state_is_taken(write: Any, key: str, tmp_path: Path) -> 
 
 
 @writers
-@pytest.mark.parametrize("prefix", ["model.", "module.", "module.model."])
+@pytest.mark.parametrize("prefix", [
+    "model.", "module.", "module.model.", "_orig_mod.", "module._orig_mod.", "model._orig_mod."])
 def test_prefixes_of_wrappers_are_cut(write: Any, prefix: str, tmp_path: Path) -> None:
     write(tmp_path / "x.pth", {prefix + name: array for name, array in state().items()})
     assert read_checkpoint(tmp_path / "x.pth").arrays.keys() == state().keys()

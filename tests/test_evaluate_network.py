@@ -88,6 +88,13 @@ def test_sequences_are_known_by_their_files(file: str, name: str) -> None:
     assert recorded.sequence_name(Path("a.b") / file) == name
 
 
+def test_the_folder_one_is_in_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "Boxes_6dof").mkdir()
+    monkeypatch.chdir(tmp_path / "Boxes_6dof")
+    assert recorded.sequence_name(Path(".")) == "Boxes_6dof"
+    assert recorded.cut_of(Path(".")) == (5.0, 20.0)
+
+
 def test_cuts_are_those_of_the_benchmarks() -> None:
     assert recorded.CUTS["slider_depth"] == (1.0, 2.5)
     assert recorded.CUTS["office_zigzag"] == (5.0, 12.0)
@@ -151,6 +158,23 @@ def test_video_and_flow_are_scored_and_written(
     aggregates = {p: evaluate_network.protocol_of(Options(protocol=p)).aggregate
                   for p in ("evreal", "etnet")}
     assert aggregates == {"evreal": "frames", "etnet": "sequences"}
+
+
+def test_images_that_are_not_clipped_are_for_the_log_domain(tmp_path: Path) -> None:
+    trained = load_network(saved(tmp_path, E2VID(base=4, encoders=1, blocks=0)))
+    part = recorded.part_of(recording(1.0), "x", 0.0, np.inf, 0.0, 33.0)
+    scores, _ = evaluate_network.real_video(trained, [part], Options(protocol="etnet"), None)
+    assert scores["protocol"]["clip"] is False
+    assert np.isfinite([scores["mse"], scores["log_mse"]]).all()
+
+
+@pytest.mark.parametrize("wrong", [
+    {"window_ms": 0.0}, {"window_ms": np.nan}, {"warmup_s": -0.2}, {"warmup_s": np.inf},
+    {"scenes": 0}, {"side": 8}])
+def test_options_out_of_range_are_refused(tmp_path: Path, wrong: dict) -> None:
+    with pytest.raises(EvflowDataError, match=f"EV020.*{next(iter(wrong)).replace('_', '-')}"):
+        evaluate_network.main(Options(out=tmp_path / "out", **wrong))
+    assert not (tmp_path / "out").exists()
 
 
 def test_recordings_that_give_nothing_are_an_error(

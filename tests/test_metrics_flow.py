@@ -198,7 +198,7 @@ def test_scores_say_how_they_were_made() -> None:
     assert json.loads(json.dumps(scores)) == scores
     assert scores["convention"] == FwlConvention().as_dict()
     assert (scores["windows"], scores["window_ms"]) == (2, 25.0)
-    assert scores["events_per_window"] == 500.0
+    assert scores["events_per_window"] == len(recorded()) / 2
     assert scores["aee"] == scores["outlier_percent"] == 0.0
     assert scores["fwl"] == scores["fwl_truth"] > 1.2
     valid = np.zeros((3, *SIZE[::-1]), bool)
@@ -212,7 +212,8 @@ def test_windows_without_events_have_no_score() -> None:
     flow = np.zeros((1, 2, *SIZE[::-1]), np.float32)
     silence = metrics.score_flow(recorded(), np.array([60_000, 70_000]), flow, truth=flow)
     assert silence["windows"] == 0
-    for name in ("fwl", "rsat", "aee", "outlier_percent", "fwl_truth"):
+    for name in ("window_ms", "events_per_window", "fwl", "rsat", "aee", "outlier_percent",
+                 "fwl_truth"):
         assert silence[name] is None
     assert "aee" not in metrics.score_flow(recorded(), np.array([60_000, 70_000]), flow)
 

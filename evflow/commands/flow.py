@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from evflow.commands.options import check_finite, note_idle, own_first, refuse, value
-from evflow.commands.windows import Windowed, lasting
+from evflow.commands.windows import Windowed, frames_amid, lasting
 from evflow.commands.writing import need_absent
 from evflow.errors import EvflowDataError
 
@@ -102,7 +102,10 @@ class Flow(Windowed):
             truth = load_truth(self.truth, recording.events.size)
             _require_overlap(recording, truth.edges_us, self.truth)
             return recording, truth.edges_us, truth
-        return recording, window_edges(recording, self.times(recording)), None
+        times = self.times(recording)
+        if times is recording.frame_times:
+            frames_amid(recording, times)
+        return recording, window_edges(recording, times), None
 
     def _film(
         self, flows: Iterator[np.ndarray], recording: Recording, edges: np.ndarray, full_px: float

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from evflow.commands.options import check_finite, own_first, refuse
-from evflow.commands.windows import Windowed, lasting
-from evflow.commands.writing import need_absent
+from evflow.commands.windows import Windowed, frames_amid, lasting
+from evflow.commands.writing import need_absent, refuse_stdout
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
@@ -56,8 +56,11 @@ class Reconstruct(Windowed):
         recording = self.read(self.recording)
         times = self.times(recording)
         seen = times is recording.frame_times
-        amid, notes = _amid(recording, times) if seen else (range(0), [])
-        notes = [*recording.notes, *notes]
+        amid = frames_amid(recording, times) if seen else range(0)
+        notes = list(recording.notes)
+        if seen and (outside := len(times) - len(amid)):
+            notes.append(f"{outside} of {len(times)} frames lie outside the events and are not "
+                         "scored")
         scores = self._scores(len(amid)) if seen else None
         with bar("reconstructing") as progress:
             images = reconstructions(
@@ -78,6 +81,7 @@ class Reconstruct(Windowed):
         """The suffix of a film, "" for a folder; EV020 for anything else."""
         from evflow.report.video import SUFFIXES
 
+        refuse_stdout(self.out)
         kind = self.out.suffix.lower()
         if kind not in ("", *SUFFIXES):
             raise EvflowDataError("EV020", f"{self.out.name} is none of {', '.join(SUFFIXES)}, and "
@@ -113,25 +117,6 @@ class Reconstruct(Windowed):
 
         return write_images(self.out, images, times, overwrite=self.overwrite,
                             remark=f"images were {MADE} {Path(self.weights).name}")
-
-
-def _amid(recording: Recording, times: np.ndarray) -> tuple[range, list[str]]:
-    """The frames that lie amid the events: only those are scored, as without events nothing is to
-    be seen; and a note where others do not. EV012 where none does."""
-    import numpy as np
-
-    t = recording.events.t
-    first, stop = (int(np.searchsorted(times, end, "right")) for end in (t[0], t[-1]))
-    if first == stop:
-        raise EvflowDataError(
-            "EV012", f"events cover {t[0]:,}..{t[-1]:,} us, but the frames "
-            f"{times[0]:,}..{times[-1]:,} us.",
-            "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms; or "
-            "pass --sync ms, which does not look at the frames.")
-    outside = len(times) - (stop - first)
-    return range(first, stop), [
-        f"{outside} of {len(times)} frames lie outside the events and are not scored"
-    ] if outside else []
 
 
 def _watched(

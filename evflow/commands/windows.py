@@ -57,6 +57,24 @@ class Windowed(Reading):
                           window_us=round(1000 * self.window_ms))
 
 
+def frames_amid(recording: Recording, times: np.ndarray) -> range:
+    """Which frames lie amid the events, as without events nothing is to be seen; where all events
+    lie between two frames, the second. EV012 where events and frames do not overlap."""
+    import numpy as np
+
+    t = recording.events.t
+    first, stop = (int(np.searchsorted(times, end, "right")) for end in (t[0], t[-1]))
+    if first == stop and 0 < first < len(times):
+        return range(first, first + 1)
+    if first == stop:
+        raise EvflowDataError(
+            "EV012", f"events cover {t[0]:,}..{t[-1]:,} us, but the frames "
+            f"{times[0]:,}..{times[-1]:,} us.",
+            "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms; or "
+            "pass --sync ms, which does not look at the frames.")
+    return range(first, stop)
+
+
 def lasting(pictures: int, duration_us: int) -> float:
     """Pictures per second of a film that lasts as long as what it shows, within what players can
     do."""

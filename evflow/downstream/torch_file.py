@@ -32,6 +32,7 @@ STORAGES = {
     "Float": "<f4", "Double": "<f8", "Half": "<f2", "Long": "<i8", "Int": "<i4", "Short": "<i2",
     "Char": "i1", "Byte": "u1", "Bool": "?", "BFloat16": "<u2",
 }
+WRAPPERS = ("module.", "_orig_mod.")
 # What a training program puts beside its weights, of which nothing is needed.
 DROPPED = (
     "parse_config.ConfigParser", "pathlib.PosixPath", "pathlib.PurePosixPath",
@@ -231,7 +232,7 @@ def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpo
     key = "state_dict" if "state_dict" in content or len(nested) != 1 else nested[0]
     tensors = _tensors(content.get(key, content))
     if tensors and all(name.startswith("model.") for name in tensors):
-        tensors = {name.removeprefix("model."): value for name, value in tensors.items()}
+        tensors = {_bare(name.removeprefix("model.")): value for name, value in tensors.items()}
     if not tensors:
         raise EvflowDataError(
             "EV018", f"{path} holds no weights, but {sorted(map(str, content))[:8]}.",
@@ -246,9 +247,16 @@ def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpo
 
 def _tensors(value: Any) -> dict[str, _Tensor]:
     """The named tensors of a dict."""
-    return {name.removeprefix("module."): tensor for name, tensor in value.items()
+    return {_bare(name): tensor for name, tensor in value.items()
             if isinstance(name, str) and isinstance(tensor, _Tensor)
             } if isinstance(value, dict) else {}
+
+
+def _bare(name: str) -> str:
+    """Without what data-parallel and compiled modules put before the names of what they hold."""
+    while name.startswith(WRAPPERS):
+        name = name.partition(".")[2]
+    return name
 
 
 def _plain(value: Any, depth: int = 0) -> Any:

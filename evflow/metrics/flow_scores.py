@@ -35,11 +35,12 @@ def score_flow(
     """Scores of flows (T, 2, H, W), px over each of the windows between edges_us (T + 1,); JSON-
     ready means over the windows that have events (None where none has).
 
+    "windows" says how many those are, "window_ms" and "events_per_window" what they are like.
     truth: the true flows, scored at pixels with events where valid (T, H, W) bool holds (default:
     where they are finite). The FWL of the truth is that of events where it is known.
     Raises EV002 (shapes), EV004 (edges that do not rise), EV007 (flows that are not finite).
     """
-    edges = np.asarray(edges_us, np.int64)
+    edges, flows = np.asarray(edges_us, np.int64), np.asarray(flows)
     shape = (len(edges) - 1, 2, events.size[1], events.size[0])
     for name, array in (("flows", flows), ("truth", truth)):
         if array is not None and array.shape != shape:
@@ -54,16 +55,16 @@ def score_flow(
     windows = [events.slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
     length = 1 << max(0, max(map(len, windows)) - 1).bit_length()  # one shape, one compilation
     rows = []
-    for i, part in enumerate(windows):
-        if len(part):
-            arrays = _padded(part, int(edges[i]), int(edges[i + 1]), length)
-            rows.append(_window(arrays, flows[i], None if truth is None else truth[i],
-                                None if valid is None else valid[i], convention))
+    seen = [i for i, part in enumerate(windows) if len(part)]
+    for i in seen:
+        arrays = _padded(windows[i], int(edges[i]), int(edges[i + 1]), length)
+        rows.append(_window(arrays, flows[i], None if truth is None else truth[i],
+                            None if valid is None else valid[i], convention))
     names = NAMES if truth is None else NAMES + OF_TRUTH  # a silent recording has them too
     means = {name: _mean([float(row[name]) for row in rows]) for name in names}
     return {"convention": convention.as_dict(), "outlier_px": OUTLIER_PX, "windows": len(rows),
-            "window_ms": float(np.diff(edges).mean() * 1e-3),
-            "events_per_window": _mean([float(len(w)) for w in windows]), **means}
+            "window_ms": _mean([1e-3 * float(edges[i + 1] - edges[i]) for i in seen]),
+            "events_per_window": _mean([float(len(windows[i])) for i in seen]), **means}
 
 
 def _padded(events: Events, start: int, stop: int, length: int) -> EventArrays:

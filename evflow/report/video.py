@@ -30,6 +30,7 @@ FPS = (0.1, 240.0)
 WIDTH = 640  # screen pixels that a small sensor is enlarged to...
 HEIGHT = 4096  # ...if it is not so narrow that more rows are made than codecs take
 SCALES = (1, 32)
+FINE_FPS = 65.0  # OpenCV counts rates in thousandths, MPEG-4 no more than 65535 of them a second
 GIF_TICK_S = 0.01  # GIF counts time in hundredths of a second
 GIF_FRAMES = 600  # a GIF is held in memory and grows large: more are refused
 
@@ -102,11 +103,13 @@ def _write_film(
 ) -> str:
     first = next(pictures)
     size = (first.shape[1], first.shape[0])
+    fps = round(fps, 2) if fps > FINE_FPS else fps
     writer = cv2.VideoWriter(
         str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*FOURCC[codec]), fps, size)
     if not writer.isOpened():
         raise EvflowDataError(
-            "EV019", f"OpenCV {cv2.__version__} does not write {codec} of {size[0]}x{size[1]}.",
+            "EV019", f"OpenCV {cv2.__version__} does not write {codec} of {size[0]}x{size[1]} at "
+            f"{fps:g} pictures a second.",
             "Try a smaller --scale, the other codec, or a .gif.")
     try:
         writer.write(first[..., ::-1])
