@@ -89,6 +89,23 @@ def test_disk_keeps_the_first_error() -> None:
             disk.check()
 
 
+@pytest.mark.parametrize("absent", ["ms_to_idx", "t_offset", None])
+def test_only_dsecs_own_layout_has_dsecs_size(tmp_path: Path, absent: str | None) -> None:
+    write_events(tmp_path / "a.h5", make().events)
+    with h5py.File(tmp_path / "a.h5", "r+") as f:
+        del f.attrs["height"]
+        if absent:
+            del f[absent]
+    if absent:
+        with pytest.raises(EvflowDataError, match=r"EV015.*--size"):
+            read_recording(tmp_path / "a.h5")
+    else:
+        assert any("640x480" in note for note in read_recording(tmp_path / "a.h5").notes)
+    told = read_recording(tmp_path / "a.h5", size=SIZE)
+    assert told.events.size == SIZE
+    assert told.notes == ()
+
+
 def test_dsec_without_attributes_is_640x480(tmp_path: Path) -> None:
     write_events(tmp_path / "a.h5", make().events)
     with h5py.File(tmp_path / "a.h5", "a") as f:

@@ -2,7 +2,8 @@
 
 /events/{x u16, y u16, p u8, t u32 us}, /t_offset (i64 us, add it to t), /ms_to_idx (u64; event
 ms_to_idx[m] is the first with t >= 1000 m). Of our own: attributes width and height (absent in
-DSEC, which is 640x480), and /frames, /frame_times (i64 us, without t_offset) where there are any.
+DSEC, which is 640x480; its ms_to_idx and t_offset tell it from others with such events), and
+/frames, /frame_times (i64 us, without t_offset) where there are any.
 `DsecWriter` takes events chunk by chunk, so that a long simulation never sits in memory.
 """
 
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io import tables
 from evflow.io.hdf5 import DAMAGE, MAGIC, Hdf5Writer, load_h5py, plausible
@@ -51,16 +53,17 @@ def read(path: Path, hints: Hints) -> Recording:
     """Only the part between start_s and stop_s is read. Of a folder its events.h5; a rectify map
     beside them is not applied.
 
-    Raises EV008 (a data set is missing), EV009 (damaged), EV010 (h5py or a filter is missing), and
-    what `stream.gather` and `Recording` raise.
+    Raises EV008 (a data set is missing), EV009 (damaged), EV010 (h5py or a filter is missing),
+    EV015 (neither width and height nor all of DSEC's own members), and what `stream.gather` and
+    `Recording` raise.
     """
     path = path / EVENTS if path.is_dir() else path
     notes = (RECTIFY,) if path.with_name("rectify_map.h5").is_file() else ()
     with tables.opened(path) as f:
         columns = _columns(path, f)
-        size = DSEC_SIZE
-        if "width" in f.attrs:
-            size = int(f.attrs["width"]), int(f.attrs["height"])
+        size, assumed = _size(f)
+        if assumed and hints.size is None:
+            notes = (*notes, assumed)
         offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
         events, span = gather(path, _chunks(columns, hints), hints, size, "us", offset)
         if "frames" not in f:
@@ -69,6 +72,16 @@ def read(path: Path, hints: Hints) -> Recording:
         times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
         return tables.with_frames(path, events, span, hints.microseconds(times, "us"),
                                   lambda keep: tables.stored_frames(frames, keep), notes)
+
+
+def _size(f: Any) -> tuple[Size | None, str]:
+    """Of the sensor, None where nothing tells; and what was assumed."""
+    if "width" in f.attrs and "height" in f.attrs:
+        return (int(f.attrs["width"]), int(f.attrs["height"])), ""
+    if "ms_to_idx" in f and "t_offset" in f:
+        return DSEC_SIZE, ("the sensor is taken as {}x{}, as DSEC's are: pass --size where it is "
+                           "another".format(*DSEC_SIZE))
+    return None, ""
 
 
 class DsecWriter(Hdf5Writer):
