@@ -2,7 +2,7 @@
 
 Every condition gives maps of the same number K of cameras and of one size, so that one compiled
 training step serves them all: drawn ones, the target's own K times, or K draws from an estimate
-and its errors.
+and its errors. Two have no maps: EventGAN's events, and the target's own recordings.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from evflow import Recording, estimate_camera, load_weights
 from evflow.baselines import SYSTEMS
-from evflow.camera import Camera, Summary, sample_pixels
+from evflow.camera import THETA_MIN, Camera, Summary, sample_pixels
 from evflow.camera_estimate import CameraEstimate
 from evflow.coordinates import squash
 from evflow.downstream.prior import WidePrior
@@ -33,20 +33,21 @@ from experiments.targets import Target
 Array = jax.Array
 Shape = tuple[int, int]
 
-DEFAULT, WIDE, WIDE_LOG, EVENTGAN = "default", "wide", "wide-log", "eventgan"
-OURS, ORACLE = "evflow", "oracle"
-FREE = (DEFAULT, WIDE, WIDE_LOG, EVENTGAN)  # that do not depend on the target
+DEFAULT, WIDE, WIDE_LOG, E2V, EVENTGAN = "default", "wide", "wide-log", "e2vid", "eventgan"
+OURS, ORACLE, RAW = "evflow", "oracle", "raw"
+FREE = (DEFAULT, WIDE, WIDE_LOG, E2V, EVENTGAN)  # that do not depend on the target
 # Thresholds .1 to 1 as many at .9 as at .2, or, of the prior that serves unknown cameras, .05 to 1
 # as many at .05 to .1 as at .5 to 1.
 PRIORS = {WIDE: WidePrior(theta=(0.1, 1.0), uniform=True), WIDE_LOG: WidePrior()}
 DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
+E2V_THETA = (0.18, 0.03)  # mean and deviation over cameras (Rebecq et al., PAMI 2021)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Condition:
     """label: its name in the tables; name: of the run, one for each thing that is trained;
-    targets: what it is tested on; make: maps of K cameras (K, H, W), or None where the events
-    come from EventGAN; source: of the file that it rests on, so that another is not taken for
+    targets: what it is tested on; make: maps of K cameras (K, H, W), or None where no simulated
+    camera makes the events; source: of the file that it rests on, so that another is not taken for
     it."""
 
     label: str
@@ -78,6 +79,15 @@ class Workshop:
         """Cameras of a wide prior."""
         keys = jax.random.split(jax.random.key(2), self.count)
         return jax.vmap(lambda key: PRIORS[name].sample(key, self.shape))(keys)
+
+    def e2vid(self) -> Camera:
+        """Cameras of the original E2VID: one threshold a polarity for all pixels, no noise."""
+        mean, deviation = E2V_THETA
+        drawn = mean + deviation * jax.random.normal(jax.random.key(4), (2, self.count, 1, 1))
+        on, off = jnp.broadcast_to(
+            jnp.maximum(drawn, THETA_MIN), (2, self.count, *self.shape))
+        none = jnp.zeros_like(on)
+        return Camera(on, off, none, none)
 
     def same(self, camera: Camera) -> Camera:
         """One camera, K times."""
@@ -143,14 +153,14 @@ def conditions(
     shop: Workshop, targets: Sequence[Target], names: Sequence[str],
     estimators: dict[str, Path], cameras: dict[str, Path],
 ) -> list[Condition]:
-    """Of the names (`default`, `wide`, `wide-log`, `evflow`, `oracle`, `eventgan`, or a compared
-    system), of estimators' weights, and of camera files; raises EV020 for an unknown name or one
-    used twice."""
+    """Of the names (`default`, `wide`, `wide-log`, `e2vid`, `evflow`, `oracle`, `raw`, `eventgan`,
+    or a compared system), of estimators' weights, and of camera files; raises EV020 for an unknown
+    name or one used twice."""
     twice = [n for n in (*estimators, *cameras) if n in {*names, *(estimators.keys() & cameras)}]
     if twice:
         raise EvflowDataError("EV020", f"two conditions are called {twice}.", "Rename one.")
     free: dict[str, Callable[[], Camera | None]] = {
-        DEFAULT: shop.default, EVENTGAN: lambda: None,
+        DEFAULT: shop.default, E2V: shop.e2vid, EVENTGAN: lambda: None,
         **{name: _bound(shop.wide, name) for name in PRIORS}}
     found = []
     for name in names:
@@ -162,12 +172,14 @@ def conditions(
         elif name == OURS:
             found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.estimated, t))
                       for t in targets]
+        elif name == RAW:
+            found += [Condition(name, f"{t.name} {name}", (t,), lambda: None) for t in targets]
         elif name in SYSTEMS:
             found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.compared, t, name))
                       for t in targets]
         else:
             raise EvflowDataError("EV020", f"condition {name!r}.", "Choose of "
-                                  f"{[*FREE, OURS, ORACLE, *SYSTEMS]}.")
+                                  f"{[*FREE, OURS, ORACLE, RAW, *SYSTEMS]}.")
     for name, path in estimators.items():
         params = load_weights(path)
         found += [Condition(name, f"{t.name} {name}", (t,),

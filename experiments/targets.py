@@ -113,20 +113,22 @@ def recording(seen: Target, bank: TextureBank, data: SequenceConfig, seconds: fl
 
 
 def clips(
-    seen: Target, bank: TextureBank, data: SequenceConfig, count: int, windows: int
+    seen: Target, bank: TextureBank, data: SequenceConfig, count: int, windows: int,
+    *others: str,
 ) -> Iterator[Clip]:
-    """Held-out scenes with pauses as in training, the same for every target."""
+    """Held-out scenes with pauses as in training, the same for every target. others: name scenes
+    and events that are not those held out."""
     shape = (seen.camera.shape[0], seen.camera.shape[1])
     steps = round(data.window_s * 1e6 / STEP_US)
     data = dataclasses.replace(data, windows=windows, steps_per_window=steps)
     for i in range(count):
-        k_scene, k_pause = jax.random.split(jax.random.fold_in(_key("clips"), i))
+        k_scene, k_pause = jax.random.split(jax.random.fold_in(_key("clips", *others), i))
         scene = _scene(k_scene, bank, data.scene, shape)
         clock = np.asarray(scene_clock(k_pause, data))
         lead = STEP_US * 1e-6 * np.arange(-LEAD, 0, dtype=np.float32)
         video = filmed(scene, np.concatenate([lead, clock]), shape)
         times = STEP_US * np.arange(len(video))
-        k_events = jax.random.fold_in(_key("events", seen.name), i)
+        k_events = jax.random.fold_in(_key("events", seen.name, *others), i)
         events = simulate(k_events, video, times, seen.camera, model=seen.circuit)
         yield clip_of(events, times[LEAD::steps], video[LEAD + steps::steps] / 255.0,
                       flows(scene, clock[::steps], shape))

@@ -20,6 +20,7 @@ import numpy as np
 
 from evflow import load_weights
 from evflow.downstream import EVFlowNet, Network
+from evflow.downstream.recorded import RecordedBank, sample_recorded
 from evflow.downstream.released import save_network
 from evflow.downstream.train import LearningConfig, LearningState, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
@@ -29,7 +30,7 @@ from evflow.scenes import TextureBank, make_bank
 from evflow.weights import model_card
 from experiments import eventgan_sequences, gains, held_out, targets
 from experiments.common import provenance, slug, write_result
-from experiments.conditions import EVENTGAN, Condition, Workshop, conditions, digest, told
+from experiments.conditions import EVENTGAN, RAW, Condition, Workshop, conditions, digest, told
 
 Params = dict[str, Any]
 Scores = dict[str, dict[str, dict[str, dict[int, np.ndarray]]]]  # target, label, measure, seed
@@ -73,7 +74,7 @@ class Trainings:
         self.targets = [targets.target(camera, circuit, setting.shape)
                         for camera in setting.cameras for circuit in setting.circuits]
         self._clips: dict[str, held_out.Clips] = {}
-        self._starts: dict[int, LearningState] = {}
+        self._starts: dict[tuple[int, Network], LearningState] = {}
 
     @functools.cached_property
     def bank(self) -> TextureBank:
@@ -83,6 +84,21 @@ class Trainings:
     @functools.cached_property
     def held_out_bank(self) -> TextureBank:
         return targets.held_out_bank(self.setting.textures // 2)
+
+    def network(self, condition: Condition) -> Network:
+        """What a condition trains: EV-FlowNet learns from recordings, which tell no true flow, in
+        its form of several scales, from their frames."""
+        network = self.setting.network
+        if condition.label == RAW and isinstance(network, EVFlowNet):
+            return dataclasses.replace(network, scales=network.encoders)
+        return network
+
+    def recorded(self, target: targets.Target) -> RecordedBank:
+        """What the target itself records of scenes as all are trained on."""
+        data = self.setting.learning.data
+        made = held_out.gather(targets.clips(
+            target, self.bank, data, self.setting.drawn, data.windows, "trained on"))
+        return RecordedBank(jnp.swapaxes(made.tensors, 0, 1), jnp.swapaxes(made.frames, 0, 1))
 
     @functools.cached_property
     def lpips(self) -> Params | None:
@@ -134,7 +150,7 @@ class Trainings:
         params = load_weights(path)
         for target in condition.targets:
             began = time.monotonic()
-            scores = self.score(params, target)
+            scores = self.score(self.network(condition), params, target)
             write_result(self.scored(condition, seed, target), {
                 "scores": {k: v.tolist() for k, v in scores.items()},
                 "seconds": time.monotonic() - began}, {"label": condition.label, "seed": seed})
@@ -142,17 +158,21 @@ class Trainings:
             print(f"{condition.label}, seed {seed}, {target.name}: {means}", flush=True)
 
     def train(self, condition: Condition, seed: int, path: Path) -> None:
-        """Train from the seed and save; the scenes and batches are those of every condition."""
+        """Train from the seed and save; the scenes and batches are those of every condition but
+        `raw`, whose recordings end."""
         steps, began = self.setting.learning.steps, time.monotonic()
-        camera = condition.make()
-        generated = condition.label == EVENTGAN
-        step = self._generated_step if generated else self._step
-        cameras = load_weights(str(self.eventgan)) if generated else camera
+        camera, network = condition.make(), self.network(condition)
+        bank: TextureBank | RecordedBank = self.bank
+        cameras, step = camera, self._step
+        if condition.label == EVENTGAN:
+            cameras, step = load_weights(str(self.eventgan)), self._generated_step
+        elif condition.label == RAW:
+            bank, step = self.recorded(condition.targets[0]), self._recorded_step(network)
         lpips = self.lpips if self.setting.perceptual else None
-        state, losses = self._start(seed), []
+        state, losses = self._start(seed, network), []
         with bar(f"{condition.name}, seed {seed}") as progress:
             for i in range(steps):
-                state, metrics = step(state, self.bank, cameras, lpips)
+                state, metrics = step(state, bank, cameras, lpips)
                 losses.append(metrics["loss"])
                 if i % 10 == 0:
                     jax.block_until_ready(metrics)
@@ -164,7 +184,7 @@ class Trainings:
                 "seconds": time.monotonic() - began, "source": condition.source,
                 "cameras": told(camera) if camera is not None else {}, **provenance()}
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_network(path, self.setting.network, state.params, card,
+        save_network(path, network, state.params, card,
                      normalised=self.setting.learning.normalised)
 
     @functools.cached_property
@@ -180,18 +200,21 @@ class Trainings:
         return jax.jit(make_step(self.setting.network, self.setting.learning, self._tx,
                                  eventgan_sequences.sample))
 
-    def _start(self, seed: int) -> LearningState:
-        """Where every condition of a seed starts."""
-        if seed not in self._starts:
-            learning = dataclasses.replace(self.setting.learning, seed=seed)
-            self._starts[seed] = init_state(self.setting.network, learning, self._tx)
-        return self._starts[seed]
+    def _recorded_step(self, network: Network) -> Any:
+        return jax.jit(make_step(network, self.setting.learning, self._tx, sample_recorded))
 
-    def score(self, params: Params, target: targets.Target) -> held_out.Scores:
+    def _start(self, seed: int, network: Network) -> LearningState:
+        """Where every condition of a seed starts, if it trains this network."""
+        if (seed, network) not in self._starts:
+            learning = dataclasses.replace(self.setting.learning, seed=seed)
+            self._starts[seed, network] = init_state(network, learning, self._tx)
+        return self._starts[seed, network]
+
+    def score(self, network: Network, params: Params, target: targets.Target) -> held_out.Scores:
         """Scores of a network on the clips of a target."""
         s, clips = self.setting, self.clips(target)
-        made = held_out.outputs(s.network, params, clips.tensors, s.learning.normalised)
-        if isinstance(s.network, EVFlowNet):
+        made = held_out.outputs(network, params, clips.tensors, s.learning.normalised)
+        if isinstance(network, EVFlowNet):
             return held_out.flow_scores(made, clips, s.skipped)
         return held_out.video_scores(made, clips, s.skipped, self.lpips)
 
@@ -236,6 +259,7 @@ class Trainings:
             path = self.folder(condition, 0) / "weights.safetensors"
             if target in condition.targets and path.is_file():
                 images = held_out.outputs(
-                    s.network, load_weights(path), clips.tensors, s.learning.normalised)
+                    self.network(condition), load_weights(path), clips.tensors,
+                    s.learning.normalised)
                 found[condition.label] = np.asarray(images[-1])
         return found

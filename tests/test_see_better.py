@@ -16,6 +16,7 @@ from networks import small_params
 from scipy import stats
 
 from evflow.camera import Camera
+from evflow.downstream.released import load_network
 from evflow.downstream.simulated import SequenceConfig, Sequences, _crop
 from evflow.errors import EvflowDataError
 from evflow.scenes import make_bank
@@ -110,9 +111,10 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
                              for n in ("theta_on", "theta_off", "eta_on", "eta_off")})
     found = {c.name: c for c in conditions(
         workshop(tmp_path), [target(), target(circuit="esim"), target("low")],
-        ("default", "wide", "wide-log", "oracle"), {}, {"plain": plain, "uncertain": uncertain})}
-    assert set(found) == {"default", "wide", "wide-log", "high oracle", "low oracle", "plain",
-                          "uncertain"}
+        ("default", "wide", "wide-log", "e2vid", "oracle"), {},
+        {"plain": plain, "uncertain": uncertain})}
+    assert set(found) == {"default", "wide", "wide-log", "e2vid", "high oracle", "low oracle",
+                          "plain", "uncertain"}
     made = {name: c.make() for name, c in found.items()}
     for camera in made.values():
         assert camera is not None
@@ -125,6 +127,9 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
     wide, low = (np.median(made[name].theta_on, (1, 2)) for name in ("wide", "wide-log"))
     assert 0.05 < min(low) < min(wide)
     assert min(np.std(wide), np.std(low)) > 0.05
+    np.testing.assert_array_equal(np.ptp(made["e2vid"].theta_off, (1, 2)), 0.0)
+    assert np.median(made["e2vid"].theta_on) == pytest.approx(0.18, abs=0.05)
+    assert not np.any(made["e2vid"].eta_on)
     np.testing.assert_allclose(made["plain"].theta_on, 0.3)
     assert 0.03 < float(jnp.std(made["uncertain"].theta_on)) < 0.07
     assert found["plain"].source != found["uncertain"].source
@@ -312,6 +317,28 @@ def test_runs_are_kept_and_gone_on_with(
         assert cv2.imread(str(tmp_path / name)) is not None
     with pytest.raises(EvflowDataError, match="EV013"):
         see_better.main(Options(out=tmp_path, steps=7))
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_recordings_of_the_target_train_without_true_flow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    setting = see_better.preset_of("flow", "debug")
+    setting = dataclasses.replace(setting, names=("raw",), seeds=1, drawn=3, learning=(
+        dataclasses.replace(setting.learning, steps=2)))
+    runs = Trainings(setting, tmp_path)
+    (raw,) = runs.conditions({}, {})
+    assert (raw.label, raw.name, raw.make()) == ("raw", "high noisy raw", None)
+    bank = runs.recorded(raw.targets[0])
+    assert bank.tensors.shape == (3, 4, 32, 32, 5)
+    assert bank.frames.shape == (3, 4, 32, 32)
+    assert not np.array_equal(bank.frames[0, 0], runs.clips(raw.targets[0]).frames[0, 0])
+    monkeypatch.setattr(Trainings, "recorded", lambda *_: bank)
+    runs.complete(raw, 0)
+    trained = load_network(str(runs.folder(raw, 0) / "weights.safetensors"))
+    assert trained.network == runs.network(raw) == dataclasses.replace(setting.network, scales=4)
+    found = runs.scores([raw])["high noisy"]["raw"]["aee"][0]
+    assert found.shape == (setting.scenes,)
 
 
 def test_presets_fit_their_networks() -> None:
