@@ -52,7 +52,7 @@ Preset = Literal["debug", "small", "full"]
 # of scenes as those of images, few steps of a small network learned no flow.
 MOVING = dataclasses.replace(
     SCENES, contrast=(0.5, 1.0), foregrounds=0, speed_px_s=(50.0, 250.0))
-ALL = (*SIMULATED, "s2r", "jaer", "ecc median", "match", "lgan", EVENTGAN)
+COMPARED = ("s2r", "jaer", "ecc median", "match", "lgan", EVENTGAN)
 ALONE: dict[Task, str] = {"video": E2V, "flow": RAW}  # what the paper has beside them
 
 
@@ -75,8 +75,8 @@ def preset_of(task: Task, preset: Preset) -> Setting:
             data, steps=3000, warmup=20, rate=2e-3, skip=0, elsewhere=0.0, normalised=True))
     large = dataclasses.replace(data, sequences=4, windows=40, crop=128)
     setting = Setting(
-        E2VID_PLUS, LearningConfig(large, steps=5000, warmup=200, rate=3e-4), (*ALL, ALONE[task]),
-        tuple(CAMERAS),
+        E2VID_PLUS, LearningConfig(large, steps=5000, warmup=200, rate=3e-4),
+        (*SIMULATED, ALONE[task], *COMPARED), tuple(CAMERAS),
         shape=(180, 240), textures=512, drawn=64, windows=40, skipped=10, perceptual=True)
     if task == "video":
         return setting

@@ -109,16 +109,17 @@ def test_statistics_of_batch_norm_get_no_gradient() -> None:
     assert sizes["scale"] > 0
 
 
-@pytest.mark.parametrize("encoders", [3, 4])
-def test_a_fresh_flow_network_hears_its_events(encoders: int) -> None:
+@pytest.mark.parametrize(("encoders", "scales"), [(3, 1), (4, 1), (4, 4)])
+def test_a_fresh_flow_network_hears_its_events(encoders: int, scales: int) -> None:
     """Kernels by He, so that ReLUs leave the variance as it is, and a flow that starts near 0."""
-    network = EVFlowNet(base=8, encoders=encoders)
+    network = EVFlowNet(base=8, encoders=encoders, scales=scales)
     assert network.stride == 2**encoders
     params = network.init(jax.random.key(0), (16, 16))
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if path[-1].key == "kernel":
             gain = float(leaf.std()) * np.sqrt(np.prod(leaf.shape[:-1]))
-            near = 0.1 if path[0].key == "prediction" else np.sqrt(2.0)
+            predicts = path[0].key.startswith("prediction")
+            near = 0.1 / (1 if scales == 1 else 256) if predicts else np.sqrt(2.0)
             assert gain == pytest.approx(near, rel=0.4)
     x = jax.random.normal(jax.random.key(1), (2, 48, 40, 5))
     flow = np.asarray(apply(network, params, x)[0])

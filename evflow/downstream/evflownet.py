@@ -23,7 +23,7 @@ Array = jax.Array
 ENCODERS = 4
 BLOCKS = 2
 MOST_PX = 256.0  # what the original's tanh is scaled to
-NEAR_ZERO = 0.1  # of the first prediction's kernel
+NEAR_ZERO = 0.1  # px, what predictions begin with where features are 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,15 +48,16 @@ class EVFlowNet(Network):
         return _EVFlowNet(self)
 
     def init(self, key: Array, shape: tuple[int, int]) -> Params:
-        """Fresh params; of one scale by He et al., ICCV 2015, and a prediction near zero flow.
+        """Fresh params by He et al., ICCV 2015, and predictions near zero flow.
 
         Flax's own kernels halve the variance at each layer with a ReLU, of which the deepest path
-        has eight and the shortest two: what sees motion of many pixels would hardly be heard.
+        has eight and the shortest two: what sees motion of many pixels would hardly be heard. And
+        where the flow leaves the image, frames teach nothing.
         """
         params = super().init(key, shape)
-        if self.scales > 1:
-            return params
-        gains = {name: NEAR_ZERO if name == "prediction" else math.sqrt(2.0) for name in params}
+        near_zero = NEAR_ZERO if self.scales == 1 else NEAR_ZERO / MOST_PX
+        gains = {name: near_zero if name.startswith("prediction") else math.sqrt(2.0)
+                 for name in params}
         return {name: jax.tree.map(lambda a, gain=gains[name]: gain * a, layer)
                 for name, layer in params.items()}
 
