@@ -1,7 +1,8 @@
 """The paired trainings of `experiments.see_better`, each kept with its scores as it ends.
 
 runs/<condition>/<seed>/weights.safetensors, its card the cameras it saw, and <target>.json: what is
-there is not made again. One compiled step serves all conditions and seeds.
+there is not made again. One compiled step serves all seeds, and all conditions whose events are
+simulated for them.
 """
 
 from __future__ import annotations
@@ -74,6 +75,7 @@ class Trainings:
         self.targets = [targets.target(camera, circuit, setting.shape)
                         for camera in setting.cameras for circuit in setting.circuits]
         self._clips: dict[str, held_out.Clips] = {}
+        self._recorded: dict[str, RecordedBank] = {}
         self._starts: dict[tuple[int, Network], LearningState] = {}
 
     @functools.cached_property
@@ -86,19 +88,27 @@ class Trainings:
         return targets.held_out_bank(self.setting.textures // 2)
 
     def network(self, condition: Condition) -> Network:
-        """What a condition trains: EV-FlowNet learns from recordings, which tell no true flow, in
-        its form of several scales, from their frames."""
+        """What a condition trains."""
+        return self._of_recordings if condition.label == RAW else self.setting.network
+
+    @property
+    def _of_recordings(self) -> Network:
+        """EV-FlowNet learns from recordings, which tell no true flow, in its form of several
+        scales, from their frames."""
         network = self.setting.network
-        if condition.label == RAW and isinstance(network, EVFlowNet):
+        if isinstance(network, EVFlowNet):
             return dataclasses.replace(network, scales=network.encoders)
         return network
 
     def recorded(self, target: targets.Target) -> RecordedBank:
         """What the target itself records of scenes as all are trained on."""
-        data = self.setting.learning.data
-        made = held_out.gather(targets.clips(
-            target, self.bank, data, self.setting.drawn, data.windows, "trained on"))
-        return RecordedBank(jnp.swapaxes(made.tensors, 0, 1), jnp.swapaxes(made.frames, 0, 1))
+        if target.name not in self._recorded:
+            data = self.setting.learning.data
+            made = held_out.gather(targets.clips(
+                target, self.bank, data, self.setting.drawn, data.windows, "trained on"))
+            self._recorded[target.name] = RecordedBank(
+                jnp.swapaxes(made.tensors, 0, 1), jnp.swapaxes(made.frames, 0, 1))
+        return self._recorded[target.name]
 
     @functools.cached_property
     def lpips(self) -> Params | None:
@@ -167,7 +177,7 @@ class Trainings:
         if condition.label == EVENTGAN:
             cameras, step = load_weights(str(self.eventgan)), self._generated_step
         elif condition.label == RAW:
-            bank, step = self.recorded(condition.targets[0]), self._recorded_step(network)
+            bank, step = self.recorded(condition.targets[0]), self._recorded_step
         lpips = self.lpips if self.setting.perceptual else None
         state, losses = self._start(seed, network), []
         with bar(f"{condition.name}, seed {seed}") as progress:
@@ -200,8 +210,10 @@ class Trainings:
         return jax.jit(make_step(self.setting.network, self.setting.learning, self._tx,
                                  eventgan_sequences.sample))
 
-    def _recorded_step(self, network: Network) -> Any:
-        return jax.jit(make_step(network, self.setting.learning, self._tx, sample_recorded))
+    @functools.cached_property
+    def _recorded_step(self) -> Any:
+        return jax.jit(make_step(self._of_recordings, self.setting.learning, self._tx,
+                                 sample_recorded))
 
     def _start(self, seed: int, network: Network) -> LearningState:
         """Where every condition of a seed starts, if it trains this network."""

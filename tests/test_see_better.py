@@ -320,9 +320,7 @@ def test_runs_are_kept_and_gone_on_with(
 
 
 @pytest.mark.usefixtures("quick_compilation")
-def test_recordings_of_the_target_train_without_true_flow(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> None:
     setting = see_better.preset_of("flow", "debug")
     setting = dataclasses.replace(setting, names=("raw",), seeds=1, drawn=3, learning=(
         dataclasses.replace(setting.learning, steps=2)))
@@ -333,7 +331,7 @@ def test_recordings_of_the_target_train_without_true_flow(
     assert bank.tensors.shape == (3, 4, 32, 32, 5)
     assert bank.frames.shape == (3, 4, 32, 32)
     assert not np.array_equal(bank.frames[0, 0], runs.clips(raw.targets[0]).frames[0, 0])
-    monkeypatch.setattr(Trainings, "recorded", lambda *_: bank)
+    assert runs.recorded(raw.targets[0]) is bank  # made once for all seeds
     runs.complete(raw, 0)
     trained = load_network(str(runs.folder(raw, 0) / "weights.safetensors"))
     assert trained.network == runs.network(raw) == dataclasses.replace(setting.network, scales=4)
