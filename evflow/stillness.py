@@ -32,10 +32,10 @@ def stands_still(recording: Recording) -> bool:
     events = recording.events
     if events.duration_us < LEAST_US:
         return False
-    first = _smooth(recording.frame_dn(0))
-    for i in range(1, len(recording.frame_times)):
-        if np.abs(_smooth(recording.frame_dn(i)) - first).max() > STILL:
-            return False
+    first = recording.frame_dn(0)
+    if any(moved(first, recording.frame_dn(i)).any()
+           for i in range(1, len(recording.frame_times))):
+        return False
     return not unlike_noise(events, busy_pixels(events.count_map().sum(0)))
 
 
@@ -63,6 +63,11 @@ def gathered(hot: np.ndarray) -> bool:
     pairs = int((hot[1:] & hot[:-1]).sum() + (hot[:, 1:] & hot[:, :-1]).sum())
     chance = float(hot.mean()) ** 2 * (hot[1:].size + hot[:, 1:].size)
     return pairs > chance + 5.0 * np.sqrt(chance) + 3.0
+
+
+def moved(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(H, W) bool: where two frames (H, W), in DN, differ by more than their noise."""
+    return np.asarray(np.abs(_smooth(after) - _smooth(before)) > STILL)
 
 
 def _smooth(frame: np.ndarray) -> np.ndarray:

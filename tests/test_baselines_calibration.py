@@ -7,13 +7,15 @@ import itertools
 import json
 from pathlib import Path
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from evflow import Recording, simulate
-from evflow.baselines.calibration import calibrate_step, find_rests
+from evflow.baselines.calibration import calibrate_step
+from evflow.baselines.rests import find_rests
 from evflow.camera import Camera, CameraPrior
 from evflow.errors import EvflowDataError
 from evflow.io import write_recording
@@ -149,6 +151,39 @@ def test_what_is_no_bench_is_refused() -> None:
     swapped = dataclasses.replace(recording.events, p=~recording.events.p)
     with pytest.raises(EvflowDataError, match="EV021"):
         calibrate_step(dataclasses.replace(recording, events=swapped))
+
+
+def textured(shift_px: int, part: float = 1.0) -> Recording:
+    """A texture under CYCLES, which moves `shift_px` per frame; only `part` of it is the screen."""
+    base = bench(cameras(0.03), CYCLES)
+    texture = np.exp(0.2 * cv2.GaussianBlur(
+        np.random.default_rng(0).standard_normal((SHAPE[0], 4096)), (0, 0), 2.0) * 7.0)
+    light = np.asarray(base.frames)[:, 0, 0]
+    frames = np.stack([255 * np.roll(texture, i * shift_px, 1)[:, :SHAPE[1]] / texture.max()
+                       * light[i] / light.max() for i in range(len(light))])
+    frames[:, :, round(part * SHAPE[1]):] = 40.0
+    return dataclasses.replace(base, frames=frames.astype(np.float32))
+
+
+def test_frames_must_show_a_screen_that_steps() -> None:
+    """A still texture does as well; one that moves, or that most pixels do not see, does not."""
+    assert len(find_rests(textured(0))) == len(CYCLES)
+    assert calibrate_step(textured(0, part=0.7)).valid.any()
+    with pytest.raises(EvflowDataError, match=r"EV017.*the scene moves while the light rests"):
+        calibrate_step(textured(2))
+    with pytest.raises(EvflowDataError, match="EV017"):
+        calibrate_step(textured(0, part=0.3))
+    several = textured(0, part=0.3)
+    rests = [(0, 90_000), (120_000, 210_000)]
+    with pytest.raises(EvflowDataError, match=r"EV017.*step 1 of 1 is none of the whole view"):
+        calibrate_step(several, rests_us=rests)
+
+
+def test_few_measured_pixels_are_told() -> None:
+    """Steps of a threshold and a half: one event each, of which a direction needs two."""
+    found = calibrate_step(bench(Camera.constant(SHAPE, 0.45, 0.45), [60, 120, 60]), fresh=True)
+    assert not found.valid.any()
+    assert "0% of the pixels sent enough events" in " ".join(found.warnings)
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.baselines.rests import check_steps, find_rests
 from evflow.baselines.steps import (
     camera_rate,
     camera_wide,
@@ -32,10 +33,9 @@ from evflow.types import Recording
 
 Span = tuple[int, int]
 
-STILL = 0.01  # log units between two frames, of the median pixel: the screen rests
-LEAST_STEP = 0.1  # log units between two rests
 SETTLE_US = 20_000  # events of a step come until this long after the light rests again
 FEW_EVENTS = 2  # of a polarity, over all steps
+MOST = 0.5  # of the pixels: with fewer measured, the result warns
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,7 +62,8 @@ def calibrate_step(
     memory is at the light of the first rest, as in a simulation; a running camera's may be
     anywhere. literal: theta = dlogI / events, the paper's own words; the std then counts a whole
     event. A polarity's map is measured where a pixel has 2 of its events; else it is the camera's
-    median. Raises EV001 (no events), EV011 (no frames and no light), EV017 (no two rests), EV020.
+    median. Raises EV001 (no events), EV011 (no frames and no light), EV017 (frames that show no two
+    rests, or no screen that steps), EV020.
     """
     steps = _steps(recording, rests_us, light)
     _check_polarity(steps)
@@ -72,7 +73,7 @@ def calibrate_step(
     theta, error = (ratio if literal else regression)(steps.levels, clean, strays, fresh)
     events = steps.counts.sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
-    sound = enough & np.isfinite(theta) & (theta >= THETA_MIN) & np.isfinite(error)
+    sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
     hot = is_hot(steps.rest.sum(0), float(hz.sum()), steps.rest_s)
     maps, stds, medians, spreads, notes = [], [], [], [], []
     for i, name in enumerate(("ON", "OFF")):
@@ -87,6 +88,9 @@ def calibrate_step(
     eta, eta_std = shrunk_rates(steps.rest, steps.rest_s)
     n_events = steps.counts.sum((0, 1)).astype(np.uint32)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & ~hot
+    if valid.mean() < MOST:
+        notes.append(f"{valid.mean():.0%} of the pixels sent enough events to be measured: take "
+                     "more steps, or larger ones.")
     return _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
                      n_events, hot, len(steps.counts), notes)
 
@@ -99,30 +103,6 @@ def _check_polarity(steps: Steps) -> None:
         raise EvflowDataError(
             "EV021", "ON events come where the light falls, OFF events where it rises.",
             "Pass --polarity invert (polarity='invert'), or are frames and events not aligned?")
-
-
-def find_rests(recording: Recording) -> list[tuple[int, int]]:
-    """(first, last) frame of each stretch in which the median pixel rests, those of one light
-    joined; EV011 without frames, EV017 where there are not two."""
-    if len(recording.frames) < 4:
-        raise EvflowDataError("EV011", f"the recording has {len(recording.frames)} frames.",
-                              "Record frames too; in Python, rests_us and light take their place.")
-    level = np.array([np.median(np.asarray(lin_log(recording.frame_dn(i))))
-                      for i in range(len(recording.frames))])
-    still = np.abs(np.diff(level)) < STILL
-    found: list[tuple[int, int]] = []
-    for resting, group in itertools.groupby(range(len(still)), key=lambda i: bool(still[i])):
-        part = list(group)
-        if not resting:
-            continue
-        if found and abs(level[part[0]] - level[found[-1][1]]) < LEAST_STEP:
-            found[-1] = (found[-1][0], part[-1] + 1)
-        else:
-            found.append((part[0], part[-1] + 1))
-    if len(found) < 2:
-        raise EvflowDataError("EV017", f"the light rests at {len(found)} levels.",
-                              "A step needs two, of two frames each and 10 % apart.")
-    return found
 
 
 def _steps(
@@ -139,6 +119,8 @@ def _steps(
         raise EvflowDataError("EV020", f"rests_us={spans}.",
                               "Give two or more (begin, end) in us, in order of time.")
     levels = _levels(recording, spans, light)
+    if light is None:
+        check_steps(levels)
     settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
     counts = [events.slice(before[1], after).count_map()
               for before, after in zip(spans, settled[1:], strict=False)]
