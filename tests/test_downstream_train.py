@@ -150,13 +150,29 @@ def test_the_true_flow_explains_the_frames_best() -> None:
 
     def loss(x: float, y: float) -> float:
         full = jnp.broadcast_to(jnp.array([x, y]).reshape(1, 2, 1, 1), (1, 2, 32, 32))
-        return float(losses.photometric((full[..., ::2, ::2], full), before, after))
+        return float(losses.photometric((0.5 * full[..., ::2, ::2], full), before, after))
 
     true = loss(2.0, 1.0)
     assert true < min(loss(*other) for other in ((0, 0), (-2, -1), (1, 1), (2, 2), (3, 1)))
     rough = jnp.asarray(rng.normal(size=(1, 2, 32, 32)), jnp.float32)
     same = jnp.zeros_like(before)
     assert float(losses.photometric((rough,), same, same)) > 0.2  # by its roughness alone
+
+
+def test_smoothness_does_not_outweigh_the_frames() -> None:
+    """Half of the image moves by 2 px: its flow, with a step in it, beats none and the mean."""
+    rng = np.random.default_rng(1)
+    texture = jax.image.resize(jnp.asarray(rng.uniform(size=(1, 16, 16))), (1, 64, 64), "cubic")
+    texture = 0.4 + 0.2 * texture  # the contrast of an indoor scene
+    half = jnp.arange(32) < 16
+    before = texture[:, 8:40, 8:40]
+    after = jnp.where(half, texture[:, 8:40, 6:38], before)
+
+    def loss(left: float, right: float) -> float:
+        x = jnp.broadcast_to(jnp.where(half, left, right), (1, 32, 32))
+        return float(losses.photometric((jnp.stack([x, jnp.zeros_like(x)], 1),), before, after))
+
+    assert loss(2.0, 0.0) < 0.5 * min(loss(0.0, 0.0), loss(1.0, 1.0), loss(2.0, 2.0))
 
 
 @pytest.mark.slow

@@ -3,10 +3,15 @@ and nowhere else."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import h5py
 import numpy as np
 import pytest
 
 from evflow import Events, Recording, check
+from evflow.io import read_recording
+from tests.recordings import write_ijrr
 
 SIZE = (64, 48)
 MS = 1000
@@ -67,3 +72,51 @@ def test_more_events_than_a_link_carries() -> None:
     ((severity, words),) = findings(Recording.of_events(watched(30 * pixels, 12 * MS).events))
     assert severity == "error"
     assert "--time-unit ms" in words
+
+
+def mixed(tmp_path: Path, layout: str, frames_unit: str) -> Path:
+    """A recording whose events are in ns and whose frame times are in another unit."""
+    made = watched(20_000, 500 * MS)
+    per_us = {"ns": 1000, "us": 1, "s": 1e-6}[frames_unit]
+    t, times = 1000 * made.events.t, per_us * made.frame_times
+    ev, path = made.events, tmp_path / f"mixed.{layout}"
+    if layout == "npz":
+        np.savez(path, t=t, x=ev.x, y=ev.y, p=ev.p, size=SIZE, frames=made.frames,
+                 frame_times=times)
+    elif layout == "h5":
+        with h5py.File(path, "w") as f:
+            f.attrs["width"], f.attrs["height"] = SIZE
+            for name, column in (("x", ev.x), ("y", ev.y), ("t", t), ("p", ev.p)):
+                f[f"events/{name}"] = column
+            f["frames"], f["frame_times"] = made.frames, times
+    else:
+        write_ijrr(path, made)
+        (path / "events.txt").write_text("".join(
+            f"{a} {x} {y} {int(p)}\n" for a, x, y, p in zip(t, ev.x, ev.y, ev.p, strict=True)))
+        (path / "images.txt").write_text("".join(
+            f"{a} images/frame_{i:08d}.png\n" for i, a in enumerate(times)))
+    return path
+
+
+@pytest.mark.parametrize(("layout", "frames_unit"), [
+    ("npz", "ns"), ("npz", "us"), ("h5", "ns"), ("h5", "us"), ("folder", "ns"), ("folder", "s")])
+def test_the_events_unit_leaves_plausible_frame_times_alone(
+    tmp_path: Path, layout: str, frames_unit: str
+) -> None:
+    """--time-unit is the advice where both clocks contradict, so it must not scale both."""
+    found = read_recording(mixed(tmp_path, layout, frames_unit), time_unit="ns")
+    made = watched(20_000, 500 * MS)
+    np.testing.assert_array_equal(found.events.t, made.events.t)
+    np.testing.assert_array_equal(found.frame_times, made.frame_times)
+    said = [n for n in found.notes if "frame times of" in n and "their own unit" in n]
+    assert len(said) == (frames_unit != "ns")
+
+
+def test_frame_times_in_seconds_beside_whole_events(tmp_path: Path) -> None:
+    made = watched(20_000, 500 * MS)
+    ev, path = made.events, tmp_path / "a.npz"
+    np.savez(path, t=ev.t, x=ev.x, y=ev.y, p=ev.p, size=SIZE, frames=made.frames,
+             frame_times=1e-6 * made.frame_times)
+    found = read_recording(path)
+    np.testing.assert_array_equal(found.frame_times, made.frame_times)
+    assert "were read in s (25 frames/s)" in " ".join(found.notes)

@@ -68,8 +68,8 @@ class EVFlowNet(Network):
         return jnp.moveaxis(image, -1, -3)
 
     def pyramid(self, params: Params, voxels: Array) -> tuple[Array, ...]:
-        """Flows at 1/8, 1/4, 1/2 and full resolution (scales = 4), or the one; of tensors whose
-        H and W are multiples of 16. All in pixels of the full resolution."""
+        """Flows at 1/8, 1/4, 1/2 and full resolution (scales = 4), or the one, each in pixels of
+        its own; of tensors whose H and W are multiples of 16."""
         flows: Any = self.module().apply({"params": params}, voxels, method="flows")
         return tuple(self._finish(flow) for flow in flows)
 

@@ -18,6 +18,7 @@ Array = jax.Array
 
 OCCLUSION = 50.0  # of exp(-50 (I1 - W(I0))^2): frames that differ by .14 count e^-1
 CHARBONNIER, SMOOTHNESS = 0.45, 0.5  # EV-FlowNet's exponent, and weight of smoothness
+DN = 255.0  # of a frame's white
 INSIDE = 0.99  # of a point's four neighbours: what was seen in the image
 
 
@@ -69,16 +70,17 @@ def photometric(flows: Sequence[Array], before: Array, after: Array) -> Array:
     RSS 2018, Eqs. 3-5), summed over scales: `after` read where the flow points should be `before`,
     both (..., H, W) on [0, 1], and neighbours should move alike.
 
-    flows: one (..., 2, h, w) per scale, px of the full resolution. Points that leave the image do
-    not count.
+    flows: one (..., 2, h, w) per scale, px of that scale. Frames are compared in DN, as by its
+    authors: the weight of smoothness is that beside grey levels, and on [0, 1] it would outweigh
+    them. Points that leave the image do not count.
     """
     total = jnp.zeros((), before.dtype)
     for flow in flows:
         shape = (*before.shape[:-2], *flow.shape[-2:])
-        first, second = (jax.image.resize(frame, shape, "linear") for frame in (before, after))
-        local = flow * (flow.shape[-1] / before.shape[-1])
-        seen = warp(jnp.ones_like(second), local) > INSIDE
-        total += jnp.mean(seen * _charbonnier(warp(second, local) - first))
+        first, second = (jax.image.resize(DN * frame, shape, "linear")
+                         for frame in (before, after))
+        seen = warp(jnp.ones_like(second), flow) > INSIDE
+        total += jnp.mean(seen * _charbonnier(warp(second, flow) - first))
         total += SMOOTHNESS * _roughness(flow)
     return total
 

@@ -33,6 +33,7 @@ from evflow.io.frames import FrameStack, cut
 from evflow.io.hints import Hints
 from evflow.io.limits import FREE, RATIO
 from evflow.io.stream import Chunk, Damage, gather
+from evflow.io.times import beside_events
 from evflow.types import Events, Recording
 
 NAME = "aedat4"
@@ -140,7 +141,7 @@ class _Reading:
         """The recording of these events and the frames in [start, stop) us."""
         if not self.times:
             return Recording.of_events(events)
-        times = self.hints.microseconds(np.array(self.times), "us")
+        times = beside_events(np.array(self.times), self.path, "us", self.hints)
         recording = self.stack.beside(events, times, ("frame times are mid-exposure",))
         return cut(recording, span)
 

@@ -23,6 +23,7 @@ from evflow.io import tables
 from evflow.io.hdf5 import DAMAGE, MAGIC, Hdf5Writer, load_h5py, plausible
 from evflow.io.hints import Hints
 from evflow.io.stream import Chunk, gather
+from evflow.io.times import beside_events
 from evflow.types import Events, Recording
 
 NAME = "dsec"
@@ -70,7 +71,7 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events, notes)
         frames = tables.dataset(path, f, "frames", (None, None, None))
         times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
-        return tables.with_frames(path, events, span, hints.microseconds(times, "us"),
+        return tables.with_frames(path, events, span, beside_events(times, path, "us", hints),
                                   lambda keep: tables.stored_frames(frames, keep), notes)
 
 

@@ -20,6 +20,7 @@ from evflow.io import tables
 from evflow.io.hdf5 import Hdf5Writer
 from evflow.io.hints import Hints
 from evflow.io.stream import gather
+from evflow.io.times import beside_events
 from evflow.io.writer import FLUSH, SECONDS_US
 from evflow.types import Events, Recording
 
@@ -48,7 +49,8 @@ def read(path: Path, hints: Hints) -> Recording:
         events, span = gather(path, chunks, hints, size, native)
         if not images:
             return Recording.of_events(events, notes)
-        times = hints.microseconds(np.array([_time(path, image) for image in images]), native)
+        stamps = np.array([_time(path, image) for image in images])
+        times = beside_events(stamps, path, native, hints)
         return tables.with_frames(path, events, span, times,
                                   lambda keep: (_rgb(image[:]) for image in images[keep]), notes)
 

@@ -19,6 +19,7 @@ from evflow.io import tables
 from evflow.io.arrays import GrowingArray, mapped
 from evflow.io.hints import Hints
 from evflow.io.stream import gather
+from evflow.io.times import beside_events
 from evflow.io.writer import SECONDS_US, EventWriter
 from evflow.types import Events, Recording
 
@@ -44,7 +45,7 @@ def read(path: Path, hints: Hints) -> Recording:
     if images is None:
         return Recording.of_events(events)
     stamps = mapped(path / "images_ts.npy", (len(images),))
-    times = hints.microseconds(np.asarray(stamps), _unit(stamps))
+    times = beside_events(np.asarray(stamps), path, _unit(stamps), hints)
     return tables.with_frames(path, events, span, times,
                               lambda keep: map(_rgb, images[keep]), ())
 

@@ -21,6 +21,7 @@ from evflow.io.archives import DAMAGE, unzipped
 from evflow.io.hints import Hints
 from evflow.io.images import decode
 from evflow.io.stream import Chunk, gather
+from evflow.io.times import beside_events
 from evflow.types import Recording
 
 NAME = "ijrr"
@@ -124,7 +125,8 @@ def _read_index(index: Root, hints: Hints) -> tuple[np.ndarray, list[str]]:
                 "EV009", f"{index}, line {number:,} is {content[:60]!r}; expected t[s] path.")
         seconds.append(float(fields[0]))
         names.append(fields[1].decode("utf-8"))
-    times = check_times(hints.microseconds(np.array(seconds), "s"), str(index), strict=True)
+    us = beside_events(np.array(seconds), index, "s", hints)
+    times = check_times(us, str(index), strict=True)
     if len(set(names)) < len(names):  # each would be decoded: little text, much memory
         raise EvflowDataError("EV009", f"{index} has {len(names):,} lines for {len(set(names)):,} "
                               "images.", "Give each time its own image.")

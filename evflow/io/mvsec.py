@@ -16,6 +16,7 @@ from evflow.errors import EvflowDataError
 from evflow.io import tables
 from evflow.io.hints import Hints
 from evflow.io.stream import gather
+from evflow.io.times import beside_events
 from evflow.types import Recording
 
 NAME = "mvsec"
@@ -52,5 +53,5 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events, notes)
         frames = tables.dataset(path, camera, "image_raw", (None, None, None))
         times = tables.dataset(path, camera, "image_raw_ts", (len(frames),))[:]
-        return tables.with_frames(path, events, span, hints.microseconds(times, "s"),
+        return tables.with_frames(path, events, span, beside_events(times, path, "s", hints),
                                   lambda keep: tables.stored_frames(frames, keep), notes)

@@ -23,6 +23,7 @@ from evflow.io.arrays import GrowingArray
 from evflow.io.frames import cut
 from evflow.io.hints import Hints
 from evflow.io.stream import gather
+from evflow.io.times import beside_events
 from evflow.io.writer import EventWriter
 from evflow.types import Events, Recording
 
@@ -59,7 +60,7 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events)
         if "frame_times" not in found:
             raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
-        times = hints.microseconds(found["frame_times"].whole(), "us")
+        times = beside_events(found["frame_times"].whole(), path, "us", hints)
         return cut(Recording(events, found["frames"].spooled(), times), span)
 
 

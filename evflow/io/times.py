@@ -9,6 +9,7 @@ Lines that begin with # are comments. A unit written in a comment or header coun
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection
 from pathlib import Path, PurePosixPath
@@ -25,6 +26,8 @@ MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
 EPOCH_S = (1e9, 4.1e9)  # 2001 to 2099 as seconds since 1970
 POSSIBLE_S = (2e-5, 2.0)  # between frames: 50,000 frames/s to one in two seconds
 USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s, where only one unit of 1000 can fall
+USUAL_US = 2e4  # of two units the one nearer to 50 frames/s
+TELL = "pass --timestamps-unit beside --frames (simulate: --time-unit)"
 UNIT_WORDS = re.compile(r"(?:[\[(_]|in )(ns|us|µs|ms|s|sec|seconds)\b")
 
 Times = tuple[np.ndarray, list[str], str]  # int64 us (T,); names (T,) or none; a note or ""
@@ -73,6 +76,31 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
     return check_times(us, f"{where}, read in {unit}", strict=True), note
 
 
+def beside_events(times: np.ndarray, where: object, native: str, hints: Hints) -> np.ndarray:
+    """Times (T,) of the frames that a recording brings along, as int64 us.
+
+    native: their unit in the format. That of `hints` is the events'; frames share it only where
+    it makes them the more usual video: mixed units are what it is passed for most. Fractions
+    where whole numbers belong are of the unit that makes them a video. Raises as `to_us`.
+    """
+    told = hints.time_unit != "auto"
+    odd = times.dtype.kind not in "iu" and not (times.dtype.kind == "f" and native == "s")
+    if times.ndim == 1 and odd and not told:
+        us, note = to_us(times, where)
+        hints.remarks.append(note)
+        return us
+    if times.ndim != 1 or times.dtype.kind not in "iuf" or not told:
+        return hints.microseconds(times, native)
+    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
+    unit = hints.time_unit
+    if step > 0:
+        unit = min((unit, native), key=lambda u: abs(math.log(step * UNITS_US[u] / USUAL_US)))
+    if unit != hints.time_unit:
+        hints.remarks.append(f"frame times of {where} were read in {unit}, their own unit "
+                             f"({1e6 / (step * UNITS_US[unit]):.4g} frames/s).")
+    return Hints(time_unit=unit).microseconds(times, unit)
+
+
 def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:
     """The unit in which the times are those of a video, and the sentence that says so."""
     step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
@@ -86,12 +114,12 @@ def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:
         if len(found) == 1:
             (unit,) = found
             return unit, (f"times of {where} were read in {unit} "
-                          f"({1 / (step * seconds[unit]):.4g} frames/s); else pass --time-unit.")
+                          f"({1 / (step * seconds[unit]):.4g} frames/s); else {TELL}.")
     would = ", ".join(f"{1 / (step * seconds[u]):.4g} frames/s in {u}" for u in possible)
     raise EvflowDataError(
         "EV003", f"{where}: steps of {step:g} (from {times[0]}) have no clear unit"
         + (f": {would}." if would else "."),
-        f"Pass --time-unit {', '.join(UNITS_US)}.")
+        f"Is it {', '.join(UNITS_US)}? {TELL.capitalize()}.")
 
 
 def _rows(path: Path) -> tuple[list[list[str]], str]:

@@ -14,6 +14,7 @@ import numpy as np
 from evflow.io import tables
 from evflow.io.hints import Hints
 from evflow.io.stream import gather
+from evflow.io.times import beside_events
 from evflow.types import Recording
 
 NAME = "v2e"
@@ -42,5 +43,5 @@ def read(path: Path, hints: Hints) -> Recording:
         if frames is None:
             return Recording.of_events(events)
         times = tables.dataset(path, f, "frame_ts", (len(frames),))[:]
-        return tables.with_frames(path, events, span, hints.microseconds(times, "us"),
+        return tables.with_frames(path, events, span, beside_events(times, path, "us", hints),
                                   lambda keep: tables.stored_frames(frames, keep), ())
