@@ -58,6 +58,9 @@ def sample(path: Path, *targets: Path, text: bool = False, sealed: bool = False,
 # ------------------------------------------------------------------------------------ recordings
 
 
+TEXTS = ("v2e-text", "text")
+
+
 def stream(folder: Path, kind: str) -> Sample:
     return sample(test_io_stream.write(folder, kind, test_io_stream.clustered(N)))
 
@@ -72,7 +75,7 @@ def table(folder: Path, kind: str) -> Sample:
         targets += [path / "metadata.json"] if kind == "evreal" else []
     else:
         targets = [path]
-    return sample(path, *targets, text=kind == "v2e-text", counted=kind != "v2e-text",
+    return sample(path, *targets, text=kind in TEXTS, counted=kind not in TEXTS,
                   sealed=kind == "e2vid", **test_io_tables.hint(kind))
 
 

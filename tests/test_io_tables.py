@@ -82,6 +82,12 @@ def write_text(folder: Path, r: Recording) -> Path:
     return folder / "a.txt"
 
 
+def write_csv(folder: Path, r: Recording) -> Path:
+    lines = ["polarity,timestamp_us,x,y", *(f"{p},{t},{x},{y}" for t, x, y, p in rows(r))]
+    (folder / "a.csv").write_text("\n".join(lines) + "\n")
+    return folder / "a.csv"
+
+
 def write_e2vid(folder: Path, r: Recording) -> Path:
     lines = [f"{r.events.size[0]} {r.events.size[1]}"]
     lines += [f"{t / 1e6:.9f} {x} {y} {p}" for t, x, y, p in rows(r)]
@@ -113,7 +119,8 @@ def write_evimo2(folder: Path, r: Recording) -> Path:
 
 WRITERS: dict[str, Callable[[Path, Recording], Path]] = {
     "v2e": write_v2e, "mvsec": write_mvsec, "event_utils": write_event_utils,
-    "v2e-text": write_text, "e2vid": write_e2vid, "evreal": write_evreal, "evimo2": write_evimo2}
+    "v2e-text": write_text, "text": write_csv, "e2vid": write_e2vid, "evreal": write_evreal,
+    "evimo2": write_evimo2}
 each = pytest.mark.parametrize("kind", WRITERS)
 
 
@@ -123,7 +130,7 @@ def write(folder: Path, kind: str, n: int = 2000) -> Path:
 
 
 def hint(kind: str) -> dict[str, tuple[int, int]]:
-    return {"size": SIZE} if kind in ("v2e-text", "evimo2") else {}
+    return {"size": SIZE} if kind in ("v2e-text", "text", "evimo2") else {}
 
 
 @each

@@ -80,3 +80,65 @@ def test_whole_seconds_are_no_seconds(tmp_path: Path) -> None:
     for few in ("4 4\n1 1 1 1\n2 1 1 1\n", "4 4\n" + "1 1 1 1\n" * 20):
         path.write_text(few)  # too little to be sure
         assert len(read_events(path)) > 1
+
+
+def rows(t: list[float], *, order: str = "txyp", comma: str = " ", form: str = "{}") -> str:
+    """Twelve events, their columns in that order."""
+    events = [{"t": time, "x": 3 + i, "y": 20 - i, "p": i % 2} for i, time in enumerate(t)]
+    return "".join(comma.join(form.format(event[name]) for name in order) + "\n"
+                   for event in events)
+
+
+US = [1_000_000 + 250 * i for i in range(12)]
+SECONDS = [1 + 0.00025 * i for i in range(12)]
+TEXTS = {  # name: text, and the unit that must be told
+    "seconds.csv": (rows(SECONDS, comma=","), None),
+    "semicolons.csv": (rows(SECONDS, comma="; "), None),
+    "tabs.tsv": (rows(SECONDS, comma="\t"), None),
+    "savetxt.txt": (rows(SECONDS, form="{:.18e}"), None),
+    "whole_floats.txt": (rows(US, form="{:.1f}"), "us"),
+    "us.txt": (rows(US), "us"),
+    "events.txt": (rows(US, comma=","), "us"),
+    "bom.txt": ("\ufeff" + rows(SECONDS), None),
+    "prophesee.csv": (rows(US, order="xypt", comma=","), None),
+    "pandas.csv": ("x,y,timestamp,polarity\n" + rows(SECONDS, order="xytp", comma=","), None),
+    "header.csv": ("timestamp_us,polarity,x,y\n" + rows(US, order="tpxy", comma=","), None),
+    "units.txt": ("# t [us], x, y, p\n" + rows(US), None),
+    "quoted.csv": ('"x";"y";"p";"t"\n' + rows(US, order="xypt", comma=";"), None),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_text_of_other_tools(tmp_path: Path, name: str) -> None:
+    content, unit = TEXTS[name]
+    path = tmp_path / name
+    path.write_text(content, "utf-8")
+    assert (name == "events.txt") == (find_format(path).NAME == "ijrr")
+    got = read_events(path, size=SIZE, **({"time_unit": unit} if unit else {}))
+    assert got.t.tolist() == US
+    assert got.x.tolist() == [3 + i for i in range(12)]
+    assert got.y.tolist() == [20 - i for i in range(12)]
+    assert got.p.tolist() == [bool(i % 2) for i in range(12)]
+    if unit:
+        assert refused(path, size=SIZE).code == "EV003"
+    assert refused(path, **({"time_unit": unit} if unit else {})).code == "EV015"
+
+
+@pytest.mark.parametrize("content", [
+    "0.1 3 4\n", "0.1 3 4 1 7\n", "0.1 3 4 2\n0.2 3 4 1\n", "0.2 3 4 1\n0.1 3 4 1\n", "a b c d\n",
+    "0.1 3 4 1\nfour words and no numbers\n", "0.1 3 4 1\n0.2 3 4\n"])
+def test_other_numbers_are_no_events(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "numbers.dat"
+    path.write_text(content)
+    if content.startswith("0.1 3 4 1\n"):  # it begins like IJRR's
+        assert refused(path, size=SIZE).code == "EV009"
+    else:
+        assert refused(path, size=SIZE).code == ("EV004" if "0.2 3 4 1\n0" in content else "EV008")
+
+
+def test_fractional_coordinates_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "undistorted.txt"
+    path.write_text("0.1 3.5 4.25 1\n0.2 3.5 4.25 0\n")
+    error = refused(path, size=SIZE)
+    assert error.code == "EV003"
+    assert "undistorted" in str(error)

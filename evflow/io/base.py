@@ -29,6 +29,7 @@ from evflow.io import (
     ijrr,
     mvsec,
     npz,
+    plain_text,
     rosbag,
     rosbag2,
     v2e,
@@ -58,7 +59,7 @@ class Format(Protocol):
 
 FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
     aedat4, aedat2, evt2, evt3, dat, v2e, mvsec, event_utils, dsec, npz, evimo2, evreal, e2vid,
-    v2e_text, ijrr, rosbag, rosbag2)
+    v2e_text, ijrr, plain_text, rosbag, rosbag2)
 WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
     dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
     npz.NpzWriter, Aedat4Writer)}

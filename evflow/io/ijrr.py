@@ -28,6 +28,7 @@ NAME = "ijrr"
 EXTENSIONS: tuple[str, ...] = (".zip", ".txt", "")
 
 EVENTS, IMAGES = "events.txt", "images.txt"
+ROW = re.compile(rb"\d+\.\d+[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?")
 
 Root = Path | zipfile.Path
 
@@ -41,11 +42,12 @@ def sniff(path: Path, head: bytes) -> bool:
                 return any(_is_events(name) for name in archive.namelist())
         except DAMAGE:
             return path.suffix.lower() == ".zip"  # cut off: the extension decides
-    lines = [line for line in head.split(b"\n") if line and not line.startswith(b"#")]
-    # Of a file with that name any number may be a time; `text` says what is wrong with it.
-    time = rb"[\d.eE+-]+" if path.name == EVENTS else rb"\d+\.\d+"
-    return bool(lines) and re.fullmatch(
-        time + rb"[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?", lines[0]) is not None
+    lines = [line for line in text.plain(head, 0).split(b"\n")
+             if line.strip() and not line.startswith(b"#")]
+    if path.name == EVENTS:  # any numbers may be events; `text` says what is wrong with them
+        fields = lines[0].split() if lines else []
+        return len(fields) == 4 and all(map(text.is_number, fields))
+    return bool(lines) and ROW.fullmatch(lines[0]) is not None
 
 
 def read(path: Path, hints: Hints) -> Recording:
@@ -84,7 +86,7 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
                     else (np.zeros(0, np.int64), []))
     size = _image(root, names[0]).shape[1::-1] if names else None
     with (root / name).open("rb") as f:
-        chunks = _in_seconds(path, text.events(f, (4,)), hints, size)
+        chunks = _some(path, text.in_seconds(path, text.events(f, (4,)), hints), hints, size)
         events, span = gather(path, chunks, hints, size, "s")
     if not names:
         return Recording.of_events(events)
@@ -93,18 +95,12 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
         ("frame times are those of images.txt",))
 
 
-def _in_seconds(
+def _some(
     path: Path, chunks: Iterable[Chunk], hints: Hints, size: Size | None
 ) -> Iterator[Chunk]:
-    """The chunks; EV001 where there is neither event nor size, EV003 where the times of the first
-    are whole numbers, which seconds are not."""
+    """The chunks; EV001 where there is neither event nor size."""
     seen = False
     for chunk in chunks:
-        whole = not seen and len(chunk.t) >= 10 and bool((chunk.t % 1 == 0).all())
-        if whole and hints.time_unit == "auto":
-            raise EvflowDataError(
-                "EV003", f"{path}: all times are whole numbers ({chunk.t[0]:.0f}, ...), not "
-                "seconds.", "Microseconds? Pass time_unit='us' (--time-unit us).")
         seen = seen or len(chunk.t) > 0
         yield chunk
     if not (seen or size or hints.size):

@@ -1,19 +1,25 @@
-"""Text with one event per line, in blocks of whole lines: numbers between blanks, `#` comments.
+"""Text with one event per line, in blocks of whole lines: numbers between blanks or commas, `#`
+comments.
 
 A line that is not such becomes `Damage` at its byte. Memory: one block and its table of float64.
 """
 
 from __future__ import annotations
 
+import codecs
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import IO
 
 import numpy as np
 
+from evflow.errors import EvflowDataError
+from evflow.io.hints import Hints
 from evflow.io.stream import Chunk, Damage
 
+BLANKS = bytes.maketrans(b",;", b"  ")  # what else stands between numbers
 BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
 MAX_LINE = 1000  # a longer one is not text
 
@@ -22,10 +28,30 @@ def events(f: IO[bytes], widths: tuple[int, ...], byte: int = 0) -> Iterator[Chu
     """Chunks of lines `t x y p ...` of one of these numbers of columns; f is at `byte`."""
     line = 0
     for start, block in _blocks(f, byte):
-        table, widths = _parse(start, block, widths)
+        table, widths = _parse(start, plain(block, start), widths)
         t, x, y, p = table[:, :4].T
         yield Chunk(x, y, t, p, lambda i, line=line: line + i, "event")  # type: ignore[misc]
         line += len(table)
+
+
+def in_seconds(path: Path, chunks: Iterable[Chunk], hints: Hints) -> Iterator[Chunk]:
+    """The chunks; EV003 where the times of the first are whole numbers, which seconds are not."""
+    seen = False
+    for chunk in chunks:
+        whole = not seen and len(chunk.t) >= 10 and bool((chunk.t % 1 == 0).all())
+        if whole and hints.time_unit == "auto":
+            raise EvflowDataError(
+                "EV003", f"{path}: all times are whole numbers ({chunk.t[0]:.0f}, ...), not "
+                "seconds.", "Microseconds? Pass time_unit='us' (--time-unit us).")
+        seen = seen or len(chunk.t) > 0
+        yield chunk
+
+
+def plain(block: bytes, byte: int) -> bytes:
+    """Lines with blanks between their numbers; a byte order mark at byte 0 becomes blanks too."""
+    if byte == 0 and block.startswith(codecs.BOM_UTF8):
+        block = b"   " + block[len(codecs.BOM_UTF8):]
+    return block.translate(BLANKS)
 
 
 def _blocks(f: IO[bytes], byte: int) -> Iterator[tuple[int, bytes]]:

@@ -144,8 +144,13 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
                 "EV009", f"{path}, line {number:,} is {line[:60]!r}; lines before it have "
                 f"{len(rows[0])} columns.", "Cut off or damaged? Copy it again.")
         rows.append(fields)
+    return rows, written_unit(words)
+
+
+def written_unit(words: str) -> str:
+    """The unit of times that a header or comment tells, or "auto"."""
     units = {u.replace("µ", "u")[:2].replace("se", "s") for u in UNIT_WORDS.findall(words)}
-    return rows, units.pop() if len(units) == 1 else "auto"
+    return units.pop() if len(units) == 1 else "auto"
 
 
 def _columns(

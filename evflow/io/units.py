@@ -13,7 +13,8 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.hints import UNITS_US
 
-SECONDS = ("e2vid", "event_utils", "evreal", "ijrr", "mvsec", "v2e-text")  # formats whose unit is s
+SECONDS = (  # formats whose unit is s
+    "e2vid", "event_utils", "evreal", "ijrr", "mvsec", "text", "v2e-text")
 USUAL_HZ = 5.0  # events per second and pixel; units are three decades apart
 LEAST = 10  # events: fewer may fall on whole seconds by chance
 S_US = 1_000_000
