@@ -19,6 +19,14 @@ COLUMNS = ("x", "y", "t", "p")
 RESET_US = 1_000_000  # a step back by more than this is another clock, not a late packet
 
 
+def need(value: Any, kind: Any, name: str, fix: str) -> None:
+    """EV020 where a value of another kind, a class or a union of some, was given."""
+    if not isinstance(value, kind):
+        expected = getattr(kind, "__name__", kind)
+        raise EvflowDataError(
+            "EV020", f"{name} is of type {type(value).__name__}; expected {expected}.", fix)
+
+
 def check_size(size: Any) -> Size:
     """(width, height) as ints, 1..65536, or EV020."""
     try:

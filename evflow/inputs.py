@@ -35,12 +35,18 @@ def same_precision(values: Array, tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, values.dtype), tree)
 
 
+def is_real(dtype: Any) -> bool:
+    """Real numbers, bfloat16 and float8 (which NumPy calls void) among them, or bool."""
+    return np.dtype(dtype).kind == "b" or (
+        jnp.issubdtype(dtype, jnp.number) and not jnp.issubdtype(dtype, jnp.complexfloating))
+
+
 def check_finite(name: str, values: ArrayLike) -> None:
     """EV003 where values are no real numbers, EV007 where they are not finite."""
     if isinstance(values, jax.core.Tracer):
         return
     given = np.asarray(values)
-    if given.dtype.kind not in "biuf":
+    if not is_real(given.dtype):
         raise EvflowDataError("EV003", f"{name} has dtype {given.dtype}.",
                               "Expected real numbers.")
     if not np.isfinite(given).all():
@@ -94,7 +100,7 @@ def prepare(
 def _intensity(values: Any, shape: tuple[int, ...]) -> Array:
     if not isinstance(values, jax.core.Tracer):
         given = np.asarray(values)
-        if given.dtype.kind not in "biuf":
+        if not is_real(given.dtype):
             raise EvflowDataError("EV003", f"intensity has dtype {given.dtype}.",
                                   "Expected logarithms (lin-log of DN), or NaN where unknown.")
         known = given[~np.isnan(given)]

@@ -113,6 +113,24 @@ def test_convert_errors(
     assert (tmp_path / "there.npz").read_text() == "dear to me"
 
 
+@pytest.mark.parametrize("verb", ["convert", "voxel", "simulate", "link"])
+def test_what_is_read_is_never_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str
+) -> None:
+    source = out = tmp_path / "only.npz"
+    write_recording(source, make(3000))
+    if verb == "link":
+        verb, out = "convert", tmp_path / "other.npz"
+        out.symlink_to(source)
+    before = source.read_bytes()
+    target = [out] if verb == "convert" else ["-o", out]
+    status, _, err = run(capsys, verb, source, *target, "--overwrite")
+    assert status == 2
+    assert "EV020" in err
+    assert "is what is read" in err
+    assert source.read_bytes() == before
+
+
 @pytest.mark.parametrize("name", ["a.h5", "a.npz", "folder", "a.zip", "a.aedat4"])
 def test_simulate_into_any_format(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str

@@ -144,7 +144,7 @@ def test_the_four_scales_of_flow() -> None:
 
 @pytest.mark.parametrize("options", [
     {"decoder": "nearest"}, {"norm": "group"}, {"skip": "none"}, {"output": "relu"},
-    {"encoders": 0}, {"base": 0}, {"padding": "wrap"}])
+    {"encoders": 0}, {"base": 0}, {"base": "x"}, {"bins": 2.5}, {"padding": "wrap"}])
 def test_unknown_options_are_refused(options) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         E2VID(**options)

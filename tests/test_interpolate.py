@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from videos import code_of
 
+from evflow.errors import EvflowDataError
 from evflow.simulator.interpolate import MAX_STEPS, Interpolator, unzip, upsample
 
 SIZE = 96
@@ -128,6 +129,12 @@ def test_empty_and_single() -> None:
 def test_frames_it_cannot_follow_are_refused(shapes: list[tuple[int, ...]]) -> None:
     pairs = [(np.zeros(shape, np.uint8), i) for i, shape in enumerate(shapes)]
     assert code_of(lambda: list(upsample(pairs))) == "EV002"
+
+
+def test_frames_too_small_for_motion_may_be_taken_as_they_are() -> None:
+    tiny = [(np.zeros((8, 8), np.uint8), i) for i in range(2)]
+    with pytest.raises(EvflowDataError, match=r"8x8 pixels are too small.*--no-interpolate"):
+        list(upsample(tiny))
 
 
 @pytest.mark.parametrize("step", [0.0, -1.0, float("nan")])

@@ -26,6 +26,8 @@ from recordings import (
     zipped,
 )
 
+import evflow
+from evflow import io
 from evflow.errors import EvflowDataError
 from evflow.io import DsecWriter, read_events, read_recording, write_events
 from evflow.io.base import find_format
@@ -124,6 +126,28 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
     assert len(read_events(path)) == 5
     with pytest.raises(EvflowDataError, match="EV020"):
         write_events(path, make().events, "csv")
+
+
+@pytest.mark.parametrize(("name", "format"), [
+    ("a.npz", "dsec"), ("a.txt", "dsec"), ("a.aedat4", "dsec"), ("a.h5", "npz"), ("a.zip", "npz")])
+def test_a_format_that_the_extension_denies_is_refused(
+    tmp_path: Path, name: str, format: str
+) -> None:
+    """`dsec` is the format unless told: a file called a.npz would hold HDF5."""
+    with pytest.raises(EvflowDataError, match=r"EV020.*or pass format="):
+        write_events(tmp_path / name, make(5).events, format)
+    assert not list(tmp_path.iterdir())
+    write_events(tmp_path / "a.hdf5", make(5).events, "event_utils")
+    write_events(tmp_path / "a.anything", make(5).events, "npz")
+
+
+@pytest.mark.parametrize("call", [
+    lambda events: io.write_events(events, "a.h5"), lambda events: io.iter_windows("a.h5"),
+    lambda events: io.write_recording("a.h5", events), lambda events: evflow.check(events),
+    lambda events: evflow.compare("a.h5", events), lambda events: evflow.compare(events, None)])
+def test_paths_and_recordings_in_each_others_place(call: Callable[[Events], Any]) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*is of type (str|Events|NoneType)"):
+        call(make(5).events)
 
 
 @pytest.mark.parametrize("kind", ["dsec", "npz"])

@@ -228,6 +228,7 @@ def test_windows_without_events_have_no_score() -> None:
     (lambda e, f: metrics.endpoint_error(f[0, 0], f[0, 0]), "EV002"),
     (lambda e, f: FwlConvention(splat="cubic"), "EV020"),
     (lambda e, f: FwlConvention(blur=-1.0), "EV020"),
+    (lambda e, f: FwlConvention(blur="x"), "EV020"),
 ])
 def test_what_cannot_be_scored_is_refused(call, code: str) -> None:
     with pytest.raises(EvflowDataError, match=code):

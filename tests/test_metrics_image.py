@@ -140,6 +140,11 @@ def test_metrics_are_differentiable_and_follow_the_type() -> None:
     (lambda a, b: metrics.frame_scores((255 * a).astype(np.uint8), b, PROTOCOLS["evreal"]),
      "EV003"),
     (lambda a, b: metrics.frame_scores(a, b, "mine"), "EV020"),
+    (lambda a, b: metrics.frame_scores(a, b, ["evreal"]), "EV020"),
+    (lambda a, b: metrics.frame_scores(a, b, "evreal", "alex"), "EV020"),
+    (lambda a, b: metrics.ssim(a, b, ["evreal"]), "EV020"),
+    (lambda a, b: metrics.score_images([(a[None], b[None])]), "EV020"),
+    (lambda a, b: metrics.score_images({"x": (a[None], b[None], a[None])}), "EV002"),
 ])
 def test_what_cannot_be_scored_is_refused(call, code: str) -> None:
     with pytest.raises(EvflowDataError, match=code):

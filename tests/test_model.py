@@ -87,6 +87,17 @@ def test_estimate_agrees_with_forward(shipped: dict[str, Any]) -> None:
         np.testing.assert_allclose(getattr(camera, name), getattr(expected, name), rtol=1e-3)
 
 
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_half_precision_is_taken_within_jit_and_without(dtype: Any) -> None:
+    voxels, dL, _ = seen()
+    given = voxels.astype(dtype), dL.sum(-1).astype(dtype)
+    eager = model.estimate(small_params(), *given, intensity=jnp.asarray(4.0, dtype))
+    jitted = jax.jit(lambda v, d: model.estimate(
+        small_params(), v, d, intensity=jnp.asarray(4.0, dtype)))(*given)
+    np.testing.assert_allclose(eager.theta_on, jitted.theta_on, rtol=1e-4)
+    assert eager.theta_on.dtype == jnp.float32
+
+
 def test_estimate_on_leading_axes_is_each_alone() -> None:
     voxels, dL, _ = seen()
     dlogI = dL.sum(-1)

@@ -52,6 +52,7 @@ TIMES = np.array([0, 1000, 2000])
     ({"frames": frames(dtype=bool)}, "EV003", "bool"),
     ({"frames": frames().astype(object)}, "EV003", "object"),
     ({"times_us": TIMES / 1000.0}, "EV003", "float64"),
+    ({"times_us": np.array([0, 1000, 2**64 - 1], np.uint64)}, "EV003", "more than int64"),
     ({"times_us": np.array([0, 1000, 1000])}, "EV004", "frame 2 is at 1000 us"),
     ({"times_us": np.array([0, 2000, 1000])}, "EV004", "the one before at 2000 us"),
     ({"camera": Camera.constant((6, 4))}, "EV015", "(4, 6)"),
@@ -72,6 +73,16 @@ def test_bad_input_says_what_was_seen(changed: dict[str, Any], code: str, seen: 
         simulate(KEY, **given)
     assert raised.value.code == code
     assert seen in str(raised.value)
+
+
+def test_simulate_cannot_be_traced() -> None:
+    """How many events there are is known at the end alone."""
+    def events(on: jax.Array) -> jax.Array:
+        return jnp.asarray(simulate(KEY, frames(), TIMES, dataclasses.replace(CAMERA, theta_on=on)))
+
+    for transform in (jax.jit, jax.vmap, jax.jacfwd):
+        with pytest.raises(EvflowDataError, match=r"EV020.*take simulate_voxels"):
+            transform(events)(CAMERA.theta_on)
 
 
 def test_the_same_input_unharmed_is_accepted() -> None:
@@ -111,7 +122,9 @@ LOG = jnp.full((3, *SHAPE), 4.0)
     ({"frame_dt_s": -1e-3}, "EV020"),
     ({"frame_dt_s": float("nan")}, "EV020"),
     ({"frame_dt_s": float("inf")}, "EV020"),
+    ({"frame_dt_s": np.array([1e-3, 2e-3])}, "EV020"),
     ({"bins": 1}, "EV020"),
+    ({"bins": 5.0}, "EV020"),
     ({"camera": Camera.constant((6, 4))}, "EV015"),
     ({"camera": Camera.constant((2, *SHAPE))}, "EV015"),
     ({"camera": Camera.constant((2, *SHAPE)), "log_frames": jnp.stack([LOG] * 3)}, "EV015"),

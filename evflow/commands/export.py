@@ -36,7 +36,7 @@ class Export:
         from evflow.exports import export_camera, write_export
 
         need_folder(self.out)
-        need_absent(self.out, self.overwrite)
+        need_absent(self.out, self.overwrite, self.camera)
         camera, std = Camera.load_with_std(self.camera)
         export, maps = export_camera(camera, self.to, std)
         write_export(self.out, export, maps, overwrite=self.overwrite)

@@ -61,7 +61,8 @@ class Reading:
     size: Annotated[str | None, value("WxH")] = None
     """Sensor size (346x260), where the file does not tell it or is wrong."""
     partial: bool = False
-    """Use what lies before the damage of a damaged or cut-off file (not HDF5, npz)."""
+    """Use what lies before the damage of a damaged or cut-off file (of HDF5 and npz only what lies
+    before a time that goes back)."""
     drop_outside: bool = False
     """Leave out events outside the sensor instead of refusing them."""
     frames: Annotated[Path | None, value("PATH")] = None

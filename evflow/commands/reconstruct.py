@@ -51,7 +51,7 @@ class Reconstruct(Windowed):
         check_finite(self)
         self.check_film()
         kind = self._kind()
-        need_absent(self.out, self.overwrite)
+        need_absent(self.out, self.overwrite, self.recording, self.frames)
         trained = images_of(load_network(self.weights))
         recording = self.read(self.recording)
         times = self.times(recording)

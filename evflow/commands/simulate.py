@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from evflow.commands.options import check_finite, parse_bayer, refuse, value
-from evflow.commands.writing import Format, named
+from evflow.commands.writing import Format, named, need_absent
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
@@ -108,6 +108,7 @@ class Simulate:
         from evflow.simulator.interpolate import unzip, upsample
 
         format = named(self.format, self.out)
+        need_absent(self.out, self.overwrite, self.video, self.camera)
         source = self._source()
         camera = _camera(self, source.size)
         sensor = self._model()

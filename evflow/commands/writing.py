@@ -10,7 +10,6 @@ from evflow.errors import EvflowDataError
 
 Format = Literal["auto", "dsec", "e2vid", "event_utils", "evreal", "npz", "aedat4"]
 
-KINDS = {".h5": ("dsec", "event_utils"), ".hdf5": ("dsec", "event_utils")}  # else: the one format
 FILES = frozenset((  # endings that nobody gives a folder
     ".npz", ".npy", ".json", ".html", ".htm", ".png", ".jpg", ".pdf", ".svg", ".txt", ".csv",
     ".md", ".zip", ".h5", ".hdf5", ".aedat4", ".mp4", ".gif", ".py", ".yaml"))
@@ -19,18 +18,13 @@ FILES = frozenset((  # endings that nobody gives a folder
 def named(format: Format, out: Path) -> str | None:
     """The format as `evflow.io` takes it: None for what the extension stands for. EV020 where the
     extension stands for another one."""
-    from evflow.io.base import WRITTEN
+    from evflow.io.base import writer_of
 
     refuse_stdout(out)
-    suffix = out.suffix.lower()
-    stands_for = KINDS.get(suffix, (WRITTEN[suffix],) if WRITTEN.get(suffix) and suffix else ())
-    if format != "auto" and stands_for and format not in stands_for:
-        endings = [s or "none (a folder)" for s, name in WRITTEN.items()
-                   if format in KINDS.get(s, (name,))]
-        raise EvflowDataError(
-            "EV020", f"--format {format} is not what a name that ends in {suffix} holds.",
-            f"Name the output with {' or '.join(endings)}.")
-    return None if format == "auto" else format
+    if format == "auto":
+        return None
+    writer_of(out, format)
+    return format
 
 
 def refuse_stdout(out: Path) -> None:
@@ -55,7 +49,14 @@ def need_folder(out: Path) -> None:
                               f"Name a folder: -o {out.with_suffix('')}/.")
 
 
-def need_absent(path: Path, overwrite: bool) -> None:
-    """EV013 before long work, where its output exists already."""
-    if path.exists() and not overwrite:
+def need_absent(path: Path, overwrite: bool, *sources: Path | None) -> None:
+    """EV013 before long work, where its output exists already; EV020 where it is one of the
+    sources: what is read may be the only one there is."""
+    if not path.exists():
+        return
+    if any(source is not None and source.exists() and path.samefile(source)
+           for source in sources):
+        raise EvflowDataError("EV020", f"the output {path} is what is read.",
+                              "Name another one: no command replaces what it reads.")
+    if not overwrite:
         raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite.")

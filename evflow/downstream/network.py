@@ -35,8 +35,9 @@ class Network:
     padding: str = "zeros"
 
     def __post_init__(self) -> None:
-        require(self, "bins", self.bins >= 1, ">= 1")
-        require(self, "base", self.base >= 1, ">= 1")
+        for name in ("bins", "base"):
+            value = getattr(self, name)
+            require(self, name, isinstance(value, int) and value >= 1, "a whole number, >= 1")
         require(self, "padding", self.padding in PADDINGS, f"one of {sorted(PADDINGS)}")
 
     @property

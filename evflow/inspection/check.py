@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from evflow import io
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.inspection.agreement import agreement
 from evflow.inspection.clocks import clocks
@@ -32,6 +33,8 @@ def check(recording_or_path: Recording | str | os.PathLike, **hints: Any) -> Rep
     frames.
     """
     if not isinstance(recording_or_path, Recording):
+        need(recording_or_path, str | os.PathLike, "recording_or_path",
+             "Of events: Recording.of_events(events).")
         try:
             recording_or_path = io.read_recording(Path(recording_or_path), **hints)
         except EvflowDataError as error:

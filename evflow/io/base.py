@@ -13,7 +13,7 @@ import os
 from pathlib import Path
 from typing import Any, Protocol
 
-from evflow.checks import Size
+from evflow.checks import Size, need
 from evflow.errors import EvflowDataError, naming
 from evflow.io import (
     aedat2,
@@ -66,6 +66,7 @@ WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
 WRITTEN = {  # the format that an output's extension stands for, unless told otherwise
     ".h5": "dsec", ".hdf5": "dsec", ".zip": "e2vid", ".txt": "e2vid", ".npz": "npz",
     ".aedat4": "aedat4", "": "evreal"}
+SEVERAL = {".h5": ("dsec", "event_utils"), ".hdf5": ("dsec", "event_utils")}  # else: the one format
 
 
 def find_format(path: str | os.PathLike) -> Format:
@@ -134,10 +135,13 @@ def write_events(
     """Write events, and the frames of a `Recording`, in one of `WRITERS`; all or nothing.
 
     Raises EV003 (what the format cannot hold), EV010 (a package is missing), EV013 (exists),
-    EV019 (cannot be written), EV020 (unknown format, or one without frames for a recording with).
+    EV019 (cannot be written), EV020 (unknown format, one that the extension does not stand for, or
+    one without frames for a recording with).
     """
-    recording = events if isinstance(events, Recording) else Recording.of_events(events)
-    write_recording(path, recording, format, overwrite=overwrite)
+    if not isinstance(events, Recording):
+        need(events, Events, "events", "The path comes first: write_events(path, events).")
+        events = Recording.of_events(events)
+    write_recording(path, events, format, overwrite=overwrite)
 
 
 def write_recording(
@@ -148,6 +152,7 @@ def write_recording(
     overwrite: bool = False,
 ) -> None:
     """Write events and frames; format None: what the extension stands for. Errors as above."""
+    need(recording, Recording, "recording", "Of events: Recording.of_events(events).")
     with open_writer(path, recording.events.size, format, overwrite=overwrite) as out:
         copy(recording, out)
 
@@ -160,10 +165,19 @@ def open_writer(
 
 
 def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventWriter]:
-    """The writer of a format, None: of an output's extension; EV020 where there is none."""
+    """The writer of a format, None: of an output's extension; EV020 where there is none, or where
+    the extension stands for another format."""
     if format is not None and format not in WRITERS:
         raise EvflowDataError("EV020", f"format={format!r}.", f"Choose from {sorted(WRITERS)}.")
     suffix = Path(path).suffix.lower()
+    stands_for = SEVERAL.get(suffix, (WRITTEN[suffix],) if WRITTEN.get(suffix) and suffix else ())
+    if format is not None and stands_for and format not in stands_for:
+        endings = [s or "none (a folder)" for s, name in WRITTEN.items()
+                   if format in SEVERAL.get(s, (name,))]
+        raise EvflowDataError(
+            "EV020", f"format {format} is not what a name that ends in {suffix} holds.",
+            f"Name the output with {' or '.join(endings)}, or pass format={stands_for[0]!r} "
+            f"(--format {stands_for[0]}).")
     if format is None and suffix not in WRITTEN:
         kinds = ", ".join(f"{s or 'a folder'} ({name})" for s, name in WRITTEN.items())
         raise EvflowDataError(

@@ -46,8 +46,8 @@ class Hints:
     polarity: "auto" = {0, 1} or {-1, 1}, whichever it is; "01" and "pm1" insist; "invert"
         swaps ON and OFF.
     size: (width, height), overrides what the file says.
-    partial: of a damaged or cut-off file take what lies before the damage, where events are read
-        one after another (not HDF5, npz).
+    partial: of a damaged or cut-off file take what lies before the damage; of HDF5 and npz, which
+        are sound or not as a whole, only what lies before a time that goes back.
     drop_outside: leave out events outside the sensor instead of refusing them.
     remarks: what obeying these cost, a sentence each; grows while a file is read.
     """

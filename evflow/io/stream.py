@@ -219,8 +219,9 @@ class _Gathered:
         code = "EV007" if not np.isfinite(value) else "EV006" if name == "p" else "EV003"
         fix = {"t": "Times are seconds or whole numbers: export it again.",
                "p": "Polarity is 0 or 1, or -1 or 1; a -1 stored as unsigned reads 255."}
+        place = self._place(chunk, i) + self.so_far(chunk, i)
         return EvflowDataError(
-            code, f"{self.path}: {name} is {value} at {self._place(chunk, i)}{self.so_far()}",
+            code, f"{self.path}: {name} is {value} at {place}",
             fix.get(name, "Coordinates are raw integer pixels: were they undistorted? Use the raw "
                     "ones."))
 
@@ -271,9 +272,14 @@ class _Gathered:
             for name, column in zip(COLUMNS, (chunk.x, chunk.y, t, chunk.p > 0), strict=True):
                 self.columns[name].append(column[a:b])
 
-    def so_far(self) -> str:
-        span = (self.last - self.first) // 1000 / 1000
-        return f"; {self.seen:,} events up to {span:.3f} s before that are sound."
+    def so_far(self, chunk: Chunk | None = None, begun: int = 0) -> str:
+        """What was sound; of a chunk that was not kept, its first `begun` events too."""
+        first, last = self.first, self.last
+        if chunk is not None and begun:
+            ends = self.hints.microseconds(chunk.t[[0, begun - 1]], self.native, self.offset)
+            first, last = first if self.seen else int(ends[0]), int(ends[1])
+        span = (last - first) // 1000 / 1000
+        return f"; {self.seen + begun:,} events up to {span:.3f} s before that are sound."
 
     def sound_part(self) -> str:
         until = (self.last - self.first) // 1000 / 1000  # rounded down: up to it all is sound

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.io.gaps import event_gaps
 from evflow.io.glitches import faulty_frames
@@ -41,6 +42,7 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     if not isinstance(min_us, int | np.integer) or min_us < 1:
         raise EvflowDataError("EV020", f"min_us={min_us}.",
                               "A window takes a whole number of microseconds, 1 or more.")
+    need(recording, Recording, "recording", "Of a path: evflow.read_recording(path).")
     check_overlap(recording)
     times = recording.frame_times
     start, stop = _covered(recording)

@@ -47,8 +47,9 @@ class FwlConvention:
             if getattr(self, name) not in choices:
                 raise EvflowDataError("EV020", f"FwlConvention({name}={getattr(self, name)!r}).",
                                       f"Choose one of {choices}.")
-        if not 0 <= self.blur < math.inf:
-            raise EvflowDataError("EV020", f"FwlConvention(blur={self.blur}).", "It must be >= 0.")
+        if not isinstance(self.blur, int | float) or not 0 <= self.blur < math.inf:
+            raise EvflowDataError("EV020", f"FwlConvention(blur={self.blur!r}).",
+                                  "It must be >= 0.")
 
     def as_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)

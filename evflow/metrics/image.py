@@ -120,7 +120,7 @@ def ssim(image: Array, reference: Array, preset: str = "evreal") -> Array:
     Raises EV020 for another preset, EV003 for images of integers, EV002 for images smaller than
     its window.
     """
-    if preset not in SSIM:
+    if preset not in tuple(SSIM):
         raise EvflowDataError("EV020", f"SSIM preset {preset!r}.", f"Choose one of {list(SSIM)}.")
     image, reference = check_images(image, reference)
     how = SSIM[preset]

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.metrics import image as measures
 from evflow.metrics.perceptual import LEAST_SIDE, Params, lpips
@@ -60,7 +61,6 @@ PROTOCOLS = {
 }
 
 
-@functools.partial(jax.jit, static_argnames="protocol")
 def frame_scores(
     images: Array, references: Array, protocol: ImageProtocol | str,
     lpips_params: Params | None = None,
@@ -68,9 +68,17 @@ def frame_scores(
     """mse, rmse (DN), psnr (dB), ssim and, with weights, lpips, each (...), of (..., H, W); ssim
     and lpips of images too small for them are NaN.
 
-    Raises EV002 (shapes), EV003 (integers), EV020 (unknown protocol).
+    Raises EV002 (shapes), EV003 (integers), EV020 (unknown protocol; what are no weights).
     """
-    protocol = _protocol(protocol)
+    if lpips_params is not None:
+        need(lpips_params, dict, "lpips_params", "Pass what load_lpips returns.")
+    return _frame_scores(images, references, _protocol(protocol), lpips_params)
+
+
+@functools.partial(jax.jit, static_argnames="protocol")
+def _frame_scores(
+    images: Array, references: Array, protocol: ImageProtocol, lpips_params: Params | None
+) -> dict[str, Array]:
     images, references = measures.check_images(images, references)  # clipped bytes would be 0 and 1
     if protocol.clip:
         images, references = (jnp.clip(a, 0.0, 1.0) for a in (images, references))
@@ -103,8 +111,12 @@ def score_images(
     0..1), EV007 (NaN), EV020 (unknown protocol).
     """
     protocol = _protocol(protocol)
+    need(sequences, Mapping, "sequences", "Give {name: (images, references)}.")
     if not sequences:
         raise EvflowDataError("EV001", "there are no sequences to score.")
+    if wrong := [name for name, pair in sequences.items() if len(pair) != 2]:
+        raise EvflowDataError("EV002", f"{wrong[0]} holds {len(sequences[wrong[0]])} arrays.",
+                              "Give {name: (images, references)}.")
     scores = {name: _sequence(name, *pair, protocol, lpips_params)
               for name, pair in sequences.items()}
     kinds = next(iter(scores.values())).keys()
@@ -125,7 +137,7 @@ def score_images(
 def _protocol(protocol: ImageProtocol | str) -> ImageProtocol:
     if isinstance(protocol, ImageProtocol):
         return protocol
-    if protocol not in PROTOCOLS:
+    if not isinstance(protocol, str) or protocol not in PROTOCOLS:
         raise EvflowDataError("EV020", f"protocol {protocol!r}.",
                               f"Choose one of {list(PROTOCOLS)}, or an ImageProtocol.")
     return PROTOCOLS[protocol]
@@ -160,7 +172,7 @@ def _sequence(
         part = [a[i:i + BLOCK].astype(np.float32) for a in (images, references)]
         spare = BLOCK - len(part[0]) if len(images) > BLOCK else 0  # one shape, one compilation
         padded = [np.pad(a, ((0, spare), (0, 0), (0, 0))) for a in part]
-        scores = frame_scores(*padded, protocol, lpips_params)
+        scores = _frame_scores(*map(jnp.asarray, padded), protocol, lpips_params)
         parts.append({k: np.asarray(v)[:len(part[0])] for k, v in scores.items()})
     return {kind: np.concatenate([p[kind] for p in parts]) for kind in parts[0]}
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.types import Events
 
@@ -46,6 +47,8 @@ def compare(
 
     Raises EV001 (a stream is empty), EV015 (different sizes), EV020 (an empty span).
     """
+    for name, events in (("real", real), ("synthetic", synthetic)):
+        need(events, Events, name, "Of a path: evflow.read_events(path).")
     if span_us is not None and span_us[1] <= span_us[0]:
         raise EvflowDataError("EV020", f"span_us={span_us}.", "It must end after it begins.")
     moved, shift = _aligned(real, synthetic, move=span_us is None)

@@ -50,7 +50,12 @@ def simulate(
     may be anything. camera: maps (H, W). Returns sorted `Events` with integer us times in
     (times_us[0], times_us[-1]]; with `labels`, also (N,) bool: which of them are noise (eta
     and shot noise; what leaks crosses the threshold as light does, and counts as signal).
+    Not for jit, vmap or grad (EV020): how many events there will be is not known beforehand.
     """
+    if any(isinstance(leaf, jax.core.Tracer)
+           for leaf in jax.tree.leaves((key, frames, times_us, camera))):
+        raise EvflowDataError("EV020", "simulate was called within jit, vmap or grad.",
+                              "There take simulate_voxels, or simulate_counts.")
     frames, times_us = np.asarray(frames), np.asarray(times_us)
     if frames.ndim != 3 or times_us.shape != frames.shape[:1]:
         raise EvflowDataError(

@@ -84,6 +84,9 @@ def _check_block(
     if not np.issubdtype(times.dtype, np.integer):
         raise EvflowDataError("EV003", f"frame times are {times.dtype}.",
                               "Give integer microseconds (seconds x 1e6).")
+    if times.dtype == np.uint64 and times.max(initial=0) >= 2**63:
+        raise EvflowDataError("EV003", f"frame times reach {times.max()}, more than int64 holds.",
+                              "Was a negative time stored as unsigned?")
     if block.dtype in (np.uint8, np.uint16):
         return
     if not np.issubdtype(block.dtype, np.floating):

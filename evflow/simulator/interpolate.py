@@ -40,10 +40,15 @@ def upsample(
     for frame, t1 in pairs:
         current = np.asarray(frame, np.float32)
         shape = current.shape if previous is None else previous.shape
-        if current.ndim != 2 or current.shape != shape or max(shape) < MIN_SIDE:
+        if current.ndim != 2 or current.shape != shape:
             raise EvflowDataError(
                 "EV002", f"frame at {t1} us has shape {current.shape}, the first {shape}.",
-                f"Expected (H, W) of one size, the longer side at least {MIN_SIDE} pixels.")
+                "Expected (H, W) of one size.")
+        if max(shape) < MIN_SIDE:
+            raise EvflowDataError(
+                "EV002", f"frames of {shape[1]}x{shape[0]} pixels are too small to see motion in: "
+                f"their longer side has less than {MIN_SIDE}.",
+                "Take the frames as they are: --no-interpolate, or no upsample.")
         if previous is not None:
             there, back, motion = interpolator.motion(previous, current)
             wanted = math.ceil(motion / max_motion_px)

@@ -110,9 +110,11 @@ def simulate_voxels(
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
                               "Expected (..., T, H, W) with at least two frames.")
     timed = not isinstance(frame_dt_s, jax.core.Tracer)
-    if bins < 2 or (timed and not 0 < float(frame_dt_s) < math.inf):
-        raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}, bins={bins}.",
-                              "Need frame_dt_s > 0 and bins >= 2.")
+    if not isinstance(bins, int | np.integer) or bins < 2:
+        raise EvflowDataError("EV020", f"bins={bins!r}.", "It is a whole number, >= 2.")
+    if np.ndim(frame_dt_s) or (timed and not 0 < float(frame_dt_s) < math.inf):
+        raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}.", "It is one number of seconds, "
+                              "> 0, for all videos; jax.vmap takes one for each.")
     if log_frames.dtype != jnp.uint8:
         check_log("log_frames", log_frames)
     if camera.shape[-2:] != log_frames.shape[-2:]:
