@@ -7,20 +7,24 @@ import numpy as np
 
 HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
 AROUND = 5  # pixels: side of the neighbourhood that a dead pixel is compared with
+LEAST_FIRED, LASTING = 2, 0.75  # times with events, and their share of those expected
 MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, itself included
 DEAD_EVENTS = 12  # median there: e^-12 by chance alone, and room for a high threshold
 
 
 def hot_pixels(quiet: np.ndarray, rate_hz: float) -> np.ndarray:
     """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
-    happens in front of them; less than one in a million by chance. quiet (2, H, W): events and
-    seconds of such times.
+    happens in front of them; less than one in a million by chance. quiet (4, H, W): events,
+    seconds and number of such times, and how many of these had events.
 
-    Faults are scattered: where several pixels of a neighbourhood are busy, something moved there
-    that the frames do not show, such as a fast turn.
+    Faults last and are scattered: what fires at one time and not at others was an edge that went
+    by between two frames, and where several pixels of a neighbourhood are busy, something moved
+    there that the frames do not show, such as a fast turn.
     """
-    events, seconds = quiet
-    busy = fires_alone(events, rate_hz * seconds)
+    events, seconds, times, fired = quiet
+    steady = times * -np.expm1(-events / np.maximum(times, 1))  # times with events, at its own rate
+    lasting = (fired >= LEAST_FIRED) & (fired >= LASTING * steady)
+    busy = fires_alone(events, rate_hz * seconds) & lasting
     company = cv2.boxFilter(busy.astype(np.float32), -1, (AROUND, AROUND), normalize=False,
                             borderType=cv2.BORDER_CONSTANT)
     return busy & (company <= MOST_HOT_NEAR)

@@ -32,7 +32,9 @@ from evflow.refine.moments import measure
 from evflow.refine.path import plan_chunks
 from evflow.refine.pixels import PixelEvidence, pixel_evidence
 from evflow.refine.trace import FRESH, NEVER, trace_of_camera, trace_of_events
+from evflow.scenes import SceneConfig, make_bank
 from evflow.types import Events
+from experiments.cameras import Protocol, hidden_recording
 
 SHAPE = (12, 16)
 STEPS, INTERVALS = 8, 3
@@ -302,8 +304,30 @@ def test_hot_pixels_are_those_that_fire_while_nothing_moves() -> None:
 
 def test_hot_pixels_come_alone() -> None:
     """A hundredfold rate in one pixel, or two, is a fault; in a patch of them something moved."""
-    quiet = np.stack([np.full((40, 40), 1.0), np.full((40, 40), 10.0)])
-    quiet[0, 5, 5] = quiet[0, 20, 30] = quiet[0, 20, 31] = 100.0
-    quiet[0, 28:33, 5:9] = 100.0
+    def rates(busy: float) -> np.ndarray:
+        """In 400 quiet intervals of 25 ms."""
+        return np.array([busy, 10.0, 400.0, 400.0 * -np.expm1(-busy / 400.0)])
+
+    quiet = np.tile(rates(1.0)[:, None, None], (1, 40, 40))
+    for place in ((5, 5), (20, 30), (20, 31)):
+        quiet[(slice(None), *place)] = rates(100.0)
+    quiet[:, 28:33, 5:9] = rates(100.0)[:, None, None]
     found = hot_pixels(quiet, 0.1)
     assert np.argwhere(found).tolist() == [[5, 5], [20, 30], [20, 31]]
+    quiet[3, 5, 5] = 6.0  # all its events in six of the intervals: edges that went by
+    assert np.argwhere(hot_pixels(quiet, 0.1)).tolist() == [[20, 30], [20, 31]]
+
+
+def test_fast_motion_makes_no_hot_pixels() -> None:
+    """Edges that go by between two frames alike leave events where the frames say nothing moved."""
+    fast = Protocol(scene=SceneConfig(speed_px_s=(250.0, 500.0), contrast=(0.5, 1.0)),
+                    intervals=24)
+    bank = make_bank(jax.random.key(9), 8, photos=False)
+    made = hidden_recording(jax.random.key(0), bank, fast)
+    recording = made.recording
+    runs = plan_runs(recording, plan_windows(recording).pairs)
+    quiet = survey(recording, runs).quiet
+    rate = float(made.nominal.eta_on + made.nominal.eta_off)
+    always = np.stack([*quiet[:3], quiet[0]])  # as if every event had an interval of its own
+    assert hot_pixels(always, rate).sum() > 5
+    assert not hot_pixels(quiet, rate).any()

@@ -33,9 +33,9 @@ class Chunk:
     path: (K * steps + 1, H, W) float32 log intensity, the frames at every `steps`-th;
     bright: (H, W) bool, pixels whose frames are neither near black nor saturated; dt_s: (K,)
     interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
-    evidence: about each pixel's thresholds; quiet: (2, H, W) events in
-    intervals in which the pixel's path stays within QUIET, and their seconds. Intervals with a
-    saturated or black frame are in neither. sightings: the events beside the path.
+    evidence: about each pixel's thresholds; quiet: (4, H, W) events in intervals in which the
+    pixel's path stays within QUIET, the seconds and number of these, and how many had events.
+    Intervals with a saturated or black frame are in none. sightings: the events beside the path.
     """
 
     path: np.ndarray
@@ -70,7 +70,7 @@ def survey(
     width, height = recording.events.size
     simulated = plan_chunks(recording, runs)
     chunks, evidence = [], PixelEvidence.nothing((height, width))
-    quiet = np.zeros((2, height, width))
+    quiet = np.zeros((4, height, width))
     for run in runs:
         chunk = make_chunk(recording, run)
         evidence, quiet = evidence + chunk.evidence, quiet + chunk.quiet
@@ -143,5 +143,6 @@ def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, shown: np.ndarray) 
     steps = (len(path) - 1) // len(dt_s)
     inner = path[1:].reshape(len(dt_s), steps, *path.shape[1:])
     still = (inner.max(1) - inner.min(1) < QUIET) & shown
-    events = (np.asarray(trace.counts).sum(1) * still).sum(0)
-    return np.stack([events, (dt_s[:, None, None] * still).sum(0)])
+    events = np.asarray(trace.counts).sum(1) * still
+    return np.stack([events.sum(0), (dt_s[:, None, None] * still).sum(0), still.sum(0),
+                     (events > 0).sum(0)])
