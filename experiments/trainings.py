@@ -103,7 +103,7 @@ class Trainings:
     def recorded(self, target: targets.Target) -> RecordedBank:
         """What the target itself records of scenes as all are trained on."""
         if target.name not in self._recorded:
-            data = self.setting.learning.data
+            data = self._recorded_learning.data
             made = held_out.gather(targets.clips(
                 target, self.bank, data, self.setting.drawn, data.windows, "trained on"))
             self._recorded[target.name] = RecordedBank(
@@ -212,8 +212,18 @@ class Trainings:
 
     @functools.cached_property
     def _recorded_step(self) -> Any:
-        return jax.jit(make_step(self._of_recordings, self.setting.learning, self._tx,
+        return jax.jit(make_step(self._of_recordings, self._recorded_learning, self._tx,
                                  sample_recorded))
+
+    @property
+    def _recorded_learning(self) -> LearningConfig:
+        """What is trained on recordings: one window more where the first, which has no frame at
+        its start, is not learned from, so that a step sees as many as those of the others."""
+        learning = self.setting.learning
+        if not isinstance(self.setting.network, EVFlowNet):
+            return learning
+        data = dataclasses.replace(learning.data, windows=learning.data.windows + 1)
+        return dataclasses.replace(learning, data=data)
 
     def _start(self, seed: int, network: Network) -> LearningState:
         """Where every condition of a seed starts, if it trains this network."""

@@ -159,6 +159,17 @@ def test_the_true_flow_explains_the_frames_best() -> None:
     assert float(losses.photometric((rough,), same, same)) > 0.2  # by its roughness alone
 
 
+def test_leaving_the_image_costs() -> None:
+    rng = np.random.default_rng(2)
+    frame = jnp.asarray(rng.uniform(0.2, 0.8, (1, 32, 32)), jnp.float32)
+
+    def loss(x: float) -> float:
+        flow = jnp.stack([jnp.full((1, 32, 32), x), jnp.zeros((1, 32, 32))], 1)
+        return float(losses.photometric((flow,), frame, frame))
+
+    assert loss(0.0) < 0.1 * loss(2.0) < 0.1 * loss(256.0)
+
+
 def test_smoothness_does_not_outweigh_the_frames() -> None:
     """Half of the image moves by 2 px: its flow, with a step in it, beats none and the mean."""
     rng = np.random.default_rng(1)
@@ -177,16 +188,18 @@ def test_smoothness_does_not_outweigh_the_frames() -> None:
 
 @pytest.mark.slow
 def test_four_scales_learn_without_true_flow() -> None:
-    config = LearningConfig(data=DATA, steps=12, warmup=2, rate=3e-3, skip=1)
+    """One batch over and over: it is explained better than by no flow, with which it begins. A
+    few pixels of flow leave much of a crop of 16, so there is not much to gain."""
+    config = LearningConfig(data=DATA, steps=80, warmup=20, rate=3e-4, skip=1)
     network = EVFlowNet(base=2, scales=4)
     tx = optimiser(config)
     step = jax.jit(make_step(network, config, tx))
     start = init_state(network, config, tx)
     state, history = start, []
-    for _ in range(12):
+    for _ in range(80):
         state, metrics = step(dataclasses.replace(state, step=start.step), bank())
         history.append(float(metrics["loss"]))
-    assert history[-1] < 0.95 * history[0]
+    assert history[-1] < 0.98 * history[0]
 
 
 def recorded(intervals: int, size: tuple[int, int] = (40, 24), seed: int = 0) -> Recording:

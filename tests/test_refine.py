@@ -314,11 +314,15 @@ def test_hot_pixels_come_alone() -> None:
     quiet[:, 28:33, 5:9] = rates(100.0)[:, None, None]
     found = hot_pixels(quiet, 0.1)
     assert np.argwhere(found).tolist() == [[5, 5], [20, 30], [20, 31]]
-    quiet[3, 5, 5] = 6.0  # all its events in six of the intervals: edges that went by
+    quiet[3, 5, 5] = 6.0  # all its events in six of the intervals: faults fire in bursts too
+    assert hot_pixels(quiet, 0.1)[5, 5]
+    quiet[0, 4:7, 3:8] += 3.0  # but here others send more than noise as well: edges that went by
     assert np.argwhere(hot_pixels(quiet, 0.1)).tolist() == [[20, 30], [20, 31]]
+    quiet[3, 5, 5] = quiet[2, 5, 5]
+    assert hot_pixels(quiet, 0.1)[5, 5]
 
 
-def test_fast_motion_makes_no_hot_pixels() -> None:
+def test_fast_motion_makes_few_hot_pixels() -> None:
     """Edges that go by between two frames alike leave events where the frames say nothing moved."""
     fast = Protocol(scene=SceneConfig(speed_px_s=(250.0, 500.0), contrast=(0.5, 1.0)),
                     intervals=24)
@@ -328,6 +332,6 @@ def test_fast_motion_makes_no_hot_pixels() -> None:
     runs = plan_runs(recording, plan_windows(recording).pairs)
     quiet = survey(recording, runs).quiet
     rate = float(made.nominal.eta_on + made.nominal.eta_off)
-    always = np.stack([*quiet[:3], quiet[0]])  # as if every event had an interval of its own
-    assert hot_pixels(always, rate).sum() > 5
-    assert not hot_pixels(quiet, rate).any()
+    always = np.stack([*quiet[:3], quiet[2]])  # as if they fired all the time
+    assert hot_pixels(always, rate).sum() > 12
+    assert hot_pixels(quiet, rate).sum() < 0.5 * hot_pixels(always, rate).sum()

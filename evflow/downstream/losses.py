@@ -19,7 +19,6 @@ Array = jax.Array
 OCCLUSION = 50.0  # of exp(-50 (I1 - W(I0))^2): frames that differ by .14 count e^-1
 CHARBONNIER, SMOOTHNESS = 0.45, 0.5  # EV-FlowNet's exponent, and weight of smoothness
 DN = 255.0  # of a frame's white
-INSIDE = 0.99  # of a point's four neighbours: what was seen in the image
 
 
 def reconstruction(images: Array, frames: Array, lpips_params: Params | None = None) -> Array:
@@ -72,15 +71,14 @@ def photometric(flows: Sequence[Array], before: Array, after: Array) -> Array:
 
     flows: one (..., 2, h, w) per scale, px of that scale. Frames are compared in DN, as by its
     authors: the weight of smoothness is that beside grey levels, and on [0, 1] it would outweigh
-    them. Points that leave the image do not count.
+    them. Outside the image is black: to leave it costs, or leaving all of it would be the best.
     """
     total = jnp.zeros((), before.dtype)
     for flow in flows:
         shape = (*before.shape[:-2], *flow.shape[-2:])
         first, second = (jax.image.resize(DN * frame, shape, "linear")
                          for frame in (before, after))
-        seen = warp(jnp.ones_like(second), flow) > INSIDE
-        total += jnp.mean(seen * _charbonnier(warp(second, flow) - first))
+        total += jnp.mean(_charbonnier(warp(second, flow) - first))
         total += SMOOTHNESS * _roughness(flow)
     return total
 
