@@ -83,7 +83,7 @@ class Slow:
         total = sum(s for i, s in self.step.items() if begin < self.t_us[i] <= end)
         change = log64(then, offset) - forward
         ratio = total / change if change else 0.0
-        gain = 1 / min(max(ratio, 0.6), 100) if ratio > 0 else 1.0
+        gain = 1 / ratio if 0.6 < ratio < 100 else 1.0
         share = (now - begin) / (end - begin)
         ahead = dn64(forward + gain * self.since, offset)
         back = dn64(log64(then, offset) - gain * (total - self.since), offset)

@@ -125,3 +125,11 @@ def test_log_maps_have_an_inverse_and_a_slope(offset: float) -> None:
     rise = (np.asarray(log_of(dn + 0.25, offset)) - np.asarray(log_of(dn - 0.25, offset))) / 0.5
     away = np.abs(dn - 20) > 1
     np.testing.assert_allclose(np.asarray(slope_of(dn, offset))[away], rise[away], rtol=2e-3)
+
+
+def test_frames_are_trusted_but_where_black_or_white() -> None:
+    """The ends are the sensor's: in a frame of grey every pixel counts, also its darkest one."""
+    trusted = Complementary()._alpha(np.array([[60.0, 120.0], [180.0, 200.0]]))
+    np.testing.assert_allclose(trusted, 2 * np.pi)
+    clipped = Complementary()._alpha(np.array([[0.0, 255.0], [6.375, 128.0]]))
+    np.testing.assert_allclose(clipped, 2 * np.pi * np.array([0.1, 0.1, 0.55, 1.0]))

@@ -37,13 +37,14 @@ from evflow.types import Events
 Array = jax.Array
 Values = jax.Array | np.ndarray
 
-PRECISION = 7e5  # 1/R per second of a frame at mid-range, in units of 1/255 of its range
+PRECISION = 7e5  # 1/R per second of a frame at mid-range, of brightness on 0..1
 LEAST_CERTAINTY = 0.09  # of a black or saturated pixel
 # Certainty 1 - |2 DN/255 - 1|^6, above .9 from 41 to 214 DN: the shape of the published table,
 # which was measured on one camera.
 SHARPNESS = 6
 BORDER_VARIANCE = 10.0  # Q of a pixel without eight neighbours
-SCALE_RANGE = (0.6, 100.0)  # of the contrast of an interval's events over its frame difference
+SCALE_RANGE = (0.6, 100.0)  # of the contrast of an interval's events over its frame difference:
+# beyond, the two have little to do with each other, and events are taken as they are
 LANES, GROWTH = 4096, 4  # pixels at a time; their events padded to powers of 4: few programs
 
 
@@ -198,7 +199,8 @@ class Akf(Reconstructor):
         total = np.bincount(pixel, contrast, before.size).astype(np.float32)
         change = after - before
         ratio = total / np.where(change == 0, 1, change)
-        scale = np.where((change != 0) & (ratio > 0), np.clip(ratio, *SCALE_RANGE), 1.0)
+        low, high = SCALE_RANGE
+        scale = np.where((change != 0) & (ratio > low) & (ratio < high), ratio, 1.0)
         return Reference(before, after, trust, trust_after, total,
                          (1.0 / scale).astype(np.float32), zero + 1)
 

@@ -22,9 +22,9 @@ class Complementary(Reconstructor):
     """Complementary filter.
 
     cutoff_rad_s: alpha, above which events lead (published 2 pi). trust, margin: alpha falls to
-    `trust` of itself where the frame is darkest or brightest, from `margin` of its range of log
-    intensity on (published .1 and .05): clipped pixels say little. Before the first frame, or
-    without frames, the brightness of `start_dn` takes its place.
+    `trust` of itself where the frame is black or white, from `margin` of 0..255 DN on (published
+    .1 and .05): clipped pixels say little. Before the first frame, or without frames, the
+    brightness of `start_dn` takes its place.
     """
 
     cutoff_rad_s: float = 2.0 * np.pi
@@ -43,7 +43,7 @@ class Complementary(Reconstructor):
         for part in segments(events, frame_times, times):
             if part.frame >= 0:
                 shown = np.asarray(log_of(frames[part.frame], self.offset_dn), np.float64).ravel()
-                alpha = self._alpha(shown)
+                alpha = self._alpha(frames[part.frame])
                 state = shown if part.frame == 0 else state
             pixel, step = steps_of(events, part.events, theta)
             age_s = 1e-6 * (part.end_us - events.t[part.events])
@@ -53,10 +53,9 @@ class Complementary(Reconstructor):
             images[part.images] = state.reshape(height, width)
         return images
 
-    def _alpha(self, shown: np.ndarray) -> np.ndarray:
-        """alpha of each pixel: full inside the frame's range, less towards its ends."""
-        low, high = float(shown.min()), float(shown.max())
-        edge = self.margin * (high - low)
-        inside = np.minimum(shown - low, high - shown)
-        share = np.clip(inside / edge, 0.0, 1.0) if edge > 0 else np.ones_like(shown)
+    def _alpha(self, frame: np.ndarray) -> np.ndarray:
+        """alpha (H*W,) of each pixel: full amid the range of DN, less towards its ends."""
+        dn = frame.ravel().astype(np.float64)
+        inside = np.minimum(dn, 255.0 - dn)
+        share = np.clip(inside / max(self.margin * 255.0, 1e-9), 0.0, 1.0)
         return self.cutoff_rad_s * (self.trust + (1.0 - self.trust) * share)

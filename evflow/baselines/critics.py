@@ -90,13 +90,27 @@ def window_sums(a: np.ndarray, size: int) -> np.ndarray:
 
 
 def features(counts: Array, saturating: bool) -> Array:
-    """What critics see of counts (N, 2, H, W): tanh, as published, of them and of their spatial
-    gradient, (N, H, W, CHANNELS). Under tanh pixels of three events and more look alike; else it
-    is log(1 + x)."""
+    """What critics see of counts (N, 2, H, W) and of their spatial gradient, (N, H, W, CHANNELS).
+
+    saturating: tanh, as published, of the counts and of |Sobel x| + |Sobel y|: pixels of three
+    events and more look alike, and the slope tells hardly more than whether there is one. Else
+    log(1 + x) of the counts and of the gradient's length.
+    """
+    if saturating:
+        seen = jnp.concatenate([counts, _sobel(counts)], 1)
+        return jnp.tanh(jnp.moveaxis(seen, 1, -1))
     gy, gx = jnp.gradient(counts, axis=(-2, -1))
     slope = jnp.sqrt(gx**2 + gy**2 + 1e-6)
-    seen = jnp.moveaxis(jnp.concatenate([counts, slope], 1), 1, -1)
-    return jnp.tanh(seen) if saturating else jnp.log1p(seen)
+    return jnp.log1p(jnp.moveaxis(jnp.concatenate([counts, slope], 1), 1, -1))
+
+
+def _sobel(counts: Array) -> Array:
+    """|Sobel x| + |Sobel y| of images (..., H, W)."""
+    padded = jnp.pad(counts, [(0, 0)] * (counts.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
+    smooth_y = padded[..., :-2, :] + 2.0 * padded[..., 1:-1, :] + padded[..., 2:, :]
+    smooth_x = padded[..., :-2] + 2.0 * padded[..., 1:-1] + padded[..., 2:]
+    return (jnp.abs(smooth_y[..., 2:] - smooth_y[..., :-2])
+            + jnp.abs(smooth_x[..., 2:, :] - smooth_x[..., :-2, :]))
 
 
 def cut(images: Array, places: Array, size: int) -> Array:

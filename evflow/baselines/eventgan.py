@@ -9,6 +9,7 @@ camera: what it makes is typical of the cameras it was trained on.
 Voxels are (..., H, W, 2 * bins), raw counts in [ON..., OFF...], as everywhere here; published are 9
 bins and volumes scaled one by one, which loses the count. Published cycle networks are trained
 before and frozen; here they learn beside, on true volumes only, and count from `cycle_from` on.
+Left out of the published networks: spectral norm of residual blocks and decoders, and leaky ReLUs.
 """
 
 from __future__ import annotations
@@ -110,9 +111,9 @@ class PatchCritic(nn.Module):
         for i in range(STRIDED + 1):
             stride = 2 if i < STRIDED else 1
             x = nn.Conv(self.features << i, (4, 4), (stride, stride), kernel_init=KERNEL,
-                        name=f"layer_{i}")(x)
+                        name=f"critic_{i}")(x)
             x = nn.leaky_relu(x, 0.2)
-        return nn.Conv(1, (4, 4), kernel_init=KERNEL, name="logits")(x)[..., 0]
+        return nn.Conv(1, (4, 4), kernel_init=KERNEL, name="critic_logits")(x)[..., 0]
 
 
 def networks(config: GanConfig) -> dict[str, nn.Module]:

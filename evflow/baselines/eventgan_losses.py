@@ -51,11 +51,11 @@ def flow_loss(flows: list[Array], pair: Pair) -> Array:
     moved, against the second, where events are."""
     shape = pair.frames.shape[1:3]
     active = (pair.voxels.sum(-1) > 0).astype(jnp.float32)
-    most = REACH * jnp.array(shape[::-1], jnp.float32)[None, None, None]  # px
+    sides = jnp.array(shape[::-1], jnp.float32)[None, None, None]  # px
     total = jnp.zeros(())
     for i, flow in enumerate(flows[::-1]):
-        flow = jnp.tanh(flow) * most
-        large = jax.image.resize(flow, (len(flow), *shape, 2), "nearest")
+        flow = REACH * jnp.tanh(flow)  # in sides of the frame, as smoothness counts it
+        large = jax.image.resize(flow, (len(flow), *shape, 2), "nearest") * sides
         moved, inside = jax.vmap(_moved)(pair.frames[..., 0], large)
         used = active * inside
         error = _robust(moved - pair.frames[..., 1]) * used

@@ -19,6 +19,9 @@ Array = jax.Array
 
 BLOCKS = 2
 KERNEL = nn.initializers.he_uniform()
+# As of EventGAN's authors: its predictions begin near nothing (PyTorch's kaiming_normal_ with
+# a = 10), layers of its critic with PyTorch's own bound, 1 / sqrt(inputs).
+GAINS = {"prediction_": 0.1, "critic_": 6.0**-0.5}
 
 
 def conv(features: int, stride: int = 1, *, bias: bool = True, name: str) -> nn.Conv:
@@ -28,8 +31,8 @@ def conv(features: int, stride: int = 1, *, bias: bool = True, name: str) -> nn.
 
 
 def fresh(key: Array, network: nn.Module, x: Array) -> dict[str, Any]:
-    """Params as `network.init(key, x)` gives them, of networks whose kernels are KERNEL's: one draw
-    for all of them, since XLA:CPU takes .2 s and more to compile each."""
+    """Params of a network of x: kernels by He et al., but of GAINS; biases 0, scales 1. One draw
+    for all of them, since XLA:CPU takes .2 s and more to compile each of `network.init`."""
     shapes: Any = jax.eval_shape(network.init, key, x)["params"]
     leaves, tree = jax.tree_util.tree_flatten_with_path(shapes)
     ends = [0]
@@ -40,7 +43,8 @@ def fresh(key: Array, network: nn.Module, x: Array) -> dict[str, Any]:
     for i, (path, leaf) in enumerate(leaves):
         name = path[-1].key
         if name == "kernel":
-            bound = math.sqrt(6.0 / math.prod(leaf.shape[:-1]))
+            gain = next((g for n, g in GAINS.items() if path[0].key.startswith(n)), 1.0)
+            bound = gain * math.sqrt(6.0 / math.prod(leaf.shape[:-1]))
             made.append(bound * drawn[ends[i]:ends[i + 1]].reshape(leaf.shape))
         else:
             made.append(jnp.full(leaf.shape, float(name == "scale")))
