@@ -36,12 +36,11 @@ from evflow.io import (
     v2e_text,
 )
 from evflow.io.hints import Hints
+from evflow.io.text import HEAD
 from evflow.io.units import check_seconds
 from evflow.io.write_aedat4 import Aedat4Writer
 from evflow.io.writer import EventWriter, copy
 from evflow.types import Events, Recording
-
-HEAD = 4096  # bytes of a file that `sniff` sees
 
 
 class Format(Protocol):
@@ -87,7 +86,8 @@ def find_format(path: str | os.PathLike) -> Format:
             else f"it begins with {head[:16]!r}")
     raise EvflowDataError(
         "EV008", f"{path} is none of {', '.join(f.NAME for f in FORMATS)}: {seen}.",
-        "Convert it, or check that it was copied completely.")
+        "Convert it, or check that it was copied completely. Text has lines of numbers `t x y p`, "
+        "decimal points, and a header where the order is another.")
 
 
 def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:

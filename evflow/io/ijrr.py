@@ -1,8 +1,9 @@
 """The text folder of the IJRR 2017 / ECD event-camera data sets, or a zip of it.
 
-events.txt has a line `t[s] x y p` per event; images.txt, where there is one, a line `t[s] path`
-per image. Times become int64 us by round(t * 1e6). An image's time is used as it stands: the
-data set does not say where in the exposure it lies. calib.txt, imu.txt and poses are not read.
+events.txt has a line `t[s] x y p` per event, or what its header says (`plain_text`); images.txt,
+where there is one, a line `t[s] path` per image. Times become int64 us by round(t * 1e6). An
+image's time is used as it stands: the data set does not say where in the exposure it lies.
+calib.txt, imu.txt and poses are not read.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from evflow.checks import Size, check_times
 from evflow.errors import EvflowDataError
-from evflow.io import tables, text
+from evflow.io import plain_text, tables, text
 from evflow.io.archives import DAMAGE, unzipped
 from evflow.io.hints import Hints
 from evflow.io.images import decode
@@ -46,7 +47,8 @@ def sniff(path: Path, head: bytes) -> bool:
              if line.strip() and not line.startswith(b"#")]
     if path.name == EVENTS:  # any numbers may be events; `text` says what is wrong with them
         fields = lines[0].split() if lines else []
-        return len(fields) == 4 and all(map(text.is_number, fields))
+        return plain_text.sniff(path, head) or (
+            len(fields) == 4 and all(map(text.is_number, fields)))
     return bool(lines) and ROW.fullmatch(lines[0]) is not None
 
 
@@ -86,8 +88,8 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
                     else (np.zeros(0, np.int64), []))
     size = _image(root, names[0]).shape[1::-1] if names else None
     with (root / name).open("rb") as f:
-        chunks = _some(path, text.in_seconds(path, text.events(f, (4,)), hints), hints, size)
-        events, span = gather(path, chunks, hints, size, "s")
+        chunks, native = plain_text.events(path, f, hints)
+        events, span = gather(path, _some(path, chunks, hints, size), hints, size, native)
     if not names:
         return Recording.of_events(events)
     return tables.with_frames(

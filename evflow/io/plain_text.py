@@ -1,20 +1,24 @@
-"""Text of four columns that no other format here claims: comma separated files, what NumPy and
-pandas save, the `x,y,p,t` of Prophesee's converter.
+"""Text of four columns, as any tool writes it: comma separated files, what NumPy and pandas save,
+the `x,y,p,t` of Prophesee's converter. IJRR's events.txt is read by it too.
 
 The order is that of a header (a comment or the first line: `t x y p`, `timestamp,x,y,polarity`,
-`x,y,p,t`), else that of the first lines: the polarity is the last or the third column, the time
-the other end. Times are seconds where they have fractions; whole ones are microseconds where the
-header says so ("[us]", "t_us") or the order is Prophesee's, else refused without a unit.
+`row,col,p,t`), else that of the first lines: the polarity is the last or the third column, the time
+at the other end. Times are in the unit that the header tells ("t[us]", "timestamp_ns"); else they
+are seconds where they have fractions, and microseconds where they are whole and in Prophesee's
+order; other whole ones are refused.
 """
 
 from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
+import numpy as np
+
+from evflow.errors import EvflowDataError
 from evflow.io import text
 from evflow.io.hints import Hints
 from evflow.io.stream import Chunk, collect
@@ -24,17 +28,20 @@ from evflow.types import Recording
 NAME = "text"
 EXTENSIONS: tuple[str, ...] = (".csv", ".txt", ".tsv", ".dat", ".log")
 
-HEAD = 4096
+PROPHESEE = "xypt"
 NAMES = {  # of columns, without their units
     **dict.fromkeys(("t", "ts", "time", "times", "timestamp", "timestamps"), "t"),
-    "x": "x", "y": "y", **dict.fromkeys(("p", "pol", "polarity", "polarities"), "p")}
-BRACKETS, SUFFIX = re.compile(r"[\[(].*?[\])]"), re.compile(r"_(ns|us|ms|s|sec)$")  # units
+    **dict.fromkeys(("x", "xs", "col", "column", "u"), "x"),
+    **dict.fromkeys(("y", "ys", "row", "v"), "y"),
+    **dict.fromkeys(("p", "ps", "pol", "polarity", "polarities"), "p")}
+BRACKETS, SUFFIX = re.compile(r"[\[(].*?[\])]"), re.compile(r"_[a-zµμ]+$")  # units
 POLARITIES = {-1.0, 0.0, 1.0}
+TELLING = 10  # rows: by so many, fractions in the coordinates are those of undistorted events
 
 
 class Layout(NamedTuple):
-    """order: of the columns, "txyp" or another; unit: of the times, "auto" where nothing tells;
-    begin: the byte of the first line of numbers."""
+    """order: of the columns, "txyp" or another, "itxyp" after an index; unit: of the times, "auto"
+    where no header tells it; begin: the byte at which the header ends."""
 
     order: str
     unit: str
@@ -42,79 +49,140 @@ class Layout(NamedTuple):
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    return layout(head) is not None
+    try:
+        return layout(head) is not None
+    except EvflowDataError:  # `read` says what is unclear
+        return True
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV003 (whole times without a unit), EV015 (text does not tell the size) and what
-    `stream.gather` raises."""
+    """Raises EV003 (times without a unit), EV008 (a header that is not understood), EV015 (text
+    does not tell the size) and what `stream.gather` raises."""
     with open(path, "rb") as f:
-        found = layout(f.read(HEAD))
-        assert found is not None  # or another format would be reading
-        f.seek(found.begin)
-        chunks = _ordered(text.events(f, (4,), found.begin), found.order)
-        if hints.time_unit == "auto" and found.unit != "auto":
-            return collect(path, _in_us(chunks, found.unit), hints, None)
-        return collect(path, text.in_seconds(path, chunks, hints), hints, None, native="s")
+        chunks, native = events(path, f, hints)
+        return collect(path, chunks, hints, None, native=native)
+
+
+def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str]:
+    """Chunks of the events of a text open at its beginning, and the unit of their times. Where
+    nothing tells the order it is `t x y p`. Raises as `read`."""
+    order, unit, begin = layout(f.read(text.HEAD)) or Layout("txyp", "auto", 0)
+    f.seek(begin)
+    chunks = text.events(f, (len(order),), begin, order)
+    if hints.time_unit != "auto":
+        return chunks, hints.time_unit
+    if unit != "auto":
+        return _in_us(chunks, unit), "us"
+    if order == PROPHESEE:
+        first = list(itertools.islice(chunks, 1))
+        chunks = itertools.chain(first, chunks)
+        if not first or _whole(first[0].t):
+            return _in_us(_all_whole(path, chunks), "us"), "us"
+    return text.in_seconds(path, chunks), "s"
 
 
 def layout(head: bytes) -> Layout | None:
-    """What a file that begins so holds; None where it is no text of four columns."""
+    """What a file that begins so holds; None where it is no text of events. EV008 where a header
+    names some of the columns, but not which is which."""
     rows: list[list[float]] = []
     names: list[str] = []
-    words, byte, begin = "", 0, 0
-    whole = head if len(head) < HEAD else head[: head.rfind(b"\n") + 1]
+    told, unit, byte, begin = "", "auto", 0, 0
+    whole = head if len(head) < text.HEAD else head[: head.rfind(b"\n") + 1]
     for line in whole.splitlines(keepends=True):
         content = text.plain(line, byte)
-        fields, comment = content.partition(b"#")[0].split(), content.lstrip().startswith(b"#")
-        numbers = list(map(float, fields)) if all(map(text.is_number, fields)) else []
-        if numbers and len(numbers) != 4:
-            return None
-        if numbers:
-            rows.append(numbers)
-        elif (fields or comment) and not rows:
-            told = content.decode("latin-1").strip().lstrip("#")
-            words, names = f"{words} {told}", _names(told) or names
-            begin = byte + len(line)
-        elif fields:
-            return None
         byte += len(line)
-    order = "".join(names) or _order(rows)
-    if not order:
-        return None
-    usual = "us" if order == "xypt" and all(row[3] % 1 == 0 for row in rows) else "auto"
-    unit = written_unit(words)
-    return Layout(order, usual if unit == "auto" else unit, begin)
+        fields = content.partition(b"#")[0].split()
+        if fields and not rows and not any(map(_is_float, fields)):
+            told = _decoded(content)  # the first line, which must name what there is
+        elif fields:
+            if not all(map(text.is_number, fields)) or (rows and len(fields) != len(rows[0])):
+                break  # damage, of which `text.events` tells where it is
+            rows.append(list(map(float, fields)))
+            continue
+        elif rows or not content.strip():
+            continue
+        begin = byte
+        if found := _names(_decoded(content)):
+            names, unit = found, written_unit(_decoded(content))
+    if told and not names and sum(map(bool, _columns(told))) >= 2:
+        raise EvflowDataError(
+            "EV008", f"its header is {told[:80]!r}: which columns are t, x, y and p?",
+            "Name four columns t, x, y, p (timestamp, polarity, row, col are known too).")
+    if names and rows and len(rows[0]) == 5 and _counts([row[0] for row in rows]):
+        names = ["i", *names]  # the index that pandas writes
+    if names:
+        fits = not rows or len(rows[0]) == len(names)
+        return Layout("".join(names), unit, begin) if fits else None
+    order = _order(rows) if rows and not told else ""
+    return Layout(order, "auto", begin) if order else None
 
 
-def _in_us(chunks: Iterator[Chunk], unit: str) -> Iterator[Chunk]:
-    """Chunks whose times are in that unit, with fractions or without."""
-    told = Hints(time_unit=unit)
-    for chunk in chunks:
-        yield chunk._replace(t=told.microseconds(chunk.t, unit))
+def _decoded(line: bytes) -> str:
+    """A header as text: whatever its encoding, micro is one."""
+    try:
+        return line.decode("utf-8").strip().lstrip("#").strip()
+    except UnicodeDecodeError:
+        return line.decode("latin-1").strip().lstrip("#").strip()
+
+
+def _is_float(field: bytes) -> bool:
+    """NaN too: a row, if a bad one, rather than a name."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _columns(line: str) -> list[str]:
+    """For each word of a header what it stands for, "" where that is not known."""
+    fields = BRACKETS.sub(" ", line.lower()).split()
+    return [NAMES.get(SUFFIX.sub("", field.strip("\"'")), "") for field in fields]
 
 
 def _names(line: str) -> list[str]:
-    """Which column is which, of a header that names all four; else nothing."""
-    fields = BRACKETS.sub("", line.lower()).split()
-    found = [NAMES.get(SUFFIX.sub("", field.strip("\"'")), "") for field in fields]
+    """Which column is which, of a header that names all four and nothing else; else nothing."""
+    found = _columns(line)
     return found if sorted(found) == sorted("txyp") else []
+
+
+def _counts(column: list[float]) -> bool:
+    return all(b - a == 1 for a, b in itertools.pairwise(column))
 
 
 def _order(rows: list[list[float]]) -> str:
     """Of rows without a header; empty where they cannot be events."""
-    if not rows:
+    if len(rows[0]) != 4:
         return ""
-    columns = list(zip(*rows, strict=True))
-    for order, time, polarity in (("txyp", 0, 3), ("xypt", 3, 2)):
-        rising = all(a <= b for a, b in itertools.pairwise(columns[time]))
-        if rising and set(columns[polarity]) <= POLARITIES:
+    columns = dict(enumerate(np.array(rows).T))
+    for order in ("txyp", PROPHESEE):
+        t, x, y, p = (columns[order.index(name)] for name in "txyp")
+        signs = set(p.tolist())
+        if not signs <= POLARITIES or min(x.min(), y.min()) < 0 or set(t.tolist()) <= {0.0, 1.0}:
+            continue
+        rising, both = bool((np.diff(t) >= 0).all()), len(signs) > 1
+        pixels = _whole(x) and _whole(y)
+        if (pixels and (rising or both)) or (rising and both and len(rows) >= TELLING):
             return order
     return ""
 
 
-def _ordered(chunks: Iterator[Chunk], order: str) -> Iterator[Chunk]:
-    """Chunks read as t, x, y, p, their columns named as they are."""
+def _whole(values: np.ndarray) -> bool:
+    return bool((values % 1 == 0).all())
+
+
+def _all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+    """Chunks of times that were taken for microseconds; EV003 at the first fraction."""
     for chunk in chunks:
-        column = dict(zip(order, (chunk.t, chunk.x, chunk.y, chunk.p), strict=True))
-        yield chunk._replace(x=column["x"], y=column["y"], t=column["t"], p=column["p"])
+        if not _whole(chunk.t):
+            raise EvflowDataError(
+                "EV003", f"{path}: the first times are whole, later ones are not.",
+                "Microseconds or seconds? Pass time_unit='us' or 's' (--time-unit).")
+        yield chunk
+
+
+def _in_us(chunks: Iterable[Chunk], unit: str) -> Iterator[Chunk]:
+    """Chunks whose times are in that unit, with fractions or without."""
+    told = Hints(time_unit=unit)
+    for chunk in chunks:
+        yield chunk._replace(t=told.microseconds(chunk.t, unit))

@@ -28,7 +28,9 @@ POSSIBLE_S = (2e-5, 2.0)  # between frames: 50,000 frames/s to one in two second
 USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s, where only one unit of 1000 can fall
 USUAL_US = 2e4  # of two units the one nearer to 50 frames/s
 TELL = "pass --timestamps-unit beside --frames (simulate: --time-unit)"
-UNIT_WORDS = re.compile(r"(?:[\[(_]|in )(ns|us|µs|ms|s|sec|seconds)\b")
+UNIT_WORDS = re.compile(
+    r"(?:[\[(_]|in )(n(?:s|sec|anoseconds?)|[uµμ]s(?:ec)?|microseconds?|m(?:s|sec|illiseconds?)|"
+    r"s(?:ec(?:onds?)?)?)\b", re.IGNORECASE)
 
 Times = tuple[np.ndarray, list[str], str]  # int64 us (T,); names (T,) or none; a note or ""
 
@@ -149,8 +151,14 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
 
 def written_unit(words: str) -> str:
     """The unit of times that a header or comment tells, or "auto"."""
-    units = {u.replace("µ", "u")[:2].replace("se", "s") for u in UNIT_WORDS.findall(words)}
+    units = {_unit(word.lower()) for word in UNIT_WORDS.findall(words)}
     return units.pop() if len(units) == 1 else "auto"
+
+
+def _unit(word: str) -> str:
+    if word[0] in "uµμ" or word.startswith("mic"):
+        return "us"
+    return {"n": "ns", "m": "ms", "s": "s"}[word[0]]
 
 
 def _columns(
