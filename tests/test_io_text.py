@@ -188,7 +188,7 @@ def test_fractions_after_whole_times_are_refused(
     """Frame-based simulators begin with many events at 0: those alone look like Prophesee's us."""
     monkeypatch.setattr("evflow.io.text.BLOCK", 1000)
     path = tmp_path / "a.csv"
-    path.write_text("7,3,1,0\n7,3,0,2\n" * 200 + "8,3,1,2.5\n")
+    path.write_text("7,3,1,0\n7,3,0,0\n" * 100 + "7,3,1,2\n" * 200 + "8,3,1,2.5\n")
     error = refused(path, size=SIZE)
     assert (error.code, "later ones are not" in str(error)) == ("EV003", True)
 
