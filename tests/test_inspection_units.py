@@ -76,6 +76,7 @@ def test_more_events_than_a_link_carries() -> None:
 
 def mixed(tmp_path: Path, layout: str, frames_unit: str) -> Path:
     """A recording whose events are in ns and whose frame times are in another unit."""
+    tmp_path.mkdir(exist_ok=True)
     made = watched(20_000, 500 * MS)
     per_us = {"ns": 1000, "us": 1, "s": 1e-6}[frames_unit]
     t, times = 1000 * made.events.t, per_us * made.frame_times
@@ -108,8 +109,11 @@ def test_the_events_unit_leaves_plausible_frame_times_alone(
     made = watched(20_000, 500 * MS)
     np.testing.assert_array_equal(found.events.t, made.events.t)
     np.testing.assert_array_equal(found.frame_times, made.frame_times)
-    said = [n for n in found.notes if "frame times of" in n and "their own unit" in n]
+    said = [n for n in found.notes if "frame times of" in n and f"read in {frames_unit}" in n]
     assert len(said) == (frames_unit != "ns")
+    part = read_recording(
+        mixed(tmp_path / "part", layout, frames_unit), time_unit="ns", start_s=0.2, stop_s=0.3)
+    np.testing.assert_array_equal(part.frame_times, made.frame_times[5:8])
 
 
 def test_frame_times_in_seconds_beside_whole_events(tmp_path: Path) -> None:
@@ -119,4 +123,28 @@ def test_frame_times_in_seconds_beside_whole_events(tmp_path: Path) -> None:
              frame_times=1e-6 * made.frame_times)
     found = read_recording(path)
     np.testing.assert_array_equal(found.frame_times, made.frame_times)
-    assert "were read in s (25 frames/s)" in " ".join(found.notes)
+    assert "were read in s" in " ".join(found.notes)
+
+
+@pytest.mark.parametrize(("hz", "unit"), [(2000, "ns"), (5000, "ms"), (1, "ms"), (0.5, "ns")])
+def test_frames_of_any_rate_share_the_unit_that_was_told(
+    tmp_path: Path, hz: float, unit: str
+) -> None:
+    """What one clock wrote stays together: the span of the events tells, not a usual rate."""
+    rng, per_us = np.random.default_rng(0), {"ns": 1000, "ms": 1e-3}[unit]
+    times = (np.arange(6) * 1e6 / hz).round()
+    t = np.sort(rng.integers(0, int(times[-1]) + 1, 5000))
+    path = tmp_path / "a.npz"
+    np.savez(path, t=t * per_us, x=rng.integers(0, 64, 5000), y=rng.integers(0, 48, 5000),
+             p=rng.integers(0, 2, 5000), size=SIZE, frames=np.zeros((6, 48, 64), np.uint8),
+             frame_times=times * per_us)
+    found = read_recording(path, time_unit=unit)
+    np.testing.assert_array_equal(found.frame_times, times)
+
+
+def test_whole_floats_beside_whole_events(tmp_path: Path) -> None:
+    made = watched(20_000, 500 * MS)
+    ev, path = made.events, tmp_path / "a.npz"
+    np.savez(path, t=ev.t, x=ev.x, y=ev.y, p=ev.p, size=SIZE, frames=made.frames[:1],
+             frame_times=made.frame_times[:1].astype(float))
+    np.testing.assert_array_equal(read_recording(path).frame_times, made.frame_times[:1])

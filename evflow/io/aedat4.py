@@ -141,7 +141,7 @@ class _Reading:
         """The recording of these events and the frames in [start, stop) us."""
         if not self.times:
             return Recording.of_events(events)
-        times = beside_events(np.array(self.times), self.path, "us", self.hints)
+        times = beside_events(np.array(self.times), self.path, "us", self.hints, events)
         recording = self.stack.beside(events, times, ("frame times are mid-exposure",))
         return cut(recording, span)
 

@@ -71,7 +71,8 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events, notes)
         frames = tables.dataset(path, f, "frames", (None, None, None))
         times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
-        return tables.with_frames(path, events, span, beside_events(times, path, "us", hints),
+        us = beside_events(times, path, "us", hints, events)
+        return tables.with_frames(path, events, span, us,
                                   lambda keep: tables.stored_frames(frames, keep), notes)
 
 

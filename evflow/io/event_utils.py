@@ -50,7 +50,7 @@ def read(path: Path, hints: Hints) -> Recording:
         if not images:
             return Recording.of_events(events, notes)
         stamps = np.array([_time(path, image) for image in images])
-        times = beside_events(stamps, path, native, hints)
+        times = beside_events(stamps, path, native, hints, events)
         return tables.with_frames(path, events, span, times,
                                   lambda keep: (_rgb(image[:]) for image in images[keep]), notes)
 

@@ -45,7 +45,7 @@ def read(path: Path, hints: Hints) -> Recording:
     if images is None:
         return Recording.of_events(events)
     stamps = mapped(path / "images_ts.npy", (len(images),))
-    times = beside_events(np.asarray(stamps), path, _unit(stamps), hints)
+    times = beside_events(np.asarray(stamps), path, _unit(stamps), hints, events)
     return tables.with_frames(path, events, span, times,
                               lambda keep: map(_rgb, images[keep]), ())
 

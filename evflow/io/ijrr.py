@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from evflow.checks import Size, check_times
+from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io import plain_text, tables, text
 from evflow.io.archives import DAMAGE, unzipped
@@ -84,14 +84,14 @@ def _is_events(name: str) -> bool:
 
 def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
     """path: what messages name."""
-    times, names = (_read_index(root / IMAGES, hints) if name == EVENTS
-                    else (np.zeros(0, np.int64), []))
+    seconds, names = _read_index(root / IMAGES) if name == EVENTS else (np.zeros(0), [])
     size = _image(root, names[0]).shape[1::-1] if names else None
     with (root / name).open("rb") as f:
         chunks, native = plain_text.events(path, f, hints)
         events, span = gather(path, _some(path, chunks, hints, size), hints, size, native)
     if not names:
         return Recording.of_events(events)
+    times = beside_events(seconds, root / IMAGES, "s", hints, events)
     return tables.with_frames(
         path, events, span, times, lambda keep: (_image(root, n) for n in names[keep]),
         ("frame times are those of images.txt",))
@@ -109,10 +109,11 @@ def _some(
         raise EvflowDataError("EV001", f"{path} holds no event.")
 
 
-def _read_index(index: Root, hints: Hints) -> tuple[np.ndarray, list[str]]:
-    """Times (T,) int64 us and names of the images; none where there is no images.txt."""
+def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
+    """Times (T,) as written, seconds by the format, and names of the images; none where there is no
+    images.txt."""
     if not index.is_file():
-        return np.zeros(0, np.int64), []
+        return np.zeros(0), []
     seconds, names = [], []
     for number, content in enumerate(index.read_bytes().split(b"\n"), 1):
         fields = content.partition(b"#")[0].split()
@@ -123,12 +124,15 @@ def _read_index(index: Root, hints: Hints) -> tuple[np.ndarray, list[str]]:
                 "EV009", f"{index}, line {number:,} is {content[:60]!r}; expected t[s] path.")
         seconds.append(float(fields[0]))
         names.append(fields[1].decode("utf-8"))
-    us = beside_events(np.array(seconds), index, "s", hints)
-    times = check_times(us, str(index), strict=True)
+    back = np.flatnonzero(np.diff(seconds) <= 0)
+    if len(back):
+        raise EvflowDataError(
+            "EV004", f"{index}: time {seconds[back[0] + 1]:.9g} comes after {seconds[back[0]]:.9g} "
+            f"({len(back):,} such).", "Times must increase: lines out of order, or repeated?")
     if len(set(names)) < len(names):  # each would be decoded: little text, much memory
         raise EvflowDataError("EV009", f"{index} has {len(names):,} lines for {len(set(names)):,} "
                               "images.", "Give each time its own image.")
-    return times, names
+    return np.array(seconds), names
 
 
 def _image(root: Root, name: str) -> np.ndarray:

@@ -53,5 +53,6 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events, notes)
         frames = tables.dataset(path, camera, "image_raw", (None, None, None))
         times = tables.dataset(path, camera, "image_raw_ts", (len(frames),))[:]
-        return tables.with_frames(path, events, span, beside_events(times, path, "s", hints),
+        us = beside_events(times, path, "s", hints, events)
+        return tables.with_frames(path, events, span, us,
                                   lambda keep: tables.stored_frames(frames, keep), notes)

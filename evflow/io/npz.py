@@ -60,7 +60,7 @@ def read(path: Path, hints: Hints) -> Recording:
             return Recording.of_events(events)
         if "frame_times" not in found:
             raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
-        times = beside_events(found["frame_times"].whole(), path, "us", hints)
+        times = beside_events(found["frame_times"].whole(), path, "us", hints, events)
         return cut(Recording(events, found["frames"].spooled(), times), span)
 
 

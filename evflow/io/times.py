@@ -21,6 +21,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.arrays import mapped
 from evflow.io.frames import existing
 from evflow.io.hints import UNITS_US, Hints
+from evflow.types import Events
 
 MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
 EPOCH_S = (1e9, 4.1e9)  # 2001 to 2099 as seconds since 1970
@@ -78,29 +79,53 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
     return check_times(us, f"{where}, read in {unit}", strict=True), note
 
 
-def beside_events(times: np.ndarray, where: object, native: str, hints: Hints) -> np.ndarray:
-    """Times (T,) of the frames that a recording brings along, as int64 us.
+def beside_events(
+    times: np.ndarray, where: object, native: str, hints: Hints, events: Events
+) -> np.ndarray:
+    """Times (T,) of the frames that a recording brings along with its events, as int64 us.
 
-    native: their unit in the format. That of `hints` is the events'; frames share it only where
-    it makes them the more usual video: mixed units are what it is passed for most. Fractions
-    where whole numbers belong are of the unit that makes them a video. Raises as `to_us`.
+    native: their unit in the format. That of `hints` is the events'; frames share it unless
+    another makes them last as the events do: where clocks contradict each other it is passed.
+    Fractions where whole numbers belong are of the unit that does. Raises as `to_us`.
     """
-    told = hints.time_unit != "auto"
-    odd = times.dtype.kind not in "iu" and not (times.dtype.kind == "f" and native == "s")
-    if times.ndim == 1 and odd and not told:
+    told = hints.time_unit
+    odd = times.dtype.kind == "f" and native != "s"
+    usual = told == "auto" and not odd
+    if usual or times.ndim != 1 or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+        return hints.microseconds(times, native)
+    units = [native, *UNITS_US] if told == "auto" else [told, native]
+    unit = _lasting(times, events.t, units)
+    if unit is None and told == "auto":
         us, note = to_us(times, where)
         hints.remarks.append(note)
         return us
-    if times.ndim != 1 or times.dtype.kind not in "iuf" or not told:
-        return hints.microseconds(times, native)
-    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
-    unit = hints.time_unit
-    if step > 0:
-        unit = min((unit, native), key=lambda u: abs(math.log(step * UNITS_US[u] / USUAL_US)))
-    if unit != hints.time_unit:
-        hints.remarks.append(f"frame times of {where} were read in {unit}, their own unit "
-                             f"({1e6 / (step * UNITS_US[unit]):.4g} frames/s).")
+    unit = unit or _nearest(times, units)
+    if unit != told:
+        hints.remarks.append(f"frame times of {where} were read in {unit}.")
     return Hints(time_unit=unit).microseconds(times, unit)
+
+
+def _lasting(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | None:
+    """The unit in which times (T,) share most of the span of events at t (N,) us, the first of
+    several; None where none shares any."""
+    if not (len(times) and len(t)):
+        return None
+
+    def shared(unit: str) -> float:
+        first, last = (float(v) * UNITS_US[unit] for v in (times.min(), times.max()))
+        common = min(last, float(t[-1])) - max(first, float(t[0])) + 1.0
+        return max(common, 0.0) / (max(last, float(t[-1])) - min(first, float(t[0])) + 1.0)
+
+    best = max(units, key=shared)
+    return best if shared(best) > 0 else None
+
+
+def _nearest(times: np.ndarray, units: list[str]) -> str:
+    """The unit that makes times (T,) the more usual video, the first of several."""
+    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
+    if not step > 0:
+        return units[0]
+    return min(units, key=lambda unit: abs(math.log(step * UNITS_US[unit] / USUAL_US)))
 
 
 def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:

@@ -43,5 +43,6 @@ def read(path: Path, hints: Hints) -> Recording:
         if frames is None:
             return Recording.of_events(events)
         times = tables.dataset(path, f, "frame_ts", (len(frames),))[:]
-        return tables.with_frames(path, events, span, beside_events(times, path, "us", hints),
+        us = beside_events(times, path, "us", hints, events)
+        return tables.with_frames(path, events, span, us,
                                   lambda keep: tables.stored_frames(frames, keep), ())
