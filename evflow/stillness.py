@@ -33,7 +33,7 @@ def stands_still(recording: Recording) -> bool:
     if events.duration_us < LEAST_US:
         return False
     first = recording.frame_dn(0)
-    if any(moved(first, recording.frame_dn(i)).any()
+    if any((np.abs(change(first, recording.frame_dn(i))) > STILL).any()
            for i in range(1, len(recording.frame_times))):
         return False
     return not unlike_noise(events, busy_pixels(events.count_map().sum(0)))
@@ -65,9 +65,9 @@ def gathered(hot: np.ndarray) -> bool:
     return pairs > chance + 5.0 * np.sqrt(chance) + 3.0
 
 
-def moved(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """(H, W) bool: where two frames (H, W), in DN, differ by more than their noise."""
-    return np.asarray(np.abs(_smooth(after) - _smooth(before)) > STILL)
+def change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(H, W) change of log intensity between two frames (H, W), in DN, without their noise."""
+    return _smooth(after) - _smooth(before)
 
 
 def _smooth(frame: np.ndarray) -> np.ndarray:

@@ -179,6 +179,49 @@ def test_frames_must_show_a_screen_that_steps() -> None:
         calibrate_step(several, rests_us=rests)
 
 
+def dim(levels: list[float], noise_dn: float = 1.0, screen_part: float = 1.0) -> Recording:
+    """Whole grey levels of a screen that a lens darkens towards its corners, with frame noise."""
+    rng = np.random.default_rng(0)
+    base = bench(cameras(0.03), levels)
+    y, x = (np.linspace(-1, 1, n) for n in SHAPE)
+    lens = 1 / (1 + 0.6 * (y[:, None] ** 2 + x[None] ** 2)) ** 2
+    frames = np.asarray(base.frames) * lens
+    frames[:, :, round(screen_part * SHAPE[1]):] = 4.0
+    noisy = np.clip(frames + noise_dn * rng.standard_normal(frames.shape), 0, 255)
+    return dataclasses.replace(base, frames=np.round(noisy).astype(np.uint8))
+
+
+@pytest.mark.parametrize("recording", [
+    dim([8, 40, 8, 40, 8]), dim([4, 16, 4, 16, 4]), dim([25, 225, 25, 225, 25], 3.0),
+    dim([25, 225, 25, 225, 25], screen_part=0.6)], ids=["dim", "dark", "noisy", "part"])
+def test_few_grey_levels_and_a_lens_are_no_motion(recording: Recording) -> None:
+    """One DN is .15 log units at 6 DN: the median pixel jumps where the light rests."""
+    steps = len(find_rests(recording)) - 1
+    assert steps == 4
+    assert len(calibrate_step(recording).camera.shape) == 2
+
+
+def test_a_lamp_that_settles_is_no_motion() -> None:
+    base = bench(cameras(0.03), [25, 225, 25])
+    light = np.asarray(base.frames)[:, 0, 0]
+    since = np.arange(len(light)) - np.r_[0, 1 + np.flatnonzero(np.diff(light) > 20)][-1]
+    settling = light * np.where(since >= 0, 1 + 0.15 * np.exp(-np.maximum(since, 0) / 5.0), 1.0)
+    frames = np.broadcast_to(np.minimum(settling, 255)[:, None, None], base.frames.shape)
+    assert len(find_rests(dataclasses.replace(base, frames=frames.astype(np.float32)))) >= 2
+
+
+def test_light_that_changes_while_frames_rest_is_told() -> None:
+    """A camera that regulates its exposure shows rests where there are none."""
+    base = bench(cameras(0.03), CYCLES)
+    frames = np.asarray(base.frames).copy()
+    half = len(frames) // 2
+    frames[:half], frames[half:] = 100.0, 200.0
+    found = calibrate_step(dataclasses.replace(base, frames=frames))
+    assert "in company while the frames rest" in " ".join(found.warnings)
+    quiet = calibrate_step(bench(cameras(0.03, "eq12"), CYCLES))
+    assert "in company" not in " ".join(quiet.warnings)
+
+
 def test_few_measured_pixels_are_told() -> None:
     """Steps of a threshold and a half: one event each, of which a direction needs two."""
     found = calibrate_step(bench(Camera.constant(SHAPE, 0.45, 0.45), [60, 120, 60]), fresh=True)

@@ -29,7 +29,8 @@ from evflow.camera_estimate import CameraEstimate
 from evflow.errors import EvflowDataError
 from evflow.faults import dead_pixels
 from evflow.intensity import lin_log
-from evflow.types import Recording
+from evflow.stillness import LEAST_EVENTS, MOVING, busy_pixels, company
+from evflow.types import Events, Recording
 
 Span = tuple[int, int]
 
@@ -42,13 +43,14 @@ MOST = 0.5  # of the pixels: with fewer measured, the result warns
 class Steps:
     """levels: (K+1, H, W) log intensity at each rest; counts: (K, 2, H, W) ON and OFF events of
     each step; seconds: (K,) over which they were counted; rest: (2, H, W) events while nothing
-    changed, and rest_s how long that was."""
+    changed, and rest_s how long that was; notes: what is odd about these."""
 
     levels: np.ndarray
     counts: np.ndarray
     seconds: np.ndarray
     rest: np.ndarray
     rest_s: float
+    notes: tuple[str, ...]
 
 
 def calibrate_step(
@@ -75,7 +77,7 @@ def calibrate_step(
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
     hot = is_hot(steps.rest.sum(0), float(hz.sum()), steps.rest_s)
-    maps, stds, medians, spreads, notes = [], [], [], [], []
+    maps, stds, medians, spreads, notes = [], [], [], [], list(steps.notes)
     for i, name in enumerate(("ON", "OFF")):
         good = sound[i] & ~hot
         if not good.any():
@@ -128,8 +130,17 @@ def _steps(
                for before, after in zip(spans, settled[1:], strict=False)]
     quiet = [(a, b) for a, (_, b) in zip(settled, spans, strict=True)]
     rest = np.asarray(np.sum([events.slice(a, b).count_map() for a, b in quiet], 0, np.float64))
+    busiest = max((events.slice(a, b) for a, b in quiet), key=len)
     return Steps(levels, np.array(counts, np.float64), np.array(seconds), rest,
-                 sum(b - a for a, b in quiet) * 1e-6)
+                 sum(b - a for a, b in quiet) * 1e-6, tuple(_restless(busiest)))
+
+
+def _restless(rest: Events) -> list[str]:
+    """What says that the light moved during a rest, if anything does."""
+    if len(rest) < LEAST_EVENTS or company(rest, busy_pixels(rest.count_map().sum(0))) <= MOVING:
+        return []
+    return ["events come in company while the frames rest: a light that flickers or still settles, "
+            "or a camera that regulates its exposure? Then noise rates, and thresholds, are wrong."]
 
 
 def _levels(

@@ -1,7 +1,7 @@
 """Where the light of a bench rests, told from frames; and whether they show a bench at all.
 
-The median pixel alone would do for a screen, but also for much that is none: a slow pan has frames
-whose medians differ by nothing. So most pixels must rest where it rests, and step as it steps.
+Their level alone would do for a screen, but also for much that is none: frames of a slow pan hardly
+differ in it. So most pixels must rest where it rests, and step as it steps.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log
-from evflow.stillness import moved
+from evflow.stillness import change
 from evflow.types import Recording
 
-STILL = 0.01  # log units between two frames, of the median pixel: the screen rests
+STILL = 0.01  # log units between two frames: the screen rests
 LEAST_STEP = 0.1  # log units between two rests
-MOST_MOVING = 0.1  # of the pixels, within a rest
+MOVING, MOST_MOVING = 0.1, 0.1  # log units, beside the others; of the pixels, within a rest
 LEAST_TOGETHER = 0.5  # of the pixels: those that step by half to twice what the median pixel does
 FILL_THE_VIEW = ("Steps of light need a screen, or a card, that fills the view, all of it at one "
                  "level and then at another. For a scene that moves leave --protocol out.")
@@ -26,23 +26,24 @@ FILL_THE_VIEW = ("Steps of light need a screen, or a card, that fills the view, 
 def find_rests(recording: Recording) -> list[tuple[int, int]]:
     """(first, last) frame of each stretch in which the pixels rest, those of one light joined.
 
-    EV011 without frames; EV017 where there are not two, or more than the median pixel moves.
+    EV011 without frames; EV017 where there are not two, or the scene moves in one.
     """
     if len(recording.frames) < 4:
         raise EvflowDataError("EV011", f"the recording has {len(recording.frames)} frames.",
                               "Record frames too; in Python, rests_us and light take their place.")
-    level = np.array([np.median(np.asarray(lin_log(recording.frame_dn(i))))
-                      for i in range(len(recording.frames))])
+    level = np.array([_level(recording.frame_dn(i)) for i in range(len(recording.frames))])
     still = np.abs(np.diff(level)) < STILL
     found: list[tuple[int, int]] = []
     for resting, group in itertools.groupby(range(len(still)), key=lambda i: bool(still[i])):
         part = list(group)
         if not resting:
             continue
-        if found and abs(level[part[0]] - level[found[-1][1]]) < LEAST_STEP:
-            found[-1] = (found[-1][0], part[-1] + 1)
+        first, last = part[0], part[-1] + 1
+        before = level[found[-1][0]:found[-1][1] + 1].mean() if found else np.inf
+        if abs(level[first:last + 1].mean() - before) < LEAST_STEP:
+            found[-1] = (found[-1][0], last)
         else:
-            found.append((part[0], part[-1] + 1))
+            found.append((first, last))
     if len(found) < 2:
         raise EvflowDataError("EV017", f"the light rests at {len(found)} levels.",
                               "A step needs two, of two frames each and 10 % apart.")
@@ -51,9 +52,19 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
     return found
 
 
+def _level(dn: np.ndarray) -> float:
+    """Log intensity of a frame (H, W): the mean of its middle half, which half of the pixels may
+    disturb, and which moves less than the median where grey levels are few."""
+    log = np.sort(np.asarray(lin_log(dn)), axis=None)
+    return float(log[len(log) // 4:len(log) - len(log) // 4].mean())
+
+
 def _check_rest(recording: Recording, first: int, last: int) -> None:
-    share = max(float(moved(recording.frame_dn(first), recording.frame_dn(i)).mean())
-                for i in range(first + 1, last + 1))
+    def moving(i: int) -> float:
+        off = change(recording.frame_dn(first), recording.frame_dn(i))
+        return float((np.abs(off - np.median(off)) > MOVING).mean())  # a lamp may settle
+
+    share = max(moving(i) for i in range(first + 1, last + 1))
     if share > MOST_MOVING:
         raise EvflowDataError(
             "EV017", f"the scene moves while the light rests (frames {first} to {last}): "
@@ -62,9 +73,9 @@ def _check_rest(recording: Recording, first: int, last: int) -> None:
 
 def check_steps(levels: np.ndarray) -> None:
     """EV017 where most pixels do not step together; levels (K+1, H, W) log intensity at rests."""
-    for k, change in enumerate(np.diff(levels, axis=0)):
-        median = float(np.median(change))
-        together = float((np.abs(change - 1.25 * median) <= 0.75 * abs(median)).mean())
+    for k, step in enumerate(np.diff(levels, axis=0)):
+        median = float(np.median(step))
+        together = float((np.abs(step - 1.25 * median) <= 0.75 * abs(median)).mean())
         if not median or together < LEAST_TOGETHER:
             raise EvflowDataError(
                 "EV017", f"step {k + 1} of {len(levels) - 1} is none of the whole view: the median "
