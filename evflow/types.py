@@ -25,6 +25,7 @@ from evflow.checks import (
     check_polarity,
     check_size,
     check_times,
+    need,
 )
 from evflow.errors import EvflowDataError
 
@@ -140,6 +141,7 @@ class Recording:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        need(self.events, Events, "events", "Of a path: evflow.read_recording(path).")
         frames, times = np.asarray(self.frames), np.asarray(self.frame_times)
         check_frames(frames, self.events.size)
         if times.shape != frames.shape[:1]:
@@ -153,6 +155,7 @@ class Recording:
     @staticmethod
     def of_events(events: Events, notes: tuple[str, ...] = ()) -> Recording:
         """A recording without frames."""
+        need(events, Events, "events", "Of a recording: recording.events.")
         width, height = events.size
         return Recording(
             events, np.zeros((0, height, width), np.uint8), np.zeros(0, np.int64), notes)

@@ -7,16 +7,13 @@ count is the signal. Only events in [t0, t0 + window) enter, so each event weigh
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.checks import need
 from evflow.errors import EvflowDataError
-
-if TYPE_CHECKING:
-    from evflow.types import Events
+from evflow.types import Events
 
 Array = jax.Array
 
@@ -26,6 +23,7 @@ BINS = 16
 def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np.ndarray:
     """Host events -> float32 (H, W, 2*bins) for the window [t0_us, t0_us + window_us), integer
     microseconds. Raises EV003, EV020."""
+    need(events, Events, "events", "Of a path: evflow.read_events(path).")
     for name, value in (("t0_us", t0_us), ("window_us", window_us)):
         if not isinstance(value, int | np.integer):
             raise EvflowDataError("EV003", f"{name} is {value!r}.",

@@ -18,6 +18,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
 
@@ -26,6 +27,7 @@ Params = dict[str, Any]
 
 def weights_path(name_or_path: str | os.PathLike = "default") -> Path:
     """The file of a released name ("default") or the path itself."""
+    need(name_or_path, str | os.PathLike, "name_or_path", "Give a released name or a path.")
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
         path = Path(str(resources.files("evflow") / "weights" / f"{name_or_path}.safetensors"))

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recordings import SIZE, T0, equal, make
+from recordings import SIZE, T0, equal, make, write_ijrr
 from videos import drifting
 
 from evflow.camera import Camera, CameraPrior
@@ -129,6 +129,21 @@ def test_what_is_read_is_never_replaced(
     assert "EV020" in err
     assert "is what is read" in err
     assert source.read_bytes() == before
+
+
+def test_parts_of_what_is_read_are_never_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, times = tmp_path / "ijrr", tmp_path / "times.txt"
+    write_ijrr(folder, make(300))
+    times.write_text("\n".join(str(0.05 * i) for i in range(6)))
+    before = {path: path.read_bytes() for path in (folder / "events.txt", times)}
+    for command in (["convert", folder, folder / "events.txt"],
+                    ["simulate", folder / "images", "--timestamps", times, "-o", times]):
+        status, _, err = run(capsys, *command, "--overwrite")
+        assert status == 2
+        assert "is what is read" in err
+    assert before == {path: path.read_bytes() for path in before}
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.npz", "folder", "a.zip", "a.aedat4"])

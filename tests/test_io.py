@@ -31,7 +31,7 @@ from evflow import io
 from evflow.errors import EvflowDataError
 from evflow.io import DsecWriter, read_events, read_recording, write_events
 from evflow.io.base import find_format
-from evflow.types import Events
+from evflow.types import Events, Recording
 
 
 @pytest.fixture
@@ -144,7 +144,9 @@ def test_a_format_that_the_extension_denies_is_refused(
 @pytest.mark.parametrize("call", [
     lambda events: io.write_events(events, "a.h5"), lambda events: io.iter_windows("a.h5"),
     lambda events: io.write_recording("a.h5", events), lambda events: evflow.check(events),
-    lambda events: evflow.compare("a.h5", events), lambda events: evflow.compare(events, None)])
+    lambda events: evflow.compare("a.h5", events), lambda events: evflow.compare(events, None),
+    lambda events: evflow.voxelize("a.npz", 0, 1000), lambda events: Recording.of_events("a.npz"),
+    lambda events: Recording("a.npz", np.zeros((0, 2, 2), np.uint8), np.zeros(0, int))])
 def test_paths_and_recordings_in_each_others_place(call: Callable[[Events], Any]) -> None:
     with pytest.raises(EvflowDataError, match=r"EV020.*is of type (str|Events|NoneType)"):
         call(make(5).events)

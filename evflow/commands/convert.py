@@ -42,7 +42,8 @@ class Convert(Reading):
         from evflow.types import Recording
 
         writer = writer_of(self.out, named(self.format, self.out))
-        need_absent(self.out, self.overwrite, self.recording, self.frames)
+        need_absent(self.out, self.overwrite, self.recording, self.frames,
+                    self.timestamps)
         recording = self.read(self.recording)
         notes = list(recording.notes)
         if recording.has_frames and (why := writer.refuses(recording.frames.dtype)):

@@ -87,7 +87,8 @@ class Flow(Windowed):
             refuse(self, ("sync", "window_events", "window_ms"), "the windows are those of --truth")
         if self.full_px is not None and self.full_px <= 0:
             raise EvflowDataError("EV020", f"--full-px {self.full_px}.", "It must be > 0.")
-        need_absent(self.out, self.overwrite, self.recording, self.frames)
+        need_absent(self.out, self.overwrite, self.recording, self.frames,
+                    self.timestamps, self.truth)
 
     def _read(self) -> tuple[Recording, np.ndarray, FlowTruth | None]:
         """The recording, the edges (T + 1,) of the windows, and the true flow if there is one."""

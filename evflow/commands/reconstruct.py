@@ -51,7 +51,8 @@ class Reconstruct(Windowed):
         check_finite(self)
         self.check_film()
         kind = self._kind()
-        need_absent(self.out, self.overwrite, self.recording, self.frames)
+        need_absent(self.out, self.overwrite, self.recording, self.frames,
+                    self.timestamps)
         trained = images_of(load_network(self.weights))
         recording = self.read(self.recording)
         times = self.times(recording)

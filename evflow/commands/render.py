@@ -53,7 +53,8 @@ class Render(Reading):
         film = Film(fps=self.fps, window_us=round(1000 * self.window_ms), slow=self.slow,
                     over_frames=self.over_frames, scale=self.scale, codec=self.codec)
         film.check_target(self.out, overwrite=self.overwrite)
-        need_absent(self.out, self.overwrite, self.recording, self.frames)
+        need_absent(self.out, self.overwrite, self.recording, self.frames,
+                    self.timestamps)
         kind = self.out.suffix.lower()
         refuse(self, {".png": ("fps", "slow", "codec"), ".gif": ("at", "codec"),
                       ".mp4": ("at",)}[kind], f"nothing that a {kind} has")

@@ -108,7 +108,7 @@ class Simulate:
         from evflow.simulator.interpolate import unzip, upsample
 
         format = named(self.format, self.out)
-        need_absent(self.out, self.overwrite, self.video, self.camera)
+        need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
         source = self._source()
         camera = _camera(self, source.size)
         sensor = self._model()

@@ -57,7 +57,8 @@ class Voxel(Reading):
             raise EvflowDataError("EV020", f"--bins {self.bins}, --window-ms {self.window_ms:g}.",
                                   "Need two bins and 0.001 ms at least.")
         need_suffix(self.out, ".npz")
-        need_absent(self.out, self.overwrite, self.recording, self.frames)
+        need_absent(self.out, self.overwrite, self.recording, self.frames,
+                    self.timestamps)
         recording = self.read(self.recording)
         pairs, starts, lengths, notes = _windows(recording, round(self.window_ms * 1000))
         width, height = recording.events.size

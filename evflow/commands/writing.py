@@ -49,12 +49,18 @@ def need_folder(out: Path) -> None:
                               f"Name a folder: -o {out.with_suffix('')}/.")
 
 
+def _part_of(path: Path, source: Path) -> bool:
+    """Films lie beside what they show, and are none of it."""
+    inside = source.is_dir() and path.resolve().is_relative_to(source.resolve())
+    return path.samefile(source) or (inside and path.suffix.lower() not in (".mp4", ".gif"))
+
+
 def need_absent(path: Path, overwrite: bool, *sources: Path | None) -> None:
     """EV013 before long work, where its output exists already; EV020 where it is one of the
-    sources: what is read may be the only one there is."""
+    sources, or a file in a folder that is one: what is read may be the only one there is."""
     if not path.exists():
         return
-    if any(source is not None and source.exists() and path.samefile(source)
+    if any(source is not None and source.exists() and _part_of(path, source)
            for source in sources):
         raise EvflowDataError("EV020", f"the output {path} is what is read.",
                               "Name another one: no command replaces what it reads.")
