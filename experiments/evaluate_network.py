@@ -29,7 +29,7 @@ import numpy as np
 
 from evflow.commands.options import check_finite, parse_size
 from evflow.config import as_dict
-from evflow.downstream import EVFlowNet, event_tensor, reconstruct
+from evflow.downstream import EVFlowNet, prepared, reconstruct
 from evflow.downstream.released import Trained, load_network
 from evflow.downstream.simulated import SequenceConfig
 from evflow.errors import EvflowDataError
@@ -185,7 +185,7 @@ def real_flow(trained: Trained, found: list[Part], slices: dict[str, Rotation]) 
     how = FwlConvention(reference="first")
     for name, one in slices.items():
         tensor = jnp.asarray(
-            event_tensor(one.events, trained.network.bins, trained.split))[None, None]
+            prepared(one.events, trained.network.bins, trained.split))[None, None]
         flow = np.asarray(held_out.outputs(
             trained.network, trained.params, tensor, trained.normalised)[0, 0])
         columns = (*one.xy.T, one.t, one.p, np.ones(len(one.t), np.float32))
@@ -211,13 +211,22 @@ class Synthetic:
         """Means over clips, of every camera."""
         rows = {}
         for name, clips in self.clips.items():
-            made = held_out.outputs(
-                trained.network, trained.params, clips.tensors, trained.normalised)
+            made = _outputs(trained, clips)
             found = (held_out.flow_scores(made, clips, SKIPPED)
                      if isinstance(trained.network, EVFlowNet)
                      else held_out.video_scores(made, clips, SKIPPED, lpips))
             rows[name] = {k: _mean(v) for k, v in found.items()}
         return rows
+
+
+def _outputs(trained: Trained, clips: held_out.Clips) -> Any:
+    """What a network makes of clips, time first; those that take other event tensors than the
+    clips', one clip after the other."""
+    network, params = trained.network, trained.params
+    if network.bins == clips.tensors.shape[-1] and not trained.split:
+        return held_out.outputs(network, params, clips.tensors, trained.normalised)
+    return np.stack([reconstruct(network, params, events, edges[1:], **trained.how)
+                     for events, edges in zip(clips.events, clips.edges_us, strict=True)], 1)
 
 
 def _mean(scores: np.ndarray) -> float | None:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from skimage.exposure import equalize_hist
 from skimage.filters.rank import equalize
 from skimage.morphology import disk
 
@@ -129,7 +130,7 @@ def equalised(images: np.ndarray, how: str) -> np.ndarray:
 
     def one(image: np.ndarray) -> np.ndarray:
         if how == "global":
-            return cv2.equalizeHist(image)
+            return np.rint(255 * equalize_hist(image)).astype(np.uint8)
         return clahe.apply(image) if how == "clahe" else equalize(image, footprint)
 
     gray = np.rint(255 * np.clip(images, 0, 1)).astype(np.uint8)

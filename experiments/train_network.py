@@ -185,7 +185,8 @@ def measure(
 ) -> dict[str, float]:
     """Mean figures of held-out sequences of the same kind: other textures (no photographs), other
     scenes and cameras. Of images after the first half of the windows, beside those of even grey;
-    of flow at pixels with events, beside those of none and of each window's median."""
+    of flow where more than one event is left after ON and OFF cancel, beside those of none and of
+    each window's median."""
     k_bank, k_data = jax.random.split(jax.random.key(HELD_OUT))
     bank = make_bank(k_bank, 48, photos=False)
     weights = None

@@ -17,6 +17,7 @@ from evflow.downstream import (
     Network,
     event_tensor,
     normalise,
+    prepared,
     reconstruct,
     run,
     signed,
@@ -262,3 +263,15 @@ def test_a_window_without_events_may_repeat_the_image() -> None:
         reconstruct(network, params, events, first))
 
 
+
+
+def test_split_tensors_are_scaled_as_s2r_scales_them() -> None:
+    """The 95th percentile of all entries becomes 1; where most are 0, nothing is changed."""
+    few, many = some_events(15), some_events(4000)
+    np.testing.assert_array_equal(prepared(few, 10, split=True), event_tensor(few, 10, split=True))
+    raw, made = event_tensor(many, 10, split=True), prepared(many, 10, split=True)
+    rank = np.sort(raw, axis=None)[round(0.95 * (raw.size - 1))]
+    np.testing.assert_allclose(made, np.minimum(raw, rank) / rank, rtol=1e-6)
+    assert (made.max(), raw.max() > 1) == (1.0, True)
+    np.testing.assert_array_equal(prepared(many, 5), event_tensor(many, 5))
+    assert not prepared(many.slice(20_000, 30_000), 10, split=True).any()

@@ -81,8 +81,31 @@ def test_true_flow_is_the_sharpest_and_no_flow_is_1() -> None:
     assert values[12.0] > 2
     assert values[0.0] == 1.0
     assert values[-12.0] < 1
-    ratios = {u: float(metrics.rsat(*edge(), constant(u))) for u in (0.0, 12.0, -12.0)}
+    x, y, t, p, weight = edge()  # edges of one polarity each: where both fall together they add up
+    ratios = {u: float(metrics.rsat(x, y, t, np.ones_like(p), weight, constant(u)))
+              for u in (0.0, 12.0, -12.0)}
     assert ratios[12.0] < ratios[0.0] == 1.0 < ratios[-12.0] + 0.2
+
+
+def test_rsat_is_its_definition() -> None:
+    """Hagenaars et al.: both polarities' squares over the pixels of either, votes rounded."""
+    x, y, t, p, weight = edge()
+    flow = constant(7.0)
+
+    def squares(u: float) -> float:
+        at = np.round(x + (t.max() - t) * u).astype(int)
+        inside, total, seen = (at >= 0) & (at < SIZE[0]), 0.0, set()
+        for sign in (1, -1):
+            mine = inside & (p == sign)
+            ages: dict[tuple[int, int], list[float]] = {}
+            for spot, time in zip(zip(at[mine], y[mine], strict=True), t[mine], strict=True):
+                ages.setdefault(spot, []).append((time - t.min()) / (t.max() - t.min()))
+            total += sum(np.mean(v) ** 2 for v in ages.values())
+            seen |= set(ages)
+        return total / len(seen)
+
+    np.testing.assert_allclose(float(metrics.rsat(x, y, t, p, weight, flow)),
+                               squares(7.0) / squares(0.0), rtol=1e-3)
 
 
 def test_padding_weighs_nothing() -> None:

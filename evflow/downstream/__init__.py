@@ -16,6 +16,7 @@ from evflow.downstream.sync import sync_times, window_edges
 from evflow.downstream.tensor import (
     event_tensor,
     normalise,
+    prepared,
     reconstruct,
     reconstructions,
     signed,
@@ -37,6 +38,7 @@ __all__ = [
     "load_network",
     "load_published",
     "normalise",
+    "prepared",
     "read_checkpoint",
     "reconstruct",
     "reconstructions",

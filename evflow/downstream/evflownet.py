@@ -1,8 +1,10 @@
 """EV-FlowNet: an event tensor -> optical flow, by a U-Net without memory (Zhu et al., RSS 2018).
 
 Two forms: one linear prediction at full resolution, trained on true flow (Stoffregen et al.,
-ECCV 2020); or the original's predictions 256 tanh at four scales, each fed to the next decoder
-(without its batch norm). The flow is (..., 2, H, W) = (x, y), px over the window.
+ECCV 2020); or the original's predictions 256 tanh at four scales, each fed to the next decoder. Of
+the original that form has neither the batch norm nor the input, which are counts and last times
+per polarity, and its residual blocks end in a ReLU; its training had rotations, windows of one to
+five frame intervals and weight decay. The flow is (..., 2, H, W) = (x, y), px over the window.
 """
 
 from __future__ import annotations

@@ -31,7 +31,8 @@ def reconstruction(images: Array, frames: Array, lpips_params: Params | None = N
 
 def temporal(images: Array, frames: Array, back: Array, visible: Array, skip: int = 2) -> Array:
     """Temporal consistency (Lai et al., ECCV 2018) of images after the first `skip`: the image
-    before, moved along the true flow, should be this one, where the frames themselves agree.
+    before, moved along the true flow, should be this one, where the frames themselves agree. S2R's
+    L0 counts what is compared, so its 2 is a skip of 1.
 
     images, frames, visible: (T, B, H, W); back (T, B, 2, H, W): from frame t to where its points
     were in frame t - 1.

@@ -21,6 +21,7 @@ from evflow.types import Events
 Array = jax.Array
 
 BINS = 5
+ROBUST = 0.95  # of the entries are within the range of `prepared`
 
 
 def event_tensor(events: Events, bins: int = BINS, split: bool = False) -> np.ndarray:
@@ -48,6 +49,18 @@ def event_tensor(events: Events, bins: int = BINS, split: bool = False) -> np.nd
     inside = low < steps - 1  # the last event falls on the last bin: nothing is left for a next
     grid += np.bincount(index[inside] + 1, (sign * late)[inside], size)
     return grid.astype(np.float32).reshape(height, width, bins)
+
+
+def prepared(events: Events, bins: int = BINS, split: bool = False) -> np.ndarray:
+    """`event_tensor`, of split bins scaled as S2R's later models are given them ("RobustNorm" of
+    its inference): cut off at the 95th percentile of all entries, which becomes 1. Where that is
+    0, as most entries are, it stays as it is."""
+    tensor = event_tensor(events, bins, split)
+    if not (split and tensor.size):
+        return tensor
+    rank = round(ROBUST * (tensor.size - 1))
+    most = float(np.partition(tensor, rank, axis=None)[rank])
+    return np.minimum(tensor, most) / np.float32(most) if most > 0 else tensor
 
 
 def signed(voxels: Array) -> Array:
@@ -112,7 +125,7 @@ def reconstructions(
                 continue
             part = Events.unchecked(events.x[window], events.y[window], events.t[window],
                                     events.p[window], events.size)
-            tensor = event_tensor(part, network.bins, split)
+            tensor = prepared(part, network.bins, split)
             made, state = _step(network, params, tensor, state, normalised)
             image = np.asarray(made)
             yield image
@@ -128,7 +141,7 @@ def reconstruct(
     (T, H, W) of E2VID and FireNet, about 0..1 and not clipped, or flow (T, 2, H, W).
 
     normalised: True for E2VID and FireNet, False for E2VID+, FireNet+ and EV-FlowNet; split: True
-    for S2R's later models of ten bins, see `event_tensor`.
+    for S2R's later models of ten bins, see `prepared`.
     Raises EV001 without frame times, EV004 where they fall.
     """
     return np.stack(list(reconstructions(

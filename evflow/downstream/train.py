@@ -33,8 +33,9 @@ Array = jax.Array
 class LearningConfig:
     """data: the sequences. steps, warmup, rate, clip: Adam whose rate rises for `warmup` steps
     and falls as a cosine, gradients clipped to a norm. temporal: weight of temporal consistency,
-    after the first `skip` images. elsewhere: weight, in the L1 of flow, of pixels without events.
-    normalised: event tensors of deviation 1, which hides the scale of the camera's thresholds.
+    after the first `skip` images. elsewhere: weight, in the L1 of flow, of pixels where at
+    most one event is left after ON and OFF cancel (`has_events`). normalised: event tensors of
+    deviation 1, which hides the scale of the camera's thresholds.
     seed: of params and data."""
 
     data: SequenceConfig = dataclasses.field(default_factory=SequenceConfig)

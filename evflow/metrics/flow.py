@@ -94,9 +94,10 @@ def warped_image(
 
 
 def rsat(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Array) -> Array:
-    """Ratio of the squared average timestamps, warped to unwarped, per polarity and active pixel;
-    below 1 where the flow is better than none (Hagenaars et al., NeurIPS 2021). Arguments as of
-    `fwl`; unlike it, it is not won by flow that collapses all events."""
+    """Ratio of the squared average timestamps, warped to unwarped, of both polarities per active
+    pixel, each event voting for the nearest one; below 1 where the flow is better than none
+    (Hagenaars et al., NeurIPS 2021). Arguments as of `fwl`; unlike it, it is not won by flow that
+    collapses all events."""
     columns, flow = _columns(x, y, t, p, weight), _flow(flow)
     return _timestamps(*columns, flow) / _timestamps(*columns, jnp.zeros_like(flow))
 
@@ -136,13 +137,13 @@ def _timestamps(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Arr
     shape = (flow.shape[-2], flow.shape[-1])
     x, y, age = _transported(x, y, t, weight, flow, "last")
     age = 1.0 - age / jnp.maximum(jnp.max(age * weight, initial=0.0), jnp.finfo(age.dtype).tiny)
-    squares, active = jnp.zeros((), flow.dtype), jnp.zeros((), flow.dtype)
+    squares, active = jnp.zeros((), flow.dtype), jnp.zeros(shape, bool)
     for mine in (p > 0, p <= 0):
         votes = weight * mine.astype(weight.dtype)
-        count = splat(x, y, votes, shape)
-        mean = splat(x, y, votes * age, shape) / (count + 1e-9)
-        squares, active = squares + jnp.sum(mean**2), active + jnp.sum(count > 0)
-    return squares / jnp.maximum(active, 1.0)
+        count = splat(x, y, votes, shape, "round")
+        mean = splat(x, y, votes * age, shape, "round") / (count + 1e-9)
+        squares, active = squares + jnp.sum(mean**2), active | (count > 0)
+    return squares / jnp.maximum(jnp.sum(active), 1)
 
 
 def _transported(
