@@ -124,7 +124,8 @@ _relax = jax.jit(relax, static_argnames=("process", "offset_dn"))
 @dataclasses.dataclass(frozen=True)
 class Akf(Reconstructor):
     """Asynchronous Kalman filter; published values of all but the log map, which is theirs with
-    offset_dn=255.
+    offset_dn=255 (their variances are of its steps, a third of ours in mid-grey), and of the trust
+    between two frames: the mean of both precisions, where they blend variances.
 
     reference: "between" (published) or "latest", which knows no frame that is yet to come.
     process, isolated, refractory: variance per second since a pixel's last update, since the last
