@@ -328,8 +328,8 @@ def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> Non
     (raw,) = runs.conditions({}, {})
     assert (raw.label, raw.name, raw.make()) == ("raw", "high noisy raw", None)
     bank = runs.recorded(raw.targets[0])
-    assert bank.tensors.shape == (3, 4, 32, 32, 5)
-    assert bank.frames.shape == (3, 4, 32, 32)
+    assert bank.tensors.shape == (3, 5, 32, 32, 5)  # four windows to learn from and one before
+    assert bank.frames.shape == (3, 5, 32, 32)
     assert not np.array_equal(bank.frames[0, 0], runs.clips(raw.targets[0]).frames[0, 0])
     assert runs.recorded(raw.targets[0]) is bank  # made once for all seeds
     runs.complete(raw, 0)
