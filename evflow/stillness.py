@@ -32,8 +32,8 @@ def stands_still(recording: Recording) -> bool:
     events = recording.events
     if events.duration_us < LEAST_US:
         return False
-    first = recording.frame_dn(0)
-    if any((np.abs(change(first, recording.frame_dn(i))) > STILL).any()
+    first = smooth(recording.frame_dn(0))
+    if any((np.abs(smooth(recording.frame_dn(i)) - first) > STILL).any()
            for i in range(1, len(recording.frame_times))):
         return False
     return not unlike_noise(events, busy_pixels(events.count_map().sum(0)))
@@ -65,12 +65,7 @@ def gathered(hot: np.ndarray) -> bool:
     return pairs > chance + 5.0 * np.sqrt(chance) + 3.0
 
 
-def change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """(H, W) change of log intensity between two frames (H, W), in DN, without their noise."""
-    return _smooth(after) - _smooth(before)
-
-
-def _smooth(frame: np.ndarray) -> np.ndarray:
+def smooth(frame: np.ndarray) -> np.ndarray:
     """Log intensity (H, W) without the noise of a frame, nor what is nearly black."""
     return np.log(np.maximum(cv2.blur(frame, (SMOOTH, SMOOTH)), DARK_DN))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.intensity import lin_log
-from evflow.stillness import change
+from evflow.stillness import smooth
 from evflow.types import Recording
 
 STILL = 0.01  # log units between two frames: the screen rests
@@ -60,8 +60,10 @@ def _level(dn: np.ndarray) -> float:
 
 
 def _check_rest(recording: Recording, first: int, last: int) -> None:
+    begin = smooth(recording.frame_dn(first))
+
     def moving(i: int) -> float:
-        off = change(recording.frame_dn(first), recording.frame_dn(i))
+        off = smooth(recording.frame_dn(i)) - begin
         return float((np.abs(off - np.median(off)) > MOVING).mean())  # a lamp may settle
 
     share = max(moving(i) for i in range(first + 1, last + 1))

@@ -92,7 +92,7 @@ def layout(head: bytes) -> Layout | None:
         content = text.plain(line, byte)
         byte += len(line)
         fields = content.partition(b"#")[0].split()
-        if fields and not rows and not any(map(_is_float, fields)):
+        if fields and not rows and not any(map(text.is_float, fields)):
             told = _decoded(content)  # the first line, which must name what there is
         elif fields:
             if not all(map(text.is_number, fields)) or (rows and len(fields) != len(rows[0])):
@@ -123,15 +123,6 @@ def _decoded(line: bytes) -> str:
         return line.decode("utf-8").strip().lstrip("#").strip()
     except UnicodeDecodeError:
         return line.decode("latin-1").strip().lstrip("#").strip()
-
-
-def _is_float(field: bytes) -> bool:
-    """NaN too: a row, if a bad one, rather than a name."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
 
 
 def _columns(line: str) -> list[str]:

@@ -136,7 +136,13 @@ def _before_damage(byte: int, block: bytes, widths: tuple[int, ...]) -> tuple[by
 
 def is_number(field: bytes) -> bool:
     """Is it a finite number?"""
+    return is_float(field) and bool(np.isfinite(float(field)))
+
+
+def is_float(field: bytes | str) -> bool:
+    """Is it a number, NaN and infinity among them?"""
     try:
-        return bool(np.isfinite(float(field)))
+        float(field)
     except ValueError:
         return False
+    return True

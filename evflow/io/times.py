@@ -21,6 +21,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.arrays import mapped
 from evflow.io.frames import existing
 from evflow.io.hints import UNITS_US, Hints
+from evflow.io.text import is_float
 from evflow.types import Events
 
 MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
@@ -163,7 +164,7 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
     for number, line in enumerate(text.splitlines(), 1):
         content, _, comment = line.partition("#")
         fields = [f for f in re.split(r"[\s,;]+", content) if f]
-        if not fields or (not rows and not any(map(_number, fields))):
+        if not fields or (not rows and not any(map(is_float, fields))):
             words += f" {comment if not fields else content}"  # a comment or the header
             continue
         if rows and len(fields) != len(rows[0]):
@@ -197,7 +198,7 @@ def _columns(
     label = [all(PurePosixPath(f.replace("\\", "/")).name in known for f in column)
              for column in columns]
     if sum(label) != 1:  # not the images at hand: a name is what is no number, or counts up
-        label = [not all(map(_number, column)) or _counts(column) for column in columns]
+        label = [not all(map(is_float, column)) or _counts(column) for column in columns]
     clock = [i for i, named in enumerate(label) if not named]
     times = (_numbers(path, rows, clock[0]) if len(clock) == 1 else
              _middle(path, rows, clock) if len(clock) == 2 else None)
@@ -225,7 +226,7 @@ def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
     """A column as int64 where all are whole (exact, also in ns since 1970), else float64."""
     fields = [row[column] for row in rows]
     for number, field in enumerate(fields):
-        if not _number(field):
+        if not is_float(field):
             raise EvflowDataError(
                 "EV009", f"{path}: {field[:40]!r} at time {number:,} is not a number.",
                 "Cut off or damaged? Copy it again.")
@@ -233,14 +234,6 @@ def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
         return np.array([int(f) for f in fields], np.int64)
     except (ValueError, OverflowError):
         return np.array([float(f) for f in fields])
-
-
-def _number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
 
 
 def _counts(column: tuple[str, ...]) -> bool:
