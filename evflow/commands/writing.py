@@ -62,7 +62,7 @@ def need_absent(path: Path, overwrite: bool, *sources: Path | None) -> None:
         return
     if any(source is not None and source.exists() and _part_of(path, source)
            for source in sources):
-        raise EvflowDataError("EV020", f"the output {path} is what is read.",
+        raise EvflowDataError("EV020", f"the output {path} is what is read, or lies in it.",
                               "Name another one: no command replaces what it reads.")
     if not overwrite:
         raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite.")
