@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,9 +34,9 @@ from experiments.targets import Target
 Array = jax.Array
 Shape = tuple[int, int]
 
-DEFAULT, WIDE, WIDE_LOG, E2V, EVENTGAN = "default", "wide", "wide-log", "e2vid", "eventgan"
+DEFAULT, WIDE, WIDE_LOG, E2V = "default", "wide", "wide-log", "e2vid"
 OURS, ORACLE, RAW = "evflow", "oracle", "raw"
-FREE = (DEFAULT, WIDE, WIDE_LOG, E2V, EVENTGAN)  # that do not depend on the target
+FREE = (DEFAULT, WIDE, WIDE_LOG, E2V)  # that do not depend on the target
 # Thresholds .1 to 1 as many at .9 as at .2, or, of the prior that serves unknown cameras, .05 to 1
 # as many at .05 to .1 as at .5 to 1.
 PRIORS = {WIDE: WidePrior(theta=(0.1, 1.0), uniform=True), WIDE_LOG: WidePrior()}
@@ -48,13 +49,27 @@ class Condition:
     """label: its name in the tables; name: of the run, one for each thing that is trained;
     targets: what it is tested on; make: maps of K cameras (K, H, W), or None where no simulated
     camera makes the events; source: of the file that it rests on, so that another is not taken for
-    it."""
+    it; generator: weights of the EventGAN that makes the events."""
 
     label: str
     name: str
     targets: tuple[Target, ...]
     make: Callable[[], Camera | None]
     source: str = ""
+    generator: Path | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Files:
+    """Conditions from files, by name: weights of estimators of ours, what they alone see; weights
+    of EventGAN's generator; camera files."""
+
+    estimators: dict[str, Path] = dataclasses.field(default_factory=dict)
+    generators: dict[str, Path] = dataclasses.field(default_factory=dict)
+    cameras: dict[str, Path] = dataclasses.field(default_factory=dict)
+
+
+NONE = Files()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -150,17 +165,15 @@ def network_maps(recording: Recording, params: Params) -> Camera:
 
 
 def conditions(
-    shop: Workshop, targets: Sequence[Target], names: Sequence[str],
-    estimators: dict[str, Path], cameras: dict[str, Path],
+    shop: Workshop, targets: Sequence[Target], names: Sequence[str], files: Files = NONE
 ) -> list[Condition]:
-    """Of the names (`default`, `wide`, `wide-log`, `e2vid`, `evflow`, `oracle`, `raw`, `eventgan`,
-    or a compared system), of estimators' weights, and of camera files; raises EV020 for an unknown
-    name or one used twice."""
-    twice = [n for n in (*estimators, *cameras) if n in {*names, *(estimators.keys() & cameras)}]
-    if twice:
+    """Of the names (`default`, `wide`, `wide-log`, `e2vid`, `evflow`, `oracle`, `raw`, or a
+    compared system) and of files; raises EV020 for an unknown name or one used twice."""
+    counts = Counter((*names, *files.estimators, *files.generators, *files.cameras))
+    if twice := [name for name, count in counts.items() if count > 1]:
         raise EvflowDataError("EV020", f"two conditions are called {twice}.", "Rename one.")
     free: dict[str, Callable[[], Camera | None]] = {
-        DEFAULT: shop.default, E2V: shop.e2vid, EVENTGAN: lambda: None,
+        DEFAULT: shop.default, E2V: shop.e2vid,
         **{name: _bound(shop.wide, name) for name in PRIORS}}
     found = []
     for name in names:
@@ -180,13 +193,15 @@ def conditions(
         else:
             raise EvflowDataError("EV020", f"condition {name!r}.", "Choose of "
                                   f"{[*FREE, OURS, ORACLE, RAW, *SYSTEMS]}.")
-    for name, path in estimators.items():
+    for name, path in files.estimators.items():
         params = load_weights(path)
         found += [Condition(name, f"{t.name} {name}", (t,),
                             _bound(shop.mapped, t, name, params), digest(weights_path(path)))
                   for t in targets]
+    found += [Condition(name, name, tuple(targets), lambda: None, digest(path), path)
+              for name, path in files.generators.items()]
     return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path))
-                    for name, path in cameras.items()]
+                    for name, path in files.cameras.items()]
 
 
 def _oracle(shop: Workshop, targets: Sequence[Target], one: Target) -> Condition:

@@ -20,16 +20,13 @@ Array = jax.Array
 def sample(
     key: Array, bank: TextureBank, config: SequenceConfig, generator: dict[str, Any]
 ) -> Sequences:
-    """The scenes of `sample_sequences` for this key, with the generator's events: of each window
-    from the frame before it to its own; of the first window, whose frame before is not kept, none.
-    """
+    """The scenes of `sample_sequences` for this key, with the events that the generator makes of
+    the frames at each window's borders."""
     sequences = sample_sequences(key, bank, config)
-    dn = 255.0 * sequences.frames
-    before = jnp.concatenate([dn[:1], dn[:-1]])
-    events = signed(generate(generator, before, dn))
+    events = signed(generate(generator, 255.0 * sequences.before, 255.0 * sequences.frames))
     weights = jnp.asarray(rebinning(events.shape[-1], config.bins), events.dtype)
     tensors = jnp.einsum("...b,bc->...c", events, weights)
-    return dataclasses.replace(sequences, tensors=tensors.at[0].set(0.0))
+    return dataclasses.replace(sequences, tensors=tensors)
 
 
 def rebinning(bins: int, fewer: int) -> np.ndarray:

@@ -34,13 +34,18 @@ PROTOCOL = PROTOCOLS["evreal"]  # of images; log_mse is the mse of `log_map` of 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Clips:
     """N clips of T windows: events and edges_us (T + 1,) of each; tensors (T, N, H, W, bins),
-    frames (T, N, H, W), flow (T, N, 2, H, W)."""
+    borders (T + 1, N, H, W), flow (T, N, 2, H, W)."""
 
     events: list[Events]
     edges_us: list[np.ndarray]
     tensors: Array
-    frames: Array
+    borders: Array
     flow: np.ndarray
+
+    @property
+    def frames(self) -> Array:
+        """Frames (T, N, H, W) at the windows' ends."""
+        return self.borders[1:]
 
 
 def scored_by(task: str, perceptual: bool = True) -> dict[str, Any]:
@@ -53,10 +58,10 @@ def scored_by(task: str, perceptual: bool = True) -> dict[str, Any]:
 def gather(clips: Iterable[Clip]) -> Clips:
     """All clips of a target, time first."""
     made = list(clips)
-    tensors, frames, flow = (np.stack([getattr(c, name) for c in made], 1)
-                             for name in ("tensors", "frames", "flow"))
+    tensors, borders, flow = (np.stack([getattr(c, name) for c in made], 1)
+                              for name in ("tensors", "borders", "flow"))
     return Clips([c.events for c in made], [c.edges_us for c in made], jnp.asarray(tensors),
-                 jnp.asarray(frames), flow)
+                 jnp.asarray(borders), flow)
 
 
 @functools.partial(jax.jit, static_argnames=("network", "normalised"))

@@ -8,8 +8,8 @@ VI, VII and IX)?
 The same network is trained for each condition: default parameters, wide randomisation (thresholds
 uniform on .1 to 1, and log-uniform on .05 to 1), evflow's estimate of the target camera from a 2 s
 recording of it, and the target's true maps (oracle); in `full` also what the compared systems
-estimate, EventGAN's voxels and, for video, the thresholds of the original E2VID (e2vid), for flow
-the target's own recordings, from whose frames EV-FlowNet learns (raw). Seeds are paired: scenes,
+estimate and, for video, the thresholds of the original E2VID (e2vid), for flow the target's own
+recordings, from whose frames EV-FlowNet learns (raw). Seeds are paired: scenes,
 initial parameters and batches are the same for all conditions of a seed, only the camera differs
 (not so of `raw`). Events for training come from one sensor model, those of the targets from others
 (`experiments.targets`). Images are scored in the later windows of held-out scenes, clipped to
@@ -20,7 +20,9 @@ nearest pixel) beside that of the true flow.
 A finished training stays in --out with its scores: the same command goes on with what is missing,
 and one that asks for more adds to it. One that asks for less than the tables there have is refused.
 Tables VII and IX: weights that `experiments.ablate` keeps, as --estimators "8 steps=PATH" ...; any
-camera file is a condition by --cameras NAME=PATH. Writes see_better.json, .md, .png and _clips.png.
+camera file is a condition by --cameras NAME=PATH, EventGAN by --eventgan eventgan=PATH (the
+generator.safetensors of `experiments.train_eventgan`). Writes see_better.json, .md, .png and
+_clips.png.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ from evflow.report import plots
 from evflow.weights import weights_path
 from experiments import gains, held_out
 from experiments.common import at_least, provenance, run_script, write_result
-from experiments.conditions import E2V, EVENTGAN, RAW, Condition, digest
+from experiments.conditions import E2V, RAW, Condition, Files, digest
 from experiments.targets import CAMERAS, SCENES
 from experiments.trainings import SIMULATED, Setting, Trainings
 
@@ -52,7 +54,7 @@ Preset = Literal["debug", "small", "full"]
 # of scenes as those of images, few steps of a small network learned no flow.
 MOVING = dataclasses.replace(
     SCENES, contrast=(0.5, 1.0), foregrounds=0, speed_px_s=(50.0, 250.0))
-COMPARED = ("s2r", "jaer", "ecc median", "match", "lgan", EVENTGAN)
+COMPARED = ("s2r", "jaer", "ecc median", "match", "lgan")
 ALONE: dict[Task, str] = {"video": E2V, "flow": RAW}  # what the paper has beside them
 
 
@@ -112,8 +114,8 @@ class Options:
     """More conditions, NAME=weights.safetensors: what their network alone sees."""
     weights: str = "default"
     """Of evflow's estimator."""
-    eventgan: Path | None = None
-    """EventGAN's generator.safetensors; adds the condition, which is left out without it."""
+    eventgan: tuple[str, ...] = ()
+    """More conditions, NAME=generator.safetensors: EventGAN's events, of no camera."""
     max_seconds: float = math.inf
     """Begin no other training after this long."""
 
@@ -121,9 +123,6 @@ class Options:
 def chosen(options: Options) -> Setting:
     """The preset with what the options change; EV020 where they contradict each other."""
     at_least(1, seeds=options.seeds, steps=options.steps)
-    if EVENTGAN in options.names and options.eventgan is None:
-        raise EvflowDataError("EV020", f"--names {EVENTGAN} without its weights.",
-                              "Pass --eventgan PATH, of experiments.train_eventgan.")
     setting = preset_of(options.task, options.preset)
     learning = setting.learning
     if options.normalised:
@@ -132,12 +131,8 @@ def chosen(options: Options) -> Setting:
         learning = dataclasses.replace(learning, steps=options.steps)
     given: dict[str, Any] = {"names": options.names, "cameras": options.targets,
                              "circuits": options.circuits, "seeds": options.seeds}
-    setting = dataclasses.replace(
+    return dataclasses.replace(
         setting, learning=learning, **{k: v for k, v in given.items() if v})
-    names = tuple(n for n in setting.names if n != EVENTGAN)
-    if options.eventgan is not None:
-        names = setting.names if EVENTGAN in setting.names else (*names, EVENTGAN)
-    return dataclasses.replace(setting, names=names)
 
 
 def same_setting(out: Path, shared: dict[str, Any], setting: Setting) -> None:
@@ -207,8 +202,9 @@ def main(options: Options) -> dict[str, Any]:
     shared = {"task": options.task, "weights": options.weights,
               "estimator": digest(weights_path(options.weights))}
     same_setting(options.out, shared, setting)
-    runs = Trainings(setting, options.out, options.weights, options.eventgan)
-    conditions = runs.conditions(files(options.estimators), files(options.cameras))
+    runs = Trainings(setting, options.out, options.weights)
+    conditions = runs.conditions(
+        Files(*map(files, (options.estimators, options.eventgan, options.cameras))))
     nothing_lost(options.out, conditions, setting.seeds)
     left = setting.seeds * len(conditions)
     for seed in range(setting.seeds):

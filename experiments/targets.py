@@ -64,12 +64,13 @@ class Target:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Clip:
     """T windows of a held-out scene. edges_us (T + 1,); tensors (T, H, W, bins): signed events;
-    frames (T, H, W): at the windows' ends, on [0, 1]; flow (T, 2, H, W): px over the window."""
+    borders (T + 1, H, W): frames at the edges, on [0, 1]; flow (T, 2, H, W): px over the window.
+    """
 
     events: Events
     edges_us: np.ndarray
     tensors: np.ndarray
-    frames: np.ndarray
+    borders: np.ndarray
     flow: np.ndarray
 
 
@@ -130,17 +131,17 @@ def clips(
         times = STEP_US * np.arange(len(video))
         k_events = jax.random.fold_in(_key("events", seen.name, *others), i)
         events = simulate(k_events, video, times, seen.camera, model=seen.circuit)
-        yield clip_of(events, times[LEAD::steps], video[LEAD + steps::steps] / 255.0,
+        yield clip_of(events, times[LEAD::steps], video[LEAD::steps] / 255.0,
                       flows(scene, clock[::steps], shape))
 
 
-def clip_of(events: Events, edges: np.ndarray, frames: np.ndarray, flow: np.ndarray) -> Clip:
+def clip_of(events: Events, edges: np.ndarray, borders: np.ndarray, flow: np.ndarray) -> Clip:
     """Event tensors as networks take them, by the events after the first edge."""
     events = events.slice(int(edges[0]), int(edges[-1]) + 1)
     parts = windows_between(events.t, edges[1:])
     tensors = [event_tensor(Events.unchecked(
         events.x[w], events.y[w], events.t[w], events.p[w], events.size), BINS) for w in parts]
-    return Clip(events, edges, np.stack(tensors), frames, flow)
+    return Clip(events, edges, np.stack(tensors), borders, flow)
 
 
 def flows(scene: Scene, edges_s: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -31,7 +31,7 @@ from evflow.scenes import TextureBank, make_bank
 from evflow.weights import model_card
 from experiments import eventgan_sequences, gains, held_out, targets
 from experiments.common import provenance, slug, write_result
-from experiments.conditions import EVENTGAN, RAW, Condition, Workshop, conditions, digest, told
+from experiments.conditions import NONE, RAW, Condition, Files, Workshop, conditions, told
 
 Params = dict[str, Any]
 Scores = dict[str, dict[str, dict[str, dict[int, np.ndarray]]]]  # target, label, measure, seed
@@ -67,11 +67,8 @@ class Setting:
 class Trainings:
     """Trains and tests; what runs share is made once, on first use."""
 
-    def __init__(
-        self, setting: Setting, out: Path, weights: str = "default", eventgan: Path | None = None
-    ) -> None:
-        self.setting, self.out = setting, out
-        self.weights, self.eventgan = weights, eventgan
+    def __init__(self, setting: Setting, out: Path, weights: str = "default") -> None:
+        self.setting, self.out, self.weights = setting, out, weights
         self.targets = [targets.target(camera, circuit, setting.shape)
                         for camera in setting.cameras for circuit in setting.circuits]
         self._clips: dict[str, held_out.Clips] = {}
@@ -103,11 +100,11 @@ class Trainings:
     def recorded(self, target: targets.Target) -> RecordedBank:
         """What the target itself records of scenes as all are trained on."""
         if target.name not in self._recorded:
-            data = self._recorded_learning.data
+            data = self.setting.learning.data
             made = held_out.gather(targets.clips(
                 target, self.bank, data, self.setting.drawn, data.windows, "trained on"))
             self._recorded[target.name] = RecordedBank(
-                jnp.swapaxes(made.tensors, 0, 1), jnp.swapaxes(made.frames, 0, 1))
+                jnp.swapaxes(made.tensors, 0, 1), jnp.swapaxes(made.borders, 0, 1))
         return self._recorded[target.name]
 
     @functools.cached_property
@@ -125,17 +122,13 @@ class Trainings:
                 target, self.held_out_bank, s.learning.data, s.scenes, s.windows))
         return self._clips[target.name]
 
-    def conditions(
-        self, estimators: dict[str, Path], cameras: dict[str, Path]
-    ) -> list[Condition]:
+    def conditions(self, files: Files = NONE) -> list[Condition]:
         s = self.setting
         shop = Workshop(
             s.shape, s.drawn, self.out / "cameras",
             lambda t: targets.recording(t, self.held_out_bank, s.learning.data, s.seconds),
             load_weights(self.weights))
-        found = conditions(shop, self.targets, s.names, estimators, cameras)
-        return [dataclasses.replace(c, source=digest(self.eventgan))
-                if c.label == EVENTGAN and self.eventgan else c for c in found]
+        return conditions(shop, self.targets, s.names, files)
 
     def folder(self, condition: Condition, seed: int) -> Path:
         return self.out / "runs" / slug(condition.name) / str(seed)
@@ -173,9 +166,10 @@ class Trainings:
         steps, began = self.setting.learning.steps, time.monotonic()
         camera, network = condition.make(), self.network(condition)
         bank: TextureBank | RecordedBank = self.bank
-        cameras, step = camera, self._step
-        if condition.label == EVENTGAN:
-            cameras, step = load_weights(str(self.eventgan)), self._generated_step
+        cameras: Any = camera
+        step = self._step
+        if condition.generator is not None:
+            cameras, step = load_weights(condition.generator), self._generated_step
         elif condition.label == RAW:
             bank, step = self.recorded(condition.targets[0]), self._recorded_step
         lpips = self.lpips if self.setting.perceptual else None
@@ -212,18 +206,8 @@ class Trainings:
 
     @functools.cached_property
     def _recorded_step(self) -> Any:
-        return jax.jit(make_step(self._of_recordings, self._recorded_learning, self._tx,
+        return jax.jit(make_step(self._of_recordings, self.setting.learning, self._tx,
                                  sample_recorded))
-
-    @property
-    def _recorded_learning(self) -> LearningConfig:
-        """What is trained on recordings: one window more where the first, which has no frame at
-        its start, is not learned from, so that a step sees as many as those of the others."""
-        learning = self.setting.learning
-        if not isinstance(self.setting.network, EVFlowNet):
-            return learning
-        data = dataclasses.replace(learning.data, windows=learning.data.windows + 1)
-        return dataclasses.replace(learning, data=data)
 
     def _start(self, seed: int, network: Network) -> LearningState:
         """Where every condition of a seed starts, if it trains this network."""

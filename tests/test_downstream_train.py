@@ -58,8 +58,8 @@ def test_sequences_have_time_first_and_frames_on_0_to_1() -> None:
 
 def test_events_follow_the_light_between_frames() -> None:
     s = sequences()
-    change = np.diff(np.log(np.asarray(s.frames) + 0.08), axis=0)
-    events = np.asarray(s.tensors.sum(-1))[1:]
+    change = np.diff(np.log(np.asarray(s.borders) + 0.08), axis=0)
+    events = np.asarray(s.tensors.sum(-1))
     some = np.abs(change) > 0.15
     assert some.sum() > 100
     assert np.corrcoef(change[some], events[some])[0, 1] > 0.6
@@ -67,9 +67,9 @@ def test_events_follow_the_light_between_frames() -> None:
 
 def test_frames_moved_along_the_flow_are_the_next_frames() -> None:
     s = sequences()
-    inside = np.asarray(s.visible[1:], bool)
-    still = np.abs(np.asarray(s.frames[:-1] - s.frames[1:]))[inside].mean()
-    moved = np.abs(np.asarray(losses.warp(s.frames[:-1], s.back[1:]) - s.frames[1:]))[inside].mean()
+    inside = np.asarray(s.visible, bool)
+    still = np.abs(np.asarray(s.before - s.frames))[inside].mean()
+    moved = np.abs(np.asarray(losses.warp(s.before, s.back) - s.frames))[inside].mean()
     assert moved < 0.6 * still
 
 
@@ -220,13 +220,14 @@ def test_recordings_give_sequences_of_their_own_events() -> None:
     counts = np.zeros((24, 40))
     np.add.at(counts, (inside.y, inside.x), sign)
     np.testing.assert_allclose(found.tensors[1, 0].sum(-1), counts, atol=1e-5)
-    np.testing.assert_allclose(found.frames[1, 0], recording.frames[5] / 255, rtol=1e-6)
+    np.testing.assert_allclose(found.borders[1], recording.frames[4:9] / 255, rtol=1e-6)
     s = jax.jit(sample_recorded, static_argnames="config")(jax.random.key(0), found, DATA)
     assert s.tensors.shape == (4, 4, 16, 16, 5)
-    crops = {np.asarray(found.frames[n, 0, y:y + 16, x:x + 16]).tobytes()
+    crops = {np.asarray(found.borders[n, 1, y:y + 16, x:x + 16]).tobytes()
              for n in range(2) for y in range(9) for x in range(25)}
     assert all(np.asarray(frame).tobytes() in crops for frame in s.frames[0])
-    assert recorded_bank([recording], DATA, most_bytes=1).frames.shape[0] == 1
+    np.testing.assert_array_equal(s.before[1:], s.frames[:-1])
+    assert recorded_bank([recording], DATA, most_bytes=1).borders.shape[0] == 1
 
 
 def test_recordings_that_cannot_train_are_refused() -> None:

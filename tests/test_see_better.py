@@ -23,7 +23,7 @@ from evflow.scenes import make_bank
 from evflow.types import Events
 from experiments import eventgan_sequences, gains, held_out, see_better, targets
 from experiments.common import slug
-from experiments.conditions import Workshop, conditions, network_maps, told
+from experiments.conditions import Files, Workshop, conditions, network_maps, told
 from experiments.see_better import Options, files
 from experiments.trainings import SIMULATED, Trainings
 
@@ -64,8 +64,8 @@ def test_event_tensors_and_frames_are_those_of_their_windows() -> None:
     edges = np.array([1000, 31_000, 61_000])
     t = np.array([500, 1000, 1001, 31_000, 31_001, 61_000, 61_001])
     events = Events(np.arange(7), np.zeros(7, np.int64), t, np.ones(7, bool), (32, 24))
-    frames = np.zeros((2, *SHAPE))
-    clip = targets.clip_of(events, edges, frames, np.zeros((2, 2, *SHAPE)))
+    borders = np.zeros((3, *SHAPE))
+    clip = targets.clip_of(events, edges, borders, np.zeros((2, 2, *SHAPE)))
     np.testing.assert_allclose(clip.tensors.sum((1, 2, 3)), [3, 2])
     assert clip.tensors[0, 0, 1:4].sum() == clip.tensors[0].sum()
 
@@ -76,10 +76,10 @@ def test_clips_are_scenes_that_events_follow_and_repeat_themselves() -> None:
     first, again = (next(targets.clips(target("low"), bank, data, 1, 4)) for _ in range(2))
     assert first.tensors.shape == (4, *SHAPE, 5)
     assert first.flow.shape == (4, 2, *SHAPE)
-    assert 0 <= first.frames.min() < first.frames.max() <= 1
+    assert 0 <= first.borders.min() < first.borders.max() <= 1
     np.testing.assert_array_equal(first.tensors, again.tensors)
-    change = np.diff(np.log(first.frames + 0.08), axis=0)
-    events = first.tensors.sum(-1)[1:]
+    change = np.diff(np.log(first.borders + 0.08), axis=0)
+    events = first.tensors.sum(-1)
     some = np.abs(change) > 0.15
     assert some.sum() > 100
     assert np.corrcoef(change[some], events[some])[0, 1] > 0.5
@@ -89,10 +89,10 @@ def test_scores_stand_beside_those_of_no_network() -> None:
     """Two clips of two windows, of which the first is not scored: flow (3, 4) px in one of them."""
     edges = np.array([0, 1000, 2000])
     events = [Events([3, 4], [3, 4], [1, 1500], [True, True], (32, 24))] * 2
-    frames = jnp.stack([jnp.zeros((2, *SHAPE)), jnp.full((2, *SHAPE), 0.9)])
+    borders = jnp.zeros((3, 2, *SHAPE)).at[2].set(0.9)
     flow = np.zeros((2, 2, 2, *SHAPE), np.float32)
     flow[1, 0] = np.array([3.0, 4.0])[:, None, None]
-    clips = held_out.Clips(events, [edges] * 2, jnp.zeros((2, 2, *SHAPE, 5)), frames, flow)
+    clips = held_out.Clips(events, [edges] * 2, jnp.zeros((2, 2, *SHAPE, 5)), borders, flow)
     found = held_out.without_network("flow", clips, 1, None)
     np.testing.assert_allclose(found["no flow"]["aee"], [5.0, 0.0], atol=1e-5)
     np.testing.assert_allclose(found["mean flow of the clip"]["aee"], 0.0, atol=1e-5)
@@ -111,8 +111,8 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
                              for n in ("theta_on", "theta_off", "eta_on", "eta_off")})
     found = {c.name: c for c in conditions(
         workshop(tmp_path), [target(), target(circuit="esim"), target("low")],
-        ("default", "wide", "wide-log", "e2vid", "oracle"), {},
-        {"plain": plain, "uncertain": uncertain})}
+        ("default", "wide", "wide-log", "e2vid", "oracle"),
+        Files(cameras={"plain": plain, "uncertain": uncertain}))}
     assert set(found) == {"default", "wide", "wide-log", "e2vid", "high oracle", "low oracle",
                           "plain", "uncertain"}
     made = {name: c.make() for name, c in found.items()}
@@ -148,11 +148,16 @@ def test_an_ablated_network_is_taken_by_its_own_maps() -> None:
 def test_unclear_conditions_are_refused(tmp_path: Path) -> None:
     shop = workshop(tmp_path)
     with pytest.raises(EvflowDataError, match=r"EV020.*nonsense"):
-        conditions(shop, [target()], ("nonsense",), {}, {})
-    with pytest.raises(EvflowDataError, match="EV020"):
-        conditions(shop, [target()], ("default",), {}, {"default": tmp_path / "x.npz"})
-    with pytest.raises(EvflowDataError, match="EV016"):
-        conditions(shop, [target()], (), {}, {"mine": tmp_path / "absent.npz"})
+        conditions(shop, [target()], ("nonsense",))
+    path = tmp_path / "absent.npz"
+    for names, twice in ((("default",), Files(cameras={"default": path})),
+                         (("wide", "wide"), Files()),
+                         ((), Files(generators={"a": path}, cameras={"a": path}))):
+        with pytest.raises(EvflowDataError, match=r"EV020.*two conditions"):
+            conditions(shop, [target()], names, twice)
+    for absent in (Files(cameras={"mine": path}), Files(generators={"mine": path})):
+        with pytest.raises(EvflowDataError, match=r"EV016.*absent"):
+            conditions(shop, [target()], (), absent)
     for given in (("x",), ("=y",), ("a=b", "a=c")):
         with pytest.raises(EvflowDataError, match="EV020"):
             files(given)
@@ -181,9 +186,9 @@ def test_eventgan_keeps_the_scenes_and_all_of_its_events(monkeypatch: pytest.Mon
     np.testing.assert_allclose(weights[0], [1, 0, 0, 0, 0])
     np.testing.assert_allclose(weights[-1], [0, 0, 0, 0, 1])
     config = SequenceConfig(sequences=2, windows=3, crop=16, noise=0.0)
-    frames = jax.random.uniform(jax.random.key(0), (3, 2, 16, 16))
+    borders = jax.random.uniform(jax.random.key(0), (4, 2, 16, 16))
     ones = jnp.ones((3, 2, 16, 16, 5))
-    given = Sequences(ones, 0 * ones, frames, frames, frames, frames)
+    given = Sequences(ones, 0 * ones, borders, borders, borders, borders)
     monkeypatch.setattr(eventgan_sequences, "sample_sequences", lambda *_: given)
     seen: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -194,11 +199,10 @@ def test_eventgan_keeps_the_scenes_and_all_of_its_events(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(eventgan_sequences, "generate", generate)
     made = eventgan_sequences.sample(jax.random.key(1), None, config, {})
-    np.testing.assert_array_equal(made.frames, frames)
-    np.testing.assert_allclose(seen[0][0][1:], 255 * frames[:-1])
-    np.testing.assert_allclose(seen[0][1], 255 * frames)
-    assert not np.asarray(made.tensors[0]).any()
-    np.testing.assert_allclose(made.tensors[1:].sum(-1), 16, rtol=1e-5)  # 2 - 1 of each bin
+    np.testing.assert_array_equal(made.borders, borders)
+    np.testing.assert_allclose(seen[0][0], 255 * borders[:-1])
+    np.testing.assert_allclose(seen[0][1], 255 * borders[1:])
+    np.testing.assert_allclose(made.tensors.sum(-1), 16, rtol=1e-5)  # 2 - 1 of each bin
 
 
 def test_gains_are_paired_and_their_interval_is_students() -> None:
@@ -240,30 +244,21 @@ def test_less_error_is_better_and_nothing_is_claimed_of_a_single_seed() -> None:
 def test_a_table_is_never_replaced_by_a_narrower_one(tmp_path: Path) -> None:
     path = tmp_path / "see_better.json"
     both = [target(), target("low")]
-    full, fewer = (conditions(workshop(tmp_path), both, names, {}, {})
+    full, fewer = (conditions(workshop(tmp_path), both, names)
                    for names in (("default", "wide", "oracle"), ("wide",)))
     see_better.nothing_lost(tmp_path, fewer, 1)  # there is none
     rows = {name: {"ssim": scores([0.1, 0.2])} for name in ("default", "wide", "oracle")}
     found = {t.name: gains.compared(rows) for t in both}
     path.write_text(json.dumps({"result": {"targets": found}}))
     see_better.nothing_lost(tmp_path, full, 2)
-    alone = conditions(workshop(tmp_path), both[:1], ("default", "wide", "oracle"), {}, {})
+    alone = conditions(workshop(tmp_path), both[:1], ("default", "wide", "oracle"))
     for given, seeds, lost in ((fewer, 3, "default, oracle,"), (full, 1, "seed 1,"),
                                (alone, 2, "low noisy,")):
         with pytest.raises(EvflowDataError, match=f"EV013.* has {lost} which"):
             see_better.nothing_lost(tmp_path, given, seeds)
 
 
-def test_eventgan_goes_with_its_weights(tmp_path: Path) -> None:
-    with pytest.raises(EvflowDataError, match=r"EV020.*--eventgan PATH"):
-        see_better.chosen(Options(names=("default", "eventgan")))
-    weights = tmp_path / "absent.safetensors"
-    for preset in ("debug", "full"):
-        assert see_better.chosen(Options(preset=preset, eventgan=weights)).names[-1] == "eventgan"
-    setting = see_better.chosen(Options(names=("default",), eventgan=weights))
-    assert setting.names == ("default", "eventgan")
-    with pytest.raises(EvflowDataError, match=r"EV016.*absent"):
-        Trainings(setting, tmp_path, eventgan=weights).conditions({}, {})
+def test_numbers_that_leave_nothing_to_do_are_refused() -> None:
     for wrong in ({"seeds": 0}, {"steps": 0}):
         with pytest.raises(EvflowDataError, match=r"EV020.*Give 1 or more"):
             see_better.chosen(Options(**wrong))
@@ -325,12 +320,12 @@ def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> Non
     setting = dataclasses.replace(setting, names=("raw",), seeds=1, drawn=3, learning=(
         dataclasses.replace(setting.learning, steps=2)))
     runs = Trainings(setting, tmp_path)
-    (raw,) = runs.conditions({}, {})
+    (raw,) = runs.conditions()
     assert (raw.label, raw.name, raw.make()) == ("raw", "high noisy raw", None)
     bank = runs.recorded(raw.targets[0])
-    assert bank.tensors.shape == (3, 5, 32, 32, 5)  # four windows to learn from and one before
-    assert bank.frames.shape == (3, 5, 32, 32)
-    assert not np.array_equal(bank.frames[0, 0], runs.clips(raw.targets[0]).frames[0, 0])
+    assert bank.tensors.shape == (3, 4, 32, 32, 5)
+    assert bank.borders.shape == (3, 5, 32, 32)
+    assert not np.array_equal(bank.borders[0, 0], runs.clips(raw.targets[0]).borders[0, 0])
     assert runs.recorded(raw.targets[0]) is bank  # made once for all seeds
     runs.complete(raw, 0)
     trained = load_network(str(runs.folder(raw, 0) / "weights.safetensors"))
@@ -349,5 +344,4 @@ def test_presets_fit_their_networks() -> None:
             assert s.network.bins == s.learning.data.bins
     chosen = see_better.chosen(Options(preset="full", targets=("low",), seeds=2))
     assert chosen.cameras == ("low",)
-    assert "eventgan" not in chosen.names
     assert dataclasses.replace(chosen, seeds=5).seeds != chosen.seeds

@@ -29,11 +29,11 @@ MOST_BYTES = 1 << 30  # of event tensors in memory: some 1200 windows of 240x180
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RecordedBank:
-    """N runs of T windows from frame to frame. tensors (N, T, H, W, bins): signed events; frames
-    (N, T, H, W): at the windows' ends, on [0, 1]."""
+    """N runs of T windows from frame to frame. tensors (N, T, H, W, bins): signed events; borders
+    (N, T + 1, H, W): frames at the windows' borders, on [0, 1]."""
 
     tensors: Array
-    frames: Array
+    borders: Array
 
 
 def recorded_bank(
@@ -57,8 +57,8 @@ def recorded_bank(
     fit = max(1, most_bytes // (4 * config.windows * width * height * (config.bins + 1)))
     chosen = np.linspace(0, len(found) - 1, min(fit, len(found))).round().astype(int)
     parts = [_run(recording, first, config) for recording, first in (found[i] for i in chosen)]
-    tensors, frames = (jnp.asarray(np.stack(column)) for column in zip(*parts, strict=True))
-    return RecordedBank(tensors, frames)
+    tensors, borders = (jnp.asarray(np.stack(column)) for column in zip(*parts, strict=True))
+    return RecordedBank(tensors, borders)
 
 
 def _runs(recording: Recording, windows: int) -> list[int]:
@@ -77,11 +77,11 @@ def _runs(recording: Recording, windows: int) -> list[int]:
 def _run(
     recording: Recording, first: int, config: SequenceConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Tensors (T, H, W, bins) and frames (T, H, W) of the intervals from `first` on."""
+    """Tensors (T, H, W, bins) and frames (T + 1, H, W) of the intervals from `first` on."""
     edges = recording.frame_times[first:first + config.windows + 1]
     tensors = [event_tensor(recording.events.slice(int(a), int(b)), config.bins)
                for a, b in itertools.pairwise(edges)]
-    frames = [recording.frame_dn(first + 1 + i) / np.float32(255) for i in range(config.windows)]
+    frames = [recording.frame_dn(first + i) / np.float32(255) for i in range(len(edges))]
     return np.stack(tensors), np.stack(frames)
 
 
@@ -95,15 +95,17 @@ def sample_recorded(
 
     def one(key: Array) -> tuple[Array, Array, Array]:
         k_run, k_row, k_column, k_noise = jax.random.split(key, 4)
-        runs, _, rows, columns = bank.frames.shape
+        runs, _, rows, columns = bank.borders.shape
         at = (jax.random.randint(k_run, (), 0, runs), 0,
               jax.random.randint(k_row, (), 0, rows - config.crop + 1),
               jax.random.randint(k_column, (), 0, columns - config.crop + 1))
-        size = (1, config.windows, config.crop, config.crop)
-        frames = jax.lax.dynamic_slice(bank.frames, at, size)[0]
-        tensors = jax.lax.dynamic_slice(bank.tensors, (*at, 0), (*size, config.bins))[0]
-        return tensors, draw_noise(k_noise, config), frames
+        size = (config.crop, config.crop)
+        borders = jax.lax.dynamic_slice(bank.borders, at, (1, config.windows + 1, *size))[0]
+        tensors = jax.lax.dynamic_slice(
+            bank.tensors, (*at, 0), (1, config.windows, *size, config.bins))[0]
+        return tensors, draw_noise(k_noise, config), borders
 
-    tensors, noise, frames = (jnp.swapaxes(a, 0, 1) for a in jax.vmap(one)(keys))
-    still = jnp.zeros((*frames.shape[:2], 2, *frames.shape[2:]), frames.dtype)
-    return Sequences(tensors, noise, frames, still, still, jnp.zeros_like(frames))
+    tensors, noise, borders = (jnp.swapaxes(a, 0, 1) for a in jax.vmap(one)(keys))
+    unseen = jnp.zeros_like(borders[1:])
+    still = jnp.stack([unseen, unseen], 2)
+    return Sequences(tensors, noise, borders, still, still, unseen)

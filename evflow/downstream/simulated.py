@@ -78,17 +78,27 @@ class Sequences:
     """T windows of B sequences, time first as the networks run.
 
     tensors (T, B, H, W, bins): signed events of each window; noise, of the same shape: what is
-    put on them for training. frames (T, B, H, W): at its end, on [0, 1]. flow (T, B, 2, H, W):
-    (x, y) px over the window, at its start. back (T, B, 2, H, W): from its end to where that point
-    was at its start; visible (T, B, H, W): it was seen there.
+    put on them for training. borders (T + 1, B, H, W): frames at the windows' borders, on [0, 1].
+    flow (T, B, 2, H, W): (x, y) px over the window, at its start. back (T, B, 2, H, W): from its
+    end to where that point was at its start; visible (T, B, H, W): it was seen there.
     """
 
     tensors: Array
     noise: Array
-    frames: Array
+    borders: Array
     flow: Array
     back: Array
     visible: Array
+
+    @property
+    def before(self) -> Array:
+        """Frames (T, B, H, W) at the windows' starts."""
+        return self.borders[:-1]
+
+    @property
+    def frames(self) -> Array:
+        """Frames (T, B, H, W) at the windows' ends."""
+        return self.borders[1:]
 
     def given(self, normalised: bool) -> Array:
         """What a network gets: the noise goes on top of normalised events, as it would else be
@@ -122,8 +132,8 @@ def _sequence(
     tensors = _simulate(k_sim, frames, seen, config)
     edges = clock[::config.steps_per_window]
     flow, back, visible = _flows(scene, edges, shape)
-    ends = frames[config.steps_per_window::config.steps_per_window]
-    return Sequences(tensors, draw_noise(k_noise, config), ends / 255.0, flow, back, visible)
+    borders = frames[::config.steps_per_window] / 255.0
+    return Sequences(tensors, draw_noise(k_noise, config), borders, flow, back, visible)
 
 
 def scene_clock(key: Array, config: SequenceConfig) -> Array:

@@ -147,10 +147,10 @@ def sequence_loss(
 def _flow_loss(
     network: EVFlowNet, params: Params, tensors: Array, sequences: Sequences, elsewhere: float
 ) -> Array:
-    """Without memory the windows are one batch; the first has no frame at its start."""
+    """Without memory the windows are one batch."""
     if network.scales == 1:
         flow, _ = network.apply(params, tensors)
         weight = jnp.where(has_events(sequences.tensors), 1.0, elsewhere)
         return losses.flow_l1(flow, sequences.flow, weight)
-    flows = network.pyramid(params, tensors[1:])
-    return losses.photometric(flows, sequences.frames[:-1], sequences.frames[1:])
+    return losses.photometric(
+        network.pyramid(params, tensors), sequences.before, sequences.frames)
