@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import cv2
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -190,3 +191,4 @@ def test_the_command_trains_resumes_and_measures(tmp_path: Path) -> None:
     jax.tree.map(np.testing.assert_array_equal, a, b)
     assert np.isfinite([v for v in result.values()]).all()
     assert len((halves / "metrics.jsonl").read_text().splitlines()) == CONFIG.steps
+    assert cv2.imread(str(halves / "eventgan.png")) is not None
