@@ -38,6 +38,14 @@ def test_exact_counts_are_those_of_the_events(camera: Camera, model: SensorModel
     np.testing.assert_array_equal(np.moveaxis(np.asarray(counts), -1, 0), events.count_map())
 
 
+def test_whole_numbers_are_taken_as_what_they_are() -> None:
+    frames = np.array([3, 4, 5, 3])[:, None, None] * np.ones((1, 3, 4), np.int32)
+    ours, same = (simulate_counts(KEY, f, Camera.constant((3, 4), 0.2, 0.3), frame_dt_s=0.01)
+                  for f in (frames, frames.astype(np.float32)))
+    np.testing.assert_array_equal(ours, same)
+    assert float(ours.min()) > 5
+
+
 @pytest.mark.parametrize("width", [0.01, 0.3, 1.0])
 def test_soft_floor_steps_smoothly_and_keeps_the_mean(width: float) -> None:
     x = jnp.linspace(0.0, 6.0, 60_001)

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from videos import SHAPE, drifting
+from videos import SHAPE, drifting, milliseconds
 
 from evflow.camera import Camera, CameraPrior
 from evflow.intensity import to_log
 from evflow.sensors import SensorModel
-from evflow.simulator import simulate, simulate_voxels
+from evflow.simulator import sensor, simulate, simulate_counts, simulate_voxels
 from evflow.simulator.bins import hat_sums
 from evflow.simulator.voxels import _voxels
 from evflow.types import Events
@@ -79,6 +79,28 @@ def test_any_number_of_frames_and_bins_and_dead_times(
                                 bins)
     assert len(events) > 500
     agree(ours, direct, events, dt_us * (count - 1), bins)
+
+
+@pytest.mark.parametrize("refractory_s", [5e-4, 2e-4])
+def test_slots_that_tie_with_the_dead_time_are_those_of_the_events(refractory_s: float) -> None:
+    """Rounding alone decides, so that every frame's time must be the same to the last bit."""
+    frames = np.random.default_rng(0).integers(0, 256, (41, 8, 16)).astype(np.uint8)
+    camera = Camera.constant((8, 16), 0.2, 0.3)
+    model = SensorModel(timestamps="v2e", refractory_s=refractory_s)
+    events = simulate(KEY, frames, milliseconds(41), camera, model=model)
+    grid = simulate_voxels(KEY, frames, camera, frame_dt_s=1e-3, model=model)
+    counts = simulate_counts(KEY, frames, camera, frame_dt_s=1e-3, model=model)
+    of_grid = np.asarray(grid).reshape(8, 16, 2, 16).sum(-1)
+    np.testing.assert_allclose(np.moveaxis(of_grid, -1, 0), events.count_map(), atol=1e-3)
+    np.testing.assert_array_equal(np.moveaxis(np.asarray(counts), -1, 0), events.count_map())
+
+
+def test_windows_one_after_another_keep_the_time() -> None:
+    """Seconds as pairs: what a sum loses to rounding is not lost."""
+    times = sensor.frame_times(1e-3 / 3, 7)
+    far = sensor.later(jnp.array([1000.0, 1e-5]), times)
+    exact = 1000.0 + float(np.float32(1e-5)) + 1e-3 / 3 * np.arange(8)
+    np.testing.assert_allclose(np.asarray(far, np.float64).sum(-1), exact, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.uint8])

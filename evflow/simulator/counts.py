@@ -42,6 +42,8 @@ def simulate_counts(
     """
     model = model or SensorModel()
     log_frames = as_log(model, jnp.asarray(log_frames))
+    if not jnp.issubdtype(log_frames.dtype, jnp.floating):
+        log_frames = log_frames.astype(jnp.float32)
     if log_frames.ndim != 3 or len(log_frames) < 2:
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
                               "Expected (T, H, W) with at least two frames; vmap for more.")
@@ -62,31 +64,30 @@ def simulate_counts(
     nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
     if nominal is not None and timed:
         noise.check_rate(noise.most_rate(model, camera, nominal), float(frame_dt_s))
-    return _counts(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32),
+    times = sensor.frame_times(frame_dt_s, len(log_frames) - 1)
+    return _counts(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32), times,
                    model=model, smooth=float(smooth))
 
 
 @partial(jax.jit, static_argnames=("model", "smooth"))
 def _counts(
-    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array, *,
-    model: SensorModel, smooth: float,
+    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array,
+    times: Array, *, model: SensorModel, smooth: float,
 ) -> Array:
     steps, *shape = log_frames.shape
     whole, state = sensor.start(key, log_frames[0], camera, model, nominal)
     frames = log_frames[1:].reshape(steps - 1, math.prod(shape))
     if smooth:  # of the thresholds themselves: rounded ones have no gradient
         whole = dataclasses.replace(whole, camera=jax.tree.map(jnp.ravel, camera))
-    scan = partial(_scan_smooth, smooth) if smooth else _scan
+    scan = partial(_scan_smooth, smooth) if smooth else partial(_scan, times)
     return jnp.stack(scan(model, whole, state, frames, dt), -1).reshape(*shape, 2)
 
 
 def _scan(
-    model: SensorModel, whole: Sensor, state: SimState, frames: Array, dt: Array
+    clock: Array, model: SensorModel, whole: Sensor, state: SimState, frames: Array, dt: Array
 ) -> tuple[Array, Array]:
-    """(ON, OFF) counts (N,) over flat log frames (T, N)."""
+    """(ON, OFF) counts (N,) over flat log frames (T, N); clock: times (T + 1, 2) of all frames."""
     steps = jnp.arange(len(frames))
-    high = dt * jnp.arange(len(frames) + 1)
-    clock = jnp.stack([high, jnp.zeros_like(high)], -1)
 
     def body(
         carry: tuple[PixelState, Array, Array], inputs: tuple[Any, ...]

@@ -11,6 +11,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from evflow.camera import Camera
 from evflow.intensity import LOG_MAPS, normalised_intensity
@@ -45,6 +46,26 @@ class SimState:
     interval: Array
     time: Array
     key: Array
+
+
+def frame_times(dt: Array | float, steps: int) -> Array:
+    """(steps + 1, 2) seconds since the first of frames dt apart, pairs as in `SimState.time`:
+    exact where dt is a number; where it is traced, rounded to float32."""
+    if isinstance(dt, jax.core.Tracer):
+        high = dt * jnp.arange(steps + 1)
+        return jnp.stack([high, jnp.zeros_like(high)], -1)
+    seconds = float(dt) * np.arange(steps + 1)
+    rounded = seconds.astype(np.float32)
+    return jnp.asarray(np.stack([rounded, seconds - rounded], -1), jnp.float32)
+
+
+def later(time: Array, by: Array) -> Array:
+    """time (2,) plus each of by (T, 2), pairs as in `SimState.time`: what the sum of the high
+    parts loses to rounding joins the low ones."""
+    high = time[0] + by[:, 0]
+    added = high - time[0]
+    lost = (time[0] - (high - added)) + (by[:, 0] - added)
+    return jnp.stack([high, lost + (time[1] + by[:, 1])], -1)
 
 
 @jax.tree_util.register_dataclass

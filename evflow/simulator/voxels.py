@@ -35,20 +35,22 @@ TILE = 8192  # pixels; their maps and grid, some 1.5 MB, are worked on at a time
 
 def simulate_window(
     model: SensorModel, whole: Sensor, state: SimState, log_frames: Array,
-    frame_dt_s: Array | float, bins: int,
+    frame_dt_s: Array | float, bins: int, times: Array | None = None,
 ) -> tuple[SimState, Array]:
     """Advance through log_frames (T, H, W), T frames after the state's own, equally spaced: log
-    intensity, or bytes.
+    intensity, or bytes. times: `sensor.frame_times`, where they are known better than by a traced
+    frame_dt_s.
 
     Returns the state and the voxel grid (H, W, 2*bins) of the window of T intervals.
     """
     steps, *shape = log_frames.shape
     count = math.prod(shape)
+    if times is None:
+        times = sensor.frame_times(frame_dt_s, steps)
+    clock = sensor.later(state.time, times)
     dt = jnp.asarray(frame_dt_s, jnp.float32)
     intervals = state.interval + jnp.arange(steps)
     salts = noise.salts(state.key, intervals)
-    high, low = state.time
-    clock = jnp.stack([high + dt * jnp.arange(steps + 1), jnp.full(steps + 1, low)], -1)
     plan, lengths = Schedule.of(steps, bins), jnp.full(steps, dt)
 
     def scanned(maps: Any) -> tuple[PixelState, Array]:
@@ -132,7 +134,8 @@ def simulate_voxels(
     nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
     if nominal is not None and timed:
         noise.check_rate(noise.most_rate(model, camera, nominal), float(frame_dt_s))
-    return _voxels(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32),
+    times = sensor.frame_times(frame_dt_s, log_frames.shape[-3] - 1)
+    return _voxels(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32), times,
                    model=model, bins=bins, lead=lead)
 
 
@@ -172,14 +175,14 @@ def _in_blocks(
 
 @partial(jax.jit, static_argnames=("model", "bins", "lead"))
 def _voxels(
-    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array, *,
-    model: SensorModel, bins: int, lead: tuple[int, ...],
+    key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array,
+    times: Array, *, model: SensorModel, bins: int, lead: tuple[int, ...],
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
         if model.kind != "voltmeter":
             first = as_log(model, frames[0])
             whole, state = sensor.start(key, first, camera, model, nominal)
-            return simulate_window(model, whole, state, frames[1:], dt, bins)[1]
+            return simulate_window(model, whole, state, frames[1:], dt, bins, times)[1]
         key, signal = jax.random.split(key)
         frames = as_log(model, frames)
         whole, state = sensor.start(key, frames[0], camera, model, nominal)
