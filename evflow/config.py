@@ -168,6 +168,9 @@ class TrainConfig:
              "as many as the cameras, or a multiple"),
             ("cameras", self.cameras, self.cameras > 0 and self.cameras % group == 0,
              "as many as the sensors of a step, or a multiple"),
+            ("block", self.block, max(self.loss.patches) <= min(self.block)
+             and max(self.block) <= self.crop,
+             f"at least {max(self.loss.patches)}, the largest patch, to {self.crop}, the crop"),
             ("steps_per_window", self.steps_per_window, self.steps_per_window % changes == 0,
              f"a multiple of the model's {changes} changes"),
         ):

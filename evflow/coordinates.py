@@ -75,8 +75,8 @@ def summary_std(summary: Summary, y_std: Array) -> Summary:
         (summary.sigma_off + SIGMA_OFFSET) * s[..., 5])
 
 
-def camera_std(camera: Camera, y_std: Array) -> Camera:
-    """Standard deviation maps in natural units from that of y (..., 4), to first order."""
-    s = jnp.moveaxis(y_std * per_channel(SCALE, y_std), -1, 0)
-    return Camera(camera.theta_on * s[0], camera.theta_off * s[1], camera.eta_on * s[2],
-                  camera.eta_off * s[3])
+def camera_std(y: Array, y_std: Array, output: Output = "log") -> Camera:
+    """Standard deviation maps in natural units from those of y (..., 4), to first order."""
+    values = jnp.stack(jax.tree.leaves(squash(y, output)), -1)
+    slope = 1.0 - values**2 if output == "tanh" else values * per_channel(SCALE, values)
+    return Camera(*jnp.moveaxis(slope * y_std, -1, 0))

@@ -254,7 +254,11 @@ def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
 def log_prob(params: Params, voxels: ArrayLike, code: Code) -> Array:
     """Log density (..., H, W) of the voxels given the code (Eq. 3): y ~ N(summary, mismatch^2),
     z ~ N(0, 1), plus the log-det. A density only where the code came from a true video and a
-    camera; with an encoded code it is a score."""
+    camera; with an encoded code it is a score. Raises EV018 for weights of the paper's network,
+    which knows no summary."""
+    if not architecture(params).pool:
+        raise EvflowDataError("EV018", "the weights have no summary, around which y is expected.",
+                              "Take those of the default network.")
     y, z, log_det = forward(params, voxels, code)
     y6 = network.over_pixels(unsquash_summary(code.summary), y.shape[:-1])
     prior = network.log_normal(y, y6[..., :4], network.base_std(y6)).sum(-1)
@@ -281,8 +285,8 @@ def estimate_with_std(
     """`estimate` and the standard deviation of every value, in the same units."""
     y, y_std = estimate_y(params, voxels, dlogI, window_s=window_s, intensity=intensity,
                           summary=summary)
-    camera = coordinates.squash(y, architecture(params).output)
-    return camera, camera_std(camera, y_std)
+    output = architecture(params).output
+    return coordinates.squash(y, output), camera_std(y, y_std, output)
 
 
 def estimate_y(

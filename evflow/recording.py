@@ -193,10 +193,10 @@ def _fuse(
         weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
         precision += gained
     total = prior_precision + precision
-    camera = squash(prior + weighted / total)
+    y = prior + weighted / total
     relative = [getattr(summary_std, n) / getattr(summary, n) for n in PARAMETERS]
     shared = jnp.stack(relative, -1)[None, None] / per_channel(SCALE, y6)
-    return camera, camera_std(camera, jnp.sqrt(1.0 / total + shared**2)), quiet
+    return squash(y), camera_std(y, jnp.sqrt(1.0 / total + shared**2)), quiet
 
 
 def _with_rates(
@@ -259,7 +259,7 @@ def _warnings(
         elif float(events) < FEW_EVENTS:
             found.append(f"only {int(events)} {name.upper()} events: theta_{name} is uncertain.")
         elif not low <= theta <= high:
-            found.append(f"theta_{name} = {theta:.2f} lies outside the {low}-{high} that the "
+            found.append(f"theta_{name} = {theta:.3f} lies outside the {low}-{high} that the "
                          "network was trained on: an extrapolation. Frames with a gamma or an "
                          "offset stretch the scale.")
     active = float((n_events >= VALID_EVENTS).mean())

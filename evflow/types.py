@@ -105,7 +105,9 @@ class Events:
 
     def slice(self, t0_us: int, t1_us: int) -> Events:
         """The events with t0_us <= t < t1_us, as views (no copy, nothing is checked again)."""
-        bounds = np.array([operator.index(t0_us), operator.index(t1_us)], np.int64)
+        whole = np.iinfo(np.int64)
+        bounds = np.array([min(max(operator.index(t), whole.min), whole.max)
+                           for t in (t0_us, t1_us)])
         first, last = np.searchsorted(self.t, bounds)
         x, y, t, p = (getattr(self, name)[first:last] for name in COLUMNS)
         return Events.unchecked(x, y, t, p, self.size)

@@ -14,7 +14,7 @@ from networks import seen, small_params
 from evflow import model, pixelwise, squash, unsquash
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.config import MODELS
-from evflow.coordinates import squash_summary, unsquash_summary
+from evflow.coordinates import camera_std, squash_summary, unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights
 
@@ -195,6 +195,14 @@ def test_squash_and_unsquash_are_inverse() -> None:
     p = Camera.constant((2, 2), 0.3, 0.2, 0.5, 0.0)
     back = squash(unsquash(p, "tanh"), "tanh")
     np.testing.assert_allclose(back.theta_on, 0.3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("output", ["log", "tanh"])
+def test_std_of_the_camera_follows_the_slope_of_its_coordinates(output: Any) -> None:
+    y, std = jax.random.normal(jax.random.key(0), (5, 6, 4)), jnp.full((5, 6, 4), 0.1)
+    _, slope = jax.jvp(lambda y: squash(y, output), (y,), (std,))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7),
+                 camera_std(y, std, output), slope)
 
 
 def summary(value: Any) -> Summary:

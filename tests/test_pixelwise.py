@@ -14,6 +14,7 @@ from networks import jiggle, seen, small_params
 from evflow import chunks, model, network, pixelwise
 from evflow.camera import Summary
 from evflow.config import MODELS
+from evflow.errors import EvflowDataError
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 close = {"rtol": 0, "atol": 2e-5}
@@ -78,3 +79,6 @@ def test_it_is_encode_and_forward(name: str) -> None:
     y, _, _ = model.forward(params, voxels, code)
     got, _ = model.estimate_y(params, voxels, dL.sum(-1), **given)
     np.testing.assert_allclose(got, y, rtol=1e-4, atol=1e-4 * float(jnp.abs(y).max()))
+    if name == "paper":  # there is nothing around which y could be expected
+        with pytest.raises(EvflowDataError, match="EV018"):
+            model.log_prob(params, voxels, code)

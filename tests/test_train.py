@@ -113,7 +113,8 @@ def test_unknown_preset() -> None:
 
 @pytest.mark.parametrize("change", [
     {"parts": ("summary", "foo")}, {"parts": ()}, {"steps": -5}, {"cameras": 0}, {"cameras": 5},
-    {"sensors": configs.TrainConfig.sensors[:3]}, {"sensors": ()}, {"steps_per_window": 10}],
+    {"sensors": configs.TrainConfig.sensors[:3]}, {"sensors": ()}, {"steps_per_window": 10},
+    {"block": (4, 16)}, {"block": (8, 80)}],
     ids=str)
 def test_impossible_configurations_are_refused(change: dict[str, Any]) -> None:
     name, = change

@@ -121,6 +121,7 @@ def test_slice_copies_nothing() -> None:
     made = events()
     assert np.shares_memory(made.slice(10, 11).x, made.x)
     assert len(made.slice(10, 11)) == 2
+    assert len(made.slice(-(1 << 70), 1 << 70)) == len(made)
 
 
 def test_count_map_is_on_then_off() -> None:
