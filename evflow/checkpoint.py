@@ -20,10 +20,14 @@ from evflow.files import atomic_write
 
 
 class Checkpoints:
-    """The checkpoints of one run in `folder`; a context manager that waits for writes."""
+    """The checkpoints of one run in `folder`; a context manager that waits for writes. Raises
+    EV019 where that is a file."""
 
     def __init__(self, folder: str | os.PathLike, keep: int = 2) -> None:
         self.folder = Path(folder).absolute()
+        if self.folder.exists() and not self.folder.is_dir():
+            raise EvflowDataError("EV019", f"{self.folder} is a file, and no folder of a run.",
+                                  "Choose another --out.")
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep, create=True, cleanup_tmp_directories=True)
         self._manager = ocp.CheckpointManager(self.folder / "steps", options=options)

@@ -24,7 +24,7 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
     A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
     over pixels that are not hot. Thresholds are those of the prior that the
     network was trained on, with its width; `valid` is False everywhere.
-    Raises EV011 where the scene moves, or is too short to tell.
+    Raises EV011 (with frames: EV017) where the scene moves, or is too short to tell.
     """
     events = recording.events
     counts = events.count_map()
@@ -59,7 +59,8 @@ def _require_static(recording: Recording, hot: np.ndarray) -> None:
     reason = unlike_noise(recording.events, hot)
     if reason:
         raise EvflowDataError(
-            "EV011", f"events alone tell the noise of a scene at rest only, and {reason}",
+            "EV017" if recording.has_frames else "EV011",
+            f"events alone tell the noise of a scene at rest only, and {reason}",
             ("It has frames: measure its thresholds too (--protocol motion). " if
              recording.has_frames else "Thresholds are measured against intensity: give frames, "
              "--frames DIR --timestamps FILE. ") +

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from networks import hidden
 
-from evflow import Recording, write_events
+from evflow import Recording, read_recording, write_events
 from evflow.cli import main
 from evflow.io.adjust import shifted
 
@@ -95,6 +96,25 @@ def test_frames_from_elsewhere(folder: Path, capsys: pytest.CaptureFixture[str])
     assert found(capsys) == {"errors": ["EV029"]}
     assert run("check", folder / "bare.npz", "--timestamps", folder / "times.txt") == 1
     assert "Pass --frames too" in capsys.readouterr().out
+
+
+def test_frames_without_a_clock_join_events_of_wall_clock_time(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The offset that EV012 names is taken, also where another one was given."""
+    bare = read_recording(folder / "bare.npz").events
+    late = dataclasses.replace(bare, t=bare.t + 1_643_243_628_737_093)
+    write_events(tmp_path / "wall.npz", Recording.of_events(late), format="npz")
+    check = ("check", tmp_path / "wall.npz", "--json", "--frames", folder / "frames.npy",
+             "--frames-fps", 25)
+    for given in ((), ("--frames-offset-ms", 30.6)):
+        assert run(*check, *given) == 1
+        (finding,) = json.loads(capsys.readouterr().out)["errors"]
+        assert finding["code"] == "EV012"
+        offset = finding["fix"].split("--frames-offset-ms ")[1].split()[0]
+        assert float(offset) == pytest.approx(late.t[0] / 1e3, abs=2e-3)
+    run(*check, "--frames-offset-ms", offset)
+    assert "EV012" not in capsys.readouterr().out
 
 
 def test_events_outside_the_sensor(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -252,7 +252,7 @@ def test_events_that_begin_at_the_end_leave_no_window(sound: Recording) -> None:
 def test_mirrored_frames(sound: Recording, side: str) -> None:
     (error,) = check(flipped(sound, side)).errors
     assert error.code == "EV029"
-    assert error.fix == f"Pass --flip-frames {side}."
+    assert error.fix == f"Pass --flip-frames {side}, or leave out what was passed."
 
 
 def test_saturated_black_and_repeated_frames(sound: Recording) -> None:

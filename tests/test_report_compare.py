@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import evflow
-from evflow import Events, EvflowDataError, Recording, write_events
+from evflow import Events, EvflowDataError, Recording, read_recording, write_events
 from evflow.cli import main
 from evflow.metrics.streams import distances
 from evflow.report.verdict import describe_streams, judge_streams, worst
@@ -194,6 +194,24 @@ def test_compare_on_the_command_line(
     assert "EV013" in capsys.readouterr().err
     assert main(["compare", *map(str, streams), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["grade"] == facts["grade"]
+
+
+def test_a_span_is_the_same_of_both_streams(
+    streams: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where one begins later; on another clock it is as many seconds from the beginning."""
+    whole = read_recording(streams[0]).events
+    first, length = int(whole.t[0]), whole.duration_us
+    later = whole.slice(first + length // 4, int(whole.t[-1]) + 1)
+    apart = dataclasses.replace(whole, t=whole.t + 10**12)
+    span = ("--start", f"{0.5e-6 * length}", "--stop", f"{0.75e-6 * length}")
+    for other in (later, apart):
+        path = tmp_path / f"{other.t[0]}.npz"
+        write_events(path, Recording.of_events(other), format="npz")
+        assert main(["compare", str(streams[0]), str(path), "--json", *span]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["rate_hz"]["ratio"]["both"] == pytest.approx(1.0, abs=0.01)
+        assert facts["duration_s"] == pytest.approx(0.25e-6 * length, rel=0.02)
 
 
 def test_compare_refuses_other_sizes(

@@ -7,12 +7,15 @@ import json
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from evflow.commands.options import Reading, note_idle, own_first, value, write_json
 from evflow.commands.writing import need_absent, need_folder
+
+if TYPE_CHECKING:
+    from evflow.types import Events
 
 
 @own_first
@@ -24,7 +27,8 @@ class Compare(Reading):
     """
 
     real: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REAL")]
-    """The recorded events, of any known format. The reading options hold for both."""
+    """The recorded events, of any known format. The reading options hold for both; --start and
+    --stop count from its first event."""
     synthetic: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SYNTHETIC")]
     """The events to hold against them, of a sensor of the same size."""
     out: Annotated[Path | None, value("FOLDER", "-o")] = None
@@ -35,6 +39,17 @@ class Compare(Reading):
     """Replace those files where they exist."""
     json: bool = False
     """Print all numbers as JSON."""
+
+    def _streams(self) -> tuple[Events, Events]:
+        """Both streams. A span is REAL's, whose instants are the same in one that shares its
+        clock; of one that does not, as many seconds from its own first event."""
+        real = self.read(self.real, with_frames=False).events
+        if (self.start is None and self.stop is None) or not len(real):
+            return real, self.read(self.synthetic, with_frames=False).events
+        whole = dataclasses.replace(self, start=None, stop=None)
+        same = whole.read(self.synthetic, with_frames=False).events.slice(
+            int(real.t[0]), int(real.t[-1]) + 1)
+        return real, same if len(same) else self.read(self.synthetic, with_frames=False).events
 
     def run(self) -> None:
         from evflow.metrics.streams import compare
@@ -52,8 +67,7 @@ class Compare(Reading):
         if self.out and self.plots:
             plots.require()
         note_idle(self, "streams are compared by their events alone")
-        real, synthetic = (self.read(path, with_frames=False).events
-                           for path in (self.real, self.synthetic))
+        real, synthetic = self._streams()
         numbers = compare(real, synthetic)
         words = describe_streams(numbers)
         facts = {"real": str(self.real), "synthetic": str(self.synthetic),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-LARGEST = 1e12  # of any number: as milliseconds still some 30 years, and whole microseconds
+LARGEST = 1e13  # of any number: as milliseconds since 1970 until 2286, and whole microseconds
 
 ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # of --frames
 CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer")  # of any frames

@@ -109,6 +109,8 @@ def _windows(
         pairs, lengths = (), np.full(len(starts), window_us)
         notes = ("no frames: windows of equal length, without dlogI.",)
     if not len(starts):
+        if not recording.has_frames:
+            notes = (f"the events span {(t[-1] - t[0]) / 1e3:g} ms",)
         raise EvflowDataError(
             "EV017", f"no window of {window_us / 1e3:g} ms can be used "
             f"({'; '.join(notes[:3]) or 'the frames span less than that'}).",

@@ -131,12 +131,13 @@ def agreement(recording: Recording) -> list[Finding]:
     if inverted:
         offset, best = _peak(offsets, -r)
         late = _is_offset(steps, offset, best, -here)
-        also = (" The frame times are off too: --frames-offset-ms "
-                f"{offset / 1e3:.1f}." if late else "")
+        also = (f" The frame times are off too: add {offset / 1e3:.1f} to --frames-offset-ms."
+                if late else "")
         return [Finding(
             "EV021", "error", "events and frame brightness anti-correlate "
             f"({over}{f', {-best:+.2f} at its clearest' if late else ''}): ON and OFF are swapped.",
-            f"Pass --polarity invert (polarity='invert'), or check the exporter.{also}")]
+            "Pass --polarity invert (polarity='invert'), or leave it out where it was passed; or "
+            f"check the exporter.{also}")]
     offset, best = _peak(offsets, r)
     if _is_offset(steps, offset, best, here):
         side = "late" if offset < 0 else "early"
@@ -144,7 +145,8 @@ def agreement(recording: Recording) -> list[Finding]:
         return [Finding(
             "EV024", severity, f"frame times are about {abs(offset) / 1e3:.1f} ms too {side} for "
             f"the events (r {here:+.2f}, {best:+.2f} where they agree best).",
-            f"Pass --frames-offset-ms {offset / 1e3:.1f}, or --frames-offset-ms auto.")]
+            f"Pass --frames-offset-ms {offset / 1e3:.1f}, added to what was passed, or "
+            "--frames-offset-ms auto.")]
     if max(best, abs(flips[flip])) < UNRELATED and steps.enough():
         return [Finding(
             "EV034", "error", f"events and frames have nothing to do with each other ({over}, and "
@@ -161,7 +163,8 @@ def _mirrored(flip: str, here: float, best: float) -> Finding:
     axis = "both axes" if flip == "both" else f"the {flip} axis"
     return Finding(
         "EV029", "error", f"events and frames agree only with the frames mirrored in {axis}"
-        f"{swapped} (r {here:+.2f} -> {abs(best):+.2f}).", f"Pass --flip-frames {flip}{also}.")
+        f"{swapped} (r {here:+.2f} -> {abs(best):+.2f}).",
+        f"Pass --flip-frames {flip}{also}, or leave out what was passed.")
 
 
 def _missing(steps: Steps) -> list[Finding]:

@@ -95,8 +95,9 @@ def with_frames(
         raise EvflowDataError(
             "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but the frames of {path} "
             f"{seen[0]:,}..{seen[-1]:,} us.",
-            f"On another clock? Pass --frames-offset-ms {(int(t[0]) - seen[0]) / 1e3:.3f} if both "
-            "begin together; in another unit, --timestamps-unit.")
+            "On another clock? Pass --frames-offset-ms "
+            f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; in another "
+            "unit, --timestamps-unit.")
     notes = (*recording.notes, f"frames are those of {path}", *map(_reworded, source.notes))
     return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes)
 
