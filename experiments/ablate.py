@@ -35,12 +35,13 @@ from evflow.scenes import TextureBank, make_bank
 from evflow.train import cut_block, init_state, make_run_step, optimiser
 from evflow.weights import load_weights, save_weights
 from experiments.common import (
-    at_least,
+    begin,
     compiled_quickly,
     provenance,
     run_script,
     slug,
     write_result,
+    write_text,
 )
 
 Array = jax.Array
@@ -151,7 +152,7 @@ def score(
 
 def main(options: Options) -> dict[str, Any]:
     """Train and score the variants; returns the figures of each."""
-    at_least(1, steps=options.steps, batches=options.batches)
+    begin(dataclasses.replace(options, out=options.out / options.study), "ablate")
     small = options.preset == "debug"
     base = dataclasses.replace(
         PRESETS["pixels"], seed=options.seed, steps=options.steps or (4 if small else 400))
@@ -173,7 +174,7 @@ def main(options: Options) -> dict[str, Any]:
     text = table(result, base.steps)
     print(text)
     write_result(out / "ablate.json", result, dataclasses.asdict(options))
-    (out / "ablate.md").write_text(text + "\n")
+    write_text(out / "ablate.md", text)
     return result
 
 

@@ -20,14 +20,15 @@ import tyro
 
 from evflow import flow, losses, network
 from evflow.batch import Batch, sample_batch
+from evflow.commands.writing import need_absent
 from evflow.config import TrainConfig, preset
 from evflow.coordinates import unsquash_summary
 from evflow.model import architecture
 from evflow.progress import bar
 from evflow.scenes import make_bank
 from evflow.train import cut_block
-from evflow.weights import load_weights, model_card, save_weights
-from experiments.common import run_script
+from evflow.weights import model_card, save_weights
+from experiments.common import at_least, estimator, run_script
 
 Array = jax.Array
 
@@ -60,10 +61,11 @@ def spread_loss(spread: Any, net: Any, batch: Batch, key: Array, config: TrainCo
 
 
 def main(options: Options) -> float:
-    params = load_weights(options.weights)
-    (name, net), = params.items()
+    at_least(1, steps=options.steps)
+    need_absent(options.out, options.overwrite)
+    name, net = estimator(options.weights)
     config = dataclasses.replace(
-        preset("default"), model=architecture(params), block=(16, 16), windows=1)
+        preset("default"), model=architecture({name: net}), block=(16, 16), windows=1)
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))
     bank = make_bank(k_bank, config.textures)
     tx = optax.adam(optax.cosine_decay_schedule(options.learning_rate, options.steps))

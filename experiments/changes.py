@@ -34,7 +34,7 @@ from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
 from experiments import change_systems as systems
 from experiments.cameras import Protocol, hidden_recording
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.images import mean_ci
 
 Array = jax.Array
@@ -191,6 +191,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "changes")
     plots.require()
     params = load_weights(options.weights)
     result = windows(options, params)
@@ -210,7 +211,7 @@ def main(options: Options) -> dict[str, Any]:
     text = table(result)
     print(text)
     write_result(options.out / "changes.json", result, dataclasses.asdict(options))
-    (options.out / "changes.md").write_text(text + "\n")
+    write_text(options.out / "changes.md", text)
     if shown:
         picture(options.out / "changes.png", list(shown.items()))
     return result

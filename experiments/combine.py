@@ -22,10 +22,10 @@ import jax
 import numpy as np
 import tyro
 
-from evflow import load_weights
+from evflow.commands.writing import need_absent
 from evflow.errors import EvflowDataError
 from evflow.weights import model_card, save_weights
-from experiments.common import run_script
+from experiments.common import estimator, run_script
 
 PIXELS = ("encoder", "flow", "spread")
 AFTER_SUMMARY = ("fusion", "signal")  # fitted to what the summary says
@@ -49,7 +49,8 @@ def main(options: Options) -> None:
     if options.summary is None and not options.pixels:
         raise EvflowDataError("EV020", "neither --summary nor --pixels was given.",
                               "Name the weights whose part is to be taken over.")
-    (name, net), = load_weights(options.weights).items()
+    need_absent(options.out, options.overwrite)
+    name, net = estimator(options.weights)
     card = cards(options.weights)
     if options.pixels:
         given = [{part: taken(w, name)[part] for part in PIXELS} for w in options.pixels]
@@ -67,7 +68,7 @@ def main(options: Options) -> None:
 
 def taken(weights: str, name: str) -> dict[str, Any]:
     """The network in `weights`, of the architecture `name`."""
-    (other, net), = load_weights(weights).items()
+    other, net = estimator(weights)
     if other != name:
         raise EvflowDataError("EV018", f"{weights} holds a network {other!r}, not {name!r}.",
                               "Combine networks of one architecture.")

@@ -4,6 +4,7 @@ script runs and ends."""
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -19,9 +20,12 @@ import tyro
 
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
+from evflow.network import architecture
 from evflow.progress import INTERRUPTED, leave, stoppable, unread
 from evflow.report.provenance import weights_hash
+from evflow.weights import load_weights
 
+HOW = ("out", "workers", "max_seconds")  # options that change nothing in a result
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 
 
@@ -42,6 +46,12 @@ def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> 
         record = {"result": result, "config": config, "weights_sha256": hashes(config),
                   **provenance()}
         temporary.write_text(json.dumps(record, indent=2, default=str) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Save a table, whole or not at all."""
+    with atomic_write(path, overwrite=True) as temporary:
+        temporary.write_text(text + "\n")
 
 
 def hashes(config: dict[str, Any]) -> dict[str, str]:
@@ -68,6 +78,31 @@ def compiled_quickly(wanted: bool) -> Iterator[None]:
         yield
     finally:
         jax.config.update("jax_disable_most_optimizations", False)
+
+
+def begin(options: Any, name: str) -> None:
+    """Before the work of a script that will write NAME.json into options.out: EV020 where a count
+    among its options is less than 1, EV013 where that file is the result of other options."""
+    at_least(1, **{field.name: value for field in dataclasses.fields(options)
+                   if type(value := getattr(options, field.name)) is int and field.name != "seed"})
+    path = options.out / f"{name}.json"
+    if not path.is_file():
+        return
+    before = json.loads(path.read_text())["config"]
+    wanted = json.loads(json.dumps(dataclasses.asdict(options), default=str))
+    differ = [k for k, v in wanted.items() if k not in HOW and before.get(k) != v]
+    if differ:
+        raise EvflowDataError("EV013", f"{path} is a result of other options "
+                              f"({', '.join(differ)}).", "Choose another --out.")
+
+
+def estimator(weights: str | Path) -> tuple[str, dict[str, Any]]:
+    """The name of the architecture in `weights`, and its network; EV018 for weights of anything
+    but an estimator."""
+    params = load_weights(weights)
+    architecture(params)
+    (name, net), = params.items()
+    return name, net
 
 
 def at_least(least: float, **options: float | None) -> None:

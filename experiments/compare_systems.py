@@ -37,7 +37,7 @@ from evflow.camera import Camera
 from evflow.errors import EvflowDataError
 from evflow.report import plots
 from experiments.cameras import Hidden, Protocol
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.evaluate import ENOUGH, protocols
 from experiments.many import Setup, scores
 
@@ -251,7 +251,10 @@ def picture(result: dict[str, Any], path: Path) -> None:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "compare_systems")
     plots.require()
+    if options.data is not None and not options.data.is_dir():
+        raise EvflowDataError("EV016", f"there is no folder {options.data}.", "Check --data.")
     count = options.sequences or {"debug": 3, "full": 30}[options.preset]
     setup, params = Setup(options.weights, options.seed), load_weights(options.weights)
     systems = systems_of(options)
@@ -274,7 +277,7 @@ def main(options: Options) -> dict[str, Any]:
     print(text)
     config = dataclasses.asdict(options) | {"systems": {k: repr(v) for k, v in systems.items()}}
     write_result(options.out / "compare_systems.json", result, config)
-    (options.out / "compare_systems.md").write_text(text + "\n")
+    write_text(options.out / "compare_systems.md", text)
     picture(result, options.out / "compare_systems.png")
     return result
 

@@ -25,7 +25,7 @@ from evflow.camera import PARAMETERS
 from evflow.report import plots
 from evflow.report.plots import TITLES
 from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.many import Setup, scores
 
 LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
@@ -136,6 +136,7 @@ def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "coverage")
     count = options.recordings or {"debug": 12, "full": 1000}[options.preset]
     jobs = [(i, drawn(np.random.default_rng((options.seed, i)), options)) for i in range(count)]
     setup = Setup(options.weights, options.seed, options.photos)
@@ -153,7 +154,7 @@ def main(options: Options) -> dict[str, Any]:
     text = "\n".join(lines)
     print(text)
     write_result(options.out / "coverage.json", result, dataclasses.asdict(options))
-    (options.out / "coverage.md").write_text(text + "\n")
+    write_text(options.out / "coverage.md", text)
     draw(found, options.out / "coverage.png")
     return result
 

@@ -21,7 +21,7 @@ from evflow.camera import CameraPrior
 from evflow.recording import pool_recording
 from evflow.report import plots
 from experiments.cameras import Hidden, Protocol
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.evaluate import ENOUGH
 from experiments.many import Setup, scores
 
@@ -78,6 +78,7 @@ def point(rows: list[dict[str, np.ndarray]], key: str, low: float = ENOUGH,
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "curves")
     count = options.recordings or {"debug": 2, "full": 60}[options.preset]
     settings: dict[str, dict[Any, Protocol]] = {
         "frame interval [ms]": {ms: dataclasses.replace(BASE, frame_ms=ms, intervals=n)
@@ -109,7 +110,7 @@ def main(options: Options) -> dict[str, Any]:
     text = table(result)
     print(text)
     write_result(options.out / "curves.json", result, dataclasses.asdict(options))
-    (options.out / "curves.md").write_text(text + "\n")
+    write_text(options.out / "curves.md", text)
     draw(result, options.out / "curves.png")
     return result
 

@@ -25,7 +25,7 @@ from evflow.camera import CameraPrior
 from evflow.recording import pool_recording
 from evflow.sensors import SensorModel
 from experiments.cameras import Hidden, Protocol
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.many import Setup, scores
 
 NAMES = ("theta_on", "theta_off", "eta_on", "eta_off")
@@ -128,6 +128,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 
 def main(options: Options) -> dict[str, dict[str, Any]]:
+    begin(options, "evaluate")
     sequences = options.sequences or {"debug": 6, "full": 320}[options.preset]
     setup = Setup(options.weights, options.seed)
     results = {}
@@ -138,7 +139,7 @@ def main(options: Options) -> dict[str, dict[str, Any]]:
     text = table(results)
     print(text)
     write_result(options.out / "evaluate.json", results, dataclasses.asdict(options))
-    (options.out / "evaluate.md").write_text(text + "\n")
+    write_text(options.out / "evaluate.md", text)
     return results
 
 

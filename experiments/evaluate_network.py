@@ -44,7 +44,7 @@ from evflow.metrics import (
 )
 from evflow.report import plots
 from experiments import held_out, targets
-from experiments.common import at_least, run_script, write_result
+from experiments.common import at_least, begin, run_script, write_result, write_text
 from experiments.network_scores import picture, report
 from experiments.recorded import (
     Part,
@@ -237,10 +237,10 @@ def _mean(scores: np.ndarray) -> float | None:
 
 def main(options: Options) -> dict[str, Any]:
     """Score every network on everything that it can see; returns what is written."""
+    begin(options, "evaluate_network")
     plots.require()
     check_finite(options)
     at_least(0, warmup_s=options.warmup_s)
-    at_least(1, scenes=options.scenes)
     at_least(LEAST_MS, window_ms=options.window_ms)
     at_least(LEAST_SIDE, side=options.side)
     networks = {name: load_network(name) for name in options.weights}
@@ -269,7 +269,7 @@ def main(options: Options) -> dict[str, Any]:
     conventions = {task: held_out.scored_by(task, lpips is not None) for task in ("video", "flow")}
     write_result(options.out / "evaluate_network.json",
                  result | ({"synthetic": conventions} if synthetic else {}), as_dict(options))
-    (options.out / "evaluate_network.md").write_text(text + "\n")
+    write_text(options.out / "evaluate_network.md", text)
     if shown:
         picture(shown, options.out / "evaluate_network.png")
     print(text)

@@ -21,8 +21,9 @@ import numpy as np
 import optax
 import tyro
 
-from evflow import Recording, finish, io, load_weights
+from evflow import Recording, finish, io
 from evflow.camera import Summary
+from evflow.commands.writing import need_absent
 from evflow.coordinates import squash, unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
@@ -32,7 +33,7 @@ from evflow.refine.fit import FusionNet
 from evflow.report.provenance import weights_hash
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import run_script
+from experiments.common import at_least, estimator, run_script
 from experiments.many import Setup, scores
 
 Array = jax.Array
@@ -92,15 +93,7 @@ def collect(options: Options) -> Rows:
     found: list[dict[str, np.ndarray]] = []
     begin, origin = 0, f"{options.seed} {weights_hash(options.weights)}"
     if options.rows and options.rows.exists():
-        with np.load(options.rows) as saved:
-            if str(saved.get("origin")) != origin:
-                raise EvflowDataError(
-                    "EV013", f"{options.rows} holds rows of other weights or of another seed.",
-                    "Choose another --rows.")
-            begin = int(saved["next"])
-            names = [n for n in saved.files if n not in ("next", "origin")]
-            found = [dict(zip(names, r, strict=True))
-                     for r in zip(*(saved[n] for n in names), strict=True)]
+        begin, found = saved_rows(options.rows, origin, options.recordings)
     setup = Setup(str(options.weights), options.seed, photos=True)
     jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i))))
             for i in range(begin, options.recordings)]
@@ -111,6 +104,25 @@ def collect(options: Options) -> Rows:
             with atomic_write(options.rows, overwrite=True) as t, open(t, "wb") as f:
                 np.savez(f, allow_pickle=False, next=i, origin=origin, **stack(found))
     return stack(found)
+
+
+def saved_rows(path: Path, origin: str, most: int) -> tuple[int, list[dict[str, np.ndarray]]]:
+    """How many recordings are done, and their rows. Raises EV009 where the file holds none, EV013
+    where they are of other weights or another seed, or of more recordings than `most`."""
+    try:
+        with np.load(path) as saved:
+            kept = dict(saved)
+        begin, seen = int(kept.pop("next")), str(kept.pop("origin"))
+    except (ValueError, KeyError, OSError) as e:
+        raise EvflowDataError("EV009", f"{path} holds no rows of this script ({e}).",
+                              "Choose another --rows.") from e
+    if seen != origin:
+        raise EvflowDataError("EV013", f"{path} holds rows of other weights or of another seed.",
+                              "Choose another --rows.")
+    if begin > most:
+        raise EvflowDataError("EV013", f"{path} holds rows of {begin} recordings, not {most}.",
+                              f"Pass --recordings {begin}, or choose another --rows.")
+    return begin, [dict(zip(kept, r, strict=True)) for r in zip(*kept.values(), strict=True)]
 
 
 def stack(rows: list[dict[str, np.ndarray]]) -> Rows:
@@ -187,8 +199,9 @@ def figures_of(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
 
 
 def main(options: Options) -> dict[str, Any]:
-    params = load_weights(options.weights)
-    (name, net), = params.items()
+    at_least(1, recordings=options.recordings, workers=options.workers)
+    need_absent(options.out, options.overwrite)
+    name, net = estimator(options.weights)
     rows = collect(options)
     y, std = cross_validated(rows, options)
     widen = np.quantile(np.abs(y - rows["true"]) / std, COVERED, axis=0)

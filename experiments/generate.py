@@ -37,7 +37,7 @@ from evflow.scenes.config import SceneConfig
 from evflow.sensors import SensorModel
 from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 
 Array = jax.Array
 Row = dict[str, np.ndarray]
@@ -191,6 +191,7 @@ def compared(
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "generate")
     params = load_weights(options.weights)
     scenes = options.scenes or {"debug": 4, "full": 100}[options.preset]
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))
@@ -208,7 +209,7 @@ def main(options: Options) -> dict[str, Any]:
     text = table(result)
     print(text)
     write_result(options.out / "generate.json", result, dataclasses.asdict(options))
-    (options.out / "generate.md").write_text(text + "\n")
+    write_text(options.out / "generate.md", text)
     return result
 
 

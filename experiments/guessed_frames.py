@@ -24,7 +24,7 @@ from evflow.recording import estimate_camera
 from evflow.scenes import make_bank
 from evflow.scenes.config import SceneConfig
 from experiments.cameras import Protocol, hidden_recording
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 
 THETAS = ("theta_on", "theta_off")
 PROTOCOL = Protocol(
@@ -48,6 +48,7 @@ class Options:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "guessed_frames")
     trained = load_network(options.weights)
     k_bank, k_data = jax.random.split(jax.random.key(1000 + options.seed))
     bank = make_bank(k_bank, 32, photos=False)
@@ -63,7 +64,7 @@ def main(options: Options) -> dict[str, Any]:
     result = {"cameras": rows, **figures([r for r in rows if r["camera"].startswith("hidden")])}
     write_result(options.out / "guessed_frames.json", result, dataclasses.asdict(options))
     text = table(result)
-    (options.out / "guessed_frames.md").write_text(text + "\n")
+    write_text(options.out / "guessed_frames.md", text)
     print(text)
     return result
 

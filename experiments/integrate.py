@@ -35,7 +35,7 @@ from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
 from experiments.cameras import Protocol, hidden_recording
 from experiments.change_systems import cut
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.images import SCORES, mean_ci, score
 
 HORIZONS = {"1 frame": 1, "5 frames": 5, "10 frames": 10, "1e5 events": 100_000,
@@ -45,9 +45,11 @@ SIZES = {"DAVIS240": (180, 240), "DAVIS346": (260, 346), "VGA": (480, 640)}
 SCENE = SceneConfig(speed_px_s=(60.0, 300.0), static_fraction=0.0, contrast=(0.6, 1.0))
 PAPER = {  # Table X: RMSE, PSNR, SSIM
     "DAVIS240": {"ecc": (37.56, 16.82, .41), "s2r": (32.37, 18.10, .45),
-                 "jaer": (35.10, 17.39, .42), "ours, maps": (32.24, 18.17, .42)},
+                 "jaer": (35.10, 17.39, .42), "lgan": (32.30, 18.15, .42),
+                 "ours, maps": (32.24, 18.17, .42)},
     "DAVIS346": {"ecc": (54.81, 13.75, .33), "s2r": (50.55, 14.45, .35),
-                 "jaer": (57.72, 13.42, .34), "ours, maps": (39.76, 16.37, .37)}}
+                 "jaer": (57.72, 13.42, .34), "lgan": (45.73, 15.29, .36),
+                 "ours, maps": (39.76, 16.37, .37)}}
 # In the picture, beside the systems that were asked for
 SHOWN = ("no events", "default .2", "ecc", "ecc median", "ours, maps")
 
@@ -230,6 +232,7 @@ def scored(case: Case, by: dict[str, Thresholds], most: int) -> dict[str, dict[s
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "integrate")
     plots.require()
     params = load_weights(options.weights)
     systems = options.systems or (QUICK if options.preset == "debug" else EACH)
@@ -264,7 +267,7 @@ def main(options: Options) -> dict[str, Any]:
     text = table(result)
     print(text)
     write_result(options.out / "integrate.json", result, dataclasses.asdict(options))
-    (options.out / "integrate.md").write_text(text + "\n")
+    write_text(options.out / "integrate.md", text)
     picture(options.out / "integrate.png", list(shown.values()))
     return result
 

@@ -33,7 +33,7 @@ from evflow.refine.pixels import evidence_of
 from evflow.refine.sightings import sight
 from evflow.refine.signal import told_apart
 from experiments.cameras import Hidden, Protocol
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.evaluate import ENOUGH, protocols
 from experiments.many import Setup, scores
 
@@ -147,6 +147,7 @@ def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "limits")
     sequences = options.sequences or {"debug": 4, "full": 100}[options.preset]
     setup = Setup(options.weights, options.seed)
     result: dict[str, Any] = {}
@@ -160,7 +161,7 @@ def main(options: Options) -> dict[str, Any]:
     text = "\n".join(lines)
     print(text)
     write_result(options.out / "limits.json", result, dataclasses.asdict(options))
-    (options.out / "limits.md").write_text(text + "\n")
+    write_text(options.out / "limits.md", text)
     return result
 
 

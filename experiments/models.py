@@ -27,7 +27,7 @@ from evflow.report import pages, plots
 from evflow.scenes.photos import load_photos
 from evflow.sensors import SENSORS, KnownSensor
 from evflow.types import Events
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.sources import density, gaps
 
 FPS, SHOWN_US, RATE_US = 1000, 8_000, 5_000
@@ -121,6 +121,7 @@ def table(result: dict[str, Any], seconds: float) -> str:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "models")
     plots.require()
     frames, key = video(options), jax.random.key(options.seed)
     seconds = options.milliseconds / 1000
@@ -137,7 +138,7 @@ def main(options: Options) -> dict[str, Any]:
     shown = (middle - SHOWN_US // 2, middle + SHOWN_US // 2)
     pages.sensor_models(options.out / "models.png", frames[len(frames) // 2], seen, result, shown)
     write_result(options.out / "models.json", result, dataclasses.asdict(options))
-    (options.out / "models.md").write_text(text + "\n")
+    write_text(options.out / "models.md", text)
     return result
 
 

@@ -29,7 +29,7 @@ from evflow.intensity import noise_factor, normalised_intensity
 from evflow.progress import bar
 from evflow.report import plots
 from evflow.sensors import SENSORS, SensorModel
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.images import mean_ci
 from experiments.measured_noise import SIDES, Rates, measured, measured_page, ours
 from experiments.noise import LUX, MIDDLE, SCP
@@ -273,6 +273,7 @@ def plain(value: Any) -> Any:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "noise_rates")
     plots.require()
     params = load_weights(options.weights)
     result: dict[str, Any] = {"simulated": {sensor: {
@@ -286,7 +287,7 @@ def main(options: Options) -> dict[str, Any]:
         measured_page(options.out / "measured.png", result["measured"])
     config = dataclasses.asdict(options) | {"repeats": options.repeats}
     write_result(options.out / "noise_rates.json", plain(result), config)
-    (options.out / "noise_rates.md").write_text(text + "\n")
+    write_text(options.out / "noise_rates.md", text)
     return result
 
 

@@ -22,7 +22,7 @@ from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.recording import pool_recording
 from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import run_script, write_result
+from experiments.common import begin, run_script, write_result, write_text
 from experiments.many import Setup, scores
 
 CASES: dict[str, dict[str, Any]] = {
@@ -110,6 +110,7 @@ def table(results: dict[str, dict[str, float]]) -> str:
 
 
 def main(options: Options) -> dict[str, dict[str, float]]:
+    begin(options, "one_polarity")
     count = options.recordings or {"debug": 3, "full": 100}[options.preset]
     setup = Setup(options.weights, options.seed)
     results = {}
@@ -121,7 +122,7 @@ def main(options: Options) -> dict[str, dict[str, float]]:
     text = table(results)
     print(text)
     write_result(options.out / "one_polarity.json", results, dataclasses.asdict(options))
-    (options.out / "one_polarity.md").write_text(text + "\n")
+    write_text(options.out / "one_polarity.md", text)
     return results
 
 

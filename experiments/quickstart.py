@@ -27,7 +27,7 @@ from evflow.scenes import SceneConfig, make_bank, render, sample_scene
 from evflow.sensors import SensorModel
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import unzip, upsample
-from experiments.common import run_script, write_result
+from experiments.common import at_least, run_script, write_result
 
 FPS, FRAME_EVERY = 1000, 25  # rendered frames per second; one in 25 is given to the estimator
 
@@ -98,6 +98,8 @@ def truth_table(truth: Summary, found: CameraEstimate) -> str:
 
 
 def main(options: Options) -> dict[str, Any]:
+    at_least(16, width=options.width, height=options.height)
+    at_least(2 * FRAME_EVERY, milliseconds=options.milliseconds)
     plots.require()
     truth = nominal = None
     if options.recording is None:

@@ -43,7 +43,7 @@ from evflow.errors import EvflowDataError
 from evflow.report import plots
 from evflow.weights import weights_path
 from experiments import gains, held_out
-from experiments.common import at_least, provenance, run_script, write_result
+from experiments.common import at_least, provenance, run_script, write_result, write_text
 from experiments.conditions import E2V, RAW, Condition, Files, digest
 from experiments.targets import CAMERAS, SCENES
 from experiments.trainings import SIMULATED, Setting, Trainings
@@ -201,10 +201,10 @@ def main(options: Options) -> dict[str, Any]:
     began, setting = time.monotonic(), chosen(options)
     shared = {"task": options.task, "weights": options.weights,
               "estimator": digest(weights_path(options.weights))}
-    same_setting(options.out, shared, setting)
     runs = Trainings(setting, options.out, options.weights)
     conditions = runs.conditions(
         Files(*map(files, (options.estimators, options.eventgan, options.cameras))))
+    same_setting(options.out, shared, setting)
     nothing_lost(options.out, conditions, setting.seeds)
     left = setting.seeds * len(conditions)
     for seed in range(setting.seeds):
@@ -223,7 +223,7 @@ def main(options: Options) -> dict[str, Any]:
                  {"targets": result, "without_network": untrained, "missing": left,
                   "scored_by": how},
                  as_dict(options) | {"setting": as_dict(setting)})
-    (options.out / "see_better.md").write_text(text + "\n")
+    write_text(options.out / "see_better.md", text)
     gains.picture(result, options.out / "see_better.png")
     if options.task == "video":
         gains.examples(runs.examples(conditions, runs.targets[0]),

@@ -22,8 +22,8 @@ import numpy as np
 import optax
 import tyro
 
-from evflow import load_weights
 from evflow.camera import Summary
+from evflow.commands.writing import need_absent
 from evflow.coordinates import squash_summary, summary_std, unsquash_summary
 from evflow.refine import Chunk, fused, refine_summary
 from evflow.refine.path import STEPS
@@ -31,7 +31,7 @@ from evflow.refine.points import Points, chunk_points
 from evflow.refine.signal import joined, log_intensity, rate_at
 from evflow.weights import model_card, save_weights
 from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import run_script
+from experiments.common import at_least, estimator, run_script
 from experiments.fuse import COVERED, before_refinement
 from experiments.many import Setup, scores
 
@@ -140,7 +140,9 @@ def judged(rows: list[Row], net: dict[str, Any]) -> tuple[float, dict[str, float
 
 
 def main(options: Options) -> dict[str, float]:
-    (name, net), = load_weights(options.weights).items()
+    at_least(1, recordings=options.recordings, workers=options.workers)
+    need_absent(options.out, options.overwrite)
+    name, net = estimator(options.weights)
     setup = Setup(str(options.weights), options.seed, photos=True)
     jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i))))
             for i in range(options.recordings)]

@@ -150,13 +150,19 @@ def goes_on(checkpoints: Checkpoints, config: Any, out: Path, resume: Resume) ->
 
 
 def started_from(state: TrainState, weights: str) -> TrainState:
-    """The fresh state with every part of the network whose shapes agree taken from `weights`."""
+    """The fresh state with every part of the network whose shapes agree taken from `weights`;
+    EV018 where none is."""
     (name, fresh), = state.params.items()
     known = load_weights(weights).get(name, {})
-    taken = {k: known[k] if k in known and shapes(known[k]) == shapes(v) else v
-             for k, v in fresh.items()}
-    return dataclasses.replace(
-        state, params={name: taken}, average=jax.tree.map(jnp.copy, {name: taken}))
+    taken = {k: known[k] for k, v in fresh.items() if k in known and shapes(known[k]) == shapes(v)}
+    if not taken:
+        raise EvflowDataError(
+            "EV018", f"{weights} has no part of the network {name!r} of this run, in its sizes.",
+            "Start from weights of the same network, or leave --start out.")
+    if distributed.is_main():
+        print(f"from {weights}: {', '.join(taken)}")
+    begun = {name: fresh | taken}
+    return dataclasses.replace(state, params=begun, average=jax.tree.map(jnp.copy, begun))
 
 
 def shapes(tree: Any) -> Any:

@@ -31,7 +31,7 @@ from evflow.report import plots
 from evflow.scenes import make_bank
 from evflow.weights import save_weights
 from experiments import generate as inverse
-from experiments.common import at_least, provenance, run_script, write_result
+from experiments.common import at_least, provenance, run_script, write_result, write_text
 from experiments.loop import train
 
 Array = jax.Array
@@ -79,7 +79,7 @@ def main(options: Options) -> dict[str, Any]:
     picture(list(itertools.islice(held_out(params, config), SHOWN)), options.out / "eventgan.png")
     text = table(result)
     print(text)
-    (options.out / "eventgan.md").write_text(text + "\n")
+    write_text(options.out / "eventgan.md", text)
     return result
 
 
