@@ -159,7 +159,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         models, changes = len(self.sensors), self.model.changes
-        group = max(1, min(self.cameras, models))
+        group, patch = max(1, min(self.cameras, models)), max(self.loss.patches, default=1)
         for name, value, good, rule in (
             ("parts", self.parts, bool(self.parts) and set(self.parts) <= set(PARTS),
              f"some of {PARTS}"),
@@ -168,9 +168,8 @@ class TrainConfig:
              "as many as the cameras, or a multiple"),
             ("cameras", self.cameras, self.cameras > 0 and self.cameras % group == 0,
              "as many as the sensors of a step, or a multiple"),
-            ("block", self.block, max(self.loss.patches) <= min(self.block)
-             and max(self.block) <= self.crop,
-             f"at least {max(self.loss.patches)}, the largest patch, to {self.crop}, the crop"),
+            ("block", self.block, patch <= min(self.block) and max(self.block) <= self.crop,
+             f"at least {patch}, the largest patch, to {self.crop}, the crop"),
             ("steps_per_window", self.steps_per_window, self.steps_per_window % changes == 0,
              f"a multiple of the model's {changes} changes"),
         ):
