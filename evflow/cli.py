@@ -26,7 +26,7 @@ from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
-from evflow.progress import INTERRUPTED, leave, stoppable, unread
+from evflow.progress import INTERRUPTED, leave, print_anything, stoppable, unread
 
 EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
 
@@ -78,6 +78,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def run() -> NoReturn:
     """The process `evflow`: `main`, and its exit code."""
+    print_anything()
     code = main()
     if code == INTERRUPTED:
         leave(code)

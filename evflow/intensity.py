@@ -84,7 +84,8 @@ def check_log(name: str, values: Any) -> None:
         return
     values = np.asarray(values)
     with np.errstate(over="ignore", invalid="ignore"):
-        mean = values.sum() / max(values.size, 1)
+        wide = np.float64 if values.dtype.itemsize < 4 else None  # half precision overflows
+        mean = values.sum(dtype=wide) / max(values.size, 1)
         if not (np.isfinite(mean) or np.isfinite(values).all()):
             raise EvflowDataError("EV007", f"{name} holds NaN or infinite values.",
                                   "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")

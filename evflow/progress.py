@@ -4,6 +4,7 @@ to stop; and where nobody reads on."""
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -16,6 +17,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 INTERRUPTED = 130  # the shell's exit code of Ctrl-C
+
+
+def print_anything() -> None:
+    """Let standard output take what its encoding has no letter for, such as the bytes of a file's
+    name, as \\x..: words must not end the work that they tell of."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextlib.contextmanager

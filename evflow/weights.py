@@ -73,7 +73,11 @@ def _check_tensors(path: Path, file: Any) -> None:
 def save_weights(
     path: str | os.PathLike, params: Params, card: dict[str, Any], *, overwrite: bool = False
 ) -> Path:
-    """Write params and a model card (any JSON-ready dict) as one .safetensors file."""
+    """Write params and a model card (any JSON-ready dict) as one .safetensors file; EV020 where it
+    has another name, by which it could not be read again."""
+    if Path(path).suffix != ".safetensors":
+        raise EvflowDataError("EV020", f"{path} does not end in .safetensors.",
+                              f"Name it {Path(path).with_suffix('.safetensors')}.")
     leaves = jax.tree_util.tree_leaves_with_path(params)
     tensors = {"/".join(str(k.key) for k in keys): np.asarray(leaf, np.float32)
                for keys, leaf in leaves}
@@ -88,9 +92,13 @@ def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
     path = weights_path(name_or_path)
     try:
         with safe_open(path, framework="numpy") as file:
-            return json.loads((file.metadata() or {}).get("card", "{}"))
+            card = json.loads((file.metadata() or {}).get("card", "{}"))
     except (SafetensorError, ValueError, RecursionError) as e:
         raise EvflowDataError("EV009", f"{path} has no readable model card ({e}).") from e
+    if not isinstance(card, dict):
+        raise EvflowDataError("EV009", f"the model card of {path} is no object but a "
+                              f"{type(card).__name__}.")
+    return card
 
 
 def trained_steps(card: dict[str, Any]) -> dict[str, int]:

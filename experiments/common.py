@@ -21,7 +21,7 @@ import tyro
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
 from evflow.network import architecture
-from evflow.progress import INTERRUPTED, leave, stoppable, unread
+from evflow.progress import INTERRUPTED, leave, print_anything, stoppable, unread
 from evflow.report.provenance import weights_hash
 from evflow.weights import load_weights
 
@@ -122,6 +122,7 @@ def end_with(work: Callable[[], object]) -> NoReturn:
     """Do the work and end the process: by the number that it returns, or 0; by one line and 1 on
     an error about the data; on Ctrl-C or SIGTERM by one line, that of the exception if it says
     anything, and 130."""
+    print_anything()
     try:
         with stoppable():
             code = work()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -120,6 +121,12 @@ def test_help_loads_no_jax() -> None:
             "try: main(['--help'])\nexcept SystemExit: pass\n"
             "assert 'jax' not in sys.modules and 'cv2' not in sys.modules")
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_words_that_the_terminal_has_no_letters_for() -> None:
+    ascii_only = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
+    subprocess.run([sys.executable, "-m", "evflow", "estimate", "--help"], check=True,
+                   capture_output=True, env=ascii_only)
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

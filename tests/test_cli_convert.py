@@ -276,7 +276,9 @@ def test_export_has_maps_scripts_and_words(
     for script in out.glob("*.py"):
         compile(script.read_text(), str(script), "exec")
     assert run(capsys, "export", camera, "--to", to, "-o", out)[0] == 1
-    assert run(capsys, "export", camera, "--to", to, "-o", out, "--overwrite")[0] == 0
+    for other in ("iebcs", to):  # what another simulator was given goes
+        assert run(capsys, "export", camera, "--to", other, "-o", out, "--overwrite")[0] == 0
+    assert (out / "noise_pos.npy").exists() == (to == "iebcs")
 
 
 def test_the_spread_is_that_of_the_camera_not_of_its_estimates() -> None:
@@ -348,14 +350,18 @@ def test_noise_that_is_added_has_the_measured_rates() -> None:
     maps = {"eta_on": np.full((20, 30), 2.0), "eta_off": np.zeros((20, 30))}
     maps["eta_on"][:10] = 0.5
     x, y, t, p = home["add_noise"](
-        np.array([3, 4]), np.array([5, 6]), np.array([T0, T0 + 10_000_000]), np.array([0, 0]), maps)
+        np.array([3, 4]), np.array([5, 6]), np.array([T0 + 10, T0 + 1000]), np.array([0, 0]), maps,
+        T0, T0 + 10_000_000)
     assert (np.diff(t) >= 0).all()
+    assert T0 <= t[0] < t[-1] < T0 + 10_000_000
     assert (p == 0).sum() == 2
     assert (x[p == 0].tolist(), y[p == 0].tolist()) == ([3, 4], [5, 6])
     for rows, rate in (((y < 10) & (p == 1), 0.5), ((y >= 10) & (p == 1), 2.0)):
         expected = rate * 10 * 300
         assert abs(rows.sum() - expected) < 5 * expected**0.5
     assert x.max() < 30
+    nothing = [np.zeros(0, np.int64)] * 4  # a scene at rest sends noise alone
+    assert len(home["add_noise"](*nothing, maps, 0, 10_000_000)[2]) == pytest.approx(7500, rel=0.1)
 
 
 def test_iebcs_spectra_have_the_measured_rates() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from evflow import metrics
 from evflow.errors import EvflowDataError
-from evflow.metrics.flow import FwlConvention, splat
+from evflow.metrics.flow import FwlConvention, aee, rsat, splat
 from evflow.types import Events
 
 SIZE = (32, 24)  # width, height
@@ -267,6 +267,24 @@ def test_flow_that_is_not_finite_is_no_good_flow() -> None:
                     (4, 4))
     with pytest.raises(EvflowDataError, match="EV007"):
         metrics.score_flow(events, np.array([0, 10]), np.full((1, 2, 4, 4), np.nan))
+
+
+def test_half_precision_is_scored_in_single() -> None:
+    rng = np.random.default_rng(0)
+    flow, truth = rng.normal(size=(2, 2, 260, 346)).astype(np.float16)
+    single = [a.astype(np.float32) for a in (flow, truth)]
+    np.testing.assert_array_equal(aee(flow, truth), aee(*single))
+    x, y, t = (rng.integers(0, n, 500).astype(np.float16) for n in (346, 260, 500))
+    ones = np.ones(500, np.float16)
+    columns = [a.astype(np.float32) for a in (x, y, t, ones, ones)]
+    for score in (fwl, rsat):
+        assert float(score(x, y, t, ones, ones, flow)) == float(score(*columns, single[0]))
+
+
+def test_an_even_image_has_no_fwl() -> None:
+    y, x = (a.ravel() for a in np.mgrid[:16, :16])
+    events = (x, y, np.arange(256), np.ones(256), np.ones(256))
+    assert np.isnan(fwl(*events, np.full((2, 16, 16), 0.01)))
 
 
 def test_unknown_truth_is_not_scored() -> None:

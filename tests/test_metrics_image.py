@@ -8,6 +8,7 @@ import json
 import math
 import pickle
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jax
@@ -151,6 +152,17 @@ def test_what_cannot_be_scored_is_refused(call, code: str) -> None:
         call(*pair())
 
 
+@pytest.mark.parametrize("dtype", [np.float16, jnp.bfloat16])
+def test_half_precision_is_scored_in_single(dtype: Any) -> None:
+    """No image's pixels can be counted in it, and squares of small errors are 0."""
+    images, references = (jnp.asarray(a, dtype) for a in pair((260, 346)))
+    single = [a.astype(jnp.float32) for a in (images, references)]
+    for score in (metrics.mse, metrics.psnr, functools.partial(metrics.ssim, preset="global"),
+                  metrics.ssim):
+        assert float(score(images, references)) == float(score(*single))
+        assert float(score(*map(np.asarray, (images, references)))) == float(score(*single))
+
+
 def test_lists_are_images_and_one_reference_serves_several() -> None:
     image, reference = pair((3, 40, 53))
     for measure in (metrics.mse, metrics.ssim, metrics.mae_intensity_change):
@@ -286,8 +298,10 @@ def test_images_too_small_for_lpips_have_their_other_scores() -> None:
     (pickle.dumps({"AlexNet_0": np.zeros(3, np.float32)}, 2), "EV009|EV018"),
     (pickle.dumps(np.save), "EV009"), (b"", "EV009"),
     (pickle.dumps({"AlexNet_0": 3}), "EV009"), (b"}.", "EV018"),
-    (pickle.dumps({"AlexNet_0": None, **{f"NetLinLayer_{i}": None for i in range(5)}}), "EV018"),
-], ids=["other", "code", "empty", "number", "nothing", "hollow"])
+    (pickle.dumps({"AlexNet_0": None, **{f"NetLinLayer_{i}": None for i in range(5)}}), "EV009"),
+    (b"\x80\x02(Nq\x00" + 40 * b"h\x00h\x00\x86q\x00" + b"t.", "EV009"),
+    (b"\x80\x02" + 1000 * b"]" + 999 * b"a" + b".", "EV009"),
+], ids=["other", "code", "empty", "number", "nothing", "hollow", "doubled", "nested"])
 def test_files_that_are_no_lpips_weights_are_refused(content: bytes, code, tmp_path: Path) -> None:
     (tmp_path / "alexnet.ckpt").write_bytes(content)
     with pytest.raises(EvflowDataError, match=code):

@@ -13,6 +13,7 @@ import evflow
 from evflow import Events, EvflowDataError, Recording, read_recording, write_events
 from evflow.cli import main
 from evflow.metrics.streams import distances
+from evflow.report.page import write_page
 from evflow.report.verdict import describe_streams, judge_streams, worst
 
 SIZE = (32, 24)
@@ -222,6 +223,17 @@ def test_compare_refuses_other_sizes(
     assert main(["compare", str(streams[0]), str(wide), "-o", str(tmp_path / "no")]) == 1
     assert "EV015" in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
+
+
+def test_a_span_of_numpys_numbers_is_ready_for_json() -> None:
+    span = np.array([1000, 500_000])
+    numbers = evflow.compare(noise(0), noise(1), span_us=(span[0], span[1]))
+    assert json.loads(json.dumps(numbers))["span_us"] == [1000, 500_000]
+
+
+def test_names_that_are_not_utf8_are_written(tmp_path: Path) -> None:
+    write_page(tmp_path / "page.html", "fl\udcff.h5", "of fl\udcff.h5", [], {"file": "fl\udcff.h5"})
+    assert "fl\\udcff.h5" in (tmp_path / "page.html").read_text("utf-8")
 
 
 def test_swapped_polarity_is_told() -> None:

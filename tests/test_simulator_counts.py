@@ -44,6 +44,9 @@ def test_whole_numbers_are_taken_as_what_they_are() -> None:
                   for f in (frames, frames.astype(np.float32)))
     np.testing.assert_array_equal(ours, same)
     assert float(ours.min()) > 5
+    wide = np.broadcast_to(np.full((10, 1, 1), 4.0, np.float16), (10, 64, 64))
+    camera = Camera.constant((64, 64), 0.2, 0.3)
+    assert simulate_counts(KEY, wide, camera, frame_dt_s=0.01).dtype == jnp.float32
 
 
 @pytest.mark.parametrize("width", [0.01, 0.3, 1.0])

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from networks import small_params
+from safetensors.numpy import save
 
 from evflow.errors import EvflowDataError
 from evflow.weights import load_weights, model_card, save_weights, trained_steps, weights_path
@@ -35,6 +36,16 @@ def test_refusals(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(EvflowDataError, match="EV009"):
         load_weights(path)
+
+
+def test_names_and_cards_by_which_weights_can_be_read_again(tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*\.safetensors"):
+        save_weights(tmp_path / "weights", {"a": np.zeros(3)}, {})
+    path = tmp_path / "a.safetensors"
+    for card in ("[1]", "3", "null"):
+        path.write_bytes(save({"a": np.zeros(3, np.float32)}, metadata={"card": card}))
+        with pytest.raises(EvflowDataError, match=r"EV009.*no object"):
+            model_card(path)
 
 
 def test_shipped_weights_are_small_finite_and_explained() -> None:

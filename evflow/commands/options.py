@@ -160,11 +160,11 @@ def refuse(options: Any, names: Iterable[str], why: str) -> None:
 
 def check_finite(options: Any) -> None:
     """EV020 where a number among the options is NaN, infinite, larger than whole microseconds
-    can be told or, of a seed, beyond 64 bits."""
+    can be told or, of a seed, beyond the 32 bits that a key is made of."""
     for field in dataclasses.fields(options):
         number = getattr(options, field.name)
-        if field.name == "seed" and not -2**63 <= number < 2**63:
-            raise EvflowDataError("EV020", f"--seed {number}.", "Give one of at most 64 bits.")
+        if field.name == "seed" and not -2**31 <= number < 2**32:
+            raise EvflowDataError("EV020", f"--seed {number}.", "Give one of at most 32 bits.")
         if isinstance(number, float) and not abs(number) <= LARGEST:
             raise EvflowDataError("EV020", f"{flag(field.name)} {number}.",
                                   f"Give a number of at most {LARGEST:g}.")

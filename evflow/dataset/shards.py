@@ -43,11 +43,13 @@ def build(
     goes on after any interruption. No two processes may make one shard at a time.
 
     Raises EV009 (a damaged file or manifest), EV013 (another set is there), EV019 (the disk is
-    full, the folder cannot be written, a worker died), EV020 (shard or workers out of range).
+    full, the folder cannot be written, a worker died), EV020 (shard, workers, seed out of range).
     """
     if not 0 <= shard[0] < shard[1] or workers < 1:
         raise EvflowDataError("EV020", f"shard={shard[0]}/{shard[1]}, workers={workers}.",
                               "Shards are 0/N to N-1/N; workers are 1 or more.")
+    if not -2**31 <= seed < 2**32:
+        raise EvflowDataError("EV020", f"seed={seed}.", "A key is made of 32 bits.")
     folder, which = Path(folder), manifest.identity(config.as_dict(), seed, format)
     found, part = _begin(folder, shard, which, made_by or {}, only_missing)
     wanted = _wanted(found, config.names[shard[0]::shard[1]], format, only_missing, progress)

@@ -37,7 +37,7 @@ class E2VID(Network):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self, "encoders", self.encoders >= 1, ">= 1")
+        require(self, "encoders", 1 <= self.encoders <= 8, "1 to 8")
         require(self, "blocks", self.blocks >= 0, ">= 0")
         for name, choices in (("decoder", ("transposed", "upsample")), ("norm", ("batch", "none")),
                               ("skip", ("concat", "sum")), ("output", ("linear", "sigmoid"))):

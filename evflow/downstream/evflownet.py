@@ -39,7 +39,7 @@ class EVFlowNet(Network):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self, "encoders", self.encoders >= 2, ">= 2")
+        require(self, "encoders", 2 <= self.encoders <= 8, "2 to 8")
         require(self, "scales", self.scales in (1, self.encoders), f"1 or {self.encoders}")
 
     @property

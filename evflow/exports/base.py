@@ -25,13 +25,13 @@ NOISE = '''"""Adds the measured noise to simulated events: Poisson, per pixel an
 import numpy as np
 
 
-def add_noise(x, y, t_us, p, maps, seed=0):
+def add_noise(x, y, t_us, p, maps, start, stop, seed=0):
     """Columns (N,) of a simulation without noise -> columns sorted by time; p is 0 or 1.
 
-    maps: eta_on, eta_off (H, W) in Hz. The pixel's memory is not reset by a noise event.
+    maps: eta_on, eta_off (H, W) in Hz. start, stop: of the video, in us: noise does not wait for
+    the first event. The pixel's memory is not reset by a noise event.
     """
     rng, columns = np.random.default_rng(seed), [[x], [y], [t_us], [p]]
-    start, stop = int(np.min(t_us)), int(np.max(t_us)) + 1
     for polarity, name in ((1, "eta_on"), (0, "eta_off")):
         count = rng.poisson(maps[name] * (stop - start) * 1e-6)
         rows, cols = np.nonzero(count)
@@ -113,7 +113,8 @@ def write_export(
     folder: str | os.PathLike, export: Export, maps: Maps, *, overwrite: bool = False
 ) -> Path:
     """maps.npz, README.txt, the scripts and arrays in a new folder; EV013, EV019."""
-    names = {"maps.npz", "README.txt", *export.scripts, *export.arrays}
+    kinds = [make(maps, Settings.of(maps)) for make in targets().values()]
+    names = {"maps.npz", "README.txt"}.union(*(k.scripts.keys() | k.arrays.keys() for k in kinds))
     with atomic_folder(folder, names=names, overwrite=overwrite) as new:
         with open(new / "maps.npz", "wb") as f:
             np.savez_compressed(f, allow_pickle=False, **maps)

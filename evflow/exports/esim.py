@@ -18,9 +18,10 @@ from add_noise import add_noise
 
 maps = np.load(Path(__file__).with_name("maps.npz"))
 simulator = esim_py.EventSimulator({theta_on:.5f}, {theta_off:.5f}, 0.0, 1e-3, True)
-x, y, t, p = simulator.generateFromFolder(sys.argv[1], sys.argv[2]).T
+x, y, t, p = simulator.generateFromFolder(sys.argv[1], sys.argv[2]).reshape(-1, 4).T
+start, *_, stop = np.rint(np.loadtxt(sys.argv[2], ndmin=1) * 1e6).astype(np.int64)
 x, y, t, p = add_noise(x.astype(int), y.astype(int), np.rint(t * 1e6).astype(np.int64),
-                       (p > 0).astype(int), maps)
+                       (p > 0).astype(int), maps, start, stop)
 np.savez(sys.argv[3], t=t, x=x.astype(np.uint16), y=y.astype(np.uint16), p=p > 0,
          size=np.array([{width}, {height}]))
 '''

@@ -2,6 +2,9 @@
 
 A spectrum file is (H, W, 72): per pixel the cumulative share of intervals up to each of the
 instantaneous frequencies 1..9 x 10^k Hz, k = -3..4; the last entry is 0, as in the measured ones.
+IEBCS draws the interval of the entry below, so that entries here hold the share up to the
+geometric mean with the next frequency: the rate that comes out is the camera's, and one worked out
+of the file as if it were measured is 15 % higher.
 """
 
 from __future__ import annotations

@@ -33,7 +33,8 @@ while True:
     simulator.event_maker.num = 0  # flush_events would zero its buffer of 1.6 GB for each frame
     frame += 1
 events = np.concatenate(found)
-x, y, t, p = add_noise(*(events[n].astype(np.int64) for n in ("x", "y", "t", "p")), maps)
+x, y, t, p = add_noise(*(events[n].astype(np.int64) for n in ("x", "y", "t", "p")), maps,
+                       0, round(frame * step))
 np.savez(sys.argv[3], t=t, x=x.astype(np.uint16), y=y.astype(np.uint16), p=p > 0,
          size=np.array([{width}, {height}]))
 '''

@@ -72,7 +72,8 @@ def fwl(
     flow = _flow(flow)
     warped = warped_image(x, y, t, p, weight, flow, convention)
     still = warped_image(x, y, t, p, weight, jnp.zeros_like(flow), convention)
-    return jnp.var(warped) / jnp.var(still)
+    scale = jnp.var(still)
+    return jnp.where(scale > 0, jnp.var(warped) / jnp.where(scale > 0, scale, 1.0), jnp.nan)
 
 
 def warped_image(
@@ -210,7 +211,7 @@ def aee(
     (..., 2, H, W) where mask (..., H, W) is not 0: by custom, pixels with events and a valid truth.
     Where the truth is NaN it is unknown, and not scored. Both NaN where nothing is left. Raises
     EV002."""
-    flow, truth = jnp.asarray(flow), jnp.asarray(truth)
+    flow, truth = (jnp.asarray(as_array(f)) for f in (flow, truth))
     if flow.ndim < 3 or flow.shape[-3] != 2 or flow.shape != truth.shape:
         raise EvflowDataError("EV002", f"flow is {flow.shape}, truth {truth.shape}.",
                               "Expected two of (..., 2, H, W).")

@@ -79,13 +79,16 @@ def check_floats(image: Any) -> Array:
 
 
 def as_array(values: Any) -> Array:
-    """Arrays of JAX and NumPy as they are, with their precision; EV002 for what is none."""
-    if hasattr(values, "dtype"):
-        return values
-    try:
-        return jnp.asarray(values)
-    except (TypeError, ValueError) as e:
-        raise EvflowDataError("EV002", f"a {type(values).__name__} that is no array ({e}).") from e
+    """Arrays of JAX and NumPy as they are, with their precision, but half precision, in which no
+    image's pixels can be counted, as float32; EV002 for what is none."""
+    if not hasattr(values, "dtype"):
+        try:
+            values = jnp.asarray(values)
+        except (TypeError, ValueError) as e:
+            raise EvflowDataError(
+                "EV002", f"a {type(values).__name__} that is no array ({e}).") from e
+    half = jnp.issubdtype(values.dtype, jnp.floating) and values.dtype.itemsize < 4
+    return values.astype(jnp.float32) if half else values
 
 
 def pair_up(*arrays: Array) -> bool:

@@ -27,6 +27,7 @@ FILES = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
 ROOMS = {"alex": "AlexNet_0", "vgg": "VGG16_0"}
 HEADS = 5
 LEAST_SIDE = 32  # pixels; of fewer a layer's feature is empty
+DEEP, MOST_LAYERS = 3, 20  # network, layer, kernel; 13 convolutions
 MOST_BYTES = 1 << 28  # VGG16's convolutions take 59 MB
 SHIFT = (-0.030, -0.088, -0.188)  # of RGB on [-1, 1]: the networks' own normalisation
 SCALE = (0.458, 0.448, 0.450)
@@ -51,14 +52,26 @@ def load_lpips(net: str = "alex", path: str | os.PathLike | None = None) -> Para
                               f"have less than {MOST_BYTES}.")
     try:
         with open(path, "rb") as f:
-            params = pickles.load(f, _NAMES)
-        arrays = jax.tree.map(lambda a: jnp.asarray(a.value(), jnp.float32), params)
-    except (ValueError, AttributeError, RecursionError) as e:
+            found = _arrays(pickles.load(f, _NAMES), DEEP)
+        if sum(a.nbytes for a in jax.tree.leaves(found)) > MOST_BYTES:  # one of them many times
+            raise ValueError("its arrays are larger than the file")
+        arrays = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), found)
+    except ValueError as e:
         raise EvflowDataError("EV009", f"{path}: {e}.", "Install or copy it again.") from e
     rooms = {ROOMS[net], *(f"NetLinLayer_{i}" for i in range(HEADS))}
     if not isinstance(arrays, dict) or set(arrays) != rooms or not _complete(arrays):
         raise EvflowDataError("EV018", f"{path} holds no weights of LPIPS by {net!r}.")
     return arrays
+
+
+def _arrays(found: Any, deep: int) -> Any:
+    """Dicts in dicts of arrays; ValueError for anything else: a small pickle can hold one list a
+    million times, or a thousand in one another."""
+    if isinstance(found, _Array):
+        return found.value()
+    if not isinstance(found, dict) or not deep or len(found) > MOST_LAYERS:
+        raise ValueError(f"a {type(found).__name__} where layers of arrays are expected")
+    return {name: _arrays(part, deep - 1) for name, part in found.items()}
 
 
 def _complete(params: Params) -> bool:

@@ -8,6 +8,7 @@ side, NumPy only. Memory: about 100 bytes an event.
 from __future__ import annotations
 
 import dataclasses
+import operator
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,8 @@ def compare(
     """
     for name, events in (("real", real), ("synthetic", synthetic)):
         need(events, Events, name, "Of a path: evflow.read_events(path).")
+    if span_us is not None:
+        span_us = operator.index(span_us[0]), operator.index(span_us[1])
     if span_us is not None and span_us[1] <= span_us[0]:
         raise EvflowDataError("EV020", f"span_us={span_us}.", "It must end after it begins.")
     moved, shift = _aligned(real, synthetic, move=span_us is None)

@@ -105,7 +105,8 @@ def write_page(
             f"</header>\n{sections}\n"
             f'<script type="application/json" id="numbers">{data}</script>\n</body></html>\n')
     with atomic_write(path, overwrite=overwrite) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        # A file's name need not be UTF-8.
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")
 
 
 def text(words: object) -> str:

@@ -42,7 +42,7 @@ def simulate_counts(
     """
     model = model or SensorModel()
     log_frames = as_log(model, jnp.asarray(log_frames))
-    if not jnp.issubdtype(log_frames.dtype, jnp.floating):
+    if log_frames.dtype != jnp.float64:
         log_frames = log_frames.astype(jnp.float32)
     if log_frames.ndim != 3 or len(log_frames) < 2:
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
