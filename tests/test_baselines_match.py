@@ -51,6 +51,7 @@ def test_match_and_rates_on_interpolated_frames(scene: np.ndarray) -> None:
     assert min(rate.theta) <= single[0] <= max(rate.theta)
 
 
+@pytest.mark.slow
 def test_rates_of_generic_scenes_fall_and_invert() -> None:
     rates = generic_rates(2, 0)
     assert (np.diff(rates.sum(1)) <= 0).all()

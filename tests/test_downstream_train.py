@@ -107,6 +107,7 @@ def test_noise_is_not_taken_for_events() -> None:
     np.testing.assert_array_equal(s.tensors, sequences().tensors)
 
 
+@pytest.mark.slow
 def test_a_measured_camera_is_the_one_that_looks() -> None:
     """A camera of high thresholds has fewer events, and its dead columns have none."""
     silent = {"eta_on": 0.0, "eta_off": 0.0}

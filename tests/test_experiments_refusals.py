@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -90,10 +91,11 @@ def test_parts_are_those_of_estimators(tmp_path: Path) -> None:
     assert estimator("default")[0] == "default"
 
 
-def test_a_run_starts_from_something(tmp_path: Path) -> None:
-    options = train.Options(out=tmp_path / "run", preset="debug", start="e2vid-small", steps=1)
-    with pytest.raises(EvflowDataError, match=r"EV018.*no part of the network"):
-        train.main(options)
+def test_a_run_starts_from_something() -> None:
+    fresh: Any = SimpleNamespace(params={"default": {"flow": {"kernel": np.zeros(3)}}})
+    for weights in ("e2vid-small", "default"):  # another network, and one of other sizes
+        with pytest.raises(EvflowDataError, match=r"EV018.*no part of the network"):
+            train.started_from(fresh, weights)
 
 
 def test_a_file_is_no_folder_of_a_run(tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ def test_a_response_is_undone(watched: tuple[Recording, Camera]) -> None:
         linearised(recording, "log")
 
 
+@pytest.mark.slow
 def test_thresholds_of_gamma_frames_are_those_of_linear_ones(
     watched: tuple[Recording, Camera]
 ) -> None:

@@ -35,6 +35,7 @@ def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> Non
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_shares_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     voxels, dL, _ = seen()
     images = jnp.stack([voxels, voxels[::-1]])

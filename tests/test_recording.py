@@ -75,6 +75,7 @@ def test_uneven_noise_is_found_pixel_by_pixel_and_its_errors_hold() -> None:
     assert even.std() < 0.02 * even.mean()  # as its truth is
 
 
+@pytest.mark.slow
 def test_double_precision_changes_next_to_nothing(watched: tuple[Recording, Camera]) -> None:
     found = estimate_camera(watched[0])
     with jax.enable_x64(True):

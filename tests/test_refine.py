@@ -252,6 +252,7 @@ def test_pixels_learn_from_every_stretch_and_few_are_simulated(
     assert everything.evidence.equations[6].sum() > 0.95 * len(inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 5])
 def test_steps_find_the_thresholds_from_a_wrong_start(seed: int) -> None:
     """A start 25 % off, 3-8 px of motion between frames: half of the error goes at least (the

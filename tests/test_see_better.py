@@ -314,6 +314,7 @@ def test_runs_are_kept_and_gone_on_with(
         see_better.main(Options(out=tmp_path, steps=7))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_compilation")
 def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> None:
     setting = see_better.preset_of("flow", "debug")

@@ -56,6 +56,7 @@ def test_every_trainable_leaf_gets_a_gradient(bank: TextureBank, fresh: TrainSta
         assert bool(jnp.any(leaf != 0)) is not is_buffer, path
 
 
+@pytest.mark.slow
 def test_the_summary_learns(bank: TextureBank, fresh: TrainState, step) -> None:
     state, losses = fresh, []
     for _ in range(40):
