@@ -20,7 +20,7 @@ import tyro
 
 from evflow import flow, losses, network
 from evflow.batch import Batch, sample_batch
-from evflow.commands.writing import need_absent
+from evflow.commands.writing import need_absent, need_suffix
 from evflow.config import TrainConfig, preset
 from evflow.coordinates import unsquash_summary
 from evflow.model import architecture
@@ -62,6 +62,7 @@ def spread_loss(spread: Any, net: Any, batch: Batch, key: Array, config: TrainCo
 
 def main(options: Options) -> float:
     at_least(1, steps=options.steps)
+    need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights)
     config = dataclasses.replace(

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 import tyro
 
-from evflow.commands.writing import need_absent
+from evflow.commands.writing import need_absent, need_suffix
 from evflow.errors import EvflowDataError
 from evflow.weights import model_card, save_weights
 from experiments.common import estimator, run_script
@@ -49,6 +49,7 @@ def main(options: Options) -> None:
     if options.summary is None and not options.pixels:
         raise EvflowDataError("EV020", "neither --summary nor --pixels was given.",
                               "Name the weights whose part is to be taken over.")
+    need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights)
     card = cards(options.weights)

@@ -11,6 +11,7 @@ fitted to all recordings.
 from __future__ import annotations
 
 import dataclasses
+import zipfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ import tyro
 
 from evflow import Recording, finish, io
 from evflow.camera import Summary
-from evflow.commands.writing import need_absent
+from evflow.commands.writing import need_absent, need_suffix
 from evflow.coordinates import squash, unsquash_summary
 from evflow.errors import EvflowDataError
 from evflow.files import atomic_write
@@ -110,10 +111,10 @@ def saved_rows(path: Path, origin: str, most: int) -> tuple[int, list[dict[str, 
     """How many recordings are done, and their rows. Raises EV009 where the file holds none, EV013
     where they are of other weights or another seed, or of more recordings than `most`."""
     try:
-        with np.load(path) as saved:
+        with open(path, "rb") as file, np.load(file) as saved:
             kept = dict(saved)
         begin, seen = int(kept.pop("next")), str(kept.pop("origin"))
-    except (ValueError, KeyError, OSError) as e:
+    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as e:
         raise EvflowDataError("EV009", f"{path} holds no rows of this script ({e}).",
                               "Choose another --rows.") from e
     if seen != origin:
@@ -200,6 +201,7 @@ def figures_of(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
 
 def main(options: Options) -> dict[str, Any]:
     at_least(1, recordings=options.recordings, workers=options.workers)
+    need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights)
     rows = collect(options)

@@ -23,7 +23,7 @@ import optax
 import tyro
 
 from evflow.camera import Summary
-from evflow.commands.writing import need_absent
+from evflow.commands.writing import need_absent, need_suffix
 from evflow.coordinates import squash_summary, summary_std, unsquash_summary
 from evflow.refine import Chunk, fused, refine_summary
 from evflow.refine.path import STEPS
@@ -141,6 +141,7 @@ def judged(rows: list[Row], net: dict[str, Any]) -> tuple[float, dict[str, float
 
 def main(options: Options) -> dict[str, float]:
     at_least(1, recordings=options.recordings, workers=options.workers)
+    need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights)
     setup = Setup(str(options.weights), options.seed, photos=True)

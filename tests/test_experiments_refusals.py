@@ -73,6 +73,8 @@ def test_existing_weights_are_seen_before_the_work(script: Any, tmp_path: Path) 
     with pytest.raises(EvflowDataError, match="EV013"):
         script.main(script.Options("default", out=out))
     assert out.read_text() == "kept"
+    with pytest.raises(EvflowDataError, match=r"EV020.*\.safetensors"):  # could not be read again
+        script.main(script.Options("default", out=tmp_path / "made"))
 
 
 @pytest.mark.parametrize("script", FITS, ids=lambda s: s.__name__)
@@ -113,9 +115,10 @@ def test_a_refused_command_leaves_its_folder_to_the_next(tmp_path: Path) -> None
 
 def test_rows_are_those_of_this_command(tmp_path: Path) -> None:
     path = tmp_path / "rows.npz"
-    path.write_bytes(b"no rows")
-    with pytest.raises(EvflowDataError, match="EV009"):
-        fuse.saved_rows(path, "0 a", 5)
+    for damaged in (b"no rows", b"PK\x03\x04 cut"):
+        path.write_bytes(damaged)
+        with pytest.raises(EvflowDataError, match="EV009"):
+            fuse.saved_rows(path, "0 a", 5)
     np.savez(path, next=4, origin="0 a", y=np.arange(6.0).reshape(3, 2))
     begun, rows = fuse.saved_rows(path, "0 a", 5)
     assert (begun, [r["y"].tolist() for r in rows]) == (4, [[0, 1], [2, 3], [4, 5]])

@@ -113,7 +113,8 @@ def write_export(
     folder: str | os.PathLike, export: Export, maps: Maps, *, overwrite: bool = False
 ) -> Path:
     """maps.npz, README.txt, the scripts and arrays in a new folder; EV013, EV019."""
-    kinds = [make(maps, Settings.of(maps)) for make in targets().values()]
+    corner = {name: values[:1, :1] for name, values in maps.items()}  # files are named by no map
+    kinds = [make(corner, Settings.of(corner)) for make in targets().values()]
     names = {"maps.npz", "README.txt"}.union(*(k.scripts.keys() | k.arrays.keys() for k in kinds))
     with atomic_folder(folder, names=names, overwrite=overwrite) as new:
         with open(new / "maps.npz", "wb") as f:
