@@ -1,0 +1,103 @@
+"""The same keys give the same bytes: hashes of what simulation, estimate, training step and data
+set make. Rounding differs between processors and versions of XLA, so hashes are kept for each;
+on another machine the test skips and says how to add it:
+
+    python tests/test_same_bytes.py
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from networks import hidden, small_config
+
+import evflow as ef
+from evflow.dataset.config import PRESETS
+from evflow.dataset.generate import make_sequence
+from evflow.scenes import make_bank
+from evflow.train import init_state, make_run_step, optimiser
+
+STORED = Path(__file__).parent / "data" / "same_bytes.json"
+PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
+FLAGS = ("avx2", "fma", "avx512f", "avx512_bf16", "amx_tile")  # what XLA's code depends on
+
+
+def machine() -> str:
+    """What the rounding depends on."""
+    info = Path("/proc/cpuinfo")
+    flags = set(re.findall(r"\w+", info.read_text())) if info.exists() else set()
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES]
+    return ", ".join([platform.machine(), *(f for f in FLAGS if f in flags), *versions])
+
+
+def digest(arrays: Iterable[Any]) -> str:
+    found = hashlib.sha256()
+    for array in map(np.asarray, arrays):
+        found.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()[:16]
+
+
+def simulated() -> str:
+    walk = np.random.default_rng(0).normal(0, 6, (24, 20, 28)).cumsum(0)
+    frames = np.clip(128 + walk, 0, 255).astype(np.uint8)
+    sensor = ef.SensorModel(cutoff_hz=200.0, refractory_s=5e-4, leak_hz=0.1, leak_jitter=0.1,
+                            shot_hz=1.0, noise_resets_memory=True)
+    camera = ef.Camera.sample(jax.random.key(1), (20, 28))
+    events = ef.simulate(
+        jax.random.key(0), frames, 5_000 * np.arange(24), camera, model=sensor)
+    return digest([events.x, events.y, events.t, events.p])
+
+
+def estimated() -> str:
+    found = ef.estimate_camera(hidden(3)[0])
+    maps = found.camera, found.std, found.summary, found.summary_std, found.valid, found.n_events
+    return digest(jax.tree.leaves(maps))
+
+
+def trained() -> str:
+    config = small_config(steps=2, warmup=1)
+    tx = optimiser(config)
+    bank = make_bank(jax.random.key(0), 4, photos=False, size=64, cutout_size=32)
+    state = init_state(config, tx, bank, "default")
+    jax.config.update("jax_disable_most_optimizations", True)  # a minute less of compilation
+    try:
+        state, metrics = jax.jit(make_run_step(config, tx))(state, bank)
+    finally:
+        jax.config.update("jax_disable_most_optimizations", False)
+    return digest(jax.tree.leaves((state.params, state.average, metrics)))
+
+
+def made() -> str:
+    sequence = make_sequence(PRESETS["debug"], 0, 0)
+    events = sequence.events
+    return digest([events.x, events.y, events.t, events.p, sequence.frames,
+                   *(sequence.truth[name] for name in sorted(sequence.truth))])
+
+
+MADE: dict[str, Callable[[], str]] = {
+    "simulate": simulated, "estimate_camera": estimated, "train step": trained,
+    "make_sequence": made}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_the_same_keys_give_the_same_bytes(name: str) -> None:
+    stored = json.loads(STORED.read_text()).get(machine())
+    if stored is None:
+        pytest.skip(f"no hashes for {machine()}: python {Path(__file__).name} adds them")
+    assert MADE[name]() == stored[name]
+
+
+if __name__ == "__main__":
+    known = json.loads(STORED.read_text()) if STORED.exists() else {}
+    known[machine()] = {name: make() for name, make in MADE.items()}
+    STORED.write_text(json.dumps(known, indent=1) + "\n")
