@@ -1,10 +1,11 @@
 """Whole recordings: windows -> additive statistics -> the camera's summary -> per-pixel maps.
 
-Two passes over the windows, each in bounded memory: the first adds up `Stats`, the second
-estimates every pixel of every window at the final summary and fuses the windows by their
-precision. Between them the recording is surveyed stretch by stretch (evflow/refine): some are
-simulated, to refine the summary, and all tell each pixel's thresholds. A pixel that says nothing
-keeps the camera's summary, with a wide std.
+The windows are pooled: their `Stats` add up to the network's summary. The recording is surveyed
+stretch by stretch (evflow/refine): some are simulated, to refine the summary, and the regression
+on all of them gives each pixel's thresholds. The flow is not run. Only without a path between the
+frames (refine="off", or frames too small for optical flow) the flow estimates every pixel of
+every window, and the windows are fused by their precision. Noise rates are those of the quiet
+time, either way. A pixel that says nothing keeps the camera's summary, with a wide std.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def estimate_camera(
     params = load_weights() if params is None else params
     plan = io.plan_windows(recording, min_window_us)
     runs = plan_runs(recording, plan.pairs) if refine == "auto" else []
-    total, done = 2 * len(plan.pairs) + len(runs), 0
+    total, done = len(plan.pairs) * (2 if runs else 3) + len(runs), 0
 
     def advance() -> None:
         nonlocal done
@@ -102,10 +103,12 @@ def estimate_camera(
     unknown = untold(stats, summary)
     if unknown:
         summary, summary_std = without(unknown, chunks, summary, summary_std)
-    camera, std, quiet = _fuse(params, windows(), summary, summary_std, hot)
-    camera, std = _with_rates(camera, std, quiet, hot, summary, summary_std)
+    quiet = _quiet_time(windows(), summary, hot)
     if runs:
-        camera, std = _with_regression(camera, std, surveyed.evidence, summary, summary_std)
+        camera, std = _by_regression(surveyed.evidence, summary, summary_std)
+    else:
+        camera, std = _by_flow(params, windows(), summary, summary_std)
+    camera, std = _with_rates(camera, std, quiet, hot, summary, summary_std)
     dead = dead_pixels(n_events)
     return CameraEstimate(
         camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
@@ -168,24 +171,30 @@ def _shown_stats(params: model.Params, window: Window, shown: np.ndarray) -> mod
     return stats if share == 1 else jax.tree.map(lambda leaf: leaf * share, stats)
 
 
-def _fuse(
-    params: model.Params, windows: Iterator[Window], summary: Summary, summary_std: Summary,
-    hot: np.ndarray,
-) -> tuple[Camera, Camera, np.ndarray]:
-    """Product of the windows' posteriors: each is N(y, s^2) and contains the prior (the
+def _quiet_time(windows: Iterator[Window], summary: Summary, hot: np.ndarray) -> np.ndarray:
+    """The `quiet_time` of all windows: (2, 2, H, W), ON and OFF, events and seconds."""
+    noise = np.array([summary.eta_on, summary.eta_off])
+    total = np.zeros((2, 2, *hot.shape))
+    for window in windows:
+        before, after = window.frame0, window.frame1
+        total += quiet_time(window.events.count_map(), np.asarray(lin_log(after) - lin_log(before)),
+                            exposed(before, after), hot, window.window_s, noise)
+    return total
+
+
+def _by_flow(
+    params: model.Params, windows: Iterator[Window], summary: Summary, summary_std: Summary
+) -> tuple[Camera, Camera]:
+    """Product of the windows' posteriors by the flow: each is N(y, s^2) and contains the prior (the
     summary and the mismatch) once, so the prior's precision is taken off all but one. The
-    summary's own error, which all pixels share, is added to the std at the end. Beside it, the
-    `quiet_time` of all windows."""
+    summary's own error, which all pixels share, is added to the std at the end."""
     y6 = unsquash_summary(summary)[None, None]
     prior, prior_precision = y6[..., :4], network.base_std(y6) ** -2.0
     precision, weighted = jnp.zeros_like(prior), jnp.zeros_like(prior)
-    quiet, noise = np.zeros((2, 2, *hot.shape)), np.array([summary.eta_on, summary.eta_off])
     for window in windows:
         voxels, dlogI, given = window_inputs(window)
         y, s = model.estimate_y(params, voxels, dlogI, summary=summary, **given)
         shown = exposed(window.frame0, window.frame1)
-        quiet += quiet_time(window.events.count_map(), np.asarray(dlogI), shown, hot,
-                            window.window_s, noise)
         told = jnp.maximum(s**-2.0 - prior_precision, 0.0)
         gained = jnp.where(jnp.asarray(shown)[..., None], told, 0.0)
         # A posterior mean is shrunk towards the prior; (gained) (x - prior) = s^-2 (y - prior)
@@ -196,7 +205,7 @@ def _fuse(
     y = prior + weighted / total
     relative = [getattr(summary_std, n) / getattr(summary, n) for n in PARAMETERS]
     shared = jnp.stack(relative, -1)[None, None] / per_channel(SCALE, y6)
-    return squash(y), camera_std(y, jnp.sqrt(1.0 / total + shared**2)), quiet
+    return squash(y), camera_std(y, jnp.sqrt(1.0 / total + shared**2))
 
 
 def _with_rates(
@@ -223,17 +232,18 @@ def _refined(
     return refined.summary, refined.std
 
 
-def _with_regression(
-    camera: Camera, std: Camera, evidence: PixelEvidence, summary: Summary, summary_std: Summary
+def _by_regression(
+    evidence: PixelEvidence, summary: Summary, summary_std: Summary
 ) -> tuple[Camera, Camera]:
-    """The maps with each pixel's thresholds from its regression on the path; the summary's own
-    error, which all pixels share, is added to the std."""
+    """Each pixel's thresholds from its regression on the path, beside the summary's noise rates;
+    the summary's own error, which all pixels share, is added to the std."""
     theta, error = pixel_posterior(evidence, summary)
     shared = (float(summary_std.theta_on), float(summary_std.theta_off))
     on, off = (jnp.sqrt(e**2 + s**2) for e, s in zip(jnp.asarray(error), shared, strict=True))
-    camera = dataclasses.replace(
-        camera, theta_on=jnp.asarray(theta[0]), theta_off=jnp.asarray(theta[1]))
-    return camera, dataclasses.replace(std, theta_on=on, theta_off=off)
+    flat = jnp.ones(theta.shape[1:])
+    return (Camera(jnp.asarray(theta[0]), jnp.asarray(theta[1]), summary.eta_on * flat,
+                   summary.eta_off * flat),
+            Camera(on, off, summary_std.eta_on * flat, summary_std.eta_off * flat))
 
 
 def _warnings(
