@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.files.atomic import atomic_write
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 

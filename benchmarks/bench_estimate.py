@@ -19,14 +19,15 @@ from jax.sharding import AxisType
 from jax.sharding import PartitionSpec as P
 
 from benchmarks.harness import Case, Setting, Workload, cores
-from evflow import flow
 from evflow.camera import Camera, Summary
-from evflow.config import MODELS, PRESETS, ModelConfig
-from evflow.coordinates import unsquash_summary
 from evflow.errors import EvflowDataError
-from evflow.model import estimate, estimate_y, finish, summarize
-from evflow.network import architecture, init
-from evflow.weights import load_weights
+from evflow.network import flow
+from evflow.network.api import estimate, estimate_y, finish, summarize
+from evflow.network.architecture import config_of, init
+from evflow.network.config import MODELS, ModelConfig
+from evflow.network.coordinates import unsquash_summary
+from evflow.network.weights import load_weights
+from evflow.training.config import PRESETS
 
 Params = dict[str, Any]
 # On one core 1024 rows are faster: 2.5 s of CPU a frame, 3.3 with 2048 (2.7 if compiled, in both).
@@ -62,7 +63,7 @@ def known_summary() -> Summary:
 
 def dense_flop(params: Params, *parts: str) -> int:
     """Floating-point operations per pixel of the dense layers in those parts of the network."""
-    config, net = architecture(params), next(iter(params.values()))
+    config, net = config_of(params), next(iter(params.values()))
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path({part: net[part] for part in parts}):
         name = "/".join(str(k.key) for k in path)
@@ -126,7 +127,7 @@ def pixels_torch(
     from benchmarks import peer_torch
 
     (params, note), (voxels, dlogI) = network(setting), window(setting)
-    n, config = dlogI.size, architecture(params)
+    n, config = dlogI.size, config_of(params)
     y = np.tile(np.asarray(unsquash_summary(known_summary())), (n, 1))
     inputs = [torch.tensor(np.asarray(a)) for a in (
         voxels.reshape(n, -1), dlogI.reshape(n), np.zeros((n, 3), np.float32), y)]
@@ -154,7 +155,7 @@ def flow_inputs(setting: Setting, config: ModelConfig) -> tuple[jax.Array, jax.A
 
 def flow_evflow(setting: Setting, folded: bool, chunk: int | None = None) -> Workload:
     params, note = network(setting)
-    config, net = architecture(params), next(iter(params.values()))["flow"]
+    config, net = config_of(params), next(iter(params.values()))["flow"]
     net = flow.fold(net, config.flow) if folded else net
     sizes = {"chunk": chunk} if chunk else {}
 
@@ -173,7 +174,7 @@ def flow_torch(setting: Setting) -> Workload:
     from benchmarks import peer_torch
 
     params, note = network(setting)
-    config, net = architecture(params), peer_torch.weights(next(iter(params.values()))["flow"])
+    config, net = config_of(params), peer_torch.weights(next(iter(params.values()))["flow"])
     x, u = (torch.tensor(np.asarray(a)) for a in flow_inputs(setting, config))
 
     def call() -> Any:

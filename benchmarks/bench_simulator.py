@@ -16,9 +16,9 @@ import numpy as np
 
 from benchmarks.harness import Case, Setting, Workload
 from evflow.camera import Camera
-from evflow.intensity import uint8_table
+from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import uint8_table
 from evflow.scenes.photos import load_photos
-from evflow.sensors import SensorModel
 from evflow.simulator import simulate, simulate_voxels
 
 CUTOFF_HZ, LEAK_HZ, SHOT_HZ = 30.0, 0.1, 5.0

@@ -14,12 +14,12 @@ import numpy as np
 
 from benchmarks.bench_estimate import dense_flop, fresh
 from benchmarks.harness import Case, Setting, Workload
-from evflow import flow
-from evflow.batch import sample_batch
-from evflow.config import PRESETS, TrainConfig
-from evflow.network import log_normal
+from evflow.network import flow
+from evflow.network.architecture import log_normal
 from evflow.scenes import make_bank
-from evflow.train import init_state, make_run_step, make_train_step, optimiser
+from evflow.training.batch import sample_batch
+from evflow.training.config import PRESETS, TrainConfig
+from evflow.training.step import init_state, make_run_step, make_train_step, optimiser
 
 TEXTURES = 8  # procedural ones in the bank; their number does not change what a step does
 

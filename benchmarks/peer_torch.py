@@ -16,10 +16,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from evflow.config import ModelConfig
-from evflow.coordinates import CENTRE, SCALE
-from evflow.encoder import LOG_RANGE
-from evflow.flow import FlowConfig, shuffle
+from evflow.network.config import ModelConfig
+from evflow.network.coordinates import CENTRE, SCALE
+from evflow.network.encoder import LOG_RANGE
+from evflow.network.flow import FlowConfig, shuffle
 
 Tensor = torch.Tensor
 Weights = dict[str, Any]

@@ -26,7 +26,7 @@ from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
-from evflow.progress import INTERRUPTED, leave, print_anything, stoppable, unread
+from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
 EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
 

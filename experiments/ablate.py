@@ -26,15 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from evflow import flow, network
-from evflow.batch import sample_batch
-from evflow.config import PRESETS, TrainConfig, as_dict
-from evflow.coordinates import squash, unsquash_summary
-from evflow.progress import bar
+from evflow.network import architecture, flow
+from evflow.network.coordinates import squash, unsquash_summary
+from evflow.network.weights import load_weights, save_weights
+from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
-from evflow.train import cut_block, init_state, make_run_step, optimiser
-from evflow.weights import load_weights, save_weights
-from experiments.common import (
+from evflow.training.batch import sample_batch
+from evflow.training.config import PRESETS, TrainConfig, as_dict
+from evflow.training.step import cut_block, init_state, make_run_step, optimiser
+from experiments.shared.common import (
     begin,
     compiled_quickly,
     provenance,
@@ -124,17 +124,17 @@ def score(
         block = cut_block(k_block, batch, config)
         known = unsquash_summary(batch.nominal)
         noise = config.summary_noise * jax.random.normal(k_noise, known.shape)
-        y6 = network.over_pixels(known + noise, block.dlogI.shape)
-        changes, _ = network.encode_changes(
+        y6 = architecture.over_pixels(known + noise, block.dlogI.shape)
+        changes, _ = architecture.encode_changes(
             model, net, block.voxels, block.dlogI, block.context, y6)
-        u = network.condition(model, changes, block.context, y6)
-        centre = network.centre(model, y6)
+        u = architecture.condition(model, changes, block.context, y6)
+        centre = architecture.centre(model, y6)
         y, z, log_det = flow.forward(net["flow"], block.voxels, u, model.flow)
         made, _ = flow.inverse(net["flow"], block.y - centre, jax.random.normal(k_z, z.shape), u,
                                model.flow)
         seen, true = squash(y + centre, model.output), squash(block.y, model.output)
         fired = block.voxels.sum(-1) > 0
-        likelihood = network.log_normal(z, 0.0, jnp.ones(())).sum(-1) + log_det
+        likelihood = architecture.log_normal(z, 0.0, jnp.ones(())).sum(-1) + log_det
         found = {"events": made.sum() / block.voxels.sum(), "log p(z)": likelihood.mean()}
         for name in NAMES:
             off = jnp.abs(getattr(seen, name) - getattr(true, name))

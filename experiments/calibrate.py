@@ -18,17 +18,18 @@ import jax
 import optax
 import tyro
 
-from evflow import flow, losses, network
-from evflow.batch import Batch, sample_batch
 from evflow.commands.writing import need_absent, need_suffix
-from evflow.config import TrainConfig, preset
-from evflow.coordinates import unsquash_summary
-from evflow.model import architecture
-from evflow.progress import bar
+from evflow.network import architecture, flow
+from evflow.network.api import config_of
+from evflow.network.coordinates import unsquash_summary
+from evflow.network.weights import model_card, save_weights
+from evflow.process.terminal import bar
 from evflow.scenes import make_bank
-from evflow.train import cut_block
-from evflow.weights import model_card, save_weights
-from experiments.common import at_least, estimator, run_script
+from evflow.training import losses
+from evflow.training.batch import Batch, sample_batch
+from evflow.training.config import TrainConfig, preset
+from evflow.training.step import cut_block
+from experiments.shared.common import at_least, estimator, run_script
 
 Array = jax.Array
 
@@ -50,13 +51,13 @@ def spread_loss(spread: Any, net: Any, batch: Batch, key: Array, config: TrainCo
     """Gaussian likelihood of the pixel errors at the true summary."""
     net = {**net, "spread": spread}
     block = cut_block(key, batch, config)
-    y6 = network.over_pixels(unsquash_summary(batch.nominal), block.y.shape[:-1])
-    changes, _ = network.encode_changes(
+    y6 = architecture.over_pixels(unsquash_summary(batch.nominal), block.y.shape[:-1])
+    changes, _ = architecture.encode_changes(
         config.model, net, block.voxels, block.dlogI, block.context, y6)
-    u = network.condition(config.model, changes, block.context, y6)
+    u = architecture.condition(config.model, changes, block.context, y6)
     y, _, _ = flow.forward(net["flow"], block.voxels, u, config.model.flow)
-    error = jax.lax.stop_gradient(y + network.centre(config.model, y6)) - block.y
-    std = network.spread(net, block.voxels, block.dlogI, block.context, u)
+    error = jax.lax.stop_gradient(y + architecture.centre(config.model, y6)) - block.y
+    std = architecture.spread(net, block.voxels, block.dlogI, block.context, u)
     return losses.gaussian_nll(error, std).mean()
 
 
@@ -66,7 +67,7 @@ def main(options: Options) -> float:
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights)
     config = dataclasses.replace(
-        preset("default"), model=architecture({name: net}), block=(16, 16), windows=1)
+        preset("default"), model=config_of({name: net}), block=(16, 16), windows=1)
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))
     bank = make_bank(k_bank, config.textures)
     tx = optax.adam(optax.cosine_decay_schedule(options.learning_rate, options.steps))

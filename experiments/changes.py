@@ -25,17 +25,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow import Recording, encode, load_weights, read_recording
-from evflow.batch import Batch, sample_batch
 from evflow.camera import CameraPrior
-from evflow.config import preset
-from evflow.intensity import lin_log
-from evflow.progress import bar
+from evflow.light.log_maps import lin_log
+from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
-from experiments import change_systems as systems
-from experiments.cameras import Protocol, hidden_recording
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.images import mean_ci
+from evflow.training.batch import Batch, sample_batch
+from evflow.training.config import preset
+from experiments.shared import change_systems as systems
+from experiments.shared.cameras import Protocol, hidden_recording
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.images import mean_ci
 
 Array = jax.Array
 LOG_255 = float(np.log(255.0))

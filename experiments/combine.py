@@ -24,8 +24,8 @@ import tyro
 
 from evflow.commands.writing import need_absent, need_suffix
 from evflow.errors import EvflowDataError
-from evflow.weights import model_card, save_weights
-from experiments.common import estimator, run_script
+from evflow.network.weights import model_card, save_weights
+from experiments.shared.common import estimator, run_script
 
 PIXELS = ("encoder", "flow", "spread")
 AFTER_SUMMARY = ("fusion", "signal")  # fitted to what the summary says

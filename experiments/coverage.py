@@ -24,9 +24,9 @@ from evflow import estimate_camera
 from evflow.camera import PARAMETERS
 from evflow.report import plots
 from evflow.report.plots import TITLES
-from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.many import Setup, scores
+from experiments.shared.cameras import Hidden, Protocol, draw_protocol
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.many import Setup, scores
 
 LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
 EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf),

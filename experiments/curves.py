@@ -18,12 +18,12 @@ import numpy as np
 
 from evflow import estimate_camera, finish
 from evflow.camera import CameraPrior
-from evflow.recording import pool_recording
+from evflow.estimation.pipeline import pool_recording
 from evflow.report import plots
-from experiments.cameras import Hidden, Protocol
-from experiments.common import begin, run_script, write_result, write_text
 from experiments.evaluate import ENOUGH
-from experiments.many import Setup, scores
+from experiments.shared.cameras import Hidden, Protocol
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.many import Setup, scores
 
 BASE = Protocol(prior=CameraPrior(mismatch=(0.03, 0.03)))
 # 200 ms at other frame rates, other durations at 25 ms, other speeds; (frame_ms, intervals).

@@ -22,11 +22,11 @@ import numpy as np
 
 from evflow import estimate_camera, finish
 from evflow.camera import CameraPrior
-from evflow.recording import pool_recording
-from evflow.sensors import SensorModel
-from experiments.cameras import Hidden, Protocol
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.many import Setup, scores
+from evflow.camera.sensors import SensorModel
+from evflow.estimation.pipeline import pool_recording
+from experiments.shared.cameras import Hidden, Protocol
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.many import Setup, scores
 
 NAMES = ("theta_on", "theta_off", "eta_on", "eta_off")
 PAPER = {"theta_on": 0.023, "theta_off": 0.022, "eta_on": 0.045, "eta_off": 0.027}

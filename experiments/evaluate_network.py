@@ -7,9 +7,9 @@
 
 Weights: released names, .safetensors files, published checkpoints. --data takes recordings of any
 format: IJRR, MVSEC, HQF, EVIMO2v2 (flow alone: its event cameras have no frames), EVREAL. The cuts
-are those of `experiments.recorded.CUTS`, by the sequence's name; files called NAME_cut have theirs
-already. Without --data: synthetic cameras behind three circuits that no training simulates
-(`experiments.targets`), and, where the environment variable EVFLOW_DATA names a folder with them,
+are those of `CUTS` (shared/recorded.py), by the sequence's name; files called NAME_cut have
+theirs already. Without --data: synthetic cameras behind three circuits that no training simulates
+(shared/targets.py), and, where the environment variable EVFLOW_DATA names a folder with them,
 two real recordings and two slices of rotations, whose flow the gyroscope tells.
 
 Images are scored linear and in the log domain, log(1 + 255 I) / log 256; flow of real recordings by
@@ -28,7 +28,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.commands.options import check_finite, parse_size
-from evflow.config import as_dict
 from evflow.downstream import EVFlowNet, prepared, reconstruct
 from evflow.downstream.released import Trained, load_network
 from evflow.downstream.simulated import SequenceConfig
@@ -43,10 +42,11 @@ from evflow.metrics import (
     score_images,
 )
 from evflow.report import plots
-from experiments import held_out, targets
-from experiments.common import at_least, begin, run_script, write_result, write_text
-from experiments.network_scores import picture, report
-from experiments.recorded import (
+from evflow.training.config import as_dict
+from experiments.shared import held_out, targets
+from experiments.shared.common import at_least, begin, run_script, write_result, write_text
+from experiments.shared.network_scores import picture, report
+from experiments.shared.recorded import (
     Part,
     Rotation,
     cut_of,
@@ -188,9 +188,9 @@ def real_flow(trained: Trained, found: list[Part], slices: dict[str, Rotation]) 
             prepared(one.events, trained.network.bins, trained.split))[None, None]
         flow = np.asarray(held_out.outputs(
             trained.network, trained.params, tensor, trained.normalised)[0, 0])
-        columns = (*one.xy.T, one.t, one.p, np.ones(len(one.t), np.float32))
-        rows[name] = {"fwl": float(fwl(*columns, flow, how)), "convention": how.as_dict(),
-                      "fwl_truth": float(fwl(*columns, one.flow, how)),
+        x, y, t, p, ones = map(jnp.asarray, (*one.xy.T, one.t, one.p, np.ones(len(one.t))))
+        made, ideal = (fwl(x, y, t, p, ones, jnp.asarray(f), how) for f in (flow, one.flow))
+        rows[name] = {"fwl": float(made), "convention": how.as_dict(), "fwl_truth": float(ideal),
                       "events_per_window": float(len(one.t))}
     return rows
 

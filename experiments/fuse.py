@@ -2,7 +2,7 @@
 
     python -m experiments.fuse runs/default/weights.safetensors --out final.safetensors
 
-Each recording passes through the network and the Gauss-Newton steps of `evflow.refine`; what they
+Each recording passes through the network and the Gauss-Newton steps of `refine`; what they
 leave is regressed on the features. Five-fold cross-validation gives the figures of the model card
 and the factor that makes the std cover 70 % of the held-out folds; the network that ships is
 fitted to all recordings.
@@ -22,20 +22,20 @@ import numpy as np
 import optax
 import tyro
 
-from evflow import Recording, finish, io
+from evflow import Recording, finish
 from evflow.camera import Summary
 from evflow.commands.writing import need_absent, need_suffix
-from evflow.coordinates import squash, unsquash_summary
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
-from evflow.recording import pool_recording
-from evflow.refine import Chunk, fused, refine_summary, refinement_chunks
-from evflow.refine.fit import FusionNet
-from evflow.report.provenance import weights_hash
-from evflow.weights import model_card, save_weights
-from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import at_least, estimator, run_script
-from experiments.many import Setup, scores
+from evflow.estimation.pipeline import pool_recording
+from evflow.estimation.refine import Chunk, fused, refine_summary, refinement_chunks
+from evflow.estimation.refine.fit import FusionNet
+from evflow.files.atomic import atomic_write
+from evflow.network.coordinates import squash, unsquash_summary
+from evflow.network.weights import model_card, save_weights, weights_hash
+from evflow.recordings.windows import plan_windows
+from experiments.shared.cameras import Hidden, Protocol, draw_protocol
+from experiments.shared.common import at_least, estimator, run_script
+from experiments.shared.many import Setup, scores
 
 Array = jax.Array
 Rows = dict[str, np.ndarray]
@@ -69,7 +69,7 @@ def before_refinement(
     nothing fired."""
     if len(recording.events) < 10:
         return None
-    plan = io.plan_windows(recording)
+    plan = plan_windows(recording)
     if not plan.pairs:
         return None
     stats, _ = pool_recording(params, recording)

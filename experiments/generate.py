@@ -29,15 +29,15 @@ import numpy as np
 
 from evflow import Camera, code_from_video, generate, load_weights, log_prob
 from evflow.camera import THETA_MIN, CameraPrior, sample_nominal, sample_pixels
-from evflow.intensity import lin_log, noise_factor, normalised_intensity
-from evflow.model import Params
-from evflow.progress import bar
+from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import lin_log, noise_factor, normalised_intensity
+from evflow.network.api import Params
+from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank, render, sample_scene
 from evflow.scenes.config import SceneConfig
-from evflow.sensors import SensorModel
 from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
-from experiments.common import begin, run_script, write_result, write_text
+from experiments.shared.common import begin, run_script, write_result, write_text
 
 Array = jax.Array
 Row = dict[str, np.ndarray]

@@ -19,12 +19,12 @@ import numpy as np
 
 from evflow import Recording, read_recording
 from evflow.downstream import Trained, load_network, with_reconstructed_frames
-from evflow.progress import bar
-from evflow.recording import estimate_camera
+from evflow.estimation.pipeline import estimate_camera
+from evflow.process.terminal import bar
 from evflow.scenes import make_bank
 from evflow.scenes.config import SceneConfig
-from experiments.cameras import Protocol, hidden_recording
-from experiments.common import begin, run_script, write_result, write_text
+from experiments.shared.cameras import Protocol, hidden_recording
+from experiments.shared.common import begin, run_script, write_result, write_text
 
 THETAS = ("theta_on", "theta_off")
 PROTOCOL = Protocol(

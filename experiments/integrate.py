@@ -30,13 +30,13 @@ from evflow.baselines.base import usable
 from evflow.baselines.integration import Integration
 from evflow.camera import Camera, CameraPrior, Summary
 from evflow.errors import EvflowDataError
-from evflow.progress import bar
+from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
-from experiments.cameras import Protocol, hidden_recording
-from experiments.change_systems import cut
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.images import SCORES, mean_ci, score
+from experiments.shared.cameras import Protocol, hidden_recording
+from experiments.shared.change_systems import cut
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.images import SCORES, mean_ci, score
 
 HORIZONS = {"1 frame": 1, "5 frames": 5, "10 frames": 10, "1e5 events": 100_000,
             "5e5 events": 500_000}  # frames, or events from 1000 on

@@ -23,19 +23,20 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from evflow import estimate_camera, finish, io
+from evflow import estimate_camera, finish
 from evflow.camera import Summary
-from evflow.intensity import lin_log
-from evflow.recording import pool_recording
-from evflow.refine import Chunk, pixel_posterior, refine_summary, refinement_chunks
-from evflow.refine.path import STEPS
-from evflow.refine.pixels import evidence_of
-from evflow.refine.sightings import sight
-from evflow.refine.signal import told_apart
-from experiments.cameras import Hidden, Protocol
-from experiments.common import begin, run_script, write_result, write_text
+from evflow.estimation.pipeline import pool_recording
+from evflow.estimation.refine import Chunk, pixel_posterior, refine_summary, refinement_chunks
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.pixels import evidence_of
+from evflow.estimation.refine.sightings import sight
+from evflow.estimation.refine.signal import told_apart
+from evflow.light.log_maps import lin_log
+from evflow.recordings.windows import plan_windows
 from experiments.evaluate import ENOUGH, protocols
-from experiments.many import Setup, scores
+from experiments.shared.cameras import Hidden, Protocol
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.many import Setup, scores
 
 EDGES = {"signal": (200, 1000, 5000, np.inf), "speed": (0, 2, 6, np.inf)}
 NAMES = ("theta_on", "theta_off")
@@ -76,7 +77,7 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     recording = hidden.recording
     if len(recording.events) <= ENOUGH:
         return None
-    pairs = io.plan_windows(recording).pairs
+    pairs = plan_windows(recording).pairs
     chunks = refinement_chunks(recording, pairs)
     starts = np.cumsum([pairs[0][0], *(len(c.dt_s) for c in chunks)])
     known = [known_path(hidden, c, i) for c, i in zip(chunks, starts, strict=False)]

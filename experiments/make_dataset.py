@@ -24,8 +24,8 @@ from evflow.dataset.config import PRESETS, DatasetConfig
 from evflow.dataset.manifest import MERGED, verify
 from evflow.dataset.shards import build
 from evflow.errors import EvflowDataError
-from evflow.progress import bar
-from experiments.common import provenance, run_script
+from evflow.process.terminal import bar
+from experiments.shared.common import provenance, run_script
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,13 +22,14 @@ import numpy as np
 
 from evflow import simulate
 from evflow.camera import Summary, noise_of_threshold, sample_pixels
-from evflow.progress import bar
-from evflow.report import pages, plots
+from evflow.camera.sensors import SENSORS, KnownSensor
+from evflow.process.terminal import bar
+from evflow.report import plots
 from evflow.scenes.photos import load_photos
-from evflow.sensors import SENSORS, KnownSensor
 from evflow.types import Events
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.sources import density, gaps
+from experiments.shared import pages
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.sources import density, gaps
 
 FPS, SHOWN_US, RATE_US = 1000, 8_000, 5_000
 SPEED, SHAKE, SHAKE_HZ = 150.0, 6.0, 8.0  # px/s, px, Hz

@@ -21,12 +21,12 @@ import numpy as np
 
 from evflow import simulate
 from evflow.camera import Camera, Summary, noise_of_threshold, sample_pixels
-from evflow.progress import bar
-from evflow.report import pages, plots
-from evflow.sensors import SENSORS, SensorModel
-from experiments import laws
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.sources import figure_four, sources
+from evflow.camera.sensors import SENSORS, SensorModel
+from evflow.process.terminal import bar
+from evflow.report import plots
+from experiments.shared import laws, pages
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.sources import figure_four, sources
 
 MODELS = ("noisy", "v2e", "paper", "dvs346", "dvs240")
 SCP = (101, 121, 141, 161, 181, 201)

@@ -25,15 +25,15 @@ import numpy as np
 from evflow import Recording, load_weights, simulate
 from evflow.baselines import v2e_noise, voltmeter_noise
 from evflow.camera import Summary, noise_of_threshold, sample_pixels
-from evflow.intensity import noise_factor, normalised_intensity
-from evflow.progress import bar
+from evflow.camera.sensors import SENSORS, SensorModel
+from evflow.light.log_maps import noise_factor, normalised_intensity
+from evflow.process.terminal import bar
 from evflow.report import plots
-from evflow.sensors import SENSORS, SensorModel
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.images import mean_ci
-from experiments.measured_noise import SIDES, Rates, measured, measured_page, ours
 from experiments.noise import LUX, MIDDLE, SCP
 from experiments.noise import PAPER as TABLE_TWO
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.images import mean_ci
+from experiments.shared.measured_noise import SIDES, Rates, measured, measured_page, ours
 
 MODELS = {"eq12": SensorModel(eta_intensity=True), "dvs346": SENSORS["dvs346"].model}
 SCENES = ("flat", "still", "moving")

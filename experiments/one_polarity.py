@@ -20,10 +20,10 @@ import numpy as np
 from evflow import estimate_camera, finish
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
-from evflow.recording import pool_recording
-from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import begin, run_script, write_result, write_text
-from experiments.many import Setup, scores
+from evflow.estimation.pipeline import pool_recording
+from experiments.shared.cameras import Hidden, Protocol, draw_protocol
+from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.many import Setup, scores
 
 CASES: dict[str, dict[str, Any]] = {
     "brighter": {}, "darker": {}, "OFF unreached": {"off": "unreached"},

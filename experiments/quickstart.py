@@ -20,14 +20,14 @@ import tyro
 
 from evflow import CameraEstimate, Events, Recording, estimate_camera, read_recording, simulate
 from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
-from evflow.progress import bar
+from evflow.camera.sensors import SensorModel
+from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.report.text import LABELS, describe
 from evflow.scenes import SceneConfig, make_bank, render, sample_scene
-from evflow.sensors import SensorModel
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import unzip, upsample
-from experiments.common import at_least, run_script, write_result
+from experiments.shared.common import at_least, run_script, write_result
 
 FPS, FRAME_EVERY = 1000, 25  # rendered frames per second; one in 25 is given to the estimator
 

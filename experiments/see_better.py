@@ -12,7 +12,7 @@ estimate and, for video, the thresholds of the original E2VID (e2vid), for flow 
 recordings, from whose frames EV-FlowNet learns (raw). Seeds are paired: scenes,
 initial parameters and batches are the same for all conditions of a seed, only the camera differs
 (not so of `raw`). Events for training come from one sensor model, those of the targets from others
-(`experiments.targets`). Images are scored in the later windows of held-out scenes, clipped to
+(shared/targets.py). Images are scored in the later windows of held-out scenes, clipped to
 [0, 1]: SSIM (preset evreal), MSE, PSNR, LPIPS where its weights are installed, and MSE of
 log(1 + 255 I) / log 256; flow by its error at pixels with events, and FWL (votes rounded to the
 nearest pixel) beside that of the true flow.
@@ -35,18 +35,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
-from evflow.config import as_dict
 from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet
 from evflow.downstream.simulated import SequenceConfig
 from evflow.downstream.train import LearningConfig
 from evflow.errors import EvflowDataError
+from evflow.network.weights import weights_path
 from evflow.report import plots
-from evflow.weights import weights_path
-from experiments import gains, held_out
-from experiments.common import at_least, provenance, run_script, write_result, write_text
-from experiments.conditions import E2V, RAW, Condition, Files, digest
-from experiments.targets import CAMERAS, SCENES
-from experiments.trainings import SIMULATED, Setting, Trainings
+from evflow.training.config import as_dict
+from experiments.shared import gains, held_out
+from experiments.shared.common import at_least, provenance, run_script, write_result, write_text
+from experiments.shared.conditions import E2V, RAW, Condition, Files, digest
+from experiments.shared.targets import CAMERAS, SCENES
+from experiments.shared.trainings import SIMULATED, Setting, Trainings
 
 Task = Literal["video", "flow"]
 Preset = Literal["debug", "small", "full"]

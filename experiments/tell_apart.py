@@ -24,16 +24,16 @@ import tyro
 
 from evflow.camera import Summary
 from evflow.commands.writing import need_absent, need_suffix
-from evflow.coordinates import squash_summary, summary_std, unsquash_summary
-from evflow.refine import Chunk, fused, refine_summary
-from evflow.refine.path import STEPS
-from evflow.refine.points import Points, chunk_points
-from evflow.refine.signal import joined, log_intensity, rate_at
-from evflow.weights import model_card, save_weights
-from experiments.cameras import Hidden, Protocol, draw_protocol
-from experiments.common import at_least, estimator, run_script
+from evflow.estimation.refine import Chunk, fused, refine_summary
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.points import Points, chunk_points
+from evflow.estimation.refine.signal import joined, log_intensity, rate_at
+from evflow.network.coordinates import squash_summary, summary_std, unsquash_summary
+from evflow.network.weights import model_card, save_weights
 from experiments.fuse import COVERED, before_refinement
-from experiments.many import Setup, scores
+from experiments.shared.cameras import Hidden, Protocol, draw_protocol
+from experiments.shared.common import at_least, estimator, run_script
+from experiments.shared.many import Setup, scores
 
 Array = jax.Array
 Row = dict[str, Any]

@@ -30,15 +30,15 @@ import jax.numpy as jnp
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from evflow import distributed
-from evflow.checkpoint import Checkpoints
-from evflow.config import TrainConfig, as_dict, preset
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.files.atomic import atomic_write
+from evflow.network.weights import load_weights, save_weights
+from evflow.process import devices
 from evflow.scenes import TextureBank, make_bank
-from evflow.train import TrainState, init_state, make_run_step, optimiser
-from evflow.weights import load_weights, save_weights
-from experiments.common import end_with, provenance
+from evflow.training.checkpoint import Checkpoints
+from evflow.training.config import TrainConfig, as_dict, preset
+from evflow.training.step import TrainState, init_state, make_run_step, optimiser
+from experiments.shared.common import end_with, provenance
 
 Resume = Literal["auto", "never", "must"]
 
@@ -91,8 +91,8 @@ class Options:
 
 def main(options: Options) -> Metrics:
     """One run; returns the mean metrics of its last hundred steps."""
-    distributed.initialise(options.coordinator, options.processes, options.process_id)
-    mesh = distributed.make_mesh()
+    devices.initialise(options.coordinator, options.processes, options.process_id)
+    mesh = devices.make_mesh()
     config = configuration(options, mesh.size)
     if options.resume == "must" and not options.out.is_dir():  # before a folder is made
         raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
@@ -105,18 +105,18 @@ def main(options: Options) -> Metrics:
         state = init_state(config, tx, bank, name)
         if options.start is not None:
             state = started_from(state, options.start)
-        state, bank = distributed.replicate((state, bank), mesh)
+        state, bank = devices.replicate((state, bank), mesh)
         if resumed:
             state = checkpoints.restore(state)
-        step = distributed.parallel(make_run_step(config, tx), mesh)
+        step = devices.parallel(make_run_step(config, tx), mesh)
         with Log(options.out / "metrics.jsonl", config.steps, int(state.step)) as log:
             state = run(step, state, bank, config, options, checkpoints, log, requests)
     card = {"preset": options.preset, "steps": int(state.step), "seed": config.seed,
             "devices": mesh.size, "training_figures": log.figures, "config": as_dict(config),
             **provenance()}
-    if distributed.is_main():
+    if devices.is_main():
         save_weights(options.out / "weights.safetensors", state.average, card, overwrite=True)
-    distributed.agree(True)  # leave together: a process that ends alone is a dead one to the others
+    devices.agree(True)  # leave together: a process that ends alone is a dead one to the others
     return log.figures
 
 
@@ -144,7 +144,7 @@ def goes_on(checkpoints: Checkpoints, config: Any, out: Path, resume: Resume) ->
     if resume == "must" or checkpoints.latest is not None:
         checkpoints.check_config(as_dict(config))
         return True
-    if distributed.is_main():
+    if devices.is_main():
         checkpoints.write_config(as_dict(config))
     return False
 
@@ -159,7 +159,7 @@ def started_from(state: TrainState, weights: str) -> TrainState:
         raise EvflowDataError(
             "EV018", f"{weights} has no part of the network {name!r} of this run, in its sizes.",
             "Start from weights of the same network, or leave --start out.")
-    if distributed.is_main():
+    if devices.is_main():
         print(f"from {weights}: {', '.join(taken)}")
     begun = {name: fresh | taken}
     return dataclasses.replace(state, params=begun, average=jax.tree.map(jnp.copy, begun))
@@ -176,7 +176,7 @@ def run(
     """Steps until the end, the time limit or a signal; the last step is saved."""
     started, step = time.monotonic(), int(state.step)
     # All processes must stop after the same step, but neither signals nor clocks are the same.
-    while step < config.steps and not distributed.agree(
+    while step < config.steps and not devices.agree(
             bool(requests) or time.monotonic() - started > options.max_seconds):
         state, metrics = step_fn(state, bank)
         step += 1
@@ -212,7 +212,7 @@ class Log:
     """
 
     def __init__(self, path: Path, steps: int, step: int) -> None:
-        self._main = distributed.is_main()
+        self._main = devices.is_main()
         self._recent: list[Metrics] = []
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                    TimeRemainingColumn())

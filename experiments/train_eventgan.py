@@ -23,16 +23,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.baselines.eventgan import GANS, GanConfig, generate, init_state, run_step
-from evflow.config import as_dict
 from evflow.downstream.tensor import signed
-from evflow.intensity import lin_log_inverse
-from evflow.progress import bar
+from evflow.light.log_maps import lin_log_inverse
+from evflow.network.weights import save_weights
+from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import make_bank
-from evflow.weights import save_weights
+from evflow.training.config import as_dict
 from experiments import generate as inverse
-from experiments.common import at_least, provenance, run_script, write_result, write_text
-from experiments.loop import train
+from experiments.shared.common import at_least, provenance, run_script, write_result, write_text
+from experiments.shared.loop import train
 
 Array = jax.Array
 

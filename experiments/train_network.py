@@ -25,7 +25,6 @@ import numpy as np
 
 from evflow import read_recording
 from evflow.camera import Camera
-from evflow.config import as_dict
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, run
 from evflow.downstream.presets import training
@@ -37,12 +36,13 @@ from evflow.errors import EvflowDataError
 from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import frame_scores
 from evflow.metrics.perceptual import load_lpips
+from evflow.network.weights import weights_path
 from evflow.scenes import make_bank
-from evflow.weights import weights_path
-from experiments.common import at_least, provenance, run_script, write_result
-from experiments.conditions import digest
-from experiments.held_out import ENDPOINTS, PROTOCOL, scored_by
-from experiments.loop import train
+from evflow.training.config import as_dict
+from experiments.shared.common import at_least, provenance, run_script, write_result
+from experiments.shared.conditions import digest
+from experiments.shared.held_out import ENDPOINTS, PROTOCOL, scored_by
+from experiments.shared.loop import train
 
 Array = jax.Array
 

@@ -29,7 +29,7 @@ import evflow as ef
 from evflow.cli import Command, main
 from evflow.errors import CODES
 from evflow.io import write_recording
-from evflow.io.base import FORMATS, WRITERS
+from evflow.io.registry import FORMATS, WRITERS
 from experiments import make_dataset, see_better, train_network
 
 ROOT = Path(__file__).parents[1]

@@ -19,13 +19,13 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from networks import hidden, small_config
+from helpers.networks import hidden, small_config
 
 import evflow as ef
 from evflow.dataset.config import PRESETS
 from evflow.dataset.generate import make_sequence
 from evflow.scenes import make_bank
-from evflow.train import init_state, make_run_step, optimiser
+from evflow.training.step import init_state, make_run_step, optimiser
 
 STORED = Path(__file__).parent / "data" / "same_bytes.json"
 PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers.videos import code_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from videos import code_of
 
 from evflow.types import Events
 from evflow.voxel import voxelize, voxelize_padded

@@ -11,7 +11,6 @@ strongest fair reading differ, both are here.
 
 from evflow.baselines.akf import Akf
 from evflow.baselines.base import Fitted, Solution, System
-from evflow.baselines.calibration import calibrate_step
 from evflow.baselines.complementary import Complementary
 from evflow.baselines.ecc import Ecc, EccEvents
 from evflow.baselines.integration import Integration
@@ -21,6 +20,7 @@ from evflow.baselines.match import Match
 from evflow.baselines.noise_forms import v2e_noise, voltmeter_noise
 from evflow.baselines.reconstruction import Reconstructor
 from evflow.baselines.s2r import S2r
+from evflow.estimation.bench.calibration import calibrate_step
 
 # By name, in the order of the table; an experiment is a loop over them.
 SYSTEMS: dict[str, System] = {

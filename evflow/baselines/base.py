@@ -19,9 +19,9 @@ import numpy as np
 
 from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
-from evflow.intensity import lin_log
-from evflow.io import plan_windows
-from evflow.refine.trace import trace_of_events
+from evflow.estimation.refine.trace import trace_of_events
+from evflow.light.log_maps import lin_log
+from evflow.recordings import plan_windows
 from evflow.types import Recording
 
 UNKNOWN = 0.3  # log units: where nothing is known, the middle of the common range .1-.5

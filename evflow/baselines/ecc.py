@@ -20,8 +20,8 @@ import numpy as np
 from evflow.baselines.base import UNKNOWN, Solution, System, constant, intervals, usable
 from evflow.camera import THETA_MIN
 from evflow.errors import EvflowDataError
-from evflow.intensity import lin_log
-from evflow.refine.trace import trace_of_events
+from evflow.estimation.refine.trace import trace_of_events
+from evflow.light.log_maps import lin_log
 from evflow.types import Recording
 
 Array = jax.Array

@@ -25,13 +25,13 @@ import optax
 
 from evflow.baselines.eventgan_losses import Pair, critic_loss, flow_loss, reconstruction_loss
 from evflow.baselines.unet import KERNEL, UNet, fresh
-from evflow.batch import Batch, sample_batch
 from evflow.camera import CameraPrior
-from evflow.config import NuisanceConfig, TrainConfig
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
-from evflow.intensity import lin_log_inverse
+from evflow.light.log_maps import lin_log_inverse
 from evflow.scenes import TextureBank
-from evflow.sensors import SensorModel
+from evflow.training.batch import Batch, sample_batch
+from evflow.training.config import NuisanceConfig, TrainConfig
 
 Array = jax.Array
 Params = dict[str, Any]
@@ -49,8 +49,8 @@ DATA = TrainConfig(
 class GanConfig:
     """One training run; the content of step i depends on (config, i) alone.
 
-    data: the simulated windows (`evflow.batch`); bins follow its model. base, encoders: of the
-    generator; critic: features of the critic's first layer; scales: predictions of the cycle
+    data: the simulated windows (`evflow.training.batch`); bins follow its model. base, encoders:
+    of the generator; critic: features of the critic's first layer; scales: predictions of the cycle
     networks. paired: weight of the L1 distance to the simulated volume of the same frames, 0 as
     published: the fair strongest reading has pairs, since a simulator makes them.
     """

@@ -33,8 +33,8 @@ from evflow.baselines.lgan_simulator import Runs, compared, lead, runs_of, simul
 from evflow.baselines.resimulate import Path, scene_of
 from evflow.baselines.unet import UNet
 from evflow.camera import THETA_MIN
-from evflow.intensity import lin_log_inverse
-from evflow.progress import bar
+from evflow.light.log_maps import lin_log_inverse
+from evflow.process.terminal import bar
 from evflow.types import Recording
 
 Array = jax.Array

@@ -17,7 +17,7 @@ import numpy as np
 
 from evflow.baselines.resimulate import Scene
 from evflow.camera import Camera
-from evflow.sensors import SensorModel
+from evflow.camera.sensors import SensorModel
 from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
 

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from evflow.intensity import noise_factor, normalised_intensity
-from evflow.sensors import DVS346, Voltmeter
+from evflow.camera.sensors import DVS346, Voltmeter
+from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.simulator.voltmeter import exit_against
 
 Array = jax.Array

@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 from evflow.camera import Camera
 from evflow.checks import check_frames, check_times
 from evflow.errors import EvflowDataError
-from evflow.intensity import LINLOG_KNEE, LINLOG_SLOPE, lin_log, lin_log_inverse
+from evflow.light.log_maps import LINLOG_KNEE, LINLOG_SLOPE, lin_log, lin_log_inverse
 from evflow.types import Events
 
 Array = jax.Array

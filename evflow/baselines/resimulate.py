@@ -18,12 +18,12 @@ import numpy as np
 from evflow.baselines.base import usable
 from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
-from evflow.intensity import lin_log
-from evflow.refine import Chunk, make_chunk, refinement_chunks
-from evflow.refine.noise import combined_rate, quiet_events
-from evflow.refine.path import STEPS
-from evflow.refine.pixels import pixel_evidence
-from evflow.refine.trace import Trace, trace_of_camera
+from evflow.estimation.refine import Chunk, make_chunk, refinement_chunks
+from evflow.estimation.refine.noise import combined_rate, quiet_events
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.pixels import pixel_evidence
+from evflow.estimation.refine.trace import Trace, trace_of_camera
+from evflow.light.log_maps import lin_log
 from evflow.types import Recording
 
 Array = jax.Array

@@ -22,8 +22,8 @@ from evflow.baselines.match import PIXELS, camera_rows
 from evflow.baselines.resimulate import scene_of
 from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
-from evflow.intensity import lin_log
-from evflow.io import plan_windows
+from evflow.light.log_maps import lin_log
+from evflow.recordings import plan_windows
 from evflow.scenes import make_bank, render, sample_scene
 from evflow.scenes.config import SceneConfig
 from evflow.simulator import simulate_counts

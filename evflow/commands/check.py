@@ -29,7 +29,7 @@ class Check(Reading):
     """Take warnings for errors."""
 
     def run(self) -> None:
-        from evflow.inspection import Finding, Report, check
+        from evflow.recordings.check import Finding, Report, check
 
         try:
             recording = self.read(self.recording)

@@ -53,8 +53,8 @@ class Compare(Reading):
 
     def run(self) -> None:
         from evflow.metrics.streams import compare
+        from evflow.process.provenance import sha256, versions
         from evflow.report import plots
-        from evflow.report.provenance import sha256, versions
         from evflow.report.streams import write_comparison
         from evflow.report.verdict import describe_streams, judge_streams, worst
 

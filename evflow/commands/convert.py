@@ -38,7 +38,7 @@ class Convert(Reading):
 
     def run(self) -> None:
         from evflow import io
-        from evflow.io.base import writer_of
+        from evflow.io.registry import writer_of
         from evflow.types import Recording
 
         writer = writer_of(self.out, named(self.format, self.out))

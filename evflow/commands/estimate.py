@@ -16,7 +16,7 @@ from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
-    from evflow.camera_estimate import CameraEstimate
+    from evflow.estimation.result import CameraEstimate
     from evflow.types import Recording
 
 FILES = ("camera.npz", "camera.json", "maps.png", "histograms.png", "report.html")
@@ -63,7 +63,7 @@ class Estimate(Reading):
     """Print the summary as JSON."""
 
     def run(self) -> None:
-        from evflow.folders import staged
+        from evflow.files.folders import staged
         from evflow.report import plots
         from evflow.report.text import describe
 
@@ -97,7 +97,7 @@ class Estimate(Reading):
 
     def _checked(self, recording: Recording) -> list[str]:
         """What `evflow check` doubts; raises its errors, unless told not to."""
-        from evflow.inspection import check
+        from evflow.recordings.check import check
 
         report = check(recording)
         if self.checks:
@@ -110,7 +110,7 @@ class Estimate(Reading):
     def _reconstructed(self, recording: Recording) -> Recording:
         """The recording with frames made from its events; EV020 where it has frames."""
         from evflow.downstream.video import with_reconstructed_frames
-        from evflow.progress import bar
+        from evflow.process.terminal import bar
 
         if recording.has_frames:
             raise EvflowDataError("EV020", f"--reconstruct, but {self.recording} has frames.",
@@ -120,9 +120,9 @@ class Estimate(Reading):
                 recording, self.reconstruct_weights, progress=progress)
 
     def _estimated(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
-        from evflow.progress import bar
-        from evflow.recording import estimate_camera
-        from evflow.weights import load_weights, model_card, trained_steps
+        from evflow.estimation.pipeline import estimate_camera
+        from evflow.network.weights import load_weights, model_card, trained_steps
+        from evflow.process.terminal import bar
 
         params = load_weights(self.weights)
         with bar("estimating") as progress:
@@ -136,13 +136,13 @@ class Estimate(Reading):
                        "weights_steps": trained_steps(model_card(self.weights))}
 
     def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
-        from evflow.baselines.calibration import calibrate_step
-        from evflow.noise_only import estimate_noise
+        from evflow.estimation.bench.calibration import calibrate_step
+        from evflow.estimation.static import estimate_noise
 
         return (calibrate_step if self.protocol == "step" else estimate_noise)(recording), {}
 
     def _report(self, out: Path, found: CameraEstimate, recording: Recording) -> None:
-        from evflow.progress import bar
+        from evflow.process.terminal import bar
         from evflow.report.camera import write_report
 
         with bar("reporting") as progress:

@@ -33,7 +33,7 @@ class Export:
 
     def run(self) -> None:
         from evflow.camera import Camera
-        from evflow.exports import export_camera, write_export
+        from evflow.camera.exports import export_camera, write_export
 
         need_folder(self.out)
         need_absent(self.out, self.overwrite, self.camera)

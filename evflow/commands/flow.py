@@ -46,7 +46,7 @@ class Flow(Windowed):
     def run(self) -> None:
         from evflow.downstream.flow import FlowScores, flow_of, full_motion, window_flows
         from evflow.downstream.released import load_network
-        from evflow.progress import bar
+        from evflow.process.terminal import bar
 
         check_finite(self)
         self._check()

@@ -42,7 +42,7 @@ class Info(Reading):
 
 
 def _facts(recording: Recording) -> dict[str, Any]:
-    from evflow import io
+    from evflow.recordings.windows import condensed, plan_windows
 
     events, times = recording.events, recording.frame_times
     facts = {
@@ -56,6 +56,6 @@ def _facts(recording: Recording) -> dict[str, Any]:
         "frame_dtype": str(recording.frames.dtype), "notes": list(recording.notes),
     }
     if len(times) > 1 and len(events):
-        plan = io.plan_windows(recording)
-        facts["windows"], facts["skipped"] = len(plan.pairs), io.condensed(plan.skipped)
+        plan = plan_windows(recording)
+        facts["windows"], facts["skipped"] = len(plan.pairs), condensed(plan.skipped)
     return facts

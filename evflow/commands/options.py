@@ -108,7 +108,7 @@ class Reading:
 
     def _seeing(self, recording: Recording) -> Recording:
         """The recording with the frames asked for, put right."""
-        from evflow.io import adjust
+        from evflow.recordings import adjust
 
         offset = 0 if self.frames_offset_ms == "auto" else round(self.frames_offset_ms * 1000)
         pattern = parse_bayer(self.bayer)
@@ -127,8 +127,8 @@ class Reading:
 
 
 def _aligned(recording: Recording) -> Recording:
-    from evflow.inspection import frames_offset
-    from evflow.io import adjust
+    from evflow.recordings import adjust
+    from evflow.recordings.check import frames_offset
 
     return adjust.shifted(recording, frames_offset(recording))
 
@@ -182,7 +182,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 def parse_bayer(text: str | None) -> str | None:
     """A pattern of `colour.PATTERNS`, of any case; EV020 on anything else."""
-    from evflow.colour import PATTERNS
+    from evflow.light.colour import PATTERNS
 
     if text is None or text.lower() in PATTERNS:
         return text and text.lower()
@@ -192,7 +192,7 @@ def parse_bayer(text: str | None) -> str | None:
 
 def write_json(path: Path, facts: dict[str, Any]) -> None:
     """`facts` as an indented JSON file, replaced whole or not at all."""
-    from evflow.files import atomic_write
+    from evflow.files.atomic import atomic_write
 
     with atomic_write(path, overwrite=True) as temporary:
         temporary.write_text(json.dumps(facts, indent=2) + "\n")

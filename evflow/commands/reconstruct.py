@@ -46,7 +46,7 @@ class Reconstruct(Windowed):
         from evflow.downstream.released import load_network
         from evflow.downstream.tensor import reconstructions
         from evflow.downstream.video import images_of
-        from evflow.progress import bar
+        from evflow.process.terminal import bar
 
         check_finite(self)
         self.check_film()

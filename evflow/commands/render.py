@@ -46,7 +46,7 @@ class Render(Reading):
     """Print JSON."""
 
     def run(self) -> None:
-        from evflow.progress import bar
+        from evflow.process.terminal import bar
         from evflow.report.movie import Film, write_film, write_sheet
 
         check_finite(self)

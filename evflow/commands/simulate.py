@@ -16,9 +16,9 @@ from evflow.commands.writing import Format, named, need_absent
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
-    from evflow.io.frames import Frames, FrameSource
+    from evflow.camera.sensors import SensorModel
+    from evflow.io.images.frames import Frames, FrameSource
     from evflow.io.writer import EventWriter
-    from evflow.sensors import SensorModel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,8 +102,8 @@ class Simulate:
         import jax
 
         from evflow import io
-        from evflow.colour import as_seen
-        from evflow.progress import bar
+        from evflow.light.colour import as_seen
+        from evflow.process.terminal import bar
         from evflow.simulator import simulate_stream
         from evflow.simulator.interpolate import unzip, upsample
 
@@ -154,7 +154,7 @@ class Simulate:
 
     def _model(self) -> SensorModel:
         """The pixels' circuit; EV020 where it has no such choice."""
-        from evflow.sensors import known_sensor
+        from evflow.camera.sensors import known_sensor
 
         model = known_sensor(self.sensor).model
         if model.kind == "v2e":
@@ -165,7 +165,7 @@ class Simulate:
 
 def _recorded(video: Frames, colour: str, writer: EventWriter) -> Frames:
     """The frames on their way, each written as the pixels see it."""
-    from evflow.colour import as_seen
+    from evflow.light.colour import as_seen
 
     for frame, time in video:
         seen, _ = next(as_seen(iter([(frame, time)]), colour))
@@ -179,7 +179,7 @@ def _camera(command: Simulate, size: tuple[int, int]) -> Any:
     import jax.numpy as jnp
 
     from evflow.camera import PARAMETERS, Camera, CameraPrior
-    from evflow.sensors import known_sensor
+    from evflow.camera.sensors import known_sensor
 
     shape, key = size[::-1], jax.random.key(command.seed)
     given = {name: jnp.full(shape, value) for name in PARAMETERS

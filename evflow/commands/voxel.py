@@ -48,8 +48,8 @@ class Voxel(Reading):
     """Print JSON."""
 
     def run(self) -> None:
-        from evflow.files import atomic_write
-        from evflow.progress import bar
+        from evflow.files.atomic import atomic_write
+        from evflow.process.terminal import bar
         from evflow.voxel import voxelize
 
         check_finite(self)
@@ -94,11 +94,11 @@ def _windows(
 
     Raises EV001, EV011, EV012 as `plan_windows`, EV017 where no window is left.
     """
-    from evflow import io
+    from evflow.recordings.windows import plan_windows
 
     t = recording.events.t
     if recording.has_frames:
-        plan = io.plan_windows(recording, window_us)
+        plan = plan_windows(recording, window_us)
         ends = recording.frame_times[np.array(plan.pairs, int).reshape(-1, 2)]
         pairs, starts, lengths, notes = (
             plan.pairs, ends[:, 0], ends[:, 1] - ends[:, 0], plan.skipped)
@@ -119,7 +119,7 @@ def _windows(
 
 
 def _changes(recording: Recording, pairs: tuple[tuple[int, int], ...]) -> Iterator[np.ndarray]:
-    from evflow.intensity import to_log
+    from evflow.light.log_maps import to_log
 
     for first, last in pairs:
         before, after = (to_log(recording.frame_dn(i)) for i in (first, last))

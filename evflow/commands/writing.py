@@ -18,7 +18,7 @@ FILES = frozenset((  # endings that nobody gives a folder
 def named(format: Format, out: Path) -> str | None:
     """The format as `evflow.io` takes it: None for what the extension stands for. EV020 where the
     extension stands for another one."""
-    from evflow.io.base import writer_of
+    from evflow.io.registry import writer_of
 
     refuse_stdout(out)
     if format == "auto":

@@ -11,10 +11,10 @@ import math
 from typing import Any
 
 from evflow.camera import CameraPrior
+from evflow.camera.sensors import SensorModel
 from evflow.dataset.sequence import sequence_names
 from evflow.errors import EvflowDataError
 from evflow.scenes.config import SceneConfig
-from evflow.sensors import SensorModel
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,10 +19,10 @@ from jax.typing import ArrayLike
 
 from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
 from evflow.dataset.config import DatasetConfig
-from evflow.dataset.motion import optical_flow
 from evflow.dataset.sequence import EventSequence
-from evflow.intensity import noise_factor, normalised_intensity, to_log
+from evflow.light.log_maps import noise_factor, normalised_intensity, to_log
 from evflow.scenes import Scene, TextureBank, load_photos, make_bank, render, sample_scene
+from evflow.scenes.motion import optical_flow
 from evflow.simulator import simulate_stream
 from evflow.types import Events
 

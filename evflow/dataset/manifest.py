@@ -19,7 +19,7 @@ from typing import Any
 from evflow.dataset.sequence import EventSequence, sequence_names
 from evflow.dataset.store import SUFFIXES, Format
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.files.atomic import atomic_write
 
 Record = dict[str, Any]
 Identity = dict[str, Any]

@@ -23,8 +23,8 @@ from evflow.dataset.generate import make_sequence
 from evflow.dataset.manifest import Manifests, Part, Progress, Record
 from evflow.dataset.store import Format, write_sequence
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
-from evflow.workers import worker_pool
+from evflow.files.atomic import atomic_write
+from evflow.process.workers import worker_pool
 
 DRAFTS = ".drafts-"
 

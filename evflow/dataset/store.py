@@ -1,7 +1,8 @@
 """Sequences as files. NumPy only: reading never imports JAX, so that PyTorch workers may fork.
 
 "dsec": one HDF5 file, NAME.h5, with events, frames and frame_times in the layout of
-`evflow.io.dsec` (any reader of DSEC takes it), and flow, flow_visible, changes, camera/*, nominal.
+`evflow.io.formats.dsec` (any reader of DSEC takes it), and flow, flow_visible, changes, camera/*,
+nominal.
 "npy": a folder NAME of flat arrays: events_x.npy, ..., frames.npy, flow.npy, camera_theta_on.npy.
 Neither holds a time of day: equal sequences are equal bytes.
 """
@@ -18,9 +19,9 @@ import numpy as np
 from evflow.checks import COLUMNS
 from evflow.dataset.sequence import SPLITS, Arrays, EventSequence, truth_layout
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.files.atomic import atomic_write
 from evflow.io import DsecWriter, read_recording
-from evflow.io.hdf5 import DAMAGE, load_h5py, plausible
+from evflow.io.decode.hdf5 import DAMAGE, load_h5py, plausible
 from evflow.types import Events, Recording
 
 Format = Literal["dsec", "npy"]

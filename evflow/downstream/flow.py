@@ -14,7 +14,7 @@ from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.released import Trained
 from evflow.downstream.tensor import reconstructions
 from evflow.errors import EvflowDataError, naming
-from evflow.io.archives import load_npz
+from evflow.files.archives import load_npz
 from evflow.metrics.flow_scores import score_flow
 from evflow.types import Events
 

@@ -18,7 +18,7 @@ from evflow.camera import Camera
 from evflow.downstream.simulated import SequenceConfig, Sequences, draw_noise
 from evflow.downstream.tensor import event_tensor
 from evflow.errors import EvflowDataError
-from evflow.io import plan_windows
+from evflow.recordings import plan_windows
 from evflow.types import Recording
 
 Array = jax.Array

@@ -20,7 +20,7 @@ from evflow.downstream.network import Network, Params
 from evflow.downstream.presets import KINDS
 from evflow.downstream.published import SPLIT_BINS, join, read_published
 from evflow.errors import EvflowDataError
-from evflow.weights import load_weights, model_card, save_weights, weights_path
+from evflow.network.weights import load_weights, model_card, save_weights, weights_path
 
 PUBLISHED = (".pth", ".pt", ".tar")  # where there is no such file; else any but .safetensors
 RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: network

@@ -18,14 +18,14 @@ import jax
 import jax.numpy as jnp
 
 from evflow.camera import Camera, CameraPrior, sample_nominal, sample_pixels
-from evflow.dataset.motion import optical_flow
+from evflow.camera.sensors import SensorModel
 from evflow.downstream.prior import WidePrior
 from evflow.downstream.tensor import BINS, normalise, signed
 from evflow.errors import EvflowDataError
-from evflow.intensity import lin_log, noise_factor, normalised_intensity
+from evflow.light.log_maps import lin_log, noise_factor, normalised_intensity
 from evflow.scenes import Scene, TextureBank, render, sample_scene
 from evflow.scenes.config import SceneConfig
-from evflow.sensors import SensorModel
+from evflow.scenes.motion import optical_flow
 from evflow.simulator import noise, sensor
 from evflow.simulator.voxels import simulate_window
 

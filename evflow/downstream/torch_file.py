@@ -18,9 +18,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from evflow import pickles
 from evflow.errors import EvflowDataError
-from evflow.io.archives import is_zip, unzipped
+from evflow.files import pickles
+from evflow.files.archives import is_zip, unzipped
 
 ZIP_BEGIN = b"PK\x03\x04"
 MAGIC = 0x1950A86A20F9469CFC6C  # of the chain of pickles

@@ -10,12 +10,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera_estimate import CameraEstimate
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.released import Trained, load_network
 from evflow.downstream.sync import Sync, sync_times
 from evflow.downstream.tensor import reconstructions
 from evflow.errors import EvflowDataError
+from evflow.estimation.result import CameraEstimate
 from evflow.metrics.image_scores import ImageProtocol, score_images
 from evflow.metrics.perceptual import Params
 from evflow.types import MADE, Recording

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from evflow.errors import EvflowDataError, naming
-from evflow.io.base import find_format, read_recording
-from evflow.io.frames import FrameHints, Frames, FrameSource, Image, converted, existing
-from evflow.io.images import open_folder
-from evflow.io.stacks import is_stack, open_stack
+from evflow.io.images.folder import open_folder
+from evflow.io.images.frames import FrameHints, Frames, FrameSource, Image, converted, existing
+from evflow.io.images.stacks import is_stack, open_stack
+from evflow.io.registry import find_format, read_recording
 
 
 def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
@@ -57,7 +57,7 @@ def _folder(path: Path, told: FrameHints) -> FrameSource:
 
 
 def _video(path: Path, told: FrameHints) -> FrameSource:
-    from evflow.io.video import open_video
+    from evflow.io.images.video import open_video
 
     video = open_video(path, told)
     return _source(video.size, video.claimed, video.images, told, video.notes)

@@ -19,7 +19,7 @@ import numpy as np
 
 from evflow.checks import COLUMNS, Size, check_frames, check_size, check_times
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.files.atomic import atomic_write
 from evflow.types import Events, Recording
 
 FLUSH = 1 << 20  # events gathered before they are written: what a compressor likes

@@ -3,41 +3,6 @@
 The names load on first use: comparing streams needs no JAX.
 """
 
-from __future__ import annotations
+import lazy_loader
 
-import importlib
-from typing import Any
-
-_HOME = {
-    "aee": "flow",
-    "endpoint_error": "flow",
-    "fwl": "flow",
-    "rsat": "flow",
-    "warped_image": "flow",
-    "FwlConvention": "flow",
-    "score_flow": "flow_scores",
-    "log_map": "image",
-    "mae_intensity_change": "image",
-    "mse": "image",
-    "psnr": "image",
-    "rmse": "image",
-    "ssim": "image",
-    "ImageProtocol": "image_scores",
-    "PROTOCOLS": "image_scores",
-    "frame_scores": "image_scores",
-    "score_images": "image_scores",
-    "load_lpips": "perceptual",
-    "lpips": "perceptual",
-}
-
-__all__ = sorted(_HOME)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"evflow.metrics.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'evflow.metrics' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow import pickles
 from evflow.errors import EvflowDataError
+from evflow.files import pickles
 from evflow.metrics.image import check_images
 
 Array = jax.Array

@@ -15,16 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from evflow.camera_estimate import CameraEstimate
 from evflow.errors import EvflowDataError
-from evflow.inspection import check
-from evflow.inspection.agreement import frame_steps
-from evflow.recording import Progress
+from evflow.estimation.pipeline import Progress
+from evflow.estimation.result import CameraEstimate
+from evflow.network.weights import load_weights, weights_hash
+from evflow.process.provenance import sha256, versions
+from evflow.recordings.check import check
+from evflow.recordings.check.agreement import frame_steps
 from evflow.report import page
 from evflow.report.maps import fault_panel, map_panel, scatter_panel
 from evflow.report.page import Panel, bullets, number, paragraph, plural, spread, table
 from evflow.report.plots import require
-from evflow.report.provenance import sha256, versions, weights_hash
 from evflow.report.resimulate import (
     LEARNT_SECONDS,
     PIXELS,
@@ -55,7 +56,6 @@ from evflow.report.verdict import (
     worst,
 )
 from evflow.types import Recording
-from evflow.weights import load_weights
 
 NAMES: Names = ("recorded", "re-simulated")
 STAGES = 4

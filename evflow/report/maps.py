@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import PARAMETERS
-from evflow.camera_estimate import CameraEstimate
+from evflow.estimation.result import CameraEstimate
 from evflow.report import figures, page
 from evflow.report.page import Panel, figure, grid, number, paragraph, spread
 from evflow.report.plots import OFF_COLOUR, ON_COLOUR, robust_range

@@ -15,19 +15,11 @@ import numpy as np
 from PIL import Image
 
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
-from evflow.recording import Progress
+from evflow.estimation.pipeline import Progress
+from evflow.files.atomic import atomic_write
 from evflow.report.plots import event_image
 from evflow.report.resimulate import busiest_instant
-from evflow.report.video import (
-    CODECS,
-    FPS,
-    SCALES,
-    Codec,
-    check_within,
-    enlarged,
-    write_video,
-)
+from evflow.report.video import CODECS, FPS, SCALES, Codec, check_within, enlarged, write_video
 from evflow.types import Recording
 
 SUFFIXES = (".mp4", ".gif", ".png")

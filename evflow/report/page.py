@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from evflow.files import atomic_write
+from evflow.files.atomic import atomic_write
 
 WIDEST = 480  # pixels of a map: larger sensors are shown in blocks
 COLOURS = 256

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from evflow.camera import PARAMETERS, Camera
-from evflow.camera_estimate import CameraEstimate
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
+from evflow.estimation.result import CameraEstimate
+from evflow.files.atomic import atomic_write
 from evflow.types import Events
 
 TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON [Hz]", "eta_off": "η OFF [Hz]"}

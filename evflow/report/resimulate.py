@@ -13,13 +13,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from evflow import io
 from evflow.camera import Camera
-from evflow.camera_estimate import CameraEstimate
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
+from evflow.estimation.pipeline import estimate_camera
+from evflow.estimation.result import CameraEstimate
 from evflow.metrics.streams import compare
-from evflow.recording import estimate_camera
-from evflow.sensors import SensorModel
+from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
 from evflow.types import Events, Recording
@@ -59,7 +59,7 @@ def usable_runs(recording: Recording) -> list[Run]:
     Raises EV011, EV012 where frames are missing, EV017 where no two neighbours can be used.
     """
     runs: list[Run] = []
-    for first, last in io.plan_windows(recording, 1).pairs:
+    for first, last in plan_windows(recording, 1).pairs:
         if runs and runs[-1][1] == first:
             runs[-1] = (runs[-1][0], last)
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from evflow.camera_estimate import CameraEstimate
+from evflow.estimation.result import CameraEstimate
 
 LABELS = {
     "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON (Hz/pixel)",

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from evflow.camera_estimate import CameraEstimate
+from evflow.estimation.result import CameraEstimate
 from evflow.report.resimulate import Trial
 
 Grade = Literal["good", "fair", "poor"]

@@ -17,8 +17,8 @@ import numpy as np
 from PIL import Image
 
 from evflow.errors import EvflowDataError
-from evflow.files import atomic_write
-from evflow.folders import atomic_folder
+from evflow.files.atomic import atomic_write
+from evflow.files.folders import atomic_folder
 
 Codec = Literal["mpeg4", "vp9"]
 

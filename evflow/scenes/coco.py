@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.frames import existing
+from evflow.io.images.frames import existing
 from evflow.scenes.rle import decode_rle
 
 MAX_PIXELS = 1 << 28  # of an image: its mask takes a byte each

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.colour import luma
 from evflow.errors import EvflowDataError
-from evflow.io.frames import existing
-from evflow.io.images import decode, list_images
+from evflow.io.images.folder import decode, list_images
+from evflow.io.images.frames import existing
+from evflow.light.colour import luma
 from evflow.scenes.bank import TextureBank, make_bank
 from evflow.scenes.coco import Coco, CocoObject, read_coco
 from evflow.scenes.textures import BLUR_TEXELS

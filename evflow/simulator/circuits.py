@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.intensity import to_log
-from evflow.sensors import SensorModel
+from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import to_log
 from evflow.simulator import active, noise, pack, sensor, voltmeter
 from evflow.simulator.active import BLOCK, Block, Exit
 from evflow.simulator.pack import Keys

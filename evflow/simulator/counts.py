@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 
 from evflow.camera import Camera
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
-from evflow.intensity import check_log
-from evflow.sensors import SensorModel
+from evflow.light.log_maps import check_log
 from evflow.simulator import noise, pixel, sensor
 from evflow.simulator.grids import as_log
 from evflow.simulator.pixel import PixelState

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.sensors import SensorModel
 from evflow.checks import COLUMNS
 from evflow.errors import EvflowDataError
-from evflow.sensors import SensorModel
 from evflow.simulator import pack
 from evflow.simulator.active import BLOCK
 from evflow.simulator.circuits import circuit

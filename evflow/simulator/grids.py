@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from evflow.intensity import LOG_MAPS, normalised_intensity, to_log
-from evflow.sensors import SensorModel
+from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import LOG_MAPS, normalised_intensity, to_log
 from evflow.simulator import bins as weigh
 from evflow.simulator import noise, sensor, voltmeter
 from evflow.simulator.active import BLOCK, Block

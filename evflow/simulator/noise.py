@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
-from evflow.intensity import Values, noise_factor
-from evflow.sensors import SensorModel
+from evflow.light.log_maps import Values, noise_factor
 
 Array = jax.Array
 

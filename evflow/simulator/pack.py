@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from evflow.intensity import normalised_intensity
-from evflow.sensors import SensorModel
+from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import normalised_intensity
 from evflow.simulator import noise
 from evflow.simulator.active import TICKS, Block, Sent
 from evflow.simulator.sensor import Sensor

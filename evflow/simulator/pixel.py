@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.camera import Camera
-from evflow.sensors import SensorModel
+from evflow.camera.sensors import SensorModel
 
 Array = jax.Array
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.intensity import LOG_MAPS, normalised_intensity
-from evflow.sensors import SensorModel
+from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import LOG_MAPS, normalised_intensity
 from evflow.simulator import noise, pixel
 from evflow.simulator.pixel import PixelState, Spikes
 

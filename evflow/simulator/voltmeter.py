@@ -27,8 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.sensors import Voltmeter
 from evflow.errors import EvflowDataError
-from evflow.sensors import Voltmeter
 
 Array = jax.Array
 

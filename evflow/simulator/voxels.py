@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
-from evflow.intensity import check_log
-from evflow.sensors import SensorModel
+from evflow.light.log_maps import check_log
 from evflow.simulator import circuits, noise, sensor
 from evflow.simulator.active import BLOCK
 from evflow.simulator.bins import Schedule

@@ -1,0 +1,204 @@
+"""The camera: per-pixel contrast thresholds and noise rates, and what all its pixels share.
+
+`Camera` is a pytree of four float32 maps (..., H, W); it passes through jit, vmap and grad. What
+is *not* per pixel is the `SensorModel` (sensors.py); what cameras are drawn from, the
+`CameraPrior` (prior.py).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.errors import EvflowDataError, naming
+from evflow.files.archives import load_npz
+from evflow.files.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from evflow.camera.prior import CameraPrior
+
+Array = jax.Array
+
+THETA_MIN = 0.01  # v2e clamps thresholds here; a pixel at the clamp is a hot pixel
+PARAMETERS = ("theta_on", "theta_off", "eta_on", "eta_off")
+EXPECTED = ("Expected the camera.npz of evflow estimate (or Camera.save): maps (H, W) "
+            f"{', '.join(PARAMETERS)}.")
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Per-pixel parameters, each float32 (..., H, W).
+
+    theta_on, theta_off: contrast thresholds in natural-log units, > 0.
+    eta_on, eta_off: noise events per second (Hz) and pixel, >= 0, at the recording's mean
+    intensity (`SensorModel(eta_intensity=True)` lets the rate follow Eq. 12 with intensity).
+    """
+
+    theta_on: Array
+    theta_off: Array
+    eta_on: Array
+    eta_off: Array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(np.shape(self.theta_on))
+
+    @staticmethod
+    def constant(
+        shape: tuple[int, ...],
+        theta_on: float = 0.2,
+        theta_off: float = 0.2,
+        eta_on: float = 0.0,
+        eta_off: float = 0.0,
+    ) -> Camera:
+        """The same parameters at every pixel of `shape` = (..., H, W)."""
+        values = (theta_on, theta_off, eta_on, eta_off)
+        return Camera(*(jnp.full(shape, v, jnp.float32) for v in values)).validate()
+
+    @staticmethod
+    def sample(key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None) -> Camera:
+        """One camera with pixels (..., H, W); leading axes are independent cameras. EV002."""
+        from evflow.camera.prior import sample_camera
+
+        return sample_camera(key, shape, prior)
+
+    def drawn(self, key: Array, std: Camera) -> Camera:
+        """A camera whose pixels are drawn from estimates and their std, both (..., H, W).
+
+        The most likely value of every pixel makes a camera more even than the one measured: what
+        was not seen of a pixel is the camera's median.
+        """
+        draws = jax.random.normal(key, (len(PARAMETERS), *self.shape))
+        least = {"theta_on": THETA_MIN, "theta_off": THETA_MIN}
+        return Camera(**{
+            name: jnp.maximum(getattr(self, name) + getattr(std, name) * draw,
+                              least.get(name, 0.0))
+            for name, draw in zip(PARAMETERS, draws, strict=True)})
+
+    def validate(self) -> Camera:
+        """Return self, or raise EV002, EV014, EV015 (host side; skipped on traced arrays)."""
+        self.check_values()
+        if len(self.shape) < 2 and not self._traced():
+            raise EvflowDataError("EV002", f"the camera's maps have shape {self.shape}.",
+                                  "Expected (..., H, W).")
+        return self
+
+    def check_values(self) -> None:
+        """EV014, EV015 for parameters (...) of any shape; traced arrays pass."""
+        if self._traced():
+            return
+        leaves = {name: getattr(self, name) for name in PARAMETERS}
+        shapes = {name: np.shape(v) for name, v in leaves.items()}
+        if len(set(shapes.values())) > 1:
+            raise EvflowDataError(
+                "EV015", f"the camera's maps have different shapes: {shapes}.",
+                "All four maps must be (..., H, W) of one sensor.",
+            )
+        for name, value in leaves.items():
+            array = np.asarray(value)
+            bad = ~np.isfinite(array) | (array <= 0 if name.startswith("theta") else array < 0)
+            if bad.any():
+                where = tuple(int(i) for i in np.argwhere(bad)[0])
+                rule = "> 0" if name.startswith("theta") else ">= 0"
+                raise EvflowDataError(
+                    "EV014",
+                    f"{name} is {array[where]} at index {where} ({bad.sum()} such values).",
+                    f"It must be finite and {rule}"
+                    + (f"; clamp thresholds at {THETA_MIN}." if rule == "> 0" else "."),
+                )
+
+    def _traced(self) -> bool:
+        return any(isinstance(getattr(self, name), jax.core.Tracer) for name in PARAMETERS)
+
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: Any) -> Path:
+        """Write an .npz with the four maps, `extra` arrays beside them, and the units."""
+        self.validate()
+        if taken := {*PARAMETERS, "meta"} & set(extra):
+            raise EvflowDataError("EV020", f"extra arrays named {', '.join(sorted(taken))}.",
+                                  "The camera's own maps have these names; choose others.")
+        units = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
+        arrays: dict[str, Any] = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
+        arrays |= {k: np.asarray(v) for k, v in extra.items()}
+        with atomic_write(path, overwrite=overwrite) as temporary, open(temporary, "wb") as f:
+            np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
+        return Path(path)
+
+    @staticmethod
+    def load(path: str | os.PathLike) -> Camera:
+        """Read the maps written by `save` (pickled arrays are refused)."""
+        return Camera.load_with_std(path)[0]
+
+    @staticmethod
+    def load_with_std(path: str | os.PathLike) -> tuple[Camera, Camera | None]:
+        """The maps and their standard deviations, where the file holds an estimate."""
+        path = Path(path)
+        _check_kind(path)
+        data = load_npz(path)
+        missing = [n for n in PARAMETERS if n not in data]
+        if missing:
+            recording = " It is a recording:" if {"t", "x", "y", "p"} <= set(data) else ""
+            raise EvflowDataError(
+                "EV008", f"{path} holds {', '.join(sorted(data)[:12])} but not "
+                f"{', '.join(missing)}.{recording}", EXPECTED if not recording else
+                f"make a camera of it, evflow estimate {path} -o cam/, and pass cam/camera.npz.")
+        errors = [f"{name}_std" for name in PARAMETERS]
+        with naming(path):
+            for name in {*PARAMETERS, *errors} & set(data):
+                if data[name].dtype.kind not in "fiu":
+                    raise EvflowDataError("EV009", f"{name} has dtype {data[name].dtype}.",
+                                          "Expected float32.")
+            maps = Camera(*(jnp.asarray(data[n], jnp.float32) for n in PARAMETERS)).validate()
+            if not all(name in data for name in errors):
+                return maps, None
+            std = Camera(*(jnp.asarray(data[n], jnp.float32) for n in errors))
+            jax.tree.map(_check_std, maps, std)
+            return maps, std
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """What a whole camera shares, each float32 (...,): the medians of the four maps and the
+    threshold mismatch (standard deviation over pixels, before the clamp) per polarity. The noise
+    rates of an estimate are the means over pixels, as noise adds up; where pixels differ by a
+    tenth the two differ by half a percent."""
+
+    theta_on: Array
+    theta_off: Array
+    eta_on: Array
+    eta_off: Array
+    sigma_on: Array
+    sigma_off: Array
+
+
+def _check_kind(path: Path) -> None:
+    """EV016 where there is no file, EV008 where it is no .npz."""
+    inside = path / "camera.npz"
+    if path.is_dir() and inside.is_file():
+        raise EvflowDataError("EV016", f"{path} is a folder.", f"Pass {inside}.")
+    if not path.is_file():
+        raise EvflowDataError("EV016", f"no camera file at {path}"
+                              f"{' (a folder without camera.npz)' if path.is_dir() else ''}.",
+                              "Make one: evflow estimate RECORDING -o cam/.")
+    with open(path, "rb") as file:
+        head = file.read(6)
+    if head == np.lib.format.MAGIC_PREFIX:
+        raise EvflowDataError("EV008", f"{path} is one array (.npy), not a camera.", EXPECTED)
+    if head[:2] != b"PK" and path.suffix.lower() != ".npz":
+        raise EvflowDataError("EV008", f"{path} is no .npz: it begins with {head!r}.", EXPECTED)
+
+
+def _check_std(values: Array, std: Array) -> None:
+    """EV009 unless the std of a map (..., H, W) is one."""
+    if std.shape != values.shape or not bool(jnp.all(jnp.isfinite(std) & (std >= 0))):
+        raise EvflowDataError(
+            "EV009", f"standard deviations of shape {std.shape} for maps of shape "
+            f"{values.shape}, or negative or infinite ones.", "Make the file again.")

@@ -1,0 +1,71 @@
+"""OpenEB (metavision_core_ml.video_to_event): maps of thresholds fit; its noise does not work."""
+
+from __future__ import annotations
+
+from evflow.camera.exports.common import GREY, NOISE, Export, Maps, Settings
+
+LOW, HIGH = 0.01, 1.0  # where OpenEB clips thresholds
+
+SCRIPT = '''"""A video through OpenEB with the measured thresholds and noise of every pixel.
+
+    python run_openeb.py VIDEO FPS EVENTS.npz     # t int64 us, x, y, p {{0, 1}}, size
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from add_noise import add_noise
+from metavision_core_ml.video_to_event.simulator import EventSimulator
+
+maps = np.load(Path(__file__).with_name("maps.npz"))
+simulator = EventSimulator({height}, {width}, {theta_on:.5f}, {theta_off:.5f}, 0)
+simulator.Cps = np.clip(maps["theta_on"], 0.01, 1)
+simulator.Cns = np.clip(maps["theta_off"], 0.01, 1)
+video, step, found, frame = cv2.VideoCapture(sys.argv[1]), 1e6 / float(sys.argv[2]), [], 0
+while True:
+    more, image = video.read()
+    if not more:
+        break
+    simulator.image_callback(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), round(frame * step))
+    found.append(simulator.get_events())
+    simulator.event_maker.num = 0  # flush_events would zero its buffer of 1.6 GB for each frame
+    frame += 1
+events = np.concatenate(found)
+x, y, t, p = add_noise(*(events[n].astype(np.int64) for n in ("x", "y", "t", "p")), maps,
+                       0, round(frame * step))
+np.savez(sys.argv[3], t=t, x=x.astype(np.uint16), y=y.astype(np.uint16), p=p > 0,
+         size=np.array([{width}, {height}]))
+'''
+
+TEXT = '''The camera for OpenEB (https://github.com/prophesee-ai/openeb, metavision_core_ml)
+
+Every pixel (recommended):
+    python run_openeb.py VIDEO FPS EVENTS.npz
+
+Scalars only, its own sample:
+    python viz_video_to_event_simulator.py VIDEO --Cp {theta_on:.4f} --Cn {theta_off:.4f} \\
+        --sigma_threshold {sigma:.4f} --refractory_period 0 --cutoff_hz 0 --leak_rate_hz 0 \\
+        --shot_noise_rate_hz {shot:.4f}
+
+What OpenEB cannot represent
+- The command line has one sigma for both polarities (measured ON {sigma_on:.4f}, OFF
+  {sigma_off:.4f}); thresholds are clipped to .01 .. 1{clipped}.
+- Noise: one rate for ON and OFF together, in the dark; and its simulator makes shot noise only in
+  intervals in which some pixel has an event, 0 in a static scene. So the script leaves it off, and
+  add_noise.py adds the measured maps; the pixels' memories do not know of it.
+- The log map is log(I / 255 + 1e-7), evflow measures against v2e's, linear below 20 DN: dark scenes
+  give other counts.
+'''
+
+
+def export(maps: Maps, s: Settings) -> Export:
+    """Maps for the script; for the sample the medians."""
+    thetas = maps["theta_on"], maps["theta_off"]
+    outside = sum(int(((theta < LOW) | (theta > HIGH)).sum()) for theta in thetas)
+    clipped = f"; {outside:,} of the measured ones are" if outside else ""
+    values = vars(s) | {"sigma": s.sigma, "clipped": clipped,
+                        "shot": (s.eta_on + s.eta_off) / GREY}
+    return Export(TEXT.format(**values),
+                  {"run_openeb.py": SCRIPT.format(**vars(s)), "add_noise.py": NOISE})

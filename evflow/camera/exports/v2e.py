@@ -1,0 +1,80 @@
+"""v2e (SensorsINI): every map fits, by two attributes of its emulator; its command line takes
+scalars. Log map, thresholds and memory are those of evflow's `SensorModel(kind="v2e")`.
+"""
+
+from __future__ import annotations
+
+from evflow.camera.exports.common import GREY, Export, Maps, Settings
+
+SCRIPT = '''"""A video through v2e with the measured thresholds and noise of every pixel.
+
+    python run_v2e.py VIDEO FPS EVENTS.npy     # rows t[s], x, y, p (-1, 1), float32 as v2e has them
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from v2ecore.emulator import EventEmulator
+
+GREY = 0.59636  # v2e's shot noise at 128 DN over that in the dark
+
+maps = {{k: torch.tensor(v) for k, v in np.load(Path(__file__).with_name("maps.npz")).items()}}
+emulator = EventEmulator(
+    pos_thres={theta_on:.5f}, neg_thres={theta_off:.5f}, sigma_thres=0.01, cutoff_hz=0.0,
+    leak_rate_hz=0.0, refractory_period_s=0.0, shot_noise_rate_hz=2 / GREY, device="cpu")
+video, step, found, frame = cv2.VideoCapture(sys.argv[1]), 1 / float(sys.argv[2]), [], 0
+while True:
+    more, image = video.read()
+    if not more:
+        break
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    events = emulator.generate_events(grey, frame * step)
+    if frame == 0:  # v2e draws its thresholds at the first frame: here they are replaced
+        emulator.pos_thres, emulator.neg_thres = maps["theta_on"], maps["theta_off"]
+        # v2e's probability of a noise event is (R / 2) dt f(I) times these
+        emulator.pos_thres_pre_prob, emulator.neg_thres_pre_prob = maps["eta_on"], maps["eta_off"]
+    if events is not None:
+        found.append(events)
+    frame += 1
+np.save(sys.argv[3], np.concatenate(found) if found else np.zeros((0, 4), np.float32))
+'''
+
+TEXT = '''The camera for v2e (https://github.com/SensorsINI/v2e)
+
+Every pixel (recommended): thresholds and noise rates of maps.npz in v2e's emulator
+    python run_v2e.py VIDEO FPS EVENTS.npy
+
+Scalars only, from v2e's command line:
+    {command}
+
+What v2e cannot represent
+- The command line draws its own thresholds: one sigma for both polarities ({sigma:.4f} here;
+  measured ON {sigma_on:.4f}, OFF {sigma_off:.4f}), normal and uncorrelated. Which pixel has which
+  is lost.
+- --shot_noise_rate_hz is the total of ON and OFF in the dark, half of each, and falls to a quarter
+  in the brightest pixels. Here it is right at 128 DN for {excess}.
+- Noise is one rate on the command line, times nominal over actual threshold; in the script it is
+  the measured map, exact at 128 DN.
+- A noise event stores the present intensity in the pixel's memory.
+- All events of a pixel between two frames share v2e's time slots; its times are float32 seconds.
+'''
+
+
+def export(maps: Maps, s: Settings) -> Export:
+    """Scalars for the command line, a script for the maps."""
+    leak, both = max(s.eta_on - s.eta_off, 0.0), min(s.eta_on, s.eta_off)
+    shot = 2 * (both if leak else (s.eta_on + s.eta_off) / 2) / GREY
+    command = (
+        f"v2e -i VIDEO -o OUT --output_width {s.width} --output_height {s.height} "
+        f"--pos_thres {s.theta_on:.4f} --neg_thres {s.theta_off:.4f} --sigma_thres {s.sigma:.4f} "
+        f"--cutoff_hz 0 --leak_rate_hz {leak:.4f} --shot_noise_rate_hz {shot:.4f} "
+        "--refractory_period 0 --dvs_h5 events.h5")
+    excess = (
+        "the OFF noise (measured {eta_off:.4f} Hz); what\n  ON has more of it ({eta_on:.4f} Hz) is "
+        "--leak_rate_hz, a regular drift" if leak else
+        "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))
+    values = vars(s) | {"sigma": s.sigma, "command": command, "excess": excess}
+    return Export(TEXT.format(**values), {"run_v2e.py": SCRIPT.format(**vars(s))})

@@ -1,0 +1,116 @@
+"""What cameras are drawn from: camera-wide values, then pixels around them (paper, Section IV-E,
+Eq. 12).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera.camera import THETA_MIN, Camera, Summary
+from evflow.errors import EvflowDataError
+
+Array = jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraPrior:
+    """The distribution of cameras.
+
+    theta: range of the nominal threshold, uniform, drawn apart for ON and OFF (paper: .1-.5).
+    mismatch: range of the per-pixel standard deviation (v2e's default .03; the paper .15).
+    noise: "eq12" ties the rate to the threshold, eta = g R(theta) with the intensity factor g
+        of Eq. 12, uniform in [F, 1] where the scene's intensity is not known; "independent"
+        draws it log-uniform in `eta`; "mixed" takes either with equal chance, and a g that is
+        not the scene's in half of the tied cameras; "none" is silent.
+    eta_spread: standard deviation of log eta from pixel to pixel.
+    """
+
+    theta: tuple[float, float] = (0.1, 0.5)
+    mismatch: tuple[float, float] = (0.03, 0.03)
+    noise: Literal["eq12", "independent", "mixed", "none"] = "eq12"
+    eta: tuple[float, float] = (0.02, 1.0)
+    eta_spread: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.noise not in ("eq12", "independent", "mixed", "none"):
+            raise EvflowDataError("EV020", f"CameraPrior(noise={self.noise!r}).",
+                                  "Choose 'eq12', 'independent', 'mixed' or 'none'.")
+        lowest = {"theta": np.nextafter(0.0, 1.0), "mismatch": 0.0, "eta": np.nextafter(0.0, 1.0)}
+        for name, bound in lowest.items():
+            span = np.asarray(getattr(self, name))
+            if span.shape != (2,) or not bound <= span[0] <= span[1] < np.inf:
+                raise EvflowDataError(
+                    "EV020", f"CameraPrior({name}={getattr(self, name)}).",
+                    f"Give (low, high), low <= high, {'>=' if bound == 0 else '>'} 0.")
+        if not 0 <= self.eta_spread < np.inf:
+            raise EvflowDataError("EV020", f"CameraPrior(eta_spread={self.eta_spread}).",
+                                  "A standard deviation of log eta: >= 0.")
+
+
+def sample_camera(
+    key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None
+) -> Camera:
+    """One camera with pixels (..., H, W); leading axes are independent cameras. EV002."""
+    if len(shape) < 2:
+        raise EvflowDataError("EV002", f"shape is {shape}.", "Expected (..., H, W).")
+    prior = prior or CameraPrior()
+    k_nominal, k_pixels = jax.random.split(key)
+    nominal = sample_nominal(k_nominal, shape[:-2], prior)
+    return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)
+
+
+def noise_of_threshold(theta: Array) -> Array:
+    """R(theta) = 4 / (90 theta - 5) of Eq. 12, clipped to the paper's range [.1, 1] Hz.
+
+    The pole at theta = .0556 lies inside the clip: smaller thresholds get 1 Hz.
+    """
+    return jnp.clip(4.0 / (90.0 * jnp.maximum(theta, 0.1) - 5.0), 0.1, 1.0)
+
+
+def sample_nominal(
+    key: Array, batch: tuple[int, ...], prior: CameraPrior, factor: Array | None = None
+) -> Summary:
+    """Draw the camera-wide values, each of shape `batch`. factor: the intensity factor of Eq. 12
+    of the scene that will be seen, where it is known."""
+    k_theta, k_sigma, k_gain, k_free, k_link = jax.random.split(key, 5)
+    theta = jax.random.uniform(k_theta, (2, *batch), minval=prior.theta[0], maxval=prior.theta[1])
+    sigma = jax.random.uniform(
+        k_sigma, (2, *batch), minval=prior.mismatch[0], maxval=prior.mismatch[1])
+    gain = jax.random.uniform(k_gain, (2, *batch), minval=0.25)
+    if factor is not None:
+        exact = 0.5 if prior.noise == "mixed" else 1.0
+        gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), exact, batch),
+                         factor, gain)
+    tied = noise_of_threshold(theta) * gain
+    lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])
+    free = jnp.exp(jax.random.uniform(k_free, (2, *batch), minval=lo, maxval=hi))
+    either = jnp.where(jax.random.bernoulli(k_link, 0.5, batch), tied, free)
+    eta = {"eq12": tied, "independent": free, "mixed": either,
+           "none": jnp.zeros_like(tied)}[prior.noise]
+    return Summary(*theta, *eta, *sigma)
+
+
+def sample_pixels(
+    key: Array, nominal: Summary, shape: tuple[int, int], eta_spread: float = 0.0
+) -> Camera:
+    """Spread the camera-wide values over pixels: theta ~ N(median, sigma) clamped at .01 (v2e),
+    eta log-normal around its median. Returns maps (*batch, H, W)."""
+    k_on, k_off, k_eta = jax.random.split(key, 3)
+    size = (*jnp.shape(nominal.theta_on), *shape)
+
+    def theta(k: Array, median: Array, sigma: Array) -> Array:
+        draw = median[..., None, None] + sigma[..., None, None] * jax.random.normal(k, size)
+        return jnp.maximum(draw, THETA_MIN)
+
+    spread = jnp.exp(eta_spread * jax.random.normal(k_eta, (2, *size)))
+    return Camera(
+        theta(k_on, nominal.theta_on, nominal.sigma_on),
+        theta(k_off, nominal.theta_off, nominal.sigma_off),
+        nominal.eta_on[..., None, None] * spread[0],
+        nominal.eta_off[..., None, None] * spread[1],
+    )

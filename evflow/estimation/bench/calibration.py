@@ -1,0 +1,183 @@
+"""A camera measured on a bench: thresholds from steps of light, noise from a scene at rest.
+
+The paper's ground truth (Section III-B): a screen that fills the view brightens or darkens by a
+known dlogI, and a pixel's threshold is dlogI over its events; what a scene at rest sends is noise.
+Here recordings become counts at rests of the light and results become a `CameraEstimate`; how
+counts become thresholds is in steps.py. The noise alone: evflow/estimation/static.py.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import THETA_MIN, Camera, Summary
+from evflow.errors import EvflowDataError
+from evflow.estimation.bench.rests import check_steps, find_rests
+from evflow.estimation.bench.steps import (
+    camera_rate,
+    camera_wide,
+    is_hot,
+    ratio,
+    regression,
+    shrunk_rates,
+)
+from evflow.estimation.result import CameraEstimate
+from evflow.light.log_maps import lin_log
+from evflow.recordings.faulty_pixels import dead_pixels
+from evflow.recordings.stillness import LEAST_EVENTS, MOVING, busy_pixels, company
+from evflow.types import Events, Recording
+
+Span = tuple[int, int]
+
+SETTLE_US = 20_000  # events of a step come until this long after the light rests again
+FEW_EVENTS = 2  # of a polarity, over all steps
+MOST = 0.5  # of the pixels: with fewer measured, the result warns
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Steps:
+    """levels: (K+1, H, W) log intensity at each rest; counts: (K, 2, H, W) ON and OFF events of
+    each step; seconds: (K,) over which they were counted; rest: (2, H, W) events while nothing
+    changed, and rest_s how long that was; notes: what is odd about these."""
+
+    levels: np.ndarray
+    counts: np.ndarray
+    seconds: np.ndarray
+    rest: np.ndarray
+    rest_s: float
+    notes: tuple[str, ...]
+
+
+def calibrate_step(
+    recording: Recording, *, rests_us: Sequence[Span] | None = None,
+    light: Sequence[float] | None = None, fresh: bool = False, literal: bool = False,
+) -> CameraEstimate:
+    """Thresholds, and the noise of the rests, from a screen whose light steps between rests.
+
+    rests_us: (begin, end) of each rest in us; found in the frames if left out. light: its light
+    (any linear unit: lux, cd/m2) at each rest; the mean of the frames there if left out. fresh: the
+    memory is at the light of the first rest, as in a simulation; a running camera's may be
+    anywhere. literal: theta = dlogI / events, the paper's own words; the std then counts a whole
+    event. A polarity's map is measured where a pixel has 2 of its events; else it is the camera's
+    median. Raises EV001 (no events), EV011 (no frames and no light), EV017 (frames that show no two
+    rests, or no screen that steps), EV020.
+    """
+    steps = _steps(recording, rests_us, light)
+    _check_polarity(steps)
+    hz, _ = camera_rate(steps.rest, steps.rest_s)
+    strays = steps.seconds[:, None] * hz
+    clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
+    theta, error = (ratio if literal else regression)(steps.levels, clean, strays, fresh)
+    events = steps.counts.sum(0)
+    enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
+    sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
+    hot = is_hot(steps.rest.sum(0), float(hz.sum()), steps.rest_s)
+    maps, stds, medians, spreads, notes = [], [], [], [], list(steps.notes)
+    for i, name in enumerate(("ON", "OFF")):
+        good = sound[i] & ~hot
+        if not good.any():
+            notes.append(f"no step sends {name} events: theta_{name.lower()} is the prior's.")
+        median, spread, own = camera_wide(theta[i][good], error[i][good])
+        medians.append((median, own))
+        spreads.append(spread)
+        maps.append(np.where(sound[i], theta[i], median))
+        stds.append(np.where(sound[i], error[i], np.hypot(spread, own)))
+    eta, eta_std = shrunk_rates(steps.rest, steps.rest_s)
+    n_events = steps.counts.sum((0, 1)).astype(np.uint32)
+    valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & ~hot
+    if valid.mean() < MOST:
+        notes.append(f"{valid.mean():.0%} of the pixels sent enough events to be measured: take "
+                     "more steps, or larger ones.")
+    return _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
+                     n_events, hot, len(steps.counts), notes)
+
+
+def _check_polarity(steps: Steps) -> None:
+    """EV021 where OFF events come with steps up."""
+    change = np.median(np.diff(steps.levels, axis=0), (1, 2))
+    net = (steps.counts[:, 0] - steps.counts[:, 1]).sum((1, 2))
+    if (change * net).sum() < 0:
+        raise EvflowDataError(
+            "EV021", "ON events come where the light falls, OFF events where it rises.",
+            "Pass --polarity invert (polarity='invert'), or are frames and events not aligned?")
+
+
+def _steps(
+    recording: Recording, rests_us: Sequence[Span] | None, light: Sequence[float] | None
+) -> Steps:
+    events, times = recording.events, recording.frame_times
+    if len(events) == 0:
+        raise EvflowDataError("EV001", "the recording has no events.")
+    frames = None if rests_us is not None else find_rests(recording)
+    spans = ([(int(times[a]), int(times[b])) for a, b in frames] if frames is not None
+             else [(int(a), int(b)) for a, b in rests_us or ()])
+    flat = [t for span in spans for t in span]
+    if len(spans) < 2 or any(b < a for a, b in itertools.pairwise(flat)):
+        raise EvflowDataError("EV020", f"rests_us={spans}.",
+                              "Give two or more (begin, end) in us, in order of time.")
+    levels = _levels(recording, spans, light)
+    if light is None:
+        check_steps(levels)
+    settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
+    counts = [events.slice(before[1], after).count_map()
+              for before, after in zip(spans, settled[1:], strict=False)]
+    seconds = [(after - before[1]) * 1e-6
+               for before, after in zip(spans, settled[1:], strict=False)]
+    quiet = [(a, b) for a, (_, b) in zip(settled, spans, strict=True)]
+    rest = np.asarray(np.sum([events.slice(a, b).count_map() for a, b in quiet], 0, np.float64))
+    busiest = max((events.slice(a, b) for a, b in quiet), key=len)
+    return Steps(levels, np.array(counts, np.float64), np.array(seconds), rest,
+                 sum(b - a for a, b in quiet) * 1e-6, tuple(_restless(busiest)))
+
+
+def _restless(rest: Events) -> list[str]:
+    """What says that the light moved during a rest, if anything does."""
+    if len(rest) < LEAST_EVENTS or company(rest, busy_pixels(rest.count_map().sum(0))) <= MOVING:
+        return []
+    return ["events come in company while the frames rest: a light that flickers or still settles, "
+            "or a camera that regulates its exposure? Then noise rates, and thresholds, are wrong."]
+
+
+def _levels(
+    recording: Recording, spans: list[Span], light: Sequence[float] | None
+) -> np.ndarray:
+    width, height = recording.events.size
+    if light is not None:
+        given = np.asarray(light, np.float64)
+        if given.shape != (len(spans),) or not (np.isfinite(given) & (given > 0)).all():
+            raise EvflowDataError("EV020", f"light={light!r} for {len(spans)} rests.",
+                                  "Give one positive number per rest.")
+        return np.broadcast_to(np.log(given)[:, None, None], (len(spans), height, width))
+    times, levels = recording.frame_times, []
+    for begin, end in spans:
+        inside = np.flatnonzero((times >= begin) & (times <= end))
+        if not len(inside):
+            raise EvflowDataError("EV011", f"no frame between {begin} and {end} us.",
+                                  "Give light, its value at each rest.")
+        mean = np.mean([recording.frame_dn(int(i)) for i in inside], 0, np.float64)
+        levels.append(np.asarray(lin_log(mean.astype(np.float32)), np.float64))
+    return np.stack(levels)
+
+
+def _estimate(
+    theta: np.ndarray, theta_std: np.ndarray, medians: list[tuple[float, float]],
+    spreads: list[float], eta: np.ndarray, of_eta: tuple[np.ndarray, list[tuple[float, float]]],
+    valid: np.ndarray, n_events: np.ndarray, hot: np.ndarray, count: int, notes: list[str],
+) -> CameraEstimate:
+    eta_std, rates = of_eta
+    values = [*(m for m, _ in medians), *(m for m, _ in rates), *spreads]
+    pixels = max(int(valid.sum()), 1)
+    errors = [*(s for _, s in medians), *(s for _, s in rates),
+              *(s / np.sqrt(2 * pixels) for s in spreads)]
+    if hot.any():
+        notes = [*notes, f"{hot.sum()} hot pixels: they fire while nothing changes."]
+    return CameraEstimate(
+        Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta, *eta))).validate(),
+        Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta_std, *eta_std))),
+        Summary(*(jnp.float32(v) for v in values)), Summary(*(jnp.float32(e) for e in errors)),
+        valid, n_events, hot, dead_pixels(n_events), count, tuple(notes))

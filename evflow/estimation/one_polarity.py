@@ -1,0 +1,72 @@
+"""Polarities that tell nothing: what is said of their thresholds, and of the other's."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Summary
+from evflow.estimation.refine import Chunk, foreseen, refine_alone
+from evflow.estimation.static import uniform
+from evflow.network.pooling import Stats
+from evflow.training.config import PRESETS
+
+POLARITIES = ("on", "off")
+BEYOND_NOISE = 3.0  # standard deviations by which fewer events must exceed the noise to tell it
+UNREFINED = (0.5, 1.0)  # relative errors of theta, eta where nothing but the network tells them
+
+
+def untold(stats: Stats, summary: Summary) -> tuple[str, ...]:
+    """The polarities, of "on" and "off", whose events are not more than noise sends."""
+    found = []
+    for name in POLARITIES:
+        events = float(getattr(stats, f"events_{name}"))
+        noise = float(getattr(summary, f"eta_{name}") * stats.exposure)
+        if events - noise < BEYOND_NOISE * np.sqrt(max(events, 1.0)):
+            found.append(name)
+    return tuple(found)
+
+
+def without(
+    names: tuple[str, ...], chunks: list[Chunk], summary: Summary, std: Summary
+) -> tuple[Summary, Summary]:
+    """The summary and its std with the prior's thresholds where nothing tells them. The other
+    polarity is what the chunks tell of it alone, unless the summary itself foresees that nothing
+    is told."""
+    known = {f"theta_{n}": _theta_prior() for n in names}
+    for told, name in enumerate(POLARITIES):
+        if name in names or (chunks and foreseen(chunks, summary, std, told)):
+            continue
+        theta, eta = (float(getattr(summary, f"{p}_{name}")) for p in ("theta", "eta"))
+        if chunks:
+            *alone, noise = refine_alone(
+                chunks, *_changed(summary, std, known), told, _theta_prior())
+            known[f"theta_{name}"] = alone[0], alone[1]
+            if not noise:
+                known[f"eta_{name}"] = _eta_prior()
+        else:
+            known[f"theta_{name}"] = theta, UNREFINED[0] * theta
+            known[f"eta_{name}"] = eta, UNREFINED[1] * eta
+    return _changed(summary, std, known)
+
+
+def _theta_prior() -> tuple[float, float]:
+    return uniform(PRESETS["default"].prior.theta)
+
+
+def _eta_prior() -> tuple[float, float]:
+    """Median and standard deviation of a log-uniform rate."""
+    low, high = PRESETS["default"].prior.eta
+    log_range = math.log(high / low)
+    mean, square = (high - low) / log_range, (high**2 - low**2) / (2 * log_range)
+    return math.sqrt(low * high), math.sqrt(square - mean**2)
+
+
+def _changed(
+    summary: Summary, std: Summary, known: dict[str, tuple[float, float]]
+) -> tuple[Summary, Summary]:
+    values, errors = ({k: jnp.float32(v[i]) for k, v in known.items()} for i in (0, 1))
+    return dataclasses.replace(summary, **values), dataclasses.replace(std, **errors)

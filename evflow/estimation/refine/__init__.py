@@ -1,0 +1,33 @@
+"""Refinement by simulation: the recording's own video, simulated with the estimated camera.
+
+    frames --optical flow--> path (fine log frames)      path.py
+    recorded events, simulated events --> Trace          trace.py
+    Trace + path --> Moments, additive                   moments.py
+    recorded against simulated Moments --> the summary   fit.py
+    the same of one polarity alone --> its threshold     alone.py
+    recorded events on the path --> each pixel's theta   pixels.py
+    recorded events of quiet pixels --> noise rates      noise.py
+    events, random points --> noise told from signal     points.py, signal.py
+
+A network sees windows; this sees what the recording would look like were the estimate true, and
+moves the estimate until the two agree. Each pixel is compared only after its first event, where
+its memory is known: nothing depends on what happened before the recording began.
+"""
+
+from evflow.estimation.refine.alone import foreseen, refine_alone
+from evflow.estimation.refine.fit import Refined, fused, refine_summary
+from evflow.estimation.refine.path import (
+    Chunk,
+    Survey,
+    make_chunk,
+    plan_runs,
+    refinement_chunks,
+    survey,
+)
+from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
+
+__all__ = [
+    "Chunk", "PixelEvidence", "Refined", "Survey", "foreseen", "fused", "make_chunk",
+    "pixel_posterior", "plan_runs", "refine_alone", "refine_summary", "refinement_chunks",
+    "survey",
+]

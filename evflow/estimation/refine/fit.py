@@ -1,0 +1,284 @@
+"""From moments to the camera's summary: a few Gauss-Newton steps, then a small fusion network.
+
+The steps move log theta until the balance of the simulated recording equals that of the recorded
+one, held by the network's estimate where the data say little; the noise rates come from the quiet
+pixels (noise.py). What is left over (every residual, how many events carry it, how fast things
+move) goes into `FusionNet`, trained on simulated recordings, which corrects the estimate and says
+how sure it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import THETA_MIN, Camera, Summary
+from evflow.errors import EvflowDataError
+from evflow.estimation.refine.moments import Moments, measure
+from evflow.estimation.refine.noise import (
+    combined_rate,
+    quiet_events,
+    rate_error,
+    stratum_rates,
+    tied_probability,
+    tied_rates,
+    with_tie,
+)
+from evflow.estimation.refine.path import STEPS, Chunk
+from evflow.estimation.refine.signal import told_apart
+from evflow.estimation.refine.trace import FRESH, RUNNING, trace_of_camera
+from evflow.light.log_maps import lin_log_inverse, noise_factor, normalised_intensity
+from evflow.network.coordinates import squash_summary, summary_std, unsquash_summary
+
+Array = jax.Array
+Start = tuple[float, float]
+
+OFFSETS = (0.2, 0.08, 0.05)  # log theta: finite differences of the passes
+LONGEST_STEP = 0.5  # log theta per pass
+MODEL_ERROR = 0.04  # of a balance residual, beside the counts' own: what interpolation leaves
+EMPTY = 0.3  # balance weight below which there is no residual to speak of
+FRESH_ODDS = 2.0  # log odds that it takes to call a start fresh: few recordings do
+BEYOND = 0.04  # of the variance, for each feature beyond those of training: measured up to 8 s
+THETA_ERROR = 0.05  # relative error of the stepped thresholds, for the noise that follows them
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refined:
+    """summary, std: the camera; features: (F,) float32, what the fusion saw; fresh: whether the
+    recording starts as a simulation does, with the memory at its first frame."""
+
+    summary: Summary
+    std: Summary
+    features: np.ndarray
+    fresh: bool
+
+
+class FusionNet(nn.Module):
+    """features (F,) -> correction of y (6,) and log std of y (6,): a linear map and a little
+    more, as it learns from some thousand recordings."""
+
+    width: int = 32
+
+    @nn.compact
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        hidden = nn.relu(nn.Dense(self.width)(x))
+        out = nn.Dense(12, kernel_init=nn.initializers.zeros)(jnp.concatenate([hidden, x], -1))
+        return out[..., :6], out[..., 6:] - 1.0
+
+
+@partial(jax.jit, static_argnames="steps")
+def _simulated(
+    key: Array, path: Array, dt_s: Array, bright: Array, values: Array, start: Array, steps: int
+) -> Moments:
+    """Moments of a camera on one chunk. values (6,): theta, eta, sigma; cameras of one key see the
+    same random numbers, so that their differences are the cameras'."""
+    k_pixels, k_trace = jax.random.split(key)
+    draws = jax.random.normal(k_pixels, (2, *path.shape[1:]), path.dtype)
+    on, off, eta_on, eta_off, sigma_on, sigma_off = values
+    full = jnp.ones_like(draws[0])
+    camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
+                    jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
+                    eta_on * full, eta_off * full)
+    trace = trace_of_camera(k_trace, path, dt_s, camera, start, steps)
+    return measure(trace, path, dt_s, bright, steps)
+
+
+@partial(jax.jit, static_argnames="steps")
+def _recorded(trace: Any, path: Array, dt_s: Array, bright: Array, steps: int) -> Moments:
+    return measure(trace, path, dt_s, bright, steps)
+
+
+def _total(parts: list[Moments]) -> Moments:
+    return jax.tree.map(lambda *leaves: np.sum([np.asarray(a) for a in leaves], 0), *parts)
+
+
+def balance_residual(moments: Moments, theta: np.ndarray) -> np.ndarray:
+    """Relative excess of what the events carry over dL, (..., lags, 2 sides), at theta (..., 2)."""
+    on, off = theta[..., 0, None, None], theta[..., 1, None, None]
+    a, b, d, size = np.moveaxis(np.asarray(moments.balance), -1, 0)
+    return np.array([1.0, -1.0]) * (on * a - off * b - d) / (size + EMPTY)
+
+
+def square_residual(moments: Moments, theta: np.ndarray) -> np.ndarray:
+    """Mean squared remainder (..., 2 sides) in units of theta_on theta_off."""
+    on, off = theta[..., 0, None], theta[..., 1, None]
+    aa, bb, ab, ad, bd, dd, one = np.moveaxis(np.asarray(moments.squares), -1, 0)
+    square = (on**2 * aa + off**2 * bb - 2 * on * off * ab - 2 * on * ad + 2 * off * bd + dd)
+    return (np.maximum(square, 0.0) / (on * off) + EMPTY) / (one + EMPTY)
+
+
+class Fit:
+    """The passes over one recording's chunks; holds what they share."""
+
+    def __init__(self, chunks: list[Chunk], start: Summary, std: Summary, seed: int) -> None:
+        self.chunks, self.key = chunks, jax.random.key(seed)
+        self.names = [f.name for f in dataclasses.fields(Summary)]
+        self.prior = np.array([float(getattr(start, n)) for n in self.names])
+        relative = np.array([float(getattr(std, n)) for n in self.names]) / np.maximum(
+            self.prior, 1e-3)
+        self.prior_std = np.clip(relative, 0.02, 2.0)
+        self.values = self.prior.copy()
+        self.quiet = np.sum([quiet_events(c, STEPS) for c in chunks], 0)
+        self.values[2:4] = combined_rate(self.quiet, self.prior[2:4], self.prior_std[2:4])
+        self.start = self.later = RUNNING
+        self.factor = _mean_factor(chunks)
+        self.recorded = _total([_recorded(c.recorded, c.path, c.dt_s, c.bright, STEPS)
+                                for c in chunks])
+
+    def simulate(self, values: np.ndarray, starts: Sequence[Start] = ()) -> Moments:
+        """Summed moments of V cameras, leading axis V. starts: of the first chunk; all others, of
+        a camera that has been running, begin as `later`."""
+        starts = starts or [self.start] * len(values)
+        cameras = list(zip(values.astype(np.float32), np.array(starts, np.float32), strict=True))
+        later = np.array(self.later, np.float32)
+        totals: list[list[Moments]] = [[] for _ in cameras]
+        for i, c in enumerate(self.chunks):
+            key, path = jax.random.fold_in(self.key, i), jnp.asarray(c.path)
+            # One by one: a program for every number of cameras takes seconds to compile.
+            for parts, (row, start) in zip(totals, cameras, strict=True):
+                parts.append(_simulated(key, path, c.dt_s, c.bright, row,
+                                        later if i else start, STEPS))
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *map(_total, totals))
+
+    def choose_start(self, others: Sequence[Start] = (FRESH,)) -> None:
+        """Does the recording start as a camera that has been running, or otherwise? Whichever
+        start makes the number of pixels that fire at once the likelier (Poisson)."""
+        starts = [self.later, *others]
+        made = np.asarray(self.simulate(np.stack([self.values] * len(starts)), starts).early) + 0.5
+        log_likelihood = float(self.recorded.early) * np.log(made) - made
+        log_likelihood[0] += FRESH_ODDS
+        self.start = starts[int(np.argmax(log_likelihood))]
+
+    def step(self, offset: float) -> None:
+        """One Gauss-Newton step of log theta."""
+        values = np.stack([self.values] * 3)
+        values[1, 0] *= np.exp(offset)
+        values[2, 1] *= np.exp(offset)
+        moments = self.simulate(values)
+        excess = (balance_residual(self.recorded, values[:, :2])
+                  - balance_residual(moments, values[:, :2]))[:, :3].mean(1)  # lags 1, 2, 4
+        jacobian = ((excess[1:] - excess[0]) / offset).T
+        size = np.asarray(self.recorded.balance)[1, :, 3]
+        precision = np.diag(1.0 / (MODEL_ERROR**2 + 0.2 / (size + EMPTY)))
+        held = np.diag(self.prior_std[:2] ** -2.0)
+        away = np.log(self.values[:2] / self.prior[:2])
+        curvature = jacobian.T @ precision @ jacobian + held
+        gradient = jacobian.T @ precision @ excess[0] + held @ away
+        change = -np.linalg.solve(curvature, gradient)
+        self.move(slice(2), change)
+
+    def move(self, which: int | slice, change: np.ndarray | float) -> None:
+        """Change log theta, of ON 0 and OFF 1, by no more than a pass may."""
+        moved = self.values[which] * np.exp(np.clip(change, -LONGEST_STEP, LONGEST_STEP))
+        self.values[which] = np.clip(moved, 0.02, 2.0)
+
+    def features(self) -> np.ndarray:
+        """Everything the fusion sees, (F,), at the final values."""
+        made = jax.tree.map(lambda a: a[0], self.simulate(self.values[None]))
+        seen, theta = self.recorded, self.values[:2]
+
+        def ratio(name: str) -> np.ndarray:
+            return np.log((getattr(seen, name) + 1.0) / (getattr(made, name) + 1.0))
+
+        residual = balance_residual(seen, theta) - balance_residual(made, theta)
+        size = seen.balance[..., 3]
+        motion = np.concatenate([c.motion_px for c in self.chunks])
+        light = np.mean([c.path[0].mean() for c in self.chunks])
+        pixels = max(float(seen.pixels), 1.0)
+        parts = [
+            np.log(self.values[:4] / self.prior[:4]), np.log(self.prior_std),
+            np.log(self.values[:4]), np.log(self.values[4:] + 0.01), residual.ravel(),
+            ratio("roots"), ratio("active"), ratio("events"), [ratio("early")],
+            np.log(square_residual(seen, theta) / square_residual(made, theta)),
+            np.log(size[[0, -1]] + EMPTY).ravel(), np.log(seen.events + 1.0),
+            np.log((seen.active + 1.0) / pixels), *self.noise_features(),
+            np.log([float(seen.exposure) + 1.0, pixels]),
+            [np.log(motion.mean() + 0.1), np.log(motion.max() + 0.1), light, self.start == FRESH,
+             np.log(np.mean([c.dt_s.mean() for c in self.chunks]) / 0.025)],
+        ]
+        return np.concatenate([np.asarray(p, np.float64).ravel() for p in parts]).astype(
+            np.float32)
+
+    def noise_features(self) -> list[np.ndarray]:
+        """What the strata say beside their combination, and whether the noise follows Eq. 12."""
+        rates = stratum_rates(self.quiet, self.prior[2:4], self.prior_std[2:4])
+        theta, found = self.values[:2], np.log(self.values[2:4])
+        foretold, error = tied_rates(theta, THETA_ERROR * theta, self.factor)
+        away = found - np.log(foretold)
+        tied = tied_probability(away, np.hypot(error, rate_error(self.quiet)))
+        return [np.log(rates) - found, np.log(self.quiet + 1.0), np.clip(away, -2.0, 2.0),
+                tied * away, np.array([tied])]
+
+
+def _mean_factor(chunks: list[Chunk]) -> float:
+    """Mean intensity factor of Eq. 12 over the frames."""
+    factors = [np.asarray(noise_factor(normalised_intensity(lin_log_inverse(
+        jnp.asarray(c.path[::STEPS]))))).mean() for c in chunks]
+    return float(np.mean(factors))
+
+
+def refine_summary(
+    chunks: list[Chunk], summary: Summary, std: Summary, fusion: dict[str, Any] | None = None,
+    signal: dict[str, Any] | None = None, *, seed: int = 0,
+) -> Refined:
+    """The camera's summary, from the chunks of a recording and the network's estimate.
+
+    fusion: {"net": parameters of FusionNet, "mean", "scale", "low", "high": (F,) of the features
+    it was trained on, "widen": (6,) calibration of the std}; without it the
+    result is that of the Gauss-Newton steps alone, and std the network's. signal: the network
+    that tells noise from signal (signal.py); without it the noise is that of quiet pixels.
+    """
+    fit = Fit(chunks, summary, std, seed)
+    fit.choose_start()
+    for offset in OFFSETS:
+        fit.step(offset)
+    features = fit.features()
+    stepped = Summary(*(jnp.float32(v) for v in fit.values))
+    if fusion is None:
+        return Refined(stepped, std, features, fit.start == FRESH)
+    if fusion["mean"].shape != features.shape:
+        raise EvflowDataError(
+            "EV018", f"the weights' fusion sees {fusion['mean'].size} features of a recording, "
+            f"this version has {features.size}.",
+            'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
+    y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
+    result = squash_summary(y)
+    result, result_std = _with_noise(chunks, result, summary_std(result, y_std), signal, fit.factor)
+    return Refined(result, result_std, features, fit.start == FRESH)
+
+
+def _with_noise(
+    chunks: list[Chunk], summary: Summary, std: Summary, signal: dict[str, Any] | None,
+    factor: float,
+) -> tuple[Summary, Summary]:
+    """The noise rates of events told apart, drawn to Eq. 12 where they may well follow it."""
+    def both(s: Summary, name: str) -> np.ndarray:
+        return np.array([float(getattr(s, f"{name}_{p}")) for p in ("on", "off")])
+
+    theta, eta = both(summary, "theta"), both(summary, "eta")
+    log_eta, log_std = np.log(eta), both(std, "eta") / eta
+    if signal is not None:
+        log_eta, log_std = told_apart(chunks, theta, log_eta, log_std, signal)
+    log_eta, log_std = with_tie(theta, both(std, "theta"), log_eta, log_std, factor)
+    rates = dict(zip(("eta_on", "eta_off"), jnp.float32(np.exp(log_eta)), strict=True))
+    errors = dict(zip(rates, jnp.float32(np.exp(log_eta) * log_std), strict=True))
+    return dataclasses.replace(summary, **rates), dataclasses.replace(std, **errors)
+
+
+def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:
+    """y (..., 6) corrected, and its std; features beyond those of training are held at its
+    edge, so that a longer recording is taken for the longest known, and make the std wider."""
+    inside = jnp.clip(features, fusion["low"], fusion["high"])
+    beyond = (inside != features).sum(-1, keepdims=True)
+    outputs: Any = FusionNet().apply(
+        {"params": fusion["net"]}, (inside - fusion["mean"]) / fusion["scale"])
+    correction, log_std = outputs
+    return y + correction, (
+        jnp.exp(log_std) * fusion["widen"] * jnp.sqrt(1.0 + BEYOND * beyond))

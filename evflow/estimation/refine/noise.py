@@ -1,0 +1,153 @@
+"""Noise rates from where nothing else happens, and whether they follow from the thresholds.
+
+Events of a moving edge come in company: other pixels near by send the same polarity at about the
+same time. Noise comes alone. A pixel in whose neighbourhood no event of a polarity happens is a
+fair sample of that polarity's noise: whether the pixel itself fires does not enter the choice.
+The wider the neighbourhood, and the stiller the frames have to be, the less signal is left in
+such a sample and the smaller it is; a few `Stratum`s go from one end to the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import noise_of_threshold
+from evflow.estimation.refine.path import Chunk
+
+ANY = 1e9  # log units: no limit
+
+
+@dataclasses.dataclass(frozen=True)
+class Stratum:
+    """size: side of the neighbourhood in pixels; intervals: frame intervals that it spans;
+    in_interval, in_chunk: what the path may range over (log units, 3x3 pixels); climb: how far
+    it may move in the polarity's direction within the chunk (mean of 5x5 pixels, as a drift below
+    a pixel's frame noise still sends events); contamination: the typical share of signal, measured
+    on simulated recordings."""
+
+    size: int
+    intervals: int
+    in_interval: float
+    in_chunk: float
+    climb: float
+    contamination: float
+
+
+STRATA = (
+    Stratum(9, 1, 0.03, 0.08, 0.02, 0.05), Stratum(9, 3, 0.03, ANY, 0.02, 0.08),
+    Stratum(9, 1, 0.03, ANY, 0.02, 0.1), Stratum(5, 1, 0.03, ANY, 0.01, 0.15),
+    Stratum(9, 3, ANY, ANY, 0.02, 0.25), Stratum(9, 1, ANY, ANY, 0.02, 0.4),
+    Stratum(9, 1, ANY, ANY, ANY, 0.8))
+LEAST_PRIOR, MOST_PRIOR = 1.0, 30.0  # events that the network's word on a noise rate is worth
+
+# Of "does the noise follow Eq. 12?": free rates are log-uniform over a factor of a hundred.
+FREE_RANGE = np.log(100.0)
+TIED_ODDS = 0.1  # before any data: not more, as it costs where the noise is free
+TIED_ERROR = 0.05  # log units: of the intensity factor
+
+
+def quiet_events(chunk: Chunk, steps: int) -> np.ndarray:
+    """(strata, 2 polarities, 2): events and pixel seconds of the quiet pixels of one chunk."""
+    counts = np.asarray(chunk.recorded.counts, np.float32)
+    shape = counts.shape[2:]
+    inner = chunk.path[1:].reshape(len(chunk.dt_s), steps, *shape)
+    start = chunk.path[:-1:steps]
+    span = np.maximum(inner.max(1), start) - np.minimum(inner.min(1), start)
+    span = np.stack([_widest(s) for s in span])
+    overall = _widest(chunk.path.max(0) - chunk.path.min(0))
+    climbs = _climbs(chunk.path[::steps])
+    near = {size: _neighbours(counts, size) for size in {s.size for s in STRATA}}
+    rows = []
+    for stratum in STRATA:
+        company = near[stratum.size]
+        if stratum.intervals > 1:
+            company = _over_time(company)
+        still = (span < stratum.in_interval) & (overall < stratum.in_chunk) & chunk.bright
+        alone = (company < 0.5) & still[:, None] & (climbs < stratum.climb)
+        seconds = chunk.dt_s.astype(np.float64) @ alone.sum((2, 3))
+        rows.append(np.stack([(counts * alone).sum((0, 2, 3)), seconds], -1))
+    return np.stack(rows)
+
+
+def _widest(span: np.ndarray) -> np.ndarray:
+    return cv2.dilate(np.ascontiguousarray(span, np.float32), np.ones((3, 3), np.uint8))
+
+
+def _climbs(frames: np.ndarray) -> np.ndarray:
+    """(2, H, W): the farthest that smoothed frames (K+1, H, W) rise, and that they fall."""
+    smooth = np.stack([cv2.blur(np.ascontiguousarray(f, np.float32), (5, 5)) for f in frames])
+    rise = (smooth - np.minimum.accumulate(smooth)).max(0)
+    fall = (np.maximum.accumulate(smooth) - smooth).max(0)
+    return np.stack([rise, fall])
+
+
+def _neighbours(counts: np.ndarray, size: int) -> np.ndarray:
+    """Events (K, 2, H, W) in the size x size pixels around each, its own left out."""
+    images = counts.reshape(-1, *counts.shape[2:])
+    boxes = [cv2.boxFilter(i, -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT)
+             for i in images]
+    return np.stack(boxes).reshape(counts.shape) - counts
+
+
+def _over_time(near: np.ndarray) -> np.ndarray:
+    """Sums with the intervals before and after."""
+    padded = np.pad(near, ((1, 1), (0, 0), (0, 0), (0, 0)))
+    return padded[:-2] + padded[1:-1] + padded[2:]
+
+
+def stratum_rates(quiet: np.ndarray, prior: np.ndarray, relative_std: np.ndarray) -> np.ndarray:
+    """Rates (strata, 2) in Hz, each held by the network's estimate `prior` (2,) with its relative
+    std, as if it had seen 1/std^2 events."""
+    worth = np.clip(relative_std**-2.0, LEAST_PRIOR, MOST_PRIOR)
+    return (quiet[..., 0] + worth) / (quiet[..., 1] + worth / prior)
+
+
+def combined_rate(quiet: np.ndarray, prior: np.ndarray, relative_std: np.ndarray) -> np.ndarray:
+    """Noise rates (2,) in Hz: the strata's, weighed by how many events each has and how much
+    signal it usually lets through."""
+    rates = stratum_rates(quiet, prior, relative_std)
+    contamination = np.array([[s.contamination] for s in STRATA])
+    weight = 1.0 / (1.0 / (quiet[..., 0] + 1.0) + contamination**2)
+    return np.exp((weight * np.log(rates)).sum(0) / weight.sum(0))
+
+
+def rate_error(quiet: np.ndarray) -> np.ndarray:
+    """Relative error (2,) of the combined rates: counts, and a tenth for what signal is left."""
+    return np.sqrt(1.0 / (quiet[:, :, 0].max(0) + 1.0) + 0.1**2)
+
+
+def tied_rates(
+    theta: np.ndarray, theta_std: np.ndarray, factor: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noise rates (2,) in Hz that Eq. 12 foretells at theta (2,), and their relative error."""
+    rates = np.asarray(noise_of_threshold(jnp.asarray(theta)), np.float64) * factor
+    slope = 90.0 / np.maximum(90.0 * theta - 5.0, 4.0) * (theta > 0.1)  # -dlog R/dtheta
+    return rates, np.sqrt((slope * theta_std) ** 2 + TIED_ERROR**2)
+
+
+def tied_probability(away: np.ndarray, error: np.ndarray) -> float:
+    """Probability that the noise follows Eq. 12: away (2,) log rates less the foretold ones,
+    error (2,) of that difference; against rates that are free of the thresholds."""
+    log_odds = np.log(TIED_ODDS) + (
+        -0.5 * (away / error) ** 2 - np.log(error * np.sqrt(2 * np.pi) / FREE_RANGE)).sum()
+    return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+
+
+def with_tie(
+    theta: np.ndarray, theta_std: np.ndarray, log_eta: np.ndarray, log_std: np.ndarray,
+    factor: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """log noise rates (2,) and their std: a mixture of "the noise follows Eq. 12 at these
+    thresholds (2,)" and "it is free", each as probable as the measured rates make it."""
+    rates, error = tied_rates(theta, theta_std, factor)
+    foretold = np.log(rates)
+    tied = tied_probability(log_eta - foretold, np.hypot(error, log_std))
+    precision = error**-2.0 + log_std**-2.0
+    both = (foretold * error**-2.0 + log_eta * log_std**-2.0) / precision
+    variance = (tied / precision + (1 - tied) * log_std**2
+                + tied * (1 - tied) * (both - log_eta) ** 2)
+    return tied * both + (1 - tied) * log_eta, np.sqrt(variance)

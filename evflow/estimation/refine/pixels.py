@@ -1,0 +1,173 @@
+"""Each pixel's thresholds, from the path at the pixel's own events and from those it did not send.
+
+At the instant of an event the memory equals the brightness, so over the events i of a pixel the
+path at t_i is theta_on a_i - theta_off b_i plus a constant, a and b counting its events: a linear
+regression without quantisation noise, whose only error is the path's; the contrast that the path
+lacks is measured where most pixels tell. Its normal equations add over chunks; the camera's
+summary and mismatch are the prior, bounds.py adds what no event answered and start.py what the
+memory was at the beginning.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from evflow.camera import THETA_MIN, Summary
+from evflow.estimation.refine.bounds import NOTHING, bounded, unanswered
+from evflow.estimation.refine.sightings import PATH_ERROR, Sightings, counted, sight, trusted
+from evflow.estimation.refine.start import Belief, anchored, remembered, running_on, since_start
+from evflow.types import Events
+
+Array = np.ndarray
+
+PRIOR_COUNT = 5.0  # events' worth of belief in PATH_ERROR, against the residuals seen
+SHARED_ERROR = 2.2  # errors of neighbouring events go together: variance is this much larger
+LEAST_VARIANCE = 0.022**2  # log units squared: a path that misses all motion leaves no residuals
+PASSES = 3
+KNOWN = 0.15  # share of the prior's variance that is left
+FEW_TO_MOST = (0.5, 0.9)  # share of pixels: from where their gain is used, and fully
+GAINS = (0.7, 1.1)  # beyond, the path shows something else
+GAIN_SPREAD = 0.06  # of the gain from pixel to pixel: measured on simulated recordings of 8 s
+LEAST_SIGMA = 0.01  # log units
+START_ERROR = 0.05  # log units, of the path from the first frame to another
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PixelEvidence:
+    """equations: (7, H, W) sums of weighted aa, ab, bb, ay, by, yy about their means, and the
+    number of events. bounds: (3, H, W), see `unanswered`. start: (6, H, W), see `since_start`.
+    Evidence of several chunks adds."""
+
+    equations: Array
+    bounds: Array
+    start: Array
+
+    @staticmethod
+    def nothing(shape: tuple[int, int]) -> PixelEvidence:
+        return PixelEvidence(
+            np.zeros((7, *shape)), np.full((3, *shape), NOTHING), _no_start(shape))
+
+    def __add__(self, other: PixelEvidence) -> PixelEvidence:
+        return PixelEvidence(
+            self.equations + other.equations, np.maximum(self.bounds, other.bounds),
+            np.concatenate([self.start[:4] + other.start[:4],
+                            np.maximum(self.start[4:], other.start[4:])]))
+
+
+def _no_start(shape: tuple[int, int]) -> Array:
+    return np.concatenate([np.zeros((4, *shape)), np.full((2, *shape), NOTHING)])
+
+
+def pixel_evidence(
+    events: Events, times_us: Array, path: Array, steps: int, seen: Array | None = None, *,
+    first: bool = False,
+) -> PixelEvidence:
+    """What the events between frames at times_us (K + 1,) say about each pixel, given the path
+    (K*steps + 1, H, W) of its log brightness. seen: (K + 1, H, W) bool, frames that show what
+    the pixel saw; events of intervals that are not shown are not used. first: whether the
+    recording begins with these frames."""
+    return evidence_of(sight(events, times_us, path, steps, seen), first=first)
+
+
+def evidence_of(s: Sightings, *, first: bool = False) -> PixelEvidence:
+    """The same of events that are placed beside the path already."""
+    weight = trusted(s)
+    return PixelEvidence(_equations(s, weight), unanswered(s),
+                         since_start(s, weight) if first else _no_start(s.shape))
+
+
+def _equations(s: Sightings, weight: Array) -> Array:
+    out = np.zeros((7, s.frames.shape[1]))
+    if len(s.pixel) == 0:
+        return out.reshape(7, *s.shape)
+    group, a, b = counted(s)
+
+    def total(v: Array) -> Array:
+        return np.bincount(group, v)
+
+    def centred(v: Array) -> Array:
+        return v - (total(weight * v) / total(weight))[group]
+
+    a, b, y = (centred(v) for v in (a, b, s.path))
+    sums = [total(weight * u * v) for u, v in ((a, a), (a, b), (b, b), (a, y), (b, y), (y, y))]
+    out[:, s.pixel[s.first]] = [*sums, total(s.shown.astype(np.float64))]
+    return out.reshape(7, *s.shape)
+
+
+def pixel_posterior(evidence: PixelEvidence, summary: Summary) -> tuple[Array, Array]:
+    """theta (2, H, W) and its std, given the camera: N(median, sigma²) per pixel times the
+    regression, whose error variance each pixel learns from its own residuals, within the bounds;
+    the mean over what the memory may have been at the start. What the path lacks of the
+    brightness' contrast is alike in all pixels, but for GAIN_SPREAD."""
+    median = np.array([float(summary.theta_on), float(summary.theta_off)])
+    sigma = np.maximum([float(summary.sigma_on), float(summary.sigma_off)], LEAST_SIGMA)
+    precision, unanswered = sigma**-2.0, evidence.bounds[:2]
+    running = _regression(evidence.equations, median, precision)
+    belief = bounded(running.theta, running.covariance, unanswered)
+    belief = running_on(*belief, evidence.bounds[2], evidence.equations[6] > 0)
+    mean, variance = _with_gain_error(*belief, precision)
+    error, chance = remembered(evidence.start, running, median)
+    if chance.any():
+        known = _regression(
+            anchored(evidence.equations, evidence.start, error), median, precision)
+        belief = bounded(known.theta, known.covariance, unanswered)
+        belief = bounded(*belief, evidence.start[4:], float(np.hypot(START_ERROR, error)))
+        mean, variance = _either(chance, _with_gain_error(*belief, precision), (mean, variance))
+    return np.maximum(mean, THETA_MIN).astype(np.float32), np.sqrt(variance).astype(np.float32)
+
+
+def _either(
+    chance: Array, one: tuple[Array, Array], other: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Mean and variance of what is `one` with a chance (H, W), else the `other`."""
+    mean = chance * one[0] + (1 - chance) * other[0]
+    variance = [v + (m - mean) ** 2 for m, v in (one, other)]
+    return mean, chance * variance[0] + (1 - chance) * variance[1]
+
+
+def _with_gain_error(mean: Array, covariance: Array, precision: Array) -> tuple[Array, Array]:
+    """Mean and variance (2, H, W), with the error that gains leave in what was learned."""
+    variance = np.stack([covariance[0, 0], covariance[1, 1]])
+    learned = 1.0 - variance * precision[:, None, None]
+    return mean, variance + (GAIN_SPREAD * mean * learned) ** 2
+
+
+def _regression(equations: Array, median: Array, precision: Array) -> Belief:
+    """What the events say, before bounds, given N(median, 1 / precision)."""
+    aa, ab, bb, ay, by, yy, count = equations
+    gain, theta = 1.0, median  # from the regression a path without motion could be explained
+    for _ in range(PASSES):
+        on, off = gain * theta  # on the path's scale
+        residual = (yy - 2 * on * ay - 2 * off * by + on**2 * aa + off**2 * bb
+                    + 2 * on * off * ab)
+        variance = ((PRIOR_COUNT * PATH_ERROR**2 + np.maximum(residual, 0.0))
+                    / (PRIOR_COUNT + np.maximum(count - 1.0, 0.0)))
+        s = SHARED_ERROR * np.maximum(variance, LEAST_VARIANCE) / gain**2
+        covariance = _inverse(aa / s + precision[0], ab / s, bb / s + precision[1])
+        gain = _gain(equations, covariance, median, precision)
+        right = np.stack([ay, by]) / (gain * s) + (precision * median)[:, None, None]
+        theta = np.einsum("ij...,j...->i...", covariance, right)
+    return Belief(theta, covariance, s)
+
+
+def _inverse(a: Array, b: Array, c: Array) -> Array:
+    """(2, 2, H, W) the inverses of [[a, b], [b, c]]."""
+    return np.stack([np.stack([c, -b]), np.stack([-b, a])]) / (a * c - b**2)
+
+
+def _gain(equations: Array, covariance: Array, median: Array, precision: Array) -> float:
+    """How much of the brightness' contrast the path keeps, as frames filled in by optical flow are
+    blurred: what the regression of a pixel gives over the camera's median, the median over
+    pixels that know their thresholds. Where those are few they have low thresholds, and do not
+    tell."""
+    aa, ab, bb, ay, by = equations[:5]
+    u, v = np.einsum("i,ij...->j...", median * precision, covariance)
+    known = np.maximum(covariance[0, 0] * precision[0], covariance[1, 1] * precision[1]) < KNOWN
+    trust = float(np.interp(known.mean(), FEW_TO_MOST, (0.0, 1.0)))
+    if trust == 0:
+        return 1.0
+    due = u * (aa * median[0] + ab * median[1]) + v * (ab * median[0] + bb * median[1])
+    gain = float(np.median((u * ay + v * by)[known] / due[known]))
+    return 1.0 + trust * (gain - 1.0) if GAINS[0] < gain < GAINS[1] else 1.0

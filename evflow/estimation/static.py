@@ -1,0 +1,92 @@
+"""A camera's noise from a static scene: rates per pixel, thresholds unknown.
+
+Whether it is static the events themselves tell (recordings/stillness.py).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Camera, Summary
+from evflow.errors import EvflowDataError
+from evflow.estimation.pixel_noise import pixel_rates
+from evflow.estimation.result import CameraEstimate
+from evflow.recordings.faulty_pixels import dead_pixels
+from evflow.recordings.stillness import busy_pixels, unlike_noise
+from evflow.training.config import PRESETS
+from evflow.types import Recording
+
+
+def estimate_noise(recording: Recording) -> CameraEstimate:
+    """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
+
+    A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
+    over pixels that are not hot. Thresholds are those of the prior that the
+    network was trained on, with its width; `valid` is False everywhere.
+    Raises EV011 (with frames: EV017) where the scene moves, or is too short to tell.
+    """
+    events = recording.events
+    counts = events.count_map()
+    hot = busy_pixels(counts.sum(0))
+    _require_static(recording, hot)
+    seconds = events.duration_us * 1e-6
+    rates, errors, means, mean_errors = zip(
+        *(_rates(n, hot, seconds) for n in counts), strict=True)
+    middle, width = uniform(PRESETS["default"].prior.theta)
+    mismatch, mismatch_width = uniform(PRESETS["default"].prior.mismatch)
+
+    def camera(theta: float, eta: tuple[np.ndarray, ...]) -> Camera:
+        flat = jnp.full(hot.shape, theta, jnp.float32)
+        return Camera(flat, flat, *(jnp.asarray(e, jnp.float32) for e in eta))
+
+    def summary(theta: float, eta: tuple[float, ...], sigma: float) -> Summary:
+        return Summary(*(jnp.float32(v) for v in (theta, theta, *eta, sigma, sigma)))
+
+    total = counts.sum(0, dtype=np.uint32)
+    return CameraEstimate(
+        camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
+        summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
+        dead_pixels(total), 0, _warnings(hot, total, recording.has_frames))
+
+
+def uniform(bounds: tuple[float, float]) -> tuple[float, float]:
+    """Mean and standard deviation of a prior between bounds: of what nothing was measured."""
+    return 0.5 * sum(bounds), (bounds[1] - bounds[0]) / float(np.sqrt(12.0))
+
+
+def _require_static(recording: Recording, hot: np.ndarray) -> None:
+    reason = unlike_noise(recording.events, hot)
+    if reason:
+        raise EvflowDataError(
+            "EV017" if recording.has_frames else "EV011",
+            f"events alone tell the noise of a scene at rest only, and {reason}",
+            ("It has frames: measure its thresholds too (--protocol motion). " if
+             recording.has_frames else "Thresholds are measured against intensity: give frames, "
+             "--frames DIR --timestamps FILE. ") +
+            "The noise alone needs some seconds of a static scene.")
+
+
+def _rates(
+    counts: np.ndarray, hot: np.ndarray, seconds: float
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Rates (H, W) of one polarity in Hz and their std, the mean of the others than hot pixels
+    and its std."""
+    normal = counts[~hot].astype(np.float64)
+    mean, variance, least = float(normal.mean()), float(normal.var()), 1.0 / normal.size
+    rate, error = pixel_rates(
+        counts, np.full(hot.shape, seconds), max(mean, least) / seconds, hot)
+    mean_error = np.sqrt(max(variance, mean, least) / normal.size)
+    return rate, error, mean / seconds, float(mean_error) / seconds
+
+
+def _warnings(hot: np.ndarray, total: np.ndarray, frames: bool) -> tuple[str, ...]:
+    why = "nothing moves in frames and events" if frames else "no frames"
+    found = [f"{why}: theta_on and theta_off are undetermined, their values are the prior's; "
+             "the noise rates are those of a static scene."]
+    if hot.any():
+        share = float(total[hot].sum()) / float(total.sum())
+        y, x = np.unravel_index(int(np.argmax(np.where(hot, total, 0))), total.shape)
+        found.append(f"{hot.sum()} hot pixels send {share:.0%} of the events, most of them "
+                     f"x={x}, y={y}: left out of the summary.")
+    return tuple(found)

@@ -1,9 +1,0 @@
-"""A measured camera in the words of other simulators: maps, settings and a script per simulator.
-
-A target is a module with `export(maps, settings)`; what the other program cannot
-represent is said in the text that goes with it. NumPy only.
-"""
-
-from evflow.exports.base import Export, Settings, export_camera, targets, write_export
-
-__all__ = ["Export", "Settings", "export_camera", "targets", "write_export"]

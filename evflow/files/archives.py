@@ -1,0 +1,149 @@
+"""Zip archives and .npy headers of unknown origin: whatever Python's readers raise on damage
+becomes EV009, bombs are refused before they are unpacked, pickles are never loaded."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.files.limits import check_expansion
+from evflow.files.spool import Spool
+
+MAX_HEADER = 10_000  # bytes, NumPy's own bound
+BLOCK = 1 << 20  # bytes, or values, read at a time
+DAMAGE = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError,
+          OSError)  # what zipfile raises on a damaged archive
+
+
+def is_zip(path: Path) -> bool:
+    """Whether a file is a zip archive, or a damaged one, as `unzipped` then says."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:  # its last record claims several disks
+        return True
+
+
+@contextlib.contextmanager
+def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.ZipFile]:
+    """The open archive; EV009 where it, or what the block reads of it, is damaged or a bomb.
+
+    streamed: members that are read piece by piece, and so may be of any size."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            found, there = archive.infolist(), os.path.getsize(path)
+            if (most := max((info.compress_size for info in found), default=0)) > there:
+                # zipfile would ask for memory for all of them
+                raise ValueError(f"a member of {most} bytes in a file of {there}")
+            sizes = [info.file_size for info in found if info.filename not in streamed]
+            check_expansion(sum(sizes), there, path)
+            yield archive
+    except DAMAGE as e:
+        raise EvflowDataError(
+            "EV009", f"{path} is damaged ({e or type(e).__name__}).", "Copy it again.") from e
+
+
+def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, Fortran order and dtype of the .npy that f begins; ValueError where it is damaged or
+    holds Python objects."""
+    begin = f.read(8)  # magic and version
+    first = begin[6:7] == b"\x01"
+    length = f.read(2 if first else 4)
+    if int.from_bytes(length, "little") > MAX_HEADER:  # NumPy would take memory for all of it
+        raise ValueError("its header is damaged")
+    whole = io.BytesIO(begin + length + f.read(int.from_bytes(length, "little")))
+    try:
+        np.lib.format.read_magic(whole)
+        read: Any = (np.lib.format.read_array_header_1_0 if first
+                     else np.lib.format.read_array_header_2_0)
+        shape, fortran, dtype = read(whole)
+    except Exception as e:  # a dozen kinds: tokenize's, and MemoryError where brackets are nested
+        raise ValueError(str(e) or f"its header is damaged ({type(e).__name__})") from None
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects: pickles are refused")
+    if min(shape, default=0) < 0:
+        raise ValueError(f"its shape is {shape}")
+    return shape, fortran, dtype
+
+
+def load_npz(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an .npz by key; EV009 where any of them is damaged or pickled."""
+    with members(path) as found:
+        return {name: member.whole() for name, member in found.items()}
+
+
+@contextlib.contextmanager
+def members(path: Path) -> Iterator[dict[str, Member]]:
+    """The arrays of an .npz by key, to be read in the block; EV009 as `unzipped`."""
+    with unzipped(path) as archive:
+        found = {info.filename.removesuffix(".npy"): Member(archive, info)
+                 for info in archive.infolist()}
+        try:
+            yield found
+        finally:
+            for member in found.values():
+                member.close()
+
+
+class Member:
+    """An array of an open .npz, read whole or from its beginning on, rows by rows; ValueError and
+    what zipfile raises where it is damaged. Its checksum is compared at its end."""
+
+    def __init__(self, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
+        if not info.filename.endswith(".npy"):  # skipping it could lose the frames unseen
+            raise ValueError(f"{info.filename} is not an array")
+        self._archive, self._info = archive, info
+        self._file: IO[bytes] | None = None  # of some that are read: an open one takes 50 kB
+        with archive.open(info) as f:
+            self.shape, self.fortran, self.dtype = npy_header(f)
+        if math.prod(self.shape) * self.dtype.itemsize > info.file_size:
+            raise ValueError(f"{info.filename} is cut off: {self.dtype} {self.shape}")
+
+    def take(self, count: int) -> np.ndarray:
+        """The next `count` values, (count,), in the order of the file."""
+        return np.frombuffer(self._data().read(count * self.dtype.itemsize), self.dtype, count)
+
+    def finish(self) -> None:
+        """Read what is left of it, for the checksum."""
+        while self._data().read(BLOCK):
+            pass
+        self.close()
+
+    def whole(self) -> np.ndarray:
+        """The array, in memory."""
+        try:
+            flat = self.take(math.prod(self.shape))
+            self.finish()
+        finally:
+            self.close()
+        return flat.reshape(self.shape, order="F" if self.fortran else "C")
+
+    def spooled(self) -> np.ndarray:
+        """The array, in memory or on disk as `Spool` has it."""
+        spool, left = Spool(self.dtype), math.prod(self.shape)
+        while left:
+            spool.append(self.take(min(left, BLOCK)))
+            left -= min(left, BLOCK)
+        self.finish()
+        return spool.array().reshape(self.shape, order="F" if self.fortran else "C")
+
+    def close(self) -> None:
+        """It can be read again, from its beginning on."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _data(self) -> IO[bytes]:
+        if self._file is None:
+            self._file = self._archive.open(self._info)
+            npy_header(self._file)
+        return self._file

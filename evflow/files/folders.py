@@ -1,0 +1,77 @@
+"""Folders that appear whole or not at all, as `files.atomic_write` does for a file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+from evflow.errors import EvflowDataError
+from evflow.files.atomic import aside, atomic_write
+
+
+@contextlib.contextmanager
+def atomic_folder(
+    path: str | os.PathLike, *, names: Collection[str], overwrite: bool = False
+) -> Iterator[Path]:
+    """Yield a new folder beside `path`; rename it into place only if the block succeeds.
+
+    names: the files that such a folder holds. One that holds anything else is never replaced,
+    overwrite or not, because somebody may miss it.
+    Raises EV013 and EV019 as `atomic_write`; nothing is left behind by any failure.
+    """
+    path = Path(path).resolve()
+    old = sorted(p.name for p in path.iterdir()) if path.is_dir() else []
+    if foreign := [name for name in old if name not in names]:
+        raise EvflowDataError(
+            "EV013", f"{path} is a folder that holds {foreign[:5]}.", "Choose another output.")
+    before = aside(path, "old")
+    temporary: Path | None = None
+    try:
+        with atomic_write(path, overwrite=overwrite) as temporary:
+            temporary.mkdir()
+            yield temporary
+            if path.is_dir():
+                os.replace(path, before)
+    except BaseException:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        if before.exists():
+            os.replace(before, path)
+        raise
+    shutil.rmtree(before, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool = False
+           ) -> Iterator[Path]:
+    """Yield an empty folder; move what the block leaves there into `folder` once it succeeds.
+
+    names: all files that the block may write, of which those in `folder` from another time are
+    removed, so that nothing stale lies beside the new ones; other files stay.
+    Raises EV013 where one of them exists and `overwrite` is false, EV019 where the folder cannot
+    be written.
+    """
+    folder = Path(folder)
+    if not overwrite and (old := [name for name in names if (folder / name).exists()]):
+        raise EvflowDataError("EV013", f"{folder} holds {', '.join(old)}.",
+                              "Pass --overwrite (overwrite=True).")
+    stage = aside(folder / "stage", "tmp")
+    new = not folder.exists()
+    try:
+        with atomic_write(folder / ".probe", overwrite=True) as probe:  # before any long work
+            probe.touch()
+        (folder / ".probe").unlink()
+        stage.mkdir()
+        yield stage
+        for name in names:
+            (folder / name).unlink(missing_ok=True)
+        for path in stage.iterdir():
+            os.replace(path, folder / path.name)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        if new:
+            with contextlib.suppress(OSError):  # unless something was written
+                folder.rmdir()

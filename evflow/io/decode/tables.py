@@ -1,0 +1,133 @@
+"""Events in columns of HDF5 data sets or of arrays, read in blocks of rows; frames beside them.
+
+Every data set is checked against the size of its file before memory is taken, and whatever h5py
+raises on a damaged file becomes EV009.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size, check_times
+from evflow.errors import EvflowDataError
+from evflow.io.decode.hdf5 import DAMAGE, MAGIC, MAX_RATIO, load_h5py, need_filters, plausible
+from evflow.io.decode.stream import Chunk
+from evflow.io.images.frames import FrameStack
+from evflow.types import Events, Recording
+
+ROWS = 1 << 15  # events read at a time: 1 MiB of four float64 columns, which a cache holds
+
+
+def holds(head: bytes, path: Path, test: Callable[[Any], bool]) -> bool:
+    """Is it an HDF5 file that can be opened and passes the test?"""
+    if not head.startswith(MAGIC):
+        return False
+    try:
+        with load_h5py().File(path) as f:
+            return bool(test(f))
+    except (EvflowDataError, *DAMAGE):
+        return False
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """The open HDF5 file; EV009 (damaged), EV010 (no h5py)."""
+    h5py = load_h5py()
+    try:
+        with h5py.File(path) as f:
+            yield f
+    except DAMAGE as e:
+        raise EvflowDataError(
+            "EV009", f"{path} is cut off or damaged ({type(e).__name__}: {e}).",
+            "Copy it again; h5ls and h5dump show what is left.") from e
+
+
+def dataset(path: Path, group: Any, name: str, shape: tuple[int | None, ...]) -> Any:
+    """Data set `name` of that shape (None: any length); EV008 (absent), EV009, EV010."""
+    if name not in group:
+        raise EvflowDataError(
+            "EV008", f"{path}: {group.name} holds {sorted(group)[:8]} but not {name!r}.",
+            "Another layout? Convert it to one that `evflow info` names.")
+    data = group[name]
+    found = getattr(data, "shape", None)
+    if found is None or len(found) != len(shape) or any(
+            want is not None and want != got for want, got in zip(shape, found, strict=True)):
+        raise EvflowDataError(
+            "EV009", f"{path}: {name} of {group.name} has shape {found}; expected {shape}.",
+            "Write the file again.")
+    need_filters(path, plausible(path, data))
+    block = math.prod(data.chunks or (0,)) * data.dtype.itemsize
+    if block > MAX_RATIO * os.path.getsize(path) + (1 << 20):  # HDF5 decodes whole blocks
+        raise EvflowDataError(
+            "EV009", f"{path}: {name} claims blocks of {block:,} bytes in a file of "
+            f"{os.path.getsize(path):,}.", "Copy or write the file again.")
+    return data
+
+
+def blocks(
+    n: int,
+    rows: Callable[[slice], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
+    stored: int = 1,
+    begin: int = 0,
+) -> Iterator[Chunk]:
+    """Chunks of the events begin to n; rows(slice) gives their x, y, t, p. stored: rows of a block
+    of HDF5, which is decoded as a whole: whole ones are read, each once."""
+    for part in aligned(begin, n, max(ROWS // stored, 1) * stored):
+        yield Chunk(*rows(part), lambda i, first=part.start: first + i,  # type: ignore[misc]
+                    "event")
+
+
+def aligned(begin: int, end: int, step: int) -> Iterator[slice]:
+    """Slices that cover [begin, end) and meet at multiples of step."""
+    for first in range(begin - begin % step, end, step):
+        yield slice(max(first, begin), min(first + step, end))
+
+
+def stored_rows(data: Any) -> int:
+    """Rows in a block of an HDF5 data set; 1 where it is not stored in blocks."""
+    return int(data.chunks[0]) if data.chunks else 1
+
+
+def same_length(path: Path, columns: dict[str, Any]) -> int:
+    """The length that all columns have, or EV009."""
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise EvflowDataError(
+            "EV009", f"{path} has columns of different length: {lengths}.", "Write it again.")
+    return next(iter(lengths.values()))
+
+
+def with_frames(
+    path: Path,
+    events: Events,
+    span: tuple[int, int],
+    times: np.ndarray,
+    images: Callable[[slice], Iterable[np.ndarray]],
+    notes: tuple[str, ...],
+) -> Recording:
+    """The recording with those frames whose times (T,) int64 us lie in [start, stop)."""
+    times = check_times(times, f"{path}: frame times", strict=True)
+    keep = slice(*(int(i) for i in np.searchsorted(times, np.array(span))))
+    stack = FrameStack(path)
+    if keep.start < keep.stop:
+        for image in images(keep):
+            stack.append(image)
+    return stack.beside(events, times[keep], notes)
+
+
+def stored_frames(data: Any, keep: slice) -> Iterator[np.ndarray]:
+    """Frames of an HDF5 data set one by one, each stored block decoded once."""
+    for part in aligned(keep.start, keep.stop, stored_rows(data)):
+        yield from data[part]
+
+
+def frame_size(data: Any) -> Size | None:
+    """(width, height) of frames (T, H, W) or (T, H, W, C)."""
+    return None if data is None else (int(data.shape[2]), int(data.shape[1]))

@@ -1,0 +1,148 @@
+"""Text with one event per line, in blocks of whole lines: numbers between blanks or commas, `#`
+comments.
+
+A line that is not such becomes `Damage` at its byte. Memory: one block and its table of float64.
+"""
+
+from __future__ import annotations
+
+import codecs
+import io
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.decode.stream import Chunk, Damage
+
+BLANKS = bytes.maketrans(b",;", b"  ")  # what else stands between numbers
+HEAD = 1 << 14  # bytes by which a file is recognised, and the order of its columns told
+BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
+MAX_LINE = 1000  # a longer one is not text
+FEW, LATE_S = 10, 1000  # whole times: so many, or so late, are no seconds
+YEAR_2099_S = 4.1e9  # since 1970
+
+
+def events(
+    f: IO[bytes], widths: tuple[int, ...], byte: int = 0, order: str = "txyp"
+) -> Iterator[Chunk]:
+    """Chunks of lines of one of these numbers of columns, whose first are those of `order`; f is at
+    `byte`. What stands before a line that is none comes out before Damage is raised."""
+    line = 0
+    for start, block in _blocks(f, byte):
+        table, widths, damage = _parse(start, plain(block, start), widths)
+        t, x, y, p = (table[:, order.index(name)] for name in "txyp")
+        yield Chunk(x, y, t, p, lambda i, line=line: line + i, "event")  # type: ignore[misc]
+        if damage:
+            raise damage
+        line += len(table)
+
+
+def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+    """The chunks; EV003 where the times of the first are whole numbers, which seconds are not, or
+    later than any seconds since 1970."""
+    seen = False
+    for chunk in chunks:
+        if not seen and len(chunk.t):
+            _check_seconds(path, chunk.t)
+        seen = seen or len(chunk.t) > 0
+        yield chunk
+
+
+def _check_seconds(path: Path, t: np.ndarray) -> None:
+    last = float(np.nanmax(t, initial=0.0))
+    if last >= 2.0**63:  # no times at all, as `stream.gather` tells
+        return
+    if bool((t % 1 == 0).all()) and (len(t) >= FEW or last >= LATE_S):
+        raise EvflowDataError(
+            "EV003", f"{path}: all times are whole numbers ({t[0]:.0f}, ...), not seconds.",
+            "Microseconds? Pass time_unit='us' (--time-unit us).")
+    if last > YEAR_2099_S:
+        raise EvflowDataError(
+            "EV003", f"{path}: {last:.6f} s are no time since 1970.",
+            "Milliseconds, or microseconds? Pass time_unit='ms' or 'us' (--time-unit).")
+
+
+def plain(block: bytes, byte: int) -> bytes:
+    """Lines of as many bytes with blanks between their numbers: no commas, no byte order mark at
+    byte 0, and Python's True and False as 1 and 0."""
+    if byte == 0 and block.startswith(codecs.BOM_UTF8):
+        block = b"   " + block[len(codecs.BOM_UTF8):]
+    if b"True" in block or b"False" in block:
+        block = block.replace(b"True", b"1   ").replace(b"False", b"0    ")
+    return block.translate(BLANKS)
+
+
+def _blocks(f: IO[bytes], byte: int) -> Iterator[tuple[int, bytes]]:
+    """(its first byte, a block of whole lines); the last line may lack its end."""
+    rest = b""
+    while data := f.read(BLOCK):
+        rest += data
+        end = rest.rfind(b"\n") + 1
+        if end:
+            yield byte, rest[:end]
+            byte, rest = byte + end, rest[end:]
+        if len(rest) > MAX_LINE:
+            raise Damage(byte, f"a line of more than {MAX_LINE} bytes is not text")
+    if rest:
+        yield byte, rest
+
+
+def _parse(
+    byte: int, block: bytes, widths: tuple[int, ...]
+) -> tuple[np.ndarray, tuple[int, ...], Damage | None]:
+    """(rows, columns) float64, the one width that later blocks must have, and what is wrong with
+    the line after those rows, if there is one."""
+    table = _table(block, widths)
+    if table is not None:
+        return table, (table.shape[1],) if len(table) else widths, None
+    sound, damage = _before_damage(byte, block, widths)
+    table = _table(sound, widths)
+    if table is None:  # what no line by itself shows
+        table, damage = np.zeros((0, widths[0])), Damage(
+            byte, "what stands here is not plain text")
+    return table, (table.shape[1],), damage
+
+
+def _table(block: bytes, widths: tuple[int, ...]) -> np.ndarray | None:
+    """The numbers of a block of lines; None where they are none, or not as many a line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a block of comments holds no data
+            table = np.loadtxt(io.StringIO(block.decode("ascii")), ndmin=2)
+    except ValueError:
+        return None
+    if table.size == 0:
+        return np.zeros((0, widths[0]))
+    return table if table.shape[1] in widths and np.isfinite(table).all() else None
+
+
+def _before_damage(byte: int, block: bytes, widths: tuple[int, ...]) -> tuple[bytes, Damage]:
+    """The lines before the first that is none, and what that one is."""
+    at = 0
+    for content in block.split(b"\n"):
+        fields = content.partition(b"#")[0].split()
+        if fields and len(fields) in widths and all(map(is_number, fields)):
+            widths = (len(fields),)
+        elif fields:
+            return block[:at], Damage(byte + at, f"the line {content[:60]!r} is not `t x y p` "
+                                      f"({' or '.join(map(str, widths))} numbers)")
+        at += len(content) + 1
+    return block, Damage(byte + at, "what stands before is not plain text")
+
+
+def is_number(field: bytes) -> bool:
+    """Is it a finite number?"""
+    return is_float(field) and bool(np.isfinite(float(field)))
+
+
+def is_float(field: bytes | str) -> bool:
+    """Is it a number, NaN and infinity among them?"""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,196 @@
+"""HDF5 in the layout of the DSEC data set: the format to exchange events in.
+
+/events/{x u16, y u16, p u8, t u32 us}, /t_offset (i64 us, add it to t), /ms_to_idx (u64; event
+ms_to_idx[m] is the first with t >= 1000 m). Of our own: attributes width and height (absent in
+DSEC, which is 640x480; its ms_to_idx and t_offset tell it from others with such events), and
+/frames, /frame_times (i64 us, without t_offset) where there are any.
+`DsecWriter` takes events chunk by chunk, so that a long simulation never sits in memory.
+"""
+
+from __future__ import annotations
+
+import bisect
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.io.decode import tables
+from evflow.io.decode.hdf5 import DAMAGE, MAGIC, Hdf5Writer, load_h5py, plausible
+from evflow.io.decode.stream import Chunk, gather
+from evflow.io.hints import Hints
+from evflow.io.images.times import beside_events
+from evflow.types import Events, Recording
+
+NAME = "dsec"
+EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5", "")
+
+EVENTS = "events.h5"
+RECTIFY = ("rectify_map.h5 is not applied: events stay at the sensor's own pixels, which have the "
+           "thresholds")
+DSEC_SIZE = (640, 480)
+FLUSH = 1 << 20  # events rewritten at a time where t widens
+INDEX_MS = 1 << 20  # milliseconds indexed at a time: 8 MiB, however long the camera was silent
+MAX_MS = 10**8  # 28 hours; beyond that two clocks were joined and ms_to_idx would not fit
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return (path / EVENTS).is_file()
+    if not head.startswith(MAGIC):
+        return False
+    try:
+        with load_h5py().File(path) as f:
+            return "events" in f and hasattr(f["events"], "keys")
+    except (EvflowDataError, *DAMAGE):
+        return True  # `read` says why
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Only the part between start_s and stop_s is read. Of a folder its events.h5; a rectify map
+    beside them is not applied.
+
+    Raises EV008 (a data set is missing), EV009 (damaged), EV010 (h5py or a filter is missing),
+    EV015 (neither width and height nor all of DSEC's own members), and what `stream.gather` and
+    `Recording` raise.
+    """
+    path = path / EVENTS if path.is_dir() else path
+    notes = (RECTIFY,) if path.with_name("rectify_map.h5").is_file() else ()
+    with tables.opened(path) as f:
+        columns = _columns(path, f)
+        size, assumed = _size(f)
+        if assumed and hints.size is None:
+            notes = (*notes, assumed)
+        offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
+        events, span = gather(path, _chunks(columns, hints), hints, size, "us", offset)
+        if "frames" not in f:
+            return Recording.of_events(events, notes)
+        frames = tables.dataset(path, f, "frames", (None, None, None))
+        times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
+        us = beside_events(times, path, "us", hints, events)
+        return tables.with_frames(path, events, span, us,
+                                  lambda keep: tables.stored_frames(frames, keep), notes)
+
+
+def _size(f: Any) -> tuple[Size | None, str]:
+    """Of the sensor, None where nothing tells; and what was assumed."""
+    if "width" in f.attrs and "height" in f.attrs:
+        return (int(f.attrs["width"]), int(f.attrs["height"])), ""
+    if "ms_to_idx" in f and "t_offset" in f:
+        return DSEC_SIZE, ("the sensor is taken as {}x{}, as DSEC's are: pass --size where it is "
+                           "another".format(*DSEC_SIZE))
+    return None, ""
+
+
+class DsecWriter(Hdf5Writer):
+    """Write events (and frames) chunk by chunk; t is u32 and widens to i64 past 71 minutes."""
+
+    NAME = NAME
+    offset_us: int | None = None
+    n_events = 0  # in the file
+
+    def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
+        super()._open(temporary, stack)
+        self._file.attrs["width"], self._file.attrs["height"] = self.size
+        for name, dtype in (("x", "u2"), ("y", "u2"), ("p", "u1"), ("t", "u4")):
+            self._create(f"events/{name}", (), dtype, self.CHUNK)
+        self._create("ms_to_idx", (), "u8", self.CHUNK)
+
+    def _finish(self) -> None:
+        self._file.create_dataset("t_offset", data=np.int64(self.offset_us or 0))
+
+    def _check(self, events: Events) -> None:
+        """EV004 where the events span more than ms_to_idx should."""
+        if self.offset_us is None:
+            self.offset_us = int(events.t[0])
+        span = int(events.t[-1]) - self.offset_us
+        if span > MAX_MS * 1000:
+            raise EvflowDataError(
+                "EV004", f"events span {span / 3.6e9:,.0f} hours.",
+                "Were recordings of different clocks joined?")
+
+    def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
+        if "frames" not in self._file:
+            self._create("frames", frames.shape[1:], frames.dtype, 1)
+            self._create("frame_times", (), "i8", self.CHUNK)
+        self._extend("frames", frames)
+        self._extend("frame_times", times)
+
+    def _write(self, events: Events) -> None:
+        t = events.t - self.offset_us
+        self._widen(int(t[-1]))
+        for name, values in (("x", events.x), ("y", events.y), ("p", events.p), ("t", t)):
+            self._extend(f"events/{name}", values)
+        self._index(t)
+        self.n_events += len(events)
+
+    def _index(self, t: np.ndarray) -> None:
+        """Extend ms_to_idx to the last millisecond that begins at or before t[-1]."""
+        stop = int(t[-1]) // 1000 + 1
+        for first in range(len(self._file["ms_to_idx"]), stop, INDEX_MS):
+            ms = np.arange(first, min(first + INDEX_MS, stop))
+            self._extend("ms_to_idx", self.n_events + np.searchsorted(t, ms * 1000))
+
+    def _widen(self, last_us: int) -> None:
+        """Turn t into int64 once it no longer fits u32 (71.6 minutes)."""
+        group = self._file["events"]
+        if last_us < 2**32 or group["t"].dtype == np.int64:
+            return
+        group.move("t", "t_u32")
+        self._create("events/t", (), "i8", self.CHUNK)
+        for first in range(0, self.n_events, FLUSH):
+            self._extend("events/t", group["t_u32"][first : first + FLUSH].astype(np.int64))
+        del group["t_u32"]
+
+
+def _columns(path: Path, f: Any) -> dict[str, Any]:
+    """The four data sets, 1-D, of one length and decodable; EV008, EV009, EV010."""
+    group = f["events"]
+    missing = [name for name in ("x", "y", "t", "p") if name not in group]
+    if missing:
+        raise EvflowDataError(
+            "EV008", f"{path}: /events holds {sorted(group)} but not {missing}.",
+            "Expected the DSEC layout: /events/{x, y, t, p}.")
+    columns = {name: tables.dataset(path, group, name, (None,)) for name in ("x", "y", "t", "p")}
+    tables.same_length(path, columns)
+    return columns
+
+
+def _scalar(path: Path, f: Any, name: str) -> Any:
+    """The one value of a data set of shape () or (1,); EV009."""
+    if getattr(f[name], "size", None) != 1:
+        raise EvflowDataError("EV009", f"{path}: {name} is no single number.", "Write it again.")
+    return plausible(path, f[name])[()]
+
+
+def _chunks(columns: dict[str, Any], hints: Hints) -> Iterator[Chunk]:
+    """Chunks of the events between start_s and stop_s, found by binary search in the file, and
+    before them the very first event, from which those count."""
+    x, y, t, p = columns.values()
+    first, last = _range(t, hints)
+
+    def rows(part: slice) -> tuple[Any, Any, Any, Any]:
+        return x[part], y[part], t[part], p[part]
+
+    if first > 0:
+        yield from tables.blocks(1, rows)
+    stored = max(tables.stored_rows(column) for column in columns.values())
+    yield from tables.blocks(last, rows, stored, first)
+
+
+def _range(t: Any, hints: Hints) -> tuple[int, int]:
+    """The first event to read, and the first not to."""
+    if hints.whole or len(t) == 0:
+        return 0, len(t)
+
+    def us(value: Any) -> int:
+        return hints.instant(value, "us")
+
+    first, last = (bisect.bisect_left(t, value, key=us) for value in hints.span_us(us(t[0])))
+    if first >= last:
+        raise hints.empty(us(t[-1]) - us(t[0]))
+    return first, last

@@ -1,0 +1,142 @@
+"""HDF5 of the E2VID family (event_utils, event_cnn_minimal, the ECOCO and HQF data sets).
+
+/events/{xs, ys, ts, ps}: ts float64 s (integers: us), ps bool, {0, 1} or {-1, 1};
+/images/image000000000 ... with an attribute `timestamp` in s; attribute sensor_resolution,
+(height, width) by its authors, though files with (width, height) exist: the images decide, and
+without images the order in which all events fit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.io.decode import tables
+from evflow.io.decode.hdf5 import Hdf5Writer
+from evflow.io.decode.stream import gather
+from evflow.io.hints import Hints
+from evflow.io.images.times import beside_events
+from evflow.io.writer import FLUSH, SECONDS_US
+from evflow.types import Events, Recording
+
+NAME = "event_utils"
+EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
+
+COLUMNS = ("xs", "ys", "ts", "ps")
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    return tables.holds(head, path, lambda f: "events/xs" in f)
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises EV008, EV009, EV010 (h5py) and what `stream.gather` and `Recording` raise."""
+    with tables.opened(path) as f:
+        columns = {name: tables.dataset(path, f["events"], name, (None,)) for name in COLUMNS}
+        n = tables.same_length(path, columns)
+        xs, ys, ts, ps = columns.values()
+        names = sorted(f["images"]) if "images" in f else []
+        images = [_image(path, f["images"], name) for name in names]
+        size, notes = _size(f, images, columns)
+        native = "s" if ts.dtype.kind == "f" else "us"
+        chunks = tables.blocks(n, lambda part: (xs[part], ys[part], ts[part], ps[part]),
+                               max(tables.stored_rows(column) for column in columns.values()))
+        events, span = gather(path, chunks, hints, size, native)
+        if not images:
+            return Recording.of_events(events, notes)
+        stamps = np.array([_time(path, image) for image in images])
+        times = beside_events(stamps, path, native, hints, events)
+        return tables.with_frames(path, events, span, times,
+                                  lambda keep: (_rgb(image[:]) for image in images[keep]), notes)
+
+
+def _image(path: Path, group: Any, name: str) -> Any:
+    colour = len(getattr(group[name], "shape", ())) == 3
+    return tables.dataset(path, group, name, (None, None, None) if colour else (None, None))
+
+
+def _time(path: Path, image: Any) -> Any:
+    if "timestamp" not in image.attrs:
+        raise EvflowDataError(
+            "EV008", f"{path}: {image.name} has no attribute 'timestamp'.",
+            "Write the file again, with the time of each image in seconds.")
+    return np.asarray(image.attrs["timestamp"]).reshape(-1)[0]
+
+
+def _rgb(pixels: np.ndarray) -> np.ndarray:
+    """OpenCV, which the writers use, orders colours B, G, R; one channel becomes none."""
+    if pixels.ndim == 2:
+        return pixels
+    return pixels[..., 0] if pixels.shape[-1] == 1 else pixels[..., 2::-1]
+
+
+def _size(
+    f: Any, images: list[Any], columns: dict[str, Any]
+) -> tuple[Size | None, tuple[str, ...]]:
+    if images:
+        return (int(images[0].shape[1]), int(images[0].shape[0])), ()
+    told = np.asarray(f.attrs.get("sensor_resolution", ())).ravel()
+    if len(told) < 2 or told.dtype.kind not in "iuf" or not (told[:2] > 0).all():
+        return None, ()
+    height, width = (int(v) for v in told[:2])
+    if height <= width:  # as sensors are: no event can tell, and two columns need not be read twice
+        return (width, height), ()
+    reach = [0, 0]
+    for first in range(0, len(columns["xs"]), tables.ROWS):
+        for i, name in enumerate(("xs", "ys")):
+            reach[i] = max(reach[i], int(columns[name][first : first + tables.ROWS].max()))
+    if reach[0] >= width and reach[0] < height and reach[1] < width:
+        return (height, width), (
+            f"sensor_resolution {height}, {width} was taken as (width, height): events reach "
+            f"x={reach[0]}, y={reach[1]}",)
+    return (width, height), ()
+
+
+class EventUtilsWriter(Hdf5Writer):
+    """xs, ys int16 as their loaders want them; ts float64 s; ps bool. Every image has `timestamp`
+    and `event_idx`, the last event before it."""
+
+    NAME = NAME
+    MAX_SIDE = 2**15
+    TIMES_US = (-SECONDS_US, SECONDS_US)
+
+    def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
+        super()._open(temporary, stack)
+        self._on, self._first_s, self._image_s = 0, 0.0, np.zeros(0)
+        for name, dtype in zip(COLUMNS, ("i2", "i2", "f8", "?"), strict=True):
+            self._create(f"events/{name}", (), dtype, self.CHUNK)
+
+    def _write(self, events: Events) -> None:
+        seconds = events.t / 1e6
+        if not len(self._file["events/ts"]):
+            self._first_s = float(seconds[0])
+        for name, values in zip(COLUMNS, (events.x, events.y, seconds, events.p), strict=True):
+            self._extend(f"events/{name}", values)
+        self._on += int(events.p.sum())
+
+    def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
+        for frame, second in zip(frames, times / 1e6, strict=True):
+            image = self._file.create_dataset(
+                f"images/image{len(self._image_s):09d}", data=frame, chunks=frame.shape,
+                compression="gzip", compression_opts=1, shuffle=True)
+            image.attrs.update(size=frame.shape, timestamp=second, type="greyscale")
+            self._image_s = np.append(self._image_s, second)
+            self._disk.check()
+
+    def _finish(self) -> None:
+        ts, count = self._file["events/ts"], len(self._image_s)
+        before = np.zeros(count, np.int64)
+        for first in range(0, len(ts) if count else 0, FLUSH):
+            before += np.searchsorted(ts[first : first + FLUSH], self._image_s)
+        for index, events in enumerate(before):
+            self._file[f"images/image{index:09d}"].attrs["event_idx"] = max(events - 1, 0)
+        last_s = float(ts[-1]) if len(ts) else 0.0
+        self._file.attrs.update(
+            sensor_resolution=self.size[::-1], num_events=len(ts), num_pos=self._on,
+            num_neg=len(ts) - self._on, t0=self._first_s, tk=last_s,
+            duration=last_s - self._first_s, num_imgs=count, num_flow=0)

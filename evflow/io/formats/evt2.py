@@ -1,0 +1,86 @@
+"""Prophesee RAW, encoding EVT 2.0 (docs.prophesee.ai, data encoding formats): a `% ` header, then
+32-bit words, their type in bits 31-28.
+
+0, 1: an event, OFF or ON: time [27:22] (the low 6 bits), x [21:11], y [10:0]. 8: the high 28 bits
+of time, in 64 us; they wrap after 4.8 hours. A: trigger; E, F: other: counted, not read. Times
+stay on the sensor's clock. Events before the first time word have no time and are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.decode import prophesee
+from evflow.io.decode.stream import Chunk, Clock, collect, typed, words
+from evflow.io.hints import Hints
+from evflow.types import Recording
+
+NAME = "evt2"
+EXTENSIONS: tuple[str, ...] = (".raw",)
+
+TIME, TRIGGER = 0x8, 0xA
+UNDEFINED = np.array([kind not in (0, 1, TIME, TRIGGER, 0xE, 0xF) for kind in range(16)])
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """EVT 2.0, and the encodings that no reader knows: `read` names them."""
+    return prophesee.parse(head).encoding not in ("", "EVT3")
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises EV008 (another encoding) and what `stream.collect` raises."""
+    header = prophesee.read_header(path)
+    if header.encoding != "EVT2":
+        raise EvflowDataError(
+            "EV008", f"{path} is Prophesee RAW of encoding {header.encoding}; EVT2 and EVT3 are "
+            "read.", "Convert it with the camera's software to EVT3, DAT or HDF5 without ECF.")
+    size, notes = header.size()
+    decoder = Decoder()
+    source = words(path, header.start, f"{header.order}u4")
+    return collect(path, decoder.chunks(source), hints, size, lambda: notes + decoder.notes())
+
+
+class Decoder:
+    """The state between chunks: the high bits of time, and what was not read."""
+
+    def __init__(self) -> None:
+        self.clock = Clock(28)
+        self.timeless = self.triggers = 0
+
+    def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
+        return typed(source, UNDEFINED, "EVT2", self.decode)
+
+    def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
+        marks = np.flatnonzero(kind == TIME)
+        rows = np.flatnonzero(kind < 2)
+        before = self.clock.value
+        high = np.append(before or 0, self.clock.unwrap(table[marks] & 0xFFFFFFF))
+        edges = np.searchsorted(rows, marks)
+        if before is None:
+            lost = int(edges[0]) if len(edges) else len(rows)
+            self.timeless += lost
+            rows, edges = rows[lost:], edges - lost
+        self.triggers += int(np.count_nonzero(kind == TRIGGER))
+        events = table[rows]
+        t = np.repeat(high << 6, np.diff(edges, prepend=0, append=len(rows)))
+        t += (events >> 22) & 63
+        return Chunk(((events >> 11) & 0x7FF).astype(np.uint16), (events & 0x7FF).astype(np.uint16),
+                     t, events >= 1 << 28, lambda i: byte + 4 * int(rows[i]))
+
+    def notes(self) -> tuple[str, ...]:
+        return leftovers(self.timeless, self.triggers)
+
+
+def leftovers(timeless: int, triggers: int) -> tuple[str, ...]:
+    """Notes on what a RAW stream holds that is not in the recording."""
+    notes = []
+    if timeless:
+        notes.append(f"{timeless:,} events before the first time or row word were left out: the "
+                     "recording began amid the stream")
+    if triggers:
+        notes.append(f"{triggers:,} external triggers were not read")
+    return tuple(notes)

@@ -1,0 +1,150 @@
+"""The text folder of the IJRR 2017 / ECD event-camera data sets, or a zip of it.
+
+events.txt has a line `t[s] x y p` per event, or what its header says (`plain_text`); images.txt,
+where there is one, a line `t[s] path` per image. Times become int64 us by round(t * 1e6). An
+image's time is used as it stands: the data set does not say where in the exposure it lies.
+calib.txt, imu.txt and poses are not read.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.files.archives import DAMAGE, unzipped
+from evflow.io.decode import tables, text
+from evflow.io.decode.stream import Chunk, gather
+from evflow.io.formats import plain_text
+from evflow.io.hints import Hints
+from evflow.io.images.folder import decode
+from evflow.io.images.times import beside_events
+from evflow.types import Recording
+
+NAME = "ijrr"
+EXTENSIONS: tuple[str, ...] = (".zip", ".txt", "")
+
+EVENTS, IMAGES = "events.txt", "images.txt"
+ROW = re.compile(rb"\d+\.\d+[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?")
+
+Root = Path | zipfile.Path
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return (path / EVENTS).is_file()
+    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                return any(_is_events(name) for name in archive.namelist())
+        except DAMAGE:
+            return path.suffix.lower() == ".zip"  # cut off: the extension decides
+    lines = [line for line in text.plain(head, 0).split(b"\n")
+             if line.strip() and not line.startswith(b"#")]
+    if path.name == EVENTS:  # any numbers may be events; `text` says what is wrong with them
+        fields = lines[0].split() if lines else []
+        return plain_text.sniff(path, head) or (
+            len(fields) == 4 and all(map(text.is_number, fields)))
+    return bool(lines) and ROW.fullmatch(lines[0]) is not None
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """A folder, a zip with that folder at any depth, or events.txt itself (then images.txt is
+    looked for beside it).
+
+    Raises EV008 (not that layout), EV009 (damaged text, image or zip), EV016 (an image is
+    missing), and what `stream.gather` and `Recording` raise.
+    """
+    try:
+        if path.is_dir():
+            return _read(path / EVENTS, path, EVENTS, hints)
+        with open(path, "rb") as f:
+            zipped = f.read(2) == b"PK"
+        if not zipped:
+            return _read(path, path.parent, path.name, hints)
+        with unzipped(path) as archive:
+            found = [PurePosixPath(name) for name in archive.namelist() if _is_events(name)]
+            if len(found) != 1:
+                raise EvflowDataError(
+                    "EV008", f"{path} holds {len(found)} recordings: {sorted(map(str, found))}.",
+                    "Unpack it and pass one folder.")
+            parent = "" if found[0].parent == PurePosixPath(".") else f"{found[0].parent}/"
+            return _read(path, zipfile.Path(archive, parent), EVENTS, hints)
+    except ValueError as e:
+        raise EvflowDataError("EV009", f"{path} is damaged ({e}).", "Copy it again.") from e
+
+
+def _is_events(name: str) -> bool:
+    return PurePosixPath(name).name == EVENTS and not name.startswith("__MACOSX")
+
+
+def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
+    """path: what messages name."""
+    seconds, names = _read_index(root / IMAGES) if name == EVENTS else (np.zeros(0), [])
+    size = _image(root, names[0]).shape[1::-1] if names else None
+    with (root / name).open("rb") as f:
+        chunks, native = plain_text.events(path, f, hints)
+        events, span = gather(path, _some(path, chunks, hints, size), hints, size, native)
+    if not names:
+        return Recording.of_events(events)
+    times = beside_events(seconds, root / IMAGES, "s", hints, events)
+    return tables.with_frames(
+        path, events, span, times, lambda keep: (_image(root, n) for n in names[keep]),
+        ("frame times are those of images.txt",))
+
+
+def _some(
+    path: Path, chunks: Iterable[Chunk], hints: Hints, size: Size | None
+) -> Iterator[Chunk]:
+    """The chunks; EV001 where there is neither event nor size."""
+    seen = False
+    for chunk in chunks:
+        seen = seen or len(chunk.t) > 0
+        yield chunk
+    if not (seen or size or hints.size):
+        raise EvflowDataError("EV001", f"{path} holds no event.")
+
+
+def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
+    """Times (T,) as written, seconds by the format, and names of the images; none where there is no
+    images.txt."""
+    if not index.is_file():
+        return np.zeros(0), []
+    seconds, names = [], []
+    for number, content in enumerate(index.read_bytes().split(b"\n"), 1):
+        fields = content.partition(b"#")[0].split()
+        if not fields:
+            continue
+        if len(fields) != 2 or not text.is_number(fields[0]):
+            raise EvflowDataError(
+                "EV009", f"{index}, line {number:,} is {content[:60]!r}; expected t[s] path.")
+        seconds.append(float(fields[0]))
+        names.append(fields[1].decode("utf-8"))
+    back = np.flatnonzero(np.diff(seconds) <= 0)
+    if len(back):
+        raise EvflowDataError(
+            "EV004", f"{index}: time {seconds[back[0] + 1]:.9g} comes after {seconds[back[0]]:.9g} "
+            f"({len(back):,} such).", "Times must increase: lines out of order, or repeated?")
+    if len(set(names)) < len(names):  # each would be decoded: little text, much memory
+        raise EvflowDataError("EV009", f"{index} has {len(names):,} lines for {len(set(names)):,} "
+                              "images.", "Give each time its own image.")
+    return np.array(seconds), names
+
+
+def _image(root: Root, name: str) -> np.ndarray:
+    """One image file at its full bit depth, grey or RGB; EV008, EV009, EV016."""
+    parts = PurePosixPath(name)
+    if parts.is_absolute() or ".." in parts.parts:
+        raise EvflowDataError("EV008", f"images.txt names {name}, which leaves the recording.")
+    file = root.joinpath(*parts.parts)
+    if not file.is_file():
+        raise EvflowDataError(
+            "EV016", f"images.txt names {name}, which is not in {root}.",
+            "Restore the image, or remove its line.")
+    image = decode(file)
+    return image if image.ndim == 2 else image[..., 2::-1]  # OpenCV's order is B, G, R(, A)

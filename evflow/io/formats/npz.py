@@ -1,0 +1,127 @@
+"""evflow's own .npz: t (int64 us), x, y, p, size = (width, height); frames and frame_times beside
+them where there are any. `wh` is read as another name of `size`. Pickles are never loaded.
+
+Members are checked against the bytes that the archive really holds before memory is taken, and
+columns are decompressed side by side, block by block.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import COLUMNS, Size, check_columns
+from evflow.errors import EvflowDataError
+from evflow.files.archives import DAMAGE, Member, members
+from evflow.files.arrays import GrowingArray
+from evflow.io.decode import tables
+from evflow.io.decode.stream import gather
+from evflow.io.hints import Hints
+from evflow.io.images.frames import cut
+from evflow.io.images.times import beside_events
+from evflow.io.writer import EventWriter
+from evflow.types import Events, Recording
+
+NAME = "npz"
+EXTENSIONS: tuple[str, ...] = (".npz",)
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    if not head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith(".npy") for name in archive.namelist())
+    except DAMAGE:
+        return path.suffix.lower() in EXTENSIONS  # cut off: the extension decides
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Events are read to the end also where stop_s comes before it: checksums are compared there.
+
+    Raises EV002 (shapes), EV008 (a column is missing), EV009 (damaged), and what `stream.gather`
+    and `Recording` raise.
+    """
+    with members(path) as found:
+        missing = [name for name in ("t", "x", "y", "p") if name not in found]
+        if missing:
+            raise EvflowDataError(
+                "EV008", f"{path} holds {sorted(found)} but not {missing}.",
+                "Expected the keys t, x, y, p, size, and optionally frames, frame_times.")
+        stored = found.get("size", found.get("wh"))
+        size: Any = None if stored is None else tuple(stored.whole().ravel().tolist())
+        events, span = _events(path, [found[name] for name in COLUMNS], hints, size)
+        if "frames" not in found:
+            return Recording.of_events(events)
+        if "frame_times" not in found:
+            raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
+        times = beside_events(found["frame_times"].whole(), path, "us", hints, events)
+        return cut(Recording(events, found["frames"].spooled(), times), span)
+
+
+def _events(
+    path: Path, columns: list[Member], hints: Hints, size: Size | None
+) -> tuple[Events, tuple[int, int]]:
+    """What `gather` makes of the columns; damage is told before what it makes of them."""
+    check_columns(*(np.broadcast_to(np.int8(0), column.shape) for column in columns))
+
+    def rows(part: slice) -> Any:
+        return tuple(column.take(part.stop - part.start) for column in columns)
+
+    chunks = tables.blocks(columns[0].shape[0], rows)
+    try:
+        gathered = gather(path, chunks, hints, None if size is None else hints.sensor(size))
+    except EvflowDataError:
+        _finish(columns)
+        raise
+    _finish(columns)
+    return gathered
+
+
+def _finish(columns: list[Member]) -> None:
+    for column in columns:
+        column.finish()
+
+
+class NpzWriter(EventWriter):
+    """The columns grow as .npy files in a folder beside the output, which goes with them; at the
+    end they are compressed one after the other, and no array is ever in memory."""
+
+    NAME = NAME
+
+    def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
+        self._archive = stack.enter_context(zipfile.ZipFile(
+            temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1))
+        self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory(
+            prefix=f".{self.path.name}.", dir=self.path.parent)))
+        kinds = {"t": "i8", "x": "u2", "y": "u2", "p": "?"}
+        self._columns = {name: self._column(name, kind, stack) for name, kind in kinds.items()}
+
+    def _column(
+        self, name: str, dtype: Any, stack: contextlib.ExitStack, item: tuple[int, ...] = ()
+    ) -> GrowingArray:
+        return stack.enter_context(GrowingArray(self._folder / f"{name}.npy", dtype, item))
+
+    def _write(self, events: Events) -> None:
+        for name in ("t", "x", "y", "p"):
+            self._columns[name].append(getattr(events, name))
+
+    def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
+        if "frames" not in self._columns:
+            for name, dtype, item in (("frames", frames.dtype, frames.shape[1:]),
+                                      ("frame_times", "i8", ())):
+                self._columns[name] = self._column(name, dtype, self._stack, item)
+        self._columns["frames"].append(frames)
+        self._columns["frame_times"].append(times)
+
+    def _finish(self) -> None:
+        for name, column in self._columns.items():
+            column.close()
+            self._archive.write(self._folder / f"{name}.npy", f"{name}.npy")
+        with self._archive.open("size.npy", "w") as f:
+            np.lib.format.write_array(f, np.array(self.size, np.int32))

@@ -1,0 +1,154 @@
+"""Recordings out of bags of ROS 1 and ROS 2, which the package `rosbags` opens: one topic of
+events, and the images beside it.
+
+sensor_msgs/Image of the same name space become frames, at their header's time, where the events
+are on ROS time. Of several topics the first with events is read, and the others are named in a
+note.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.files.limits import check_expansion
+from evflow.io.decode.stream import Damage, gather
+from evflow.io.formats.ros.messages import EVENT_TYPES, IMAGE, Message, Packet
+from evflow.io.formats.ros.packets import OTHER_CLOCK, decoder
+from evflow.io.hints import Hints
+from evflow.io.images.frames import FrameStack
+from evflow.types import Recording
+
+
+def read_bag(bag: Bag, hints: Hints) -> Recording:
+    """Raises EV008 (no events, unknown encoding), EV009 (damaged) and what `stream.gather` and
+    `Recording` raise."""
+    topics = bag.topics(EVENT_TYPES)
+    if not topics:
+        raise EvflowDataError(
+            "EV008", f"{bag.path} holds no topic of events, but {sorted(bag.all())[:8]}.",
+            f"Known messages: {', '.join(EVENT_TYPES)}.")
+    topic, kind = topics[0]
+    notes = tuple(f"topic {other} was not read" for other, _ in topics[1:])
+    first = bag.first(topic, kind)
+    chunks, native = decoder(bag.path, first, bag.packets(topic, kind))
+    events, span = gather(bag.path, chunks, hints, first.size, native)
+    image_topic = bag.image_beside(topic)
+    if image_topic is None:
+        return Recording.of_events(events, notes)
+    if first.encoding in OTHER_CLOCK:
+        return Recording.of_events(events, (
+            *notes, f"images of {image_topic} were not read: events are on another clock"))
+    return bag.with_images(image_topic, events, span, hints, notes)
+
+
+class Bag:
+    """A bag, read message by message; whatever `rosbags` raises becomes EV009.
+
+    open_reader: gives the open reader of `rosbags`; aligned: messages are those of ROS 2; mend:
+    the command that repairs a bag."""
+
+    def __init__(
+        self, path: Path, open_reader: Callable[[Path], Any], *, aligned: bool, mend: str
+    ) -> None:
+        self.path, self.aligned, self.mend = path, aligned, mend
+        files = path.iterdir() if path.is_dir() else (path,)
+        self.stored = sum(file.stat().st_size for file in files)
+        try:
+            self.reader = open_reader(path)
+        except ImportError as e:
+            raise EvflowDataError(
+                "EV010", f"reading {path} needs the package 'rosbags'.",
+                'pip install "evflow-jax[ros]"') from e
+        except Exception as e:
+            raise self._damaged(e) from e
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.close()
+
+    def _damaged(self, e: Exception) -> EvflowDataError:
+        return EvflowDataError(
+            "EV009", f"{self.path} is cut off or damaged ({e or type(e).__name__}).",
+            f"Copy it again; if its recording was interrupted, run `{self.mend}` on it.")
+
+    def all(self) -> list[str]:
+        return [f"{c.topic} ({c.msgtype})" for c in self.reader.connections]
+
+    def topics(self, kinds: Iterable[str]) -> list[tuple[str, str]]:
+        """(topic, message type) of these types, by name, those with messages first."""
+        found = {(c.topic, c.msgtype): c.msgcount for c in self.reader.connections
+                 if c.msgtype in kinds}
+        return sorted(found, key=lambda pair: (found[pair] == 0, *pair))
+
+    def image_beside(self, topic: str) -> str | None:
+        """The topic of images in the name space of `topic`, else the only one."""
+        images = [name for name, _ in self.topics((IMAGE,))]
+        beside = [name for name in images if name.rsplit("/", 1)[0] == topic.rsplit("/", 1)[0]]
+        return beside[0] if beside else images[0] if len(images) == 1 else None
+
+    def messages(self, topic: str) -> Iterator[Message]:
+        wanted = [c for c in self.reader.connections if c.topic == topic]
+        source = self.reader.messages(connections=wanted)
+        index = read = 0
+        while True:
+            try:
+                _, _, raw = next(source)
+            except StopIteration:
+                return
+            except MemoryError:
+                raise
+            except Exception as e:  # ReaderError, and what bz2, lz4 and struct raise
+                raise self._damaged(e) from e
+            read += len(raw)
+            check_expansion(read, self.stored, f"the index of {self.path}")
+            yield Message(bytes(raw), index, self.aligned)
+            index += 1
+
+    def packets(self, topic: str, kind: str) -> Iterator[Packet]:
+        """The messages of events, all of one encoding and size."""
+        first: tuple[str, Size | None] | None = None
+        for message in self.messages(topic):
+            packet = message.events(kind)
+            first = first or (packet.encoding, packet.size)
+            if (packet.encoding, packet.size) != first:
+                raise Damage(message.index, f"encoding and size change from {first} to "
+                             f"{(packet.encoding, packet.size)}", "message")
+            yield packet
+
+    def first(self, topic: str, kind: str) -> Packet:
+        """The first packet of a topic; EV001 (none), EV009."""
+        try:
+            packet = next(self.packets(topic, kind), None)
+        except Damage as e:
+            raise self._wrong(topic, e) from e
+        if packet is None:
+            raise EvflowDataError("EV001", f"{self.path}: topic {topic} holds no message.")
+        return packet
+
+    def _wrong(self, topic: str, e: Damage) -> EvflowDataError:
+        return EvflowDataError(
+            "EV009", f"{self.path}, topic {topic}, message {e.byte:,}: {e.seen}.", "Copy it again.")
+
+    def with_images(
+        self, topic: str, events: Any, span: tuple[int, int], hints: Hints, notes: tuple[str, ...]
+    ) -> Recording:
+        times, images = [], FrameStack(self.path)
+        try:
+            for message in self.messages(topic):
+                stamp = hints.instant(message.stamp_ns(), "ns")
+                if span[0] <= stamp < span[1]:
+                    times.append(stamp)
+                    images.append(message.image())
+        except Damage as e:
+            raise self._wrong(topic, e) from e
+        return images.beside(
+            events, np.array(times, np.int64),
+            (*notes, f"frame times are the header times of {topic}"))

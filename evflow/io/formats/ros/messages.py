@@ -1,0 +1,151 @@
+"""Messages of event cameras as bytes, of ROS 1 and ROS 2.
+
+ROS 1: little-endian fields one after another, strings and arrays behind their u32 length
+(wiki.ros.org/msg). ROS 2: the same fields as XCDR1 (OMG DDS-XTypes): behind four bytes that say so,
+each number at a multiple of its size, strings with a final NUL. A field beyond its message is
+`Damage`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.io.decode.stream import Damage
+
+ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+EVENT_TYPES = (*ARRAYS, "event_camera_msgs/msg/EventPacket")
+IMAGE = "sensor_msgs/msg/Image"
+
+CDR_LITTLE = bytes((0, 1, 0, 0))
+EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
+ALIGNED = np.dtype({
+    "names": ["x", "y", "s", "ns", "p"], "formats": ["<u2", "<u2", "<u4", "<u4", "u1"],
+    "offsets": [0, 2, 6, 10, 14], "itemsize": 16})
+
+PIXELS: dict[str, tuple[str, int]] = {  # encoding: dtype, channels
+    "mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
+    "bgr8": ("u1", 3), "rgb8": ("u1", 3)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Packet:
+    """Events of one message: `data` bytes of `encoding` ("" for an EventArray)."""
+
+    index: int
+    encoding: str
+    size: Size | None
+    base: int
+    data: bytes
+
+    def whole(self, itemsize: int) -> np.ndarray:
+        """The data as uint8, or Damage where it is no multiple of itemsize."""
+        if len(self.data) % itemsize:
+            raise Damage(self.index, f"{len(self.data)} bytes of events are no multiple of "
+                         f"{itemsize}", "message")
+        return np.frombuffer(self.data, np.uint8)
+
+    def base_ns(self) -> np.int64:
+        if self.base >= 2**62:
+            raise Damage(self.index, f"time_base is {self.base}", "message")
+        return np.int64(self.base)
+
+
+class Message:
+    """The bytes of message number `index` of its topic, and how far they are read. aligned: those
+    of ROS 2."""
+
+    def __init__(self, raw: bytes, index: int, aligned: bool = False) -> None:
+        self.raw, self.index, self.aligned, self.at = raw, index, aligned, 0
+        if aligned and self._take(len(CDR_LITTLE))[:2] != CDR_LITTLE[:2]:
+            raise Damage(index, f"it begins with {raw[:2].hex()}, which is no little-endian XCDR1",
+                         "message")
+
+    def fields(self, layout: str) -> tuple[Any, ...]:
+        """Numbers, a letter of `struct` each."""
+        return tuple(self._number(code) for code in layout)
+
+    def _number(self, code: str) -> Any:
+        size = struct.calcsize("<" + code)
+        if self.aligned:
+            self.at += -(self.at - len(CDR_LITTLE)) % size
+        return struct.unpack("<" + code, self._take(size))[0]
+
+    def block(self, itemsize: int = 1) -> bytes:
+        """The bytes of an array."""
+        (count,) = self.fields("I")
+        return self._take(count * itemsize)
+
+    def text(self) -> str:
+        """A string."""
+        data = self.block()
+        return (data.removesuffix(b"\0") if self.aligned else data).decode("latin-1")
+
+    def _take(self, size: int) -> bytes:
+        if self.at + size > len(self.raw):
+            raise Damage(self.index, f"it claims {self.at + size:,} bytes and has "
+                         f"{len(self.raw):,}", "message")
+        self.at += size
+        return self.raw[self.at - size : self.at]
+
+    def stamp_ns(self) -> int:
+        """The header's time in ns; read once, before anything else."""
+        if not self.aligned:
+            self.fields("I")  # seq
+        seconds, nanoseconds = self.fields("II")
+        self.text()  # frame_id
+        return int(seconds) * 10**9 + int(nanoseconds)
+
+    def events(self, kind: str) -> Packet:
+        """An event message from its beginning."""
+        self.stamp_ns()
+        height, width = self.fields("II")
+        size = (width, height) if 0 < width <= 65536 and 0 < height <= 65536 else None
+        if kind in ARRAYS:
+            data = self._aligned_events() if self.aligned else self.block(EVENT.itemsize)
+            return Packet(self.index, "", size, 0, data)
+        _, base = self.fields("QQ")
+        encoding = self.text()
+        if self.fields("B")[0]:
+            raise Damage(self.index, "its events are big-endian", "message")
+        return Packet(self.index, encoding, size, base, self.block())
+
+    def _aligned_events(self) -> bytes:
+        """The events of an EventArray, packed as those of ROS 1.
+
+        Behind each polarity's byte one is spare, and before all seconds but the first event's two
+        are: with these two added, an event takes 16 bytes."""
+        (count,) = self.fields("I")
+        if not count:
+            return b""
+        data = self._take(16 * count - 3)
+        rows = np.frombuffer(data[:4] + bytes(2) + data[4:] + bytes(1), ALIGNED)
+        packed = np.empty(count, EVENT)
+        for name in EVENT.names or ():
+            packed[name] = rows[name]
+        return packed.tobytes()
+
+    def image(self) -> np.ndarray:
+        """The pixels, (H, W) or (H, W, 3) RGB, of an image whose header was read."""
+        height, width = self.fields("II")
+        encoding = self.text()
+        big_endian, step = self.fields("BI")
+        data = np.frombuffer(self.block(), np.uint8)
+        if encoding not in PIXELS:
+            raise Damage(self.index, f"images are encoded as {encoding[:20]!r}; known are "
+                         f"{', '.join(PIXELS)}", "message")
+        kind, channels = PIXELS[encoding]
+        row = width * channels * np.dtype(kind).itemsize
+        if not (0 < row <= step and step * height == len(data)):
+            raise Damage(self.index, f"an image of {width}x{height} {encoding} in rows of {step} "
+                         f"bytes has {len(data):,} bytes", "message")
+        rows = np.ascontiguousarray(data.reshape(height, step)[:, :row])
+        pixels = rows.view((">" if big_endian else "<") + kind).astype(kind)
+        if channels == 1:
+            return pixels
+        colour = pixels.reshape(height, width, channels)
+        return colour if encoding == "rgb8" else colour[..., ::-1]

@@ -1,0 +1,88 @@
+"""Events out of the packets of ROS messages.
+
+dvs_msgs/EventArray (uzh-rpg/rpg_dvs_ros; prophesee_event_msgs has the same bytes): 13-byte events
+on ROS time. event_camera_msgs/EventPacket: `evt3` (the sensor's clock), `mono` (64-bit words: ns
+since time_base, x, y, polarity), `libcaer` (32-bit words x, y, polarity; us, wrapping at 31 bits,
+on time_base) and `libcaer_cmp` (see `libcaer_words`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.decode import stream
+from evflow.io.decode.stream import Chunk, Clock, Damage
+from evflow.io.formats import evt3
+from evflow.io.formats.ros import libcaer_words
+from evflow.io.formats.ros.messages import EVENT, Packet
+
+CAER = np.dtype([("data", "<u4"), ("t", "<u4")])
+OTHER_CLOCK = ("evt3", "mono")  # encodings whose times are not those of other topics
+
+
+def decoder(
+    path: Path, first: Packet, packets: Iterable[Packet]
+) -> tuple[Iterator[Chunk], str]:
+    """Chunks of the encoding of the first packet, and the unit of their times."""
+    if first.encoding == "evt3":
+        return evt3.Decoder("payload byte").chunks(_words(packets)), "us"
+    known = {"": _event_array, "mono": _mono, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp}
+    if first.encoding not in known:
+        raise EvflowDataError(
+            "EV008", f"{path}: events are encoded as {first.encoding[:20]!r}.",
+            f"Known encodings: evt3, {', '.join(filter(None, known))}; convert the bag with "
+            "event_camera_tools.")
+    return _counted(known[first.encoding](packets)), "ns"
+
+
+def _counted(parts: Iterator[tuple[np.ndarray, ...]]) -> Iterator[Chunk]:
+    n = 0
+    for x, y, t, p in parts:
+        yield Chunk(x, y, t, p, lambda i, n=n: n + i, "event")  # type: ignore[misc]
+        n += len(t)
+
+
+def _words(packets: Iterable[Packet]) -> Iterator[tuple[int, np.ndarray]]:
+    """EVT3 words of many packets at once: a packet alone holds some thousand. Their place is that
+    in the joined payload."""
+    waiting, done = bytearray(), 0
+    for packet in packets:
+        packet.whole(2)
+        waiting += packet.data
+        while len(waiting) >= stream.CHUNK:
+            yield done, np.frombuffer(bytes(waiting[: stream.CHUNK]), "<u2")
+            done += stream.CHUNK
+            del waiting[: stream.CHUNK]
+    yield done, np.frombuffer(bytes(waiting), "<u2")
+
+
+def _event_array(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, ...]]:
+    for packet in packets:
+        table = packet.whole(EVENT.itemsize).view(EVENT)
+        if (table["ns"] >= 10**9).any():
+            raise Damage(packet.index, "a time has more than 999,999,999 ns", "message")
+        yield (table["x"], table["y"], table["s"].astype(np.int64) * 10**9 + table["ns"],
+               table["p"])
+
+
+def _mono(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, ...]]:
+    for packet in packets:
+        word = packet.whole(8).view("<u8")
+        yield (((word >> 32) & 0xFFFF).astype(np.uint16), ((word >> 48) & 0x7FFF).astype(np.uint16),
+               packet.base_ns() + (word & 0xFFFFFFFF).astype(np.int64), word >> 63 != 0)
+
+
+def _libcaer(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, ...]]:
+    for packet in packets:
+        table = packet.whole(CAER.itemsize).view(CAER)
+        data = table["data"]
+        us = Clock(31).unwrap(table["t"] & 0x7FFFFFFF)
+        yield (data >> 17, (data >> 2) & 0x7FFF, packet.base_ns() + us * 1000, data & 2 != 0)
+
+
+def _libcaer_cmp(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, ...]]:
+    return map(libcaer_words.Decoder().decode, packets)

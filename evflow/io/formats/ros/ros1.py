@@ -1,0 +1,58 @@
+"""ROS 1 bags, see bag.py."""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from evflow.files.bounded import BoundedPath
+from evflow.files.limits import RATIO
+from evflow.io.formats.ros.bag import Bag, read_bag
+from evflow.io.hints import Hints
+from evflow.types import Recording
+
+NAME = "rosbag"
+EXTENSIONS: tuple[str, ...] = (".bag",)
+
+CHUNK = 1 << 26  # bytes that a chunk may have; rosbag's own have 768 kB
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    return head.startswith(b"#ROSBAG V")
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises EV010 (no `rosbags`) and what `read_bag` raises."""
+    with Bag(path, _open, aligned=False, mend="rosbag reindex") as bag:
+        return read_bag(bag, hints)
+
+
+def _open(path: Path) -> Any:
+    from rosbags.rosbag1 import Reader
+
+    reader = Reader(BoundedPath(path))
+    reader.open()
+    for place, chunk in reader.chunks.items():  # bombs are unpacked no further
+        reader.chunks[place] = chunk._replace(decompressor=_bounded(chunk.decompressor))
+    return reader
+
+
+def _bounded(unpack: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """The same for a chunk that expands within `limits`; ValueError for others."""
+    from lz4.frame import LZ4FrameDecompressor, decompress
+
+    makers: dict[Any, Any] = {bz2.decompress: bz2.BZ2Decompressor, decompress: LZ4FrameDecompressor}
+    if unpack not in makers:  # not compressed
+        return unpack
+
+    def bounded(data: bytes) -> bytes:
+        decoder = makers[unpack]()
+        out: bytes = decoder.decompress(data, max_length=CHUNK + RATIO * len(data))
+        if not decoder.eof:
+            raise ValueError(f"a chunk of {len(data):,} bytes that is cut off, or expands to more "
+                             f"than {len(out):,}")
+        return out
+
+    return bounded

@@ -1,0 +1,48 @@
+"""HDF5 as the simulator v2e writes it (v2ecore/emulator.py, --dvs_h5 and --ddd_output).
+
+/events uint32 (N, 4): t us, x, y, p in {0, 1}. With frames: /frame uint8 (T, H, W), /frame_ts
+uint32 us. Without them the file does not tell the sensor's size.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.io.decode import tables
+from evflow.io.decode.stream import gather
+from evflow.io.hints import Hints
+from evflow.io.images.times import beside_events
+from evflow.types import Recording
+
+NAME = "v2e"
+EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    return tables.holds(head, path, lambda f: getattr(f.get("events"), "shape", ())[1:] == (4,))
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises EV008, EV009, EV010 (h5py) and what `stream.gather` and `Recording` raise."""
+    with tables.opened(path) as f:
+        data = tables.dataset(path, f, "events", (None, 4))
+        frames = None
+        if "frame" in f:
+            frames = tables.dataset(path, f, "frame", (None, None, None))
+        size = tables.frame_size(frames)
+
+        def rows(part: slice) -> tuple[Any, Any, Any, Any]:
+            t, x, y, p = np.ascontiguousarray(data[part].T)
+            return x, y, t, p
+
+        chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
+        events, span = gather(path, chunks, hints, size)
+        if frames is None:
+            return Recording.of_events(events)
+        times = tables.dataset(path, f, "frame_ts", (len(frames),))[:]
+        us = beside_events(times, path, "us", hints, events)
+        return tables.with_frames(path, events, span, us,
+                                  lambda keep: tables.stored_frames(frames, keep), ())

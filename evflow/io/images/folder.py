@@ -1,0 +1,153 @@
+"""Folders of images as a video: natural order, one decoded at a time, at their full bit depth."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.files.limits import check_expansion
+from evflow.io.images.frames import FrameHints, Image
+from evflow.io.images.pictures import claimed_bytes
+from evflow.io.images.times import read_times
+from evflow.types import MADE
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
+TIMES = ("timestamps.txt", "images.txt", "image_timestamps.txt", "timestamp.txt", "times.txt",
+         "info.txt", "rgb.txt", "data.csv", "timestamps.csv", "timestamps.npy")
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageFolder:
+    """files in the order of their times_us (T,) int64; notes: what was assumed."""
+
+    files: tuple[Path, ...]
+    times_us: np.ndarray
+    notes: tuple[str, ...]
+
+    def images(self) -> Iterator[Image]:
+        for file, time in zip(self.files, self.times_us.tolist(), strict=True):
+            yield Image(decode(file), time, str(file))
+
+
+def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
+    """The images of a folder, or of its only subfolder with images, and their times.
+
+    Times are those of `hints.timestamps`, of `hints.fps`, or of a file in `TIMES` beside them.
+    Raises EV008 (no images), EV002 (counts differ), EV016 (an image is missing), EV020 (no
+    times), and what `read_times` raises.
+    """
+    folder, files = _find(root)
+    made = _remark(folder)
+    if hints.fps is not None:
+        times = np.array([hints.at_rate(i) for i in range(len(files))], np.int64)
+        return ImageFolder(tuple(files), times, made)
+    source = _times_file(root, folder, hints)
+    by_name = {file.name: file for file in files}
+    us, names, note = read_times(source, hints.time_unit, by_name)
+    missing = [name for name in names if name not in by_name]
+    if missing:
+        raise EvflowDataError(
+            "EV016", f"{source} names {missing[0]}, which is not in {folder} "
+            f"({len(missing)} of {len(names)} are not).", "Restore the images or remove the lines.")
+    if len(us) != len(files) or len(set(names)) != len(names):
+        raise EvflowDataError(
+            "EV002", f"{folder} holds {len(files)} images, {source} times for "
+            f"{len(set(names)) if names else len(us)}.",
+            "Images lost, or of another recording? Give each image one time, or pass --fps.")
+    files = [by_name[name] for name in names] if names else files
+    return ImageFolder(tuple(files), us, ((note,) if note else ()) + made)
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files of a folder in natural order (img2 before img10), hidden ones left out."""
+    try:
+        entries = list(folder.iterdir())
+    except OSError as e:
+        raise EvflowDataError("EV016", f"{folder} cannot be listed ({e.strerror}).") from e
+    return sorted((p for p in entries if p.suffix.lower() in SUFFIXES
+                   and not p.name.startswith(".")), key=lambda p: natural(p.name))
+
+
+def natural(name: str) -> tuple[list[str | int], str]:
+    """A sort key by which the numbers in names count as numbers."""
+    parts = re.split(r"([0-9]+)", name.lower())
+    return [int(p) if i % 2 else p for i, p in enumerate(parts)], name
+
+
+def decode(file: Path | zipfile.Path) -> np.ndarray:
+    """One image at its full bit depth: (H, W) or (H, W, 3 or 4) in B, G, R(, A).
+
+    Raises EV009 (damaged, cut off), EV016 (not there).
+    """
+    import cv2
+
+    try:
+        if not file.is_file():  # a pipe has no end
+            raise OSError(0, "it is no regular file")
+        data = file.read_bytes()
+    except OSError as e:
+        raise EvflowDataError("EV016", f"{file} cannot be read ({e.strerror}).") from e
+    claimed = claimed_bytes(data)
+    if claimed is not None:
+        check_expansion(claimed, len(data), file)
+    # OpenCV fills what is missing of a cut-off JPEG or PNG with grey and says nothing.
+    jpeg, png = data.startswith(b"\xff\xd8"), data.startswith(b"\x89PNG")
+    whole = not ((jpeg and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
+                 or (png and b"IEND" not in data))
+    try:
+        image = (None if claimed is None else
+                 cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+    except cv2.error:
+        image = None
+    if image is None or not whole:
+        raise EvflowDataError(
+            "EV009", f"{file} ({len(data):,} bytes) is {'not a sound' if whole else 'a cut-off'} "
+            "image.", "Copy it again.")
+    return image
+
+
+def _find(root: Path) -> tuple[Path, list[Path]]:
+    """The folder that holds the images, and them."""
+    files = list_images(root)
+    if files:
+        return root, files
+    below = {p: found for p in sorted(root.iterdir()) if p.is_dir() and (found := list_images(p))}
+    if len(below) == 1:
+        return below.popitem()
+    seen = (f"holds images in {sorted(p.name for p in below)[:5]}" if below else
+            f"holds no image ({', '.join(s[1:] for s in SUFFIXES)}): "
+            f"{sorted(p.name for p in root.iterdir())[:5]}")
+    raise EvflowDataError("EV008", f"{root} {seen}.", "Pass the one folder that has the frames.")
+
+
+def _remark(folder: Path) -> tuple[str, ...]:
+    """What the file of times that `evflow reconstruct` writes says at its head, wherever the times
+    are taken from: that the images were made from events."""
+    path = folder / TIMES[0]
+    if not path.is_file():  # a pipe has no end
+        return ()
+    try:
+        with path.open(encoding="utf-8", errors="replace") as lines:
+            first = lines.readline(1000).lstrip("# ").strip()
+    except OSError:
+        return ()
+    return (first,) if MADE in first else ()
+
+
+def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:
+    if hints.timestamps is not None:
+        return Path(hints.timestamps)
+    found = [p for place in dict.fromkeys((folder, root)) for name in TIMES
+             if (p := place / name).is_file()]
+    if found:
+        return found[0]
+    near = [str(p) for name in TIMES if (p := folder.parent / name).is_file()]
+    raise EvflowDataError(
+        "EV020", f"{folder} has images but no file of their times ({', '.join(TIMES[:3])}, ...).",
+        f"Pass --fps, or --timestamps {near[0] if near else 'FILE'}.")

@@ -1,0 +1,262 @@
+"""Decoded images of one camera as frames in DN: what a user may tell, and how it is obeyed.
+
+A source decodes `Image`s in OpenCV's channel order; `converted` turns them, one by one, into
+frames of one shape and dtype: uint8 as it is, all else float32 on 0..255. Nothing is clipped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.files.spool import Spool
+from evflow.io.hints import UNITS_US, Hints, check_choices, known
+from evflow.light import response
+from evflow.light.colour import COLOURS, luma
+from evflow.types import Events, Recording
+from evflow.types import luma as rec709
+
+Frames = Iterator[tuple[np.ndarray, int]]
+
+WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # DN of a saturated pixel unless told
+
+
+class Image(NamedTuple):
+    """pixels (H, W) or (H, W, 1, 3 or 4) in B, G, R(, A); its time in us; where it came from."""
+
+    pixels: np.ndarray
+    time_us: int
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameHints:
+    """What the user knows about a video.
+
+    fps: frames per second, instead of the file's own times.
+    timestamps: a file with one time per frame; time_unit: "s", "ms", "us", "ns", or "auto".
+    colour: "luma", or a Bayer pattern: then colour frames stay (H, W, 3), for `colour.mosaic`.
+    full_scale: DN of white; None = 255 for uint8 and floats, 65535 for uint16.
+    partial: use what can be read of a damaged or cut-off file.
+    bayer: pattern of the raw mosaic that the frames are; they become its luma.
+    flip, response: mirror them; undo a gamma (see `light`).
+    start_s, stop_s: frames with start <= time < stop, in seconds from the first; of a recording
+        from its first event.
+    """
+
+    fps: float | None = None
+    timestamps: str | os.PathLike | None = None
+    time_unit: str = "auto"
+    colour: str = "luma"
+    full_scale: float | None = None
+    partial: bool = False
+    bayer: str | None = None
+    flip: str = "none"
+    response: str = "linear"
+    start_s: float | None = None
+    stop_s: float | None = None
+
+    def __post_init__(self) -> None:
+        check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS,
+                      flip=("none", *response.FLIPS), response=response.RESPONSES)
+        Hints(start_s=self.start_s, stop_s=self.stop_s)  # EV020 where they are no range
+        if self.bayer is not None and self.colour != "luma":
+            raise EvflowDataError(
+                "EV020", f"bayer={self.bayer} makes luma of a mosaic, colour={self.colour} wants "
+                "the mosaic itself.", "Give one of them.")
+        for name in ("fps", "full_scale"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise EvflowDataError("EV020", f"{name}={value}.", "It must be > 0.")
+        if self.fps is not None and not 1e-6 <= self.fps <= 1e6:
+            raise EvflowDataError("EV020", f"fps={self.fps:g}.", "Times are whole microseconds: "
+                                  "give 1e-6 to 1e6.")
+        if self.fps is not None and self.timestamps is not None:
+            raise EvflowDataError(
+                "EV020", f"fps={self.fps:g} and timestamps={self.timestamps} contradict.",
+                "Give one of them.")
+
+    @staticmethod
+    def parse(given: dict[str, Any]) -> FrameHints:
+        """Hints of keyword arguments; an unknown one raises EV020."""
+        return FrameHints(**known(given, FrameHints, "Videos"))
+
+    def at_rate(self, index: int) -> int:
+        """The time of frame `index` in us at `fps`."""
+        assert self.fps is not None
+        return round(index * 1e6 / self.fps)
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameSource:
+    """size (width, height); count: frames expected (0 = unknown); open(): a fresh iterator of
+    (frame, time in us), one decoded at a time. notes: what was assumed, a sentence each; it may
+    grow while frames are read. Frames are (H, W), or (H, W, 3) where a mosaic was asked for of
+    colour input, uint8 or float32 DN on 0..255."""
+
+    size: tuple[int, int]
+    count: int
+    open: Callable[[], Frames]
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    def watched(self, progress: Callable[[int, int], None]) -> Frames:
+        """The frames, with progress(done, total) called after each."""
+        for index, pair in enumerate(self.open(), 1):
+            yield pair
+            progress(index, max(self.count, index))
+
+
+def converted(images: Iterable[Image], hints: FrameHints, notes: list[str]) -> Frames:
+    """(frame, time in us) of decoded images, one at a time.
+
+    Raises EV002 (shape), EV003 (dtype, values above `full_scale`, floats on 0..1), EV004 (time
+    does not advance), EV007 (NaN), EV015 (the size changes), each with the frame it is about.
+    """
+    first: tuple[np.ndarray, np.dtype] | None = None
+    last, bright = 0, False
+    for image in images:
+        frame, bright = _seen(image, hints, bright)
+        depth = image.pixels.dtype
+        if first is None:
+            first = frame, depth
+            notes += [n for n in _remarks(image, frame, hints) if n not in notes]
+        elif image.time_us <= last:
+            raise EvflowDataError(
+                "EV004", f"{image.where} is at {image.time_us} us, the frame before at {last} us.",
+                "Frame times must increase: pass --fps, or correct --timestamps.")
+        if frame.shape[:2] != first[0].shape[:2]:
+            raise EvflowDataError(
+                "EV015", f"{image.where} is {frame.shape[1]}x{frame.shape[0]}, the first frame "
+                f"{first[0].shape[1]}x{first[0].shape[0]}.",
+                "All frames must be of one size: sort out the others.")
+        if depth != first[1] or frame.ndim != first[0].ndim:
+            raise EvflowDataError(
+                "EV003", f"{image.where} is {'grey' if frame.ndim == 2 else 'colour'} {depth}, the "
+                f"first frame {'grey' if first[0].ndim == 2 else 'colour'} {first[1]}.",
+                "All frames must have one bit depth and number of channels.")
+        last = image.time_us
+        yield frame, last
+
+
+def _seen(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, bool]:
+    """The frame as light, and `bright` as `_frame` has it."""
+    if hints.bayer is not None:
+        seen = response.luma_of_mosaic(image.pixels, hints.bayer, image.where)
+        image = image._replace(pixels=seen)
+    frame, bright = _frame(image, hints, bright)
+    frame = response.linear_light(frame, hints.response)
+    return frame if hints.flip == "none" else np.flip(frame, response.FLIPS[hints.flip]), bright
+
+
+def _frame(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, bool]:
+    """The frame, and whether any float frame so far reached beyond 1 DN."""
+    pixels, where = image.pixels, image.where
+    if pixels.ndim == 3 and pixels.shape[-1] == 1:
+        pixels = pixels[..., 0]
+    if pixels.ndim != 2 and not (pixels.ndim == 3 and pixels.shape[-1] in (3, 4)):
+        raise EvflowDataError(
+            "EV002", f"{where} has shape {pixels.shape}.", "Expected (H, W) or (H, W, 3).")
+    pixels = np.asarray(pixels, np.float32) if pixels.dtype.kind == "f" else pixels
+    white = hints.full_scale or WHITE.get(pixels.dtype.str[1:])
+    if white is None:
+        raise EvflowDataError(
+            "EV003", f"{where} is {pixels.dtype}.", "Expected uint8, uint16 or floats.")
+    if pixels.ndim == 3:  # a fourth channel is opacity, which a camera does not see
+        colour = np.ascontiguousarray(pixels[..., :3])
+        pixels = luma(colour) if hints.colour == "luma" else colour
+    if pixels.dtype == np.uint8 and white == 255:
+        return pixels, True
+    low, high = float(pixels.min()), float(pixels.max())
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise EvflowDataError(
+            "EV007", f"{where} holds {(~np.isfinite(pixels)).sum():,} NaN or infinite values.",
+            "The log of dark pixels? Give linear intensity.")
+    if low < 0 or high > white * 1.001:
+        raise EvflowDataError(
+            "EV003", f"{where} spans {low:g}..{high:g}, outside 0..{white:g}.",
+            "Pass the value of white: full_scale=1023, 4095, 65535 (--full-scale).")
+    if pixels.dtype == np.float32 and hints.full_scale is None and not bright and 0 < high <= 1:
+        raise EvflowDataError(
+            "EV003", f"{where} spans {low:g}..{high:g} where white is 255.",
+            "Floats on 0..1? Pass full_scale=1 (--full-scale 1); if it is that dark, 255.")
+    return pixels.astype(np.float32) * np.float32(255 / white), bright or high > 1
+
+
+def _remarks(image: Image, frame: np.ndarray, hints: FrameHints) -> list[str]:
+    """What the user should know about the first frame."""
+    notes = [] if hints.bayer is None else [response.remark(hints.bayer)]
+    if hints.response != "linear":
+        notes.append(f"frames linearised ({hints.response})")
+    if hints.flip != "none":
+        notes.append(f"frames flipped ({hints.flip})")
+    if hints.colour != "luma" and frame.ndim == 2:
+        notes.append(f"frames have one channel: taken as a {hints.colour} mosaic as they are.")
+    peak = int(image.pixels.max()) if image.pixels.dtype == np.uint16 else 0
+    if hints.full_scale is None and 0 < peak < 2**14:
+        notes.append(f"16-bit frames, white at 65535, but the first reaches {peak} only; for "
+                     "10-, 12- or 14-bit data pass --full-scale 1023, 4095 or 16383.")
+    return notes
+
+
+def existing(path: str | os.PathLike) -> Path:
+    """`path`, or EV016 where there is nothing."""
+    path = Path(path)
+    if not os.path.exists(path):  # false, not an error, for an impossible path
+        pattern = any(c in path.name for c in "%*?")
+        raise EvflowDataError(
+            "EV016", f"no file or folder at {path}.",
+            "For a sequence of images pass their folder." if pattern else "")
+    return path
+
+
+class FrameStack:
+    """Images (H, W) or (H, W, 3) RGB that come one by one, as the frames of a recording: colour
+    becomes luma. Kept as `Spool` does it. where: names their file in messages."""
+
+    def __init__(self, where: object) -> None:
+        self.where, self.count = where, 0
+        self._first: np.ndarray | None = None  # as it came
+        self._spool: Spool | None = None
+
+    def append(self, image: np.ndarray) -> None:
+        """Raises EV002 (no image), EV003 and EV015 (dtype or shape change), EV019 (disk full)."""
+        if self._first is None:
+            if image.ndim != 2 and not (image.ndim == 3 and image.shape[-1] in (3, 4)):
+                raise EvflowDataError(
+                    "EV002", f"{self.where} has a frame of shape {image.shape}.",
+                    "Expected (H, W) or (H, W, 3).")
+            self._first = image
+        if image.shape != self._first.shape:
+            raise EvflowDataError(
+                "EV015", f"{self.where} has frames of shapes {self._first.shape} and "
+                f"{image.shape}.", "Use those of one sensor.")
+        if image.dtype != self._first.dtype:
+            raise EvflowDataError(
+                "EV003", f"{self.where} has frames of {self._first.dtype} and {image.dtype}.",
+                "Use those of one bit depth.")
+        grey = image if image.ndim == 2 else rec709(image[..., :3])
+        self._spool = self._spool or Spool(grey.dtype)
+        self._spool.append(grey.ravel())
+        self.count += 1
+
+    def beside(self, events: Events, times: np.ndarray, notes: tuple[str, ...]) -> Recording:
+        """The recording of these events and all frames, at `times` (T,); raises what it raises."""
+        if self._first is None or self._spool is None:
+            return Recording.of_events(events, notes)
+        frames = self._spool.array().reshape(self.count, *self._first.shape[:2])
+        if self._first.ndim == 3:
+            notes = (*notes, "colour frames were converted to Rec. 709 luma")
+        return Recording(events, frames, times, notes)
+
+
+def cut(recording: Recording, span: tuple[int, int]) -> Recording:
+    """The recording with those frames alone that lie in [start, stop) us."""
+    keep = slice(*np.searchsorted(recording.frame_times, np.array(span)))
+    return dataclasses.replace(
+        recording, frames=recording.frames[keep], frame_times=recording.frame_times[keep])

@@ -1,0 +1,186 @@
+"""Videos in NumPy files: .npy stacks, mapped, and .npz, decompressed frame by frame.
+
+A stack is (T, H, W) or (T, H, W, 3) in R, G, B. In an .npz it is called frames (or images, imgs,
+video, arr_0) and its times, if there, frame_times (or timestamps, times, t).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.files.archives import BLOCK, DAMAGE, Member, is_zip, npy_header, unzipped
+from evflow.files.limits import check_expansion
+from evflow.io.images.frames import FrameHints, Image
+from evflow.io.images.times import read_times, to_us
+
+FRAMES = ("frames", "images", "imgs", "video", "arr_0")
+TIMES = ("frame_times", "timestamps", "times", "t")
+
+
+def is_stack(path: Path) -> bool:
+    """An .npy, or an .npz that holds frames and no events."""
+    if path.suffix.lower() == ".npy":
+        return True
+    if path.suffix.lower() != ".npz" or not is_zip(path):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return not {"t.npy", "x.npy", "y.npy", "p.npy"} <= set(archive.namelist())
+    except DAMAGE:
+        return True  # `open_stack` says why
+
+
+@dataclasses.dataclass(frozen=True)
+class Stack:
+    """A stack of `shape` on the disk; member: its name in an .npz, "" for an .npy. count: frames
+    to read, shape[0] unless the file is cut off. times_us (count,) int64."""
+
+    path: Path
+    member: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    fortran: bool
+    offset: int
+    times_us: np.ndarray
+    notes: tuple[str, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.shape[2], self.shape[1]
+
+    def images(self, partial: bool = False) -> Iterator[Image]:
+        """The frames in OpenCV's channel order; EV009 where an .npz ends early."""
+        read = self._members(partial) if self.member else self._mapped()
+        times = self.times_us.tolist()
+        for index, (pixels, time) in enumerate(zip(read, times, strict=not partial)):
+            order = [2, 1, 0, 3][: self.shape[3]] if len(self.shape) == 4 else []
+            pixels = pixels[..., order] if len(order) >= 3 else pixels
+            yield Image(pixels, time, f"frame {index} of {self.path}")
+
+    def _mapped(self) -> Iterator[np.ndarray]:
+        mapped = np.memmap(self.path, self.dtype, "r", self.offset, self.shape,
+                           "F" if self.fortran else "C")
+        for index in range(len(self.times_us)):
+            yield np.array(mapped[index])
+
+    def _members(self, partial: bool) -> Iterator[np.ndarray]:
+        count = math.prod(self.shape[1:])
+        done = 0
+        try:
+            with zipfile.ZipFile(self.path) as archive, archive.open(self.member) as f:
+                npy_header(f)
+                while done < self.shape[0]:
+                    data = f.read(count * self.dtype.itemsize)
+                    yield np.frombuffer(data, self.dtype, count).reshape(self.shape[1:])
+                    done += 1
+                while f.read(BLOCK):  # a damaged header may claim less: the checksum is at the end
+                    pass
+        except Exception as e:  # zip, zlib, lzma, ValueError: half a dozen kinds
+            if not (partial and done):
+                raise cut_off(self.path, done, self.shape[0], str(e)) from e
+
+
+def open_stack(path: Path, hints: FrameHints) -> Stack:
+    """Raises EV001 (no frames), EV002 (shape, number of times), EV003 (dtype), EV009 (damaged or
+    cut off, unless `hints.partial`), EV020 (no times)."""
+    try:
+        if path.suffix.lower() == ".npz":
+            stack, times = _open_npz(path)
+        else:
+            stack, times = _open_npy(path, hints.partial), None
+    except (OSError, EOFError, ValueError) as e:
+        raise EvflowDataError(
+            "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
+            "Copy or save it again.") from e
+    _check(stack)
+    us, note = _times(stack, hints, times)
+    return dataclasses.replace(stack, times_us=us, notes=(note,) if note else ())
+
+
+def cut_off(path: object, read: int, promised: int, why: str) -> EvflowDataError:
+    """EV009 that says how many frames can be read."""
+    return EvflowDataError(
+        "EV009", f"{read:,} of the {promised:,} frames of {path} can be read"
+        f"{f' ({why})' if why else ''}.",
+        "Cut off or damaged: copy it again"
+        + (", or pass --partial (partial=True) to use those." if read else "."))
+
+
+def _open_npy(path: Path, partial: bool) -> Stack:
+    with open(path, "rb") as f:
+        shape, fortran, dtype = npy_header(f)
+        offset = f.tell()
+    frame = max(1, math.prod(shape[1:]) * dtype.itemsize)
+    whole = min((path.stat().st_size - offset) // frame, shape[0] if shape else 0)
+    if shape and whole < shape[0] and not (partial and whole and not fortran):
+        raise cut_off(path, 0 if fortran else whole, shape[0], "")
+    shape = (whole, *shape[1:])
+    return Stack(path, "", shape, dtype, fortran, offset, np.zeros(0, np.int64), ())
+
+
+def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
+    with unzipped(path, streamed=[f"{name}.npy" for name in FRAMES]) as archive:
+        names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
+        member = next((name for name in FRAMES if name in names), None)
+        if member is None:
+            raise EvflowDataError(
+                "EV008", f"{path} holds {sorted(names)} but no frames.",
+                f"Expected {', '.join(FRAMES)}; or t, x, y, p for a recording.")
+        with archive.open(member + ".npy") as f:
+            shape, fortran, dtype = npy_header(f)
+        clock = next((name for name in TIMES if name in names), None)
+        times = None
+        if clock is not None:
+            times = Member(archive, archive.getinfo(clock + ".npy")).whole()
+    if fortran and len(shape) > 1:
+        raise EvflowDataError(
+            "EV009", f"{path} holds {member} in Fortran order, whose frames are not together.",
+            "Save np.ascontiguousarray(frames).")
+    stack = Stack(path, member + ".npy", shape, dtype, False, 0, np.zeros(0, np.int64), ())
+    return stack, times
+
+
+def _check(stack: Stack) -> None:
+    shape = stack.shape
+    if len(shape) not in (3, 4) or (len(shape) == 4 and shape[-1] not in (1, 3, 4)):
+        first = len(shape) == 4 and shape[1] in (1, 3, 4)
+        raise EvflowDataError(
+            "EV002", f"{stack.path} has shape {shape}.",
+            "Channels come last: np.moveaxis(frames, 1, -1)." if first else
+            "Expected frames (T, H, W), or (T, H, W, 3) in R, G, B.")
+    if stack.member:
+        check_expansion(math.prod(shape[1:]) * stack.dtype.itemsize, stack.path.stat().st_size,
+                        f"one frame of {stack.path}")
+    if min(shape) == 0:
+        raise EvflowDataError("EV001", f"{stack.path} holds frames of shape {shape}.")
+
+
+def _times(
+    stack: Stack, hints: FrameHints, times: np.ndarray | None
+) -> tuple[np.ndarray, str]:
+    count = stack.shape[0]
+    if hints.fps is not None:
+        return np.array([hints.at_rate(i) for i in range(count)], np.int64), ""
+    if hints.timestamps is not None:
+        where: Any = Path(hints.timestamps)
+        us, _, note = read_times(where, hints.time_unit)
+    elif times is not None:
+        where = f"the times in {stack.path}"
+        us, note = to_us(times, where, hints.time_unit)
+    else:
+        raise EvflowDataError(
+            "EV020", f"{stack.path} holds {count:,} frames but no times.",
+            "Pass --fps or --timestamps FILE.")
+    if len(us) != count and not (hints.partial and len(us) > count):
+        raise EvflowDataError(
+            "EV002", f"{stack.path} holds {count:,} frames, {where} {len(us):,} times.",
+            "Give one time per frame, or pass --fps.")
+    return us[:count], note

@@ -1,0 +1,243 @@
+"""Files of frame times: one time per line, alone, before or after the frame's name.
+
+Read are the layouts in use: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time`
+(DVS-Voltmeter), `index time`, begin and end of the exposure (DSEC), of which the middle is taken;
+with blanks, tabs, commas or semicolons between; and .npy arrays.
+Lines that begin with # are comments. A unit written in a comment or header counts ("[ns]",
+"timestamp_us"); else the only one that makes the numbers a plausible video is taken and noted.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from evflow.checks import check_times
+from evflow.errors import EvflowDataError
+from evflow.files.arrays import mapped
+from evflow.io.decode.text import is_float
+from evflow.io.hints import UNITS_US, Hints
+from evflow.io.images.frames import existing
+from evflow.types import Events
+
+MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
+EPOCH_S = (1e9, 4.1e9)  # 2001 to 2099 as seconds since 1970
+POSSIBLE_S = (2e-5, 2.0)  # between frames: 50,000 frames/s to one in two seconds
+USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s, where only one unit of 1000 can fall
+USUAL_US = 2e4  # of two units the one nearer to 50 frames/s
+TELL = "pass --timestamps-unit beside --frames (simulate: --time-unit)"
+UNIT_WORDS = re.compile(
+    r"(?:[\[(_]|in )(n(?:s|sec|anoseconds?)|[uµμ]s(?:ec)?|microseconds?|m(?:s|sec|illiseconds?)|"
+    r"s(?:ec(?:onds?)?)?)\b", re.IGNORECASE)
+
+Times = tuple[np.ndarray, list[str], str]  # int64 us (T,); names (T,) or none; a note or ""
+
+
+def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> Times:
+    """Frame times of a file, the frames' names where it has them, and what was assumed.
+
+    names: those of the images at hand, by which a column of names is told from one of times.
+    Raises EV008 (columns of unclear meaning), EV009 (damaged), EV001 (none), EV003 (the unit is
+    not clear), EV004 (not increasing), EV007 (NaN), EV016 (not there).
+    """
+    if existing(path).suffix == ".npy":
+        us, note = to_us(np.array(mapped(path, (None,))), path, unit)
+        return us, [], note
+    rows, written = _rows(path)
+    times, labels = _columns(path, rows, names)
+    us, note = to_us(times, path, unit if unit != "auto" else written)
+    return us, labels, note
+
+
+def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndarray, str]:
+    """Strictly increasing times (T,) as int64 us, and a note where the unit was inferred.
+
+    Raises EV001, EV002, EV003, EV004, EV007.
+    """
+    if times.ndim != 1 or times.dtype.kind not in "iuf":
+        raise EvflowDataError(
+            "EV002", f"{where} holds times of shape {times.shape} and dtype {times.dtype}.",
+            "Expected one number per frame.")
+    if len(times) == 0:
+        raise EvflowDataError("EV001", f"{where} holds no frame time.")
+    if not np.isfinite(times).all():
+        raise EvflowDataError(
+            "EV007", f"{where} holds {(~np.isfinite(times)).sum():,} times that are not finite.")
+    back = np.flatnonzero(times[1:] <= times[:-1])
+    if len(back):
+        at = int(back[0]) + 1
+        raise EvflowDataError(
+            "EV004", f"{where}: time {at:,} is {times[at]}, the one before {times[at - 1]} "
+            f"({len(back):,} such).", "Frame times must increase: lines out of order, or repeated?")
+    note = ""
+    if unit == "auto":
+        unit, note = _plausible_unit(times, where)
+    us = Hints(time_unit=unit).microseconds(times, unit)
+    return check_times(us, f"{where}, read in {unit}", strict=True), note
+
+
+def beside_events(
+    times: np.ndarray, where: object, native: str, hints: Hints, events: Events
+) -> np.ndarray:
+    """Times (T,) of the frames that a recording brings along with its events, as int64 us.
+
+    native: their unit in the format. That of `hints` is the events'; frames share it unless
+    another makes them last as the events do: where clocks contradict each other it is passed.
+    Fractions where whole numbers belong are of the unit that does. Raises as `to_us`.
+    """
+    told = hints.time_unit
+    odd = times.dtype.kind == "f" and native != "s"
+    usual = told == "auto" and not odd
+    if usual or times.ndim != 1 or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+        return hints.microseconds(times, native)
+    units = [native, *UNITS_US] if told == "auto" else [told, native]
+    unit = _lasting(times, events.t, units)
+    if unit is None and told == "auto":
+        us, note = to_us(times, where)
+        hints.remarks.append(note)
+        return us
+    unit = unit or _nearest(times, units)
+    if unit != told:
+        hints.remarks.append(f"frame times of {where} were read in {unit}.")
+    return Hints(time_unit=unit).microseconds(times, unit)
+
+
+def _lasting(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | None:
+    """The unit in which times (T,) share most of the span of events at t (N,) us, the first of
+    several; None where none shares any."""
+    if not (len(times) and len(t)):
+        return None
+
+    def shared(unit: str) -> float:
+        first, last = (float(v) * UNITS_US[unit] for v in (times.min(), times.max()))
+        common = min(last, float(t[-1])) - max(first, float(t[0])) + 1.0
+        return max(common, 0.0) / (max(last, float(t[-1])) - min(first, float(t[0])) + 1.0)
+
+    best = max(units, key=shared)
+    return best if shared(best) > 0 else None
+
+
+def _nearest(times: np.ndarray, units: list[str]) -> str:
+    """The unit that makes times (T,) the more usual video, the first of several."""
+    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
+    if not step > 0:
+        return units[0]
+    return min(units, key=lambda unit: abs(math.log(step * UNITS_US[unit] / USUAL_US)))
+
+
+def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:
+    """The unit in which the times are those of a video, and the sentence that says so."""
+    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
+    seconds = {unit: 1e-6 * scale for unit, scale in UNITS_US.items()}
+    whole = times.dtype.kind in "iu" or bool((times % 1 == 0).all())
+    epoch = [u for u, s in seconds.items() if EPOCH_S[0] < abs(float(times[0])) * s < EPOCH_S[1]]
+    possible = [u for u, s in seconds.items() if POSSIBLE_S[0] <= step * s <= POSSIBLE_S[1]
+                and (whole or u in ("s", "ms"))]
+    usual = [u for u in possible if USUAL_S[0] <= step * seconds[u] <= USUAL_S[1]]
+    for found in (set(epoch) & set(possible), possible, usual):
+        if len(found) == 1:
+            (unit,) = found
+            return unit, (f"times of {where} were read in {unit} "
+                          f"({1 / (step * seconds[unit]):.4g} frames/s); else {TELL}.")
+    would = ", ".join(f"{1 / (step * seconds[u]):.4g} frames/s in {u}" for u in possible)
+    raise EvflowDataError(
+        "EV003", f"{where}: steps of {step:g} (from {times[0]}) have no clear unit"
+        + (f": {would}." if would else "."),
+        f"Is it {', '.join(UNITS_US)}? {TELL.capitalize()}.")
+
+
+def _rows(path: Path) -> tuple[list[list[str]], str]:
+    """The fields of every line with data, all of one length, and the unit written, or "auto"."""
+    try:
+        data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b"\0"
+        text = data.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as e:
+        raise EvflowDataError("EV009", f"{path} cannot be read as text ({e}).") from e
+    if "\0" in text:
+        raise EvflowDataError("EV009", f"{path} is not a text file of times.")
+    rows: list[list[str]] = []
+    words = ""
+    for number, line in enumerate(text.splitlines(), 1):
+        content, _, comment = line.partition("#")
+        fields = [f for f in re.split(r"[\s,;]+", content) if f]
+        if not fields or (not rows and not any(map(is_float, fields))):
+            words += f" {comment if not fields else content}"  # a comment or the header
+            continue
+        if rows and len(fields) != len(rows[0]):
+            raise EvflowDataError(
+                "EV009", f"{path}, line {number:,} is {line[:60]!r}; lines before it have "
+                f"{len(rows[0])} columns.", "Cut off or damaged? Copy it again.")
+        rows.append(fields)
+    return rows, written_unit(words)
+
+
+def written_unit(words: str) -> str:
+    """The unit of times that a header or comment tells, or "auto"."""
+    units = {_unit(word.lower()) for word in UNIT_WORDS.findall(words)}
+    return units.pop() if len(units) == 1 else "auto"
+
+
+def _unit(word: str) -> str:
+    if word[0] in "uµμ" or word.startswith("mic"):
+        return "us"
+    return {"n": "ns", "m": "ms", "s": "s"}[word[0]]
+
+
+def _columns(
+    path: Path, rows: list[list[str]], names: Collection[str]
+) -> tuple[np.ndarray, list[str]]:
+    """The column of times (T,), int64 or float64, and that of the names, if there is one."""
+    columns = list(zip(*rows, strict=True))
+    if len(columns) <= 1:
+        return _numbers(path, rows, 0), []
+    known = {key: name for name in names for key in (PurePosixPath(name).stem, name)}
+    label = [all(PurePosixPath(f.replace("\\", "/")).name in known for f in column)
+             for column in columns]
+    if sum(label) != 1:  # not the images at hand: a name is what is no number, or counts up
+        label = [not all(map(is_float, column)) or _counts(column) for column in columns]
+    clock = [i for i, named in enumerate(label) if not named]
+    times = (_numbers(path, rows, clock[0]) if len(clock) == 1 else
+             _middle(path, rows, clock) if len(clock) == 2 else None)
+    if times is None or sum(label) > 1:
+        raise EvflowDataError(
+            "EV008", f"{path} has lines like {' '.join(rows[0])[:60]!r}; which column is the time?",
+            "Keep one time per line, `time name`, or begin and end of the exposure.")
+    named = columns[label.index(True)] if any(label) else ()
+    if all(map(str.isdecimal, named)) and not set(named) <= set(known):
+        return times, []
+    tails = [PurePosixPath(f.replace("\\", "/")).name for f in named]
+    return times, [known.get(tail, tail) for tail in tails]
+
+
+def _middle(path: Path, rows: list[list[str]], clock: list[int]) -> np.ndarray | None:
+    """Mid-exposure (T,) of columns of begin and end; None where they are something else."""
+    begin, end = (_numbers(path, rows, column) for column in clock)
+    if (end < begin).any() or (end[:-1] > begin[1:]).any():
+        return None
+    return begin + (end - begin) // 2 if begin.dtype == end.dtype == np.int64 else (
+        begin + 0.5 * (end - begin))
+
+
+def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
+    """A column as int64 where all are whole (exact, also in ns since 1970), else float64."""
+    fields = [row[column] for row in rows]
+    for number, field in enumerate(fields):
+        if not is_float(field):
+            raise EvflowDataError(
+                "EV009", f"{path}: {field[:40]!r} at time {number:,} is not a number.",
+                "Cut off or damaged? Copy it again.")
+    try:
+        return np.array([int(f) for f in fields], np.int64)
+    except (ValueError, OverflowError):
+        return np.array([float(f) for f in fields])
+
+
+def _counts(column: tuple[str, ...]) -> bool:
+    """Whole numbers that count up by one: an index, not times (from 2 lines on)."""
+    if len(column) < 2 or not all(f.isdecimal() and len(f) < 19 for f in column):
+        return False
+    return bool((np.diff(np.array([int(f) for f in column])) == 1).all())

@@ -1,0 +1,226 @@
+"""Video files through OpenCV: colour frames and their times, one by one.
+
+A video begins at 0 us. Its clock is `fps` or `timestamps` where the user gave one, else the
+container's, which knows of variable frame rates. OpenCV decodes to 8 bits per channel.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import cv2
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.images.folder import SUFFIXES
+from evflow.io.images.frames import FrameHints, Image, existing
+from evflow.io.images.stacks import cut_off
+from evflow.io.images.times import read_times
+
+SLACK = 1.5  # frames; containers without a count have it from their duration, rounded
+SLACK_SHARE = 0.001
+REST = "the rest is missing, damaged, or trimmed away by an edit list"
+TICK_US = 1000.5  # Matroska and WebM round times to the millisecond
+
+
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """A video file: size (width, height), fps and the frame count that its header claims (0 =
+    unknown); times_us (T,) where the user gave them."""
+
+    path: Path
+    size: tuple[int, int]
+    fps: float
+    claimed: int
+    hints: FrameHints
+    times_us: np.ndarray | None
+    notes: list[str]
+
+    def images(self) -> Iterator[Image]:
+        """The frames (H, W, 3) from first to last, B, G, R.
+
+        Raises EV002 (more or fewer frames than `timestamps`), EV004 (the container's times do
+        not increase), EV009 (fewer frames than the container promises, unless `partial`).
+        """
+        clock, count = Clock(self.path, self.fps), 0
+        with _capture(self.path) as capture:
+            while True:
+                good, pixels = capture.read()
+                if not good:
+                    break
+                yield Image(pixels, self._time(count, clock, capture), self._name(count))
+                count += 1
+        lost = min(self.claimed - count, self.claimed - 1 - clock.last_us * self.fps * 1e-6)
+        if self.times_us is not None or self.hints.fps is not None or not clock.trusted:
+            lost = self.claimed - count
+        if lost > _slack(self.claimed) and not self.hints.partial:
+            raise cut_off(self.path, count, self.claimed, REST)
+        if self.times_us is not None and count < len(self.times_us) and not self.hints.partial:
+            raise self._miscounted(f"{count:,}")
+        self.notes.extend(clock.notes())
+
+    def _name(self, index: int) -> str:
+        return f"frame {index} of {self.path}"
+
+    def _time(self, index: int, clock: Clock, capture: Any) -> int:
+        if self.hints.fps is not None:
+            return self.hints.at_rate(index)
+        if self.times_us is None:
+            return clock.time(index, capture.get(cv2.CAP_PROP_POS_MSEC))
+        if index >= len(self.times_us):
+            raise self._miscounted(f"more than {index:,}")
+        return int(self.times_us[index])
+
+    def _miscounted(self, count: str) -> EvflowDataError:
+        assert self.times_us is not None
+        return EvflowDataError(
+            "EV002", f"{self.path} has {count} frames, {self.hints.timestamps} "
+            f"{len(self.times_us):,} times.", "Give one time per frame, or pass --fps.")
+
+
+class Clock:
+    """Times of frames in us from the container's, in ms, which may be coarse or absent.
+
+    Times that are all whole milliseconds and within one of the nominal rate's are the nominal
+    ones, rounded; the rate then gives them exactly. A container whose second frame is not
+    later than its first keeps no time, and the rate alone counts.
+    """
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self.path, self.fps = path, fps
+        self.first_us = self.last_us = 0.0
+        self.trusted, self.coarse, self.steady = True, True, True
+        self.steps = (float("inf"), 0.0)
+
+    def time(self, index: int, stamp_ms: float) -> int:
+        """The time of frame `index`; EV004 where it does not follow the one before."""
+        nominal = index * 1e6 / self.fps
+        if index == 0:
+            self.first_us = stamp_ms * 1e3
+        stamp = stamp_ms * 1e3 - self.first_us
+        if index == 1:
+            self.trusted = stamp > 0
+        self.coarse &= abs(stamp_ms - round(stamp_ms)) < 1e-6
+        self.steady &= abs(stamp - nominal) <= TICK_US
+        now = nominal if not self.trusted or (self.coarse and self.steady) else stamp
+        if index and now <= self.last_us:
+            raise EvflowDataError(
+                "EV004", f"frame {index} of {self.path} is at {now:.0f} us, the one before at "
+                f"{self.last_us:.0f} us: its container's times do not increase.",
+                f"Pass --fps {self.fps:.6g} to count frames instead.")
+        if index:
+            step = now - self.last_us
+            self.steps = min(self.steps[0], step), max(self.steps[1], step)
+        self.last_us = now
+        return round(now)
+
+    def notes(self) -> list[str]:
+        """A sentence where the frame rate varied by more than rounding."""
+        shortest, longest = self.steps
+        if longest <= 1.1 * shortest + 2 * TICK_US:
+            return []
+        return [f"{self.path} has a variable frame rate ({1e6 / longest:.4g} to "
+                f"{1e6 / shortest:.4g} frames/s); its own times were used."]
+
+
+def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Video:
+    """Open a video; nothing but its first frame is decoded where it is sound.
+
+    Raises EV008 (no video, one picture), EV009 (nothing can be decoded; cut off, unless
+    `hints.partial`), EV016 (not there), EV020 (no frame rate), and what `read_times` raises.
+    """
+    path, hints = existing(path), hints or FrameHints()
+    if path.suffix.lower() in SUFFIXES:
+        raise EvflowDataError(
+            "EV008", f"{path} is one picture.", "For a sequence of images pass their folder.")
+    with _capture(path) as capture:
+        if not capture.isOpened():
+            raise EvflowDataError(
+                "EV008", f"{path} is neither a recording nor a video that OpenCV can open.",
+                "A cut-off mp4 has lost its index: copy it again. Other kinds: convert them to mp4 "
+                "(H.264) or avi (MJPG).")
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        claimed = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        good, first = capture.read()
+        if not good:
+            raise EvflowDataError("EV009", f"no frame of {path} can be decoded.", "Copy it again.")
+        if not hints.partial and claimed > 1:
+            _check_end(path, capture, claimed)
+        if not hints.partial:
+            _check_bytes(path)
+    times, notes = None, []
+    if hints.timestamps is not None:
+        times, _, note = read_times(Path(hints.timestamps), hints.time_unit)
+        notes = [note] if note else []
+    if not (rate and 0 < rate < 1e6) and times is None and hints.fps is None:
+        raise EvflowDataError("EV020", f"{path} states no frame rate ({rate:g}).", "Pass --fps.")
+    return Video(path, first.shape[1::-1], float(rate), claimed, hints, times, notes)
+
+
+def _check_end(path: Path, capture: Any, claimed: int) -> None:
+    """EV009 at once where the end is missing, not after an hour of simulation.
+
+    Only where the last frame cannot be sought are the frames counted, by decoding them all.
+    """
+    slack = int(_slack(claimed))
+    capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, claimed - 1 - slack))
+    if capture.grab():
+        return
+    with _capture(path) as again:
+        count, last = 0, 0.0
+        while again.grab():
+            count, last = count + 1, again.get(cv2.CAP_PROP_POS_MSEC)
+        by_time = claimed - 1 - last * 1e-3 * again.get(cv2.CAP_PROP_FPS)
+    lost = min(claimed - count, by_time) if last > 0 else claimed - count
+    if lost > _slack(claimed):
+        raise cut_off(path, count, claimed, REST)
+
+
+def _check_bytes(path: Path) -> None:
+    """EV009 where an AVI or an mp4 claims more bytes than the file has: OpenCV would fill the rest
+    of its last frame with grey."""
+    total = path.stat().st_size
+    with open(path, "rb") as f:
+        head = f.read(12)
+        if head.startswith(b"RIFF") and head[8:] == b"AVI ":
+            end = 8 + int.from_bytes(head[4:8], "little")
+        elif head[4:8] == b"ftyp":
+            end = _boxes_end(f, total)
+        else:
+            return
+    if end > total:
+        raise EvflowDataError(
+            "EV009", f"{path} ends {end - total:,} bytes early, at byte {total:,}.",
+            "Cut off: copy it again, or pass --partial (partial=True).")
+
+
+def _boxes_end(f: IO[bytes], total: int) -> int:
+    """Where the last box of an mp4 ends: {u32 size, name}, size 1: u64 size, 0: to the end."""
+    at = 0
+    while at + 8 <= total:
+        f.seek(at)
+        box = f.read(16)
+        size = int.from_bytes(box[:4], "big")
+        size = int.from_bytes(box[8:], "big") if size == 1 else size or total - at
+        if size < 8:
+            break
+        at += size
+    return at
+
+
+def _slack(claimed: int) -> float:
+    return SLACK + SLACK_SHARE * claimed
+
+
+@contextlib.contextmanager
+def _capture(path: Path) -> Iterator[Any]:
+    capture = cv2.VideoCapture(str(path))
+    try:
+        yield capture
+    finally:
+        capture.release()

@@ -1,0 +1,192 @@
+"""Reading and writing recordings: the registry of formats.
+
+A format is a module with a NAME, its EXTENSIONS, `sniff` and `read`, and an `EventWriter` where it
+can be written; adding one is a new file and an entry in `FORMATS` and in `WRITERS`. A file is
+recognised by its content, and by its extension only where several formats claim it. Whatever is
+wrong with a file comes out as an `EvflowDataError`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any, Protocol
+
+from evflow.checks import Size, need
+from evflow.errors import EvflowDataError, naming
+from evflow.io.decode.text import HEAD
+from evflow.io.decode.units import check_seconds
+from evflow.io.formats import (
+    aedat2,
+    aedat4,
+    dat,
+    dsec,
+    e2vid,
+    event_utils,
+    evimo2,
+    evreal,
+    evt2,
+    evt3,
+    ijrr,
+    mvsec,
+    npz,
+    plain_text,
+    v2e,
+    v2e_text,
+)
+from evflow.io.formats.ros import ros1, ros2
+from evflow.io.formats.write_aedat4 import Aedat4Writer
+from evflow.io.hints import Hints
+from evflow.io.writer import EventWriter, copy
+from evflow.types import Events, Recording
+
+
+class Format(Protocol):
+    """What a format module offers."""
+
+    NAME: str
+    EXTENSIONS: tuple[str, ...]
+
+    def sniff(self, path: Path, head: bytes) -> bool:
+        """Does this look like mine? `head` is the file's beginning, b"" for a folder."""
+
+    def read(self, path: Path, hints: Hints) -> Recording:
+        """The recording, every hint obeyed; a file without frames gives an empty stack."""
+
+
+FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
+    aedat4, aedat2, evt2, evt3, dat, v2e, mvsec, event_utils, dsec, npz, evimo2, evreal, e2vid,
+    v2e_text, ijrr, plain_text, ros1, ros2)
+WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
+    dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
+    npz.NpzWriter, Aedat4Writer)}
+WRITTEN = {  # the format that an output's extension stands for, unless told otherwise
+    ".h5": "dsec", ".hdf5": "dsec", ".zip": "e2vid", ".txt": "e2vid", ".npz": "npz",
+    ".aedat4": "aedat4", "": "evreal"}
+SEVERAL = {".h5": ("dsec", "event_utils"), ".hdf5": ("dsec", "event_utils")}  # else: the one format
+
+
+def find_format(path: str | os.PathLike) -> Format:
+    """The format of a file or folder; EV008 (unknown), EV009 (empty file), EV016 (not there)."""
+    path = Path(path)
+    try:
+        head = b"" if path.is_dir() else _head(path)
+    except (OSError, ValueError) as e:  # ValueError: a NUL in the name
+        why = e.strerror if isinstance(e, OSError) and e.strerror else e
+        raise EvflowDataError("EV016", f"{path!s:.200} cannot be opened ({why}).") from e
+    claims = [f for f in FORMATS if f.sniff(path, head)]
+    claims.sort(key=lambda f: path.suffix.lower() not in f.EXTENSIONS)
+    if claims:
+        return claims[0]
+    if not path.is_dir() and not head:
+        raise EvflowDataError("EV009", f"{path} is empty (0 bytes).", "Copy it again.")
+    seen = (f"the folder holds {sorted(p.name for p in path.iterdir())[:5]}" if path.is_dir()
+            else f"it begins with {head[:16]!r}")
+    raise EvflowDataError(
+        "EV008", f"{path} is none of {', '.join(f.NAME for f in FORMATS)}: {seen}.",
+        "Convert it, or check that it was copied completely. Text has lines of numbers `t x y p`, "
+        "decimal points, and a header where the order is another.")
+
+
+def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
+    """Read events and frames of any known format; without frames the stack is (0, H, W).
+
+    hints: start_s, stop_s, time_unit, polarity, size, partial, drop_outside (see `Hints`).
+    Raises EV008 (unknown format), EV009 (damaged), EV010 (a package is missing), EV016 (not
+    there), EV020 (unknown hint), EV023 (whole seconds), and what `Events` and `Recording` raise.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise EvflowDataError(
+            "EV020", f"a path was expected, not {type(path).__name__}.",
+            "Events without frames become a recording by Recording.of_events(events).")
+    told = Hints.parse(hints)
+    path = Path(path)
+    found = find_format(path)
+    try:
+        with naming(path):
+            recording = found.read(path, told)
+            events = recording.events
+            check_seconds(events.t, events.size, told.time_unit, found.NAME)
+    except MemoryError as e:
+        raise EvflowDataError(
+            "EV009", f"{path} asks for more memory than there is.",
+            "If it is sound, read a part: start_s, stop_s (--start, --stop).") from e
+    except OSError as e:
+        raise EvflowDataError("EV009", f"{path} cannot be read ({e}).", "Copy it again.") from e
+    if not told.remarks:
+        return recording
+    return dataclasses.replace(recording, notes=(*recording.notes, *told.remarks))
+
+
+def read_events(path: str | os.PathLike, **hints: Any) -> Events:
+    """The events alone; hints and errors as in `read_recording`."""
+    return read_recording(path, **hints).events
+
+
+def write_events(
+    path: str | os.PathLike,
+    events: Events | Recording,
+    format: str = "dsec",
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write events, and the frames of a `Recording`, in one of `WRITERS`; all or nothing.
+
+    Raises EV003 (what the format cannot hold), EV010 (a package is missing), EV013 (exists),
+    EV019 (cannot be written), EV020 (unknown format, one that the extension does not stand for, or
+    one without frames for a recording with).
+    """
+    if not isinstance(events, Recording):
+        need(events, Events, "events", "The path comes first: write_events(path, events).")
+        events = Recording.of_events(events)
+    write_recording(path, events, format, overwrite=overwrite)
+
+
+def write_recording(
+    path: str | os.PathLike,
+    recording: Recording,
+    format: str | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write events and frames; format None: what the extension stands for. Errors as above."""
+    need(recording, Recording, "recording", "Of events: Recording.of_events(events).")
+    with open_writer(path, recording.events.size, format, overwrite=overwrite) as out:
+        copy(recording, out)
+
+
+def open_writer(
+    path: str | os.PathLike, size: Size, format: str | None = None, *, overwrite: bool = False
+) -> EventWriter:
+    """A writer for events and frames in parts, to be used in a `with`; errors as above."""
+    return writer_of(path, format)(path, size, overwrite=overwrite)
+
+
+def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventWriter]:
+    """The writer of a format, None: of an output's extension; EV020 where there is none, or where
+    the extension stands for another format."""
+    if format is not None and format not in WRITERS:
+        raise EvflowDataError("EV020", f"format={format!r}.", f"Choose from {sorted(WRITERS)}.")
+    suffix = Path(path).suffix.lower()
+    stands_for = SEVERAL.get(suffix, (WRITTEN[suffix],) if WRITTEN.get(suffix) and suffix else ())
+    if format is not None and stands_for and format not in stands_for:
+        endings = [s or "none (a folder)" for s, name in WRITTEN.items()
+                   if format in SEVERAL.get(s, (name,))]
+        raise EvflowDataError(
+            "EV020", f"format {format} is not what a name that ends in {suffix} holds.",
+            f"Name the output with {' or '.join(endings)}, or pass format={stands_for[0]!r} "
+            f"(--format {stands_for[0]}).")
+    if format is None and suffix not in WRITTEN:
+        kinds = ", ".join(f"{s or 'a folder'} ({name})" for s, name in WRITTEN.items())
+        raise EvflowDataError(
+            "EV020", f"the extension {suffix} of {path} stands for no format that can be written.",
+            f"Take one of {kinds}, or pass format (--format): {', '.join(WRITERS)}.")
+    return WRITERS[WRITTEN[suffix] if format is None else format]
+
+
+def _head(path: Path) -> bytes:
+    if path.exists() and not path.is_file():  # to open a pipe would wait for its writer
+        raise OSError("it is no regular file")
+    with open(path, "rb") as f:
+        return f.read(HEAD)

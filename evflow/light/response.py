@@ -1,0 +1,53 @@
+"""Frames as they came -> the light that fell on the sensor: a raw colour mosaic as luma, a response
+undone, a mirrored image turned. Single frames (H, W), or (H, W, 3) where no mosaic is concerned.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.light.colour import mosaic_luma
+
+FLIPS: dict[str, tuple[int, ...]] = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}  # axes
+RESPONSES = ("linear", "gamma", "srgb")
+GAMMA = 2.2
+
+
+def linear_light(frame: np.ndarray, response: str) -> np.ndarray:
+    """DN on 0..255 proportional to light, float32; of "linear" the frame itself.
+
+    response: "gamma" (code = light^(1/2.2)) or "srgb" (IEC 61966-2-1). Thresholds are measured
+    against the log of light: of frames with a gamma of 2.2 they come out 2.2 times too small.
+    EV020 on any other response.
+    """
+    if response == "linear":
+        return frame
+    if response not in RESPONSES:
+        raise EvflowDataError(
+            "EV020", f"response={response!r}.", f"Choose from {', '.join(RESPONSES)}.")
+    code = frame.astype(np.float32) * np.float32(1 / 255)
+    light = code ** np.float32(GAMMA) if response == "gamma" else _srgb(code)
+    return np.minimum(light, 1) * np.float32(255)
+
+
+def _srgb(code: np.ndarray) -> np.ndarray:
+    curved = ((code + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    return np.where(code <= 0.04045, code / np.float32(12.92), curved)
+
+
+def luma_of_mosaic(frame: np.ndarray, pattern: str, where: str) -> np.ndarray:
+    """The luma (H, W) of a raw mosaic: of one channel, or of three that are equal, as videos store
+    grey. EV020 where the frame has colours already; errors of `colour.mosaic_luma`."""
+    if frame.ndim == 3:
+        if (frame[..., 1:] != frame[..., :1]).any():
+            raise EvflowDataError(
+                "EV020", f"{where} has colours already, and is no {pattern.upper()} mosaic.",
+                "Leave out --bayer.")
+        frame = np.ascontiguousarray(frame[..., 0])
+    return mosaic_luma(frame, pattern)
+
+
+def remark(pattern: str) -> str:
+    """What is said of frames that were a mosaic."""
+    return f"frames were a colour mosaic ({pattern.upper()}) and are its luma"

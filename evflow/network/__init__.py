@@ -1,0 +1,1 @@
+"""The network: events <-> camera parameters, given the change of intensity (api.py)."""

@@ -1,0 +1,45 @@
+"""The static structure of the network: `default`, and `paper` as printed.
+
+A configuration is hashable (a static argument of jit), and the weights' own name tells which it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from evflow.network.flow.config import FlowConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """Static structure of the network.
+
+    pool: estimate a camera summary from all pixels and condition on it (one pixel alone
+        cannot tell its threshold: Bayes error .105 against .003 pooled).
+    code: "changes" builds the condition from the m signed intensity changes alone, so that a
+        video is enough to generate; "feature" passes the encoder's hidden feature, which
+        contains the events themselves (paper).
+    output: "log" or "tanh" coordinates of the parameters (see coordinates.py).
+    changes: m, intensity changes per window. piece: encoder features per change.
+    """
+
+    flow: FlowConfig = FlowConfig(condition=41)
+    bins: int = 16
+    changes: int = 16
+    piece: int = 24
+    encoder_hidden: int = 96
+    summary_hidden: int = 96
+    summary_features: int = 64
+    rate_features: int = 16
+    gates: int = 4
+    pool: bool = True
+    code: Literal["changes", "feature"] = "changes"
+    output: Literal["log", "tanh"] = "log"
+
+
+PAPER_MODEL = ModelConfig(
+    flow=FlowConfig(condition=96, injector=False, asinh=False), piece=6, pool=False,
+    code="feature", output="tanh")
+
+MODELS = {"default": ModelConfig(), "paper": PAPER_MODEL}

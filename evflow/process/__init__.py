@@ -1,0 +1,1 @@
+"""The process: terminal and signals, workers, devices, chunks of work, provenance."""

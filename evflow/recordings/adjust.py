@@ -1,0 +1,111 @@
+"""A recording put right: frames from elsewhere, another clock, turned round, linear in light.
+
+Each function returns a new `Recording` with a note of what was done; events are never touched.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from typing import Any
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.source import open_frames
+from evflow.light.colour import mosaic_luma
+from evflow.light.response import FLIPS, linear_light, remark
+from evflow.types import Recording
+
+LUMA = ("colour frames", "frames were a colour mosaic")  # notes on frames that are luma already
+MARGIN_US = 1_000_000  # frames that far outside the events are kept: their clock may be off
+
+
+def linearised(recording: Recording, response: str) -> Recording:
+    """The recording with frames proportional to light, float32 DN on 0..255; response and errors
+    as in `linear_light`."""
+    if response == "linear":
+        return recording
+    frames = np.empty(recording.frames.shape, np.float32)
+    for i in range(len(frames)):
+        frames[i] = linear_light(recording.frame_dn(i), response)
+    return _changed(recording, f"frames linearised ({response})", frames=frames)
+
+
+def demosaiced(recording: Recording, pattern: str) -> Recording:
+    """The recording whose frames are a raw mosaic, with their luma in its place, of the same size
+    and dtype. EV020 where they were colour images already; errors of `colour.mosaic_luma`."""
+    if any(note.startswith(LUMA) for note in recording.notes):
+        raise EvflowDataError(
+            "EV020", "the frames are luma of colour images already, and no "
+            f"{pattern.upper()} mosaic.", "Leave out --bayer.")
+    frames = np.empty(recording.frames.shape, recording.frames.dtype)
+    for i, frame in enumerate(recording.frames):
+        frames[i] = mosaic_luma(frame, pattern)
+    return _changed(recording, remark(pattern), frames=frames)
+
+
+def shifted(recording: Recording, offset_us: int) -> Recording:
+    """The recording with offset_us added to its frame times."""
+    if not offset_us:
+        return recording
+    return _changed(recording, f"frame times moved by {offset_us / 1e3:+g} ms",
+                    frame_times=recording.frame_times + offset_us)
+
+
+def flipped(recording: Recording, side: str) -> Recording:
+    """The recording with its frames mirrored: "horizontal", "vertical" or "both"; EV020."""
+    if side not in FLIPS:
+        raise EvflowDataError("EV020", f"side={side!r}.", f"Choose from {sorted(FLIPS)}.")
+    axes = tuple(1 + axis for axis in FLIPS[side])
+    return _changed(recording, f"frames flipped ({side})",
+                    frames=np.flip(recording.frames, axes))
+
+
+def with_frames(
+    recording: Recording, path: str | os.PathLike, *, offset_us: int = 0, **hints: Any
+) -> Recording:
+    """The recording with the frames of `path` in place of its own: a folder of images, a video, a
+    NumPy stack, another recording.
+
+    hints: fps, timestamps, time_unit, full_scale, partial, bayer, as in `open_frames`; times are
+    those of the events' clock, after offset_us is added. Frames more than a second away from all
+    events are left out.
+    Raises EV012 (no frame near the events), EV015 (another size), and what `open_frames` raises.
+    """
+    try:
+        source = open_frames(path, **hints)
+    except EvflowDataError as e:
+        raise EvflowDataError(e.code, _reworded(e.seen), _reworded(e.fix)) from e
+    t = recording.events.t
+    if not len(t):
+        raise EvflowDataError("EV001", "the recording has no events.")
+    if source.size != recording.events.size:
+        raise EvflowDataError(
+            "EV015", f"frames of {path} are {source.size[0]}x{source.size[1]}, the events "
+            f"{recording.events.size[0]}x{recording.events.size[1]}.",
+            "Both must come from one sensor, uncropped.")
+    kept, times, seen = [], [], []
+    for frame, time in source.open():
+        seen.append(time + offset_us)
+        if t[0] - MARGIN_US <= seen[-1] <= t[-1] + MARGIN_US:
+            kept.append(frame)
+            times.append(seen[-1])
+    if not kept:
+        raise EvflowDataError(
+            "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but the frames of {path} "
+            f"{seen[0]:,}..{seen[-1]:,} us.",
+            "On another clock? Pass --frames-offset-ms "
+            f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; in another "
+            "unit, --timestamps-unit.")
+    notes = (*recording.notes, f"frames are those of {path}", *map(_reworded, source.notes))
+    return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes)
+
+
+def _reworded(text: str) -> str:
+    """Beside a recording, --time-unit is that of the events, and --fps a video's to be written."""
+    return text.replace("--time-unit", "--timestamps-unit").replace("--fps", "--frames-fps")
+
+
+def _changed(recording: Recording, note: str, **fields: Any) -> Recording:
+    return dataclasses.replace(recording, notes=(*recording.notes, note), **fields)

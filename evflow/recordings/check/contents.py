@@ -1,0 +1,67 @@
+"""What the events are: both polarities, enough of them, and not of a few pixels alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.recordings.check.findings import Finding
+from evflow.types import Recording
+
+LEAST_EVENTS = 1_000  # of which one polarity alone is no accident
+ONE_SHARE = 0.99
+VALID_EVENTS = 3  # fewer say next to nothing about a pixel
+ACTIVE_SHARE = 0.05  # of the pixels should have as many
+AROUND = 5  # pixels: side of the neighbourhood that a hot pixel is compared with
+HOT_FACTOR, HOT_LEAST, HOT_SHARE = 10.0, 10, 0.05  # times the median there, events, share of all
+
+
+def contents(recording: Recording) -> list[Finding]:
+    """EV001 (no events), EV011 (no frames), EV022 (polarity lost), EV017 (few events), EV033
+    (hot pixels)."""
+    events = recording.events
+    if not len(events):
+        return [Finding("EV001", "error", "the recording has no events.",
+                        "Check --start and --stop, and that the camera was recording.")]
+    counts = events.count_map()
+    found = [] if recording.has_frames else [Finding(
+        "EV011", "warning", "the recording has events but no frames: thresholds cannot be "
+        "measured without intensity.",
+        "Give frames, --frames DIR --timestamps FILE, or let a network guess them (evflow estimate "
+        "--reconstruct); of a static scene the noise alone can be estimated.")]
+    return [*found, *_one_polarity(counts), *_few(counts), *_hot(counts.sum(0))]
+
+
+def _one_polarity(counts: np.ndarray) -> list[Finding]:
+    on, off = (int(n) for n in counts.sum((1, 2), dtype=np.int64))
+    share, name = max((on / (on + off), "ON"), (off / (on + off), "OFF"))
+    if on + off < LEAST_EVENTS or share <= ONE_SHARE:
+        return []
+    return [Finding(
+        "EV022", "error", f"{share:.1%} of {on + off:,} events are {name}: polarity was probably "
+        "lost in a conversion (-1 becomes True as bool, 255 as uint8).",
+        "Export it again with signed integers, or bool.")]
+
+
+def _few(counts: np.ndarray) -> list[Finding]:
+    active = float((counts.sum(0) >= VALID_EVENTS).mean())
+    if active >= ACTIVE_SHARE:
+        return []
+    return [Finding(
+        "EV017", "warning", f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
+        "elsewhere maps show the camera's summary.", "Record more motion and texture.")]
+
+
+def _hot(counts: np.ndarray) -> list[Finding]:
+    import cv2
+
+    around = cv2.medianBlur(np.minimum(counts, 255).astype(np.uint8), AROUND)
+    hot = counts > np.maximum(HOT_FACTOR * (around + 1.0), HOT_LEAST)
+    share = float(counts[hot].sum()) / float(counts.sum())
+    if share <= HOT_SHARE:
+        return []
+    y, x = np.unravel_index(int(np.argmax(np.where(hot, counts, 0))), counts.shape)
+    return [Finding(
+        "EV033", "note", f"{hot.sum():,} pixels ({hot.mean():.2%}) send {share:.0%} of the events, "
+        f"each {HOT_FACTOR:g} times as many as those around; most of them x={x}, y={y} "
+        f"({counts[y, x]:,}): hot, or of very low threshold.",
+        "An estimate lists hot pixels in camera.json and leaves them out of its summary.")]

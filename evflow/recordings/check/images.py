@@ -1,0 +1,72 @@
+"""What the frames are: exposed, each another one, of which depth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.recordings.check.findings import Finding
+from evflow.types import Recording
+
+WHITE_DN, BLACK_DN = 254.5, 0.5
+FRAME_SHARE, ALL_SHARE = 0.5, 0.25  # of the pixels of one frame, and of all frames
+FIRING_SHARE = 0.01  # of the pixels have events where a frame should have changed
+DEPTHS = {255: 8, 1023: 10, 4095: 12, 16383: 14, 65535: 16}
+
+
+def images(recording: Recording) -> list[Finding]:
+    """EV027 (saturated, black), EV028 (repeated), EV031 (depth), EV032 (colour)."""
+    if not recording.has_frames:
+        return []
+    return [*_exposure(recording), *_repeated(recording), *_depth(recording)]
+
+
+def _exposure(recording: Recording) -> list[Finding]:
+    shares = []
+    for i in range(len(recording.frame_times)):
+        frame = recording.frame_dn(i)
+        shares.append(((frame >= WHITE_DN).mean(), (frame <= BLACK_DN).mean()))
+    found = []
+    for share, name, fix in zip(
+        np.array(shares).T, ("saturated", "black"), ("Expose shorter", "Expose longer"),
+        strict=True,
+    ):
+        bad = np.flatnonzero(share > FRAME_SHARE)
+        if len(bad) or share.mean() > ALL_SHARE:
+            which = f"; frame {bad[0]} by {share[bad[0]]:.0%}" if len(bad) else ""
+            found.append(Finding(
+                "EV027", "warning", f"{share.mean():.1%} of the frames' pixels are {name}{which} "
+                f"({len(bad)} of {len(share)} frames by more than half): they tell no thresholds.",
+                f"{fix}; such pixels are left out."))
+    return found
+
+
+def _repeated(recording: Recording) -> list[Finding]:
+    frames, times = recording.frames, recording.frame_times
+    same = [i for i in range(1, len(frames)) if np.array_equal(frames[i], frames[i - 1])
+            and _fires(recording, int(times[i - 1]), int(times[i]))]
+    if not same:
+        return []
+    return [Finding(
+        "EV028", "warning", f"{len(same)} of {len(frames)} frames repeat the one before while "
+        f"pixels fire, first frame {same[0]}: shown twice by a converter?",
+        "Remove the repeated frames, or export at the camera's own frame rate.")]
+
+
+def _fires(recording: Recording, t0: int, t1: int) -> bool:
+    return bool((recording.events.slice(t0, t1).count_map().sum(0) > 0).mean() > FIRING_SHARE)
+
+
+def _depth(recording: Recording) -> list[Finding]:
+    found = []
+    if recording.frames.dtype == np.uint16:
+        white = recording.full_scale
+        found.append(Finding(
+            "EV031", "note", f"16-bit frames, kept whole; their largest value "
+            f"{int(recording.frames.max()):,} makes them {DEPTHS[white]}-bit data, white at "
+            f"{white:,}.", "If white lies elsewhere, rescale them to that."))
+    colour = [note for note in recording.notes if "colour" in note]
+    if colour:
+        found.append(Finding(
+            "EV032", "note", f"{colour[0].rstrip('.')}.", "A pixel behind a colour filter sees "
+            "its own channel alone: expect larger errors of its thresholds."))
+    return found

@@ -1,0 +1,62 @@
+"""All rules in a row."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from evflow import io
+from evflow.checks import need
+from evflow.errors import EvflowDataError
+from evflow.recordings.check.agreement import agreement
+from evflow.recordings.check.clocks import clocks
+from evflow.recordings.check.contents import contents
+from evflow.recordings.check.findings import Finding, Report
+from evflow.recordings.check.images import images
+from evflow.recordings.stillness import stands_still
+from evflow.recordings.windows import check_overlap, iter_windows
+from evflow.types import Recording
+
+
+def check(recording_or_path: Recording | str | os.PathLike, **hints: Any) -> Report:
+    """Look for what usually goes wrong with a recording, before any estimate.
+
+    Of a path, what the reader refuses is the one finding; hints as in `read_recording`. A
+    recording without frames is checked for what can be told from events alone. Never raises
+    about the data; `report.raise_if_failed()` does.
+
+    Codes: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events or no window, EV021
+    polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned, EV025 gaps,
+    EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029 mirrored
+    frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034 unrelated
+    frames.
+    """
+    if not isinstance(recording_or_path, Recording):
+        need(recording_or_path, str | os.PathLike, "recording_or_path",
+             "Of events: Recording.of_events(events).")
+        try:
+            recording_or_path = io.read_recording(Path(recording_or_path), **hints)
+        except EvflowDataError as error:
+            return Report((Finding.of(error),))
+    return Report(tuple(_findings(recording_or_path)))
+
+
+def _findings(recording: Recording) -> list[Finding]:
+    found = contents(recording)
+    if not len(recording.events):
+        return found
+    found += clocks(recording)
+    found += images(recording)
+    if recording.has_frames and not any(f.code == "EV023" for f in found):
+        try:
+            check_overlap(recording)
+        except EvflowDataError as error:
+            return [*found, Finding.of(error)]
+        if not stands_still(recording):  # else noise agrees with nothing, as it should
+            try:
+                iter_windows(recording)
+            except EvflowDataError as error:
+                found.append(Finding.of(error))
+            found += agreement(recording)
+    return sorted(found, key=lambda f: ("error", "warning", "note").index(f.severity))

@@ -1,0 +1,84 @@
+"""Frames that do not show what the pixels saw: flashes and black frames, exposure changes.
+
+A recording's frames come from another circuit than its events. Where the frame camera alone
+stumbles, the change of brightness between two frames says nothing about thresholds. The frames
+alone tell flashes and changes of what stands still; beside the events they tell the rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.recordings.contradictions import contradicted
+from evflow.types import Recording
+
+DARK_DN, LEAST = 15.0, 0.1  # pixels below do not count; so many of all must be brighter
+STRIDE = 4  # every 4th pixel of every 4th row tells a whole frame's fault
+JUMP = 0.15  # log units: more than frame noise
+GLITCH_SHARE = 0.3  # of the pixels, all brighter or all darker: fast textures are both
+OTHER_SHARE = 0.02
+EXPOSURE = 0.08  # log units: change that most pixels share
+ALIKE, ALIKE_SHARE = 0.05, 0.6  # log units, share of pixels
+SATURATED_DN, BLACK_DN = 252.0, 0.5  # a frame at either end hides what its pixel saw
+LIT_SHARE = 0.3  # of the pixels, more ON than OFF or the reverse, where the light itself changed
+
+
+def faulty_frames(
+    recording: Recording, start_us: int, stop_us: int
+) -> tuple[dict[int, str], dict[int, str]]:
+    """({frame: fault}, {i: fault of the step from frame i to i + 1}), a short reason each.
+    start_us, stop_us: the time that the events cover."""
+    frames, intervals = contradicted(recording, start_us, stop_us)
+    glitches = dict.fromkeys(frames, "a frame that shows something else than the events (old, or "
+                             "damaged?)")
+    steps = dict.fromkeys((i for i in intervals if not _lit(recording, i)),
+                          "all of the frame changes by more than the events say (auto-exposure?)")
+    shown: list[np.ndarray] = []
+    for i in range(len(recording.frame_times)):
+        small = recording.frame_dn(i)[::STRIDE, ::STRIDE]
+        shown = [*shown[-2:], np.log(np.maximum(small, 1.0))]
+        if len(shown) == 3 and _glitch(*shown) and not _lit(recording, i - 1):
+            glitches[i - 1] = "a frame unlike the one before and the one after (a glitch?)"
+        if len(shown) > 1 and (shift := _exposure(*shown[-2:])) and not _lit(recording, i - 1):
+            steps[i - 1] = (f"all of the frame changes by {np.expm1(shift):+.0%} and no events "
+                            "say so (auto-exposure?)")
+    return glitches, steps
+
+
+def exposed(*frames: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels that are neither saturated nor black in any of the frames (H, W), DN."""
+    return np.all([(frame > BLACK_DN) & (frame < SATURATED_DN) for frame in frames], axis=0)
+
+
+def _glitch(before: np.ndarray, frame: np.ndarray, after: np.ndarray) -> bool:
+    """Much of the frame is brighter, or darker, than both neighbours, which agree."""
+    bright = _bright(before, after)
+    there, back = (frame - before)[bright], (frame - after)[bright]
+    agree = np.abs(after - before)[bright] < 0.5 * JUMP
+    brighter = (agree & (np.minimum(there, back) > JUMP)).sum()
+    darker = (agree & (np.maximum(there, back) < -JUMP)).sum()
+    most, least = max(brighter, darker), min(brighter, darker)
+    return bool(most > max(GLITCH_SHARE * bright.sum(), LEAST * bright.size)
+                and least < OTHER_SHARE * bright.size)
+
+
+def _exposure(before: np.ndarray, after: np.ndarray) -> float:
+    """The log change that most pixels share, 0 where there is none."""
+    bright = _bright(before, after)
+    if bright.mean() < LEAST:
+        return 0.0
+    change = (after - before)[bright]
+    shift = float(np.median(change))
+    alike = (np.abs(change - shift) < ALIKE).mean() > ALIKE_SHARE
+    return shift if abs(shift) > EXPOSURE and alike else 0.0
+
+
+def _bright(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.minimum(a, b) > np.log(DARK_DN)
+
+
+def _lit(recording: Recording, i: int) -> bool:
+    """Whether many pixels fire alike between frames i and i + 1."""
+    t0, t1 = (int(t) for t in recording.frame_times[i:i + 2])
+    on, off = recording.events.slice(t0, t1).count_map()
+    return bool(abs((on > off).mean() - (off > on).mean()) > LIT_SHARE)

@@ -1,0 +1,164 @@
+"""Windows: the pieces of a recording between two frames, from which a camera is estimated.
+
+A window runs from one frame to the first that is at least `min_us` later; the next begins where
+it ends. Only windows that the events cover are used, and none across a gap of theirs, a dropped or
+a faulty frame: there the brightness path between its two frames is unknown for too long, or wrong.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from evflow.checks import need
+from evflow.errors import EvflowDataError
+from evflow.recordings.gaps import event_gaps
+from evflow.recordings.glitches import faulty_frames
+from evflow.types import Recording, Window
+
+MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
+EDGE_US = 5_000  # the events may begin or end this much inside the first or last frame: of a camera
+# that starts at the first frame the first one comes when brightness has changed by a threshold
+EDGE_EVENTS = 10  # or this many of the intervals at which events come there
+DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowPlan:
+    """pairs: (first, last) frame of each window. skipped: one sentence per window left out."""
+
+    pairs: tuple[tuple[int, int], ...]
+    skipped: tuple[str, ...]
+
+
+def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
+    """Choose the windows of a recording; nothing is cut yet.
+
+    Raises EV001 (no events), EV011 (fewer than two frames), EV012 (frames and events do not
+    overlap), EV020 (min_us < 1).
+    """
+    if not isinstance(min_us, int | np.integer) or min_us < 1:
+        raise EvflowDataError("EV020", f"min_us={min_us}.",
+                              "A window takes a whole number of microseconds, 1 or more.")
+    need(recording, Recording, "recording", "Of a path: evflow.read_recording(path).")
+    check_overlap(recording)
+    times = recording.frame_times
+    start, stop = _covered(recording)
+    obstacles = _obstacles(recording, start, stop)
+    pairs: list[tuple[int, int]] = []
+    skipped: list[str] = []
+    first = 0
+    while (last := int(np.searchsorted(times, times[first] + min_us))) < len(times):
+        if found := obstacles.between(first, last):
+            why, following = found
+        elif times[first] < start or times[last] > stop:
+            why = "not covered by the events"
+            following = first + 1 if times[first] < start else last
+        else:
+            why, following = "", last
+            pairs.append((first, last))
+        if why:
+            skipped.append(f"frames {first}-{last}: {why}")
+        first = following
+    return WindowPlan(tuple(pairs), tuple(skipped))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Obstacles:
+    """What no window may cross. times: of the frames; late: (N,) intervals with frames missing;
+    silent: (M, 2) us, begin and end of gaps in the events; glitches, steps: of `faulty_frames`."""
+
+    times: np.ndarray
+    late: np.ndarray
+    silent: np.ndarray
+    glitches: dict[int, str]
+    steps: dict[int, str]
+
+    def between(self, first: int, last: int) -> tuple[str, int] | None:
+        """What is wrong between two frames, and where to go on."""
+        dropped = self.late[(self.late >= first) & (self.late < last)]
+        if len(dropped):
+            i = int(dropped[0])
+            lost_ms = (self.times[i + 1] - self.times[i]) / 1e3
+            return f"no frame for {lost_ms:.1f} ms (dropped?)", i + 1
+        begin, end = self.silent.T
+        silent = self.silent[(begin < self.times[last]) & (end > self.times[first])]
+        if len(silent):
+            return (f"no events for {np.ptp(silent[0]) / 1e3:.1f} ms (lost packets, or a scene "
+                    "that stood still?)"), last
+        faults = [(i, why) for i, why in self.glitches.items() if first <= i <= last] + [
+            (i, why) for i, why in self.steps.items() if first <= i < last]
+        if faults:
+            return faults[0][1], max(i for i, _ in faults) + 1
+        return None
+
+
+def _obstacles(recording: Recording, start: int, stop: int) -> _Obstacles:
+    times, t = recording.frame_times, recording.events.t
+    late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
+    gaps = event_gaps(t)
+    return _Obstacles(times, late, np.stack([t[gaps], t[gaps + 1]], -1),
+                      *faulty_frames(recording, start, stop))
+
+
+def iter_windows(
+    recording: Recording, min_us: int = MIN_US, plan: WindowPlan | None = None
+) -> Iterator[Window]:
+    """The windows of `plan_windows` (or of a plan made before), in time order, their events as
+    views.
+
+    Raises what `plan_windows` raises, and EV017 where no window is left.
+    """
+    plan = plan_windows(recording, min_us) if plan is None else plan
+    if not plan.pairs:
+        why = "; ".join(plan.skipped[:3]) or "the frames span less than that"
+        raise EvflowDataError(
+            "EV017", f"no window of {min_us / 1e3:g} ms or more can be used ({why}).",
+            "Record longer, or take shorter windows (min_us, --window-ms).")
+    return (_window(recording, pair, index) for index, pair in enumerate(plan.pairs))
+
+
+def condensed(skipped: tuple[str, ...]) -> list[str]:
+    """What was skipped, windows of one reason in one sentence ("frames 3-5: reason")."""
+    reasons: dict[str, list[str]] = {}
+    for sentence in skipped:
+        frames, _, reason = sentence.partition(": ")
+        reasons.setdefault(reason, []).append(frames)
+    return [f"{frames[0]} skipped: {reason}" if len(frames) == 1 else
+            f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {reason}"
+            for reason, frames in reasons.items()]
+
+
+def _window(recording: Recording, pair: tuple[int, int], index: int) -> Window:
+    t0, t1 = (int(recording.frame_times[i]) for i in pair)
+    frame0, frame1 = (recording.frame_dn(i) for i in pair)
+    return Window(recording.events.slice(t0, t1), frame0, frame1, t0, t1, index)
+
+
+def _covered(recording: Recording) -> tuple[int, int]:
+    """The time range of the events, widened by `EDGE_US` or a few of the intervals at which they
+    come near its ends: a slow scene has its first event some time after the camera started."""
+    t = recording.events.t
+    if len(t) < 2:
+        return int(t[0]) - EDGE_US, int(t[-1]) + EDGE_US
+    first, last = (EDGE_EVENTS * int(np.median(np.diff(part))) for part in (t[:100], t[-100:]))
+    return int(t[0]) - max(EDGE_US, first), int(t[-1]) + max(EDGE_US, last)
+
+
+def check_overlap(recording: Recording) -> None:
+    """EV001 (no events), EV011 (fewer than two frames), EV012 (no common time)."""
+    t, times = recording.events.t, recording.frame_times
+    if len(t) == 0:
+        raise EvflowDataError("EV001", "the recording has no events.")
+    if len(times) < 2:
+        raise EvflowDataError(
+            "EV011", f"the recording has {len(times)} frames; a window lies between two.",
+            "Thresholds are measured against intensity: record or add frames.")
+    start, stop = _covered(recording)
+    if times[-1] <= start or times[0] >= stop:
+        raise EvflowDataError(
+            "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but frames {times[0]:,}.."
+            f"{times[-1]:,} us.",
+            "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms.")

@@ -1,0 +1,1 @@
+"""Training: configurations, batches made on the device, losses, the one step, checkpoints."""

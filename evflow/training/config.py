@@ -1,0 +1,196 @@
+"""Configurations of a training run and their presets: `paper` (as printed), `default` and its
+`pixels` (ours), `debug`.
+
+They are frozen and hashable, overridden with dataclasses.replace or from the command line, and
+saved as JSON with every result.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+from evflow.camera import CameraPrior
+from evflow.camera.sensors import SensorModel
+from evflow.errors import EvflowDataError
+from evflow.network.config import PAPER_MODEL, ModelConfig
+from evflow.network.flow.config import FlowConfig
+from evflow.scenes.config import SceneConfig
+
+PARTS = ("summary", "encoder", "flow", "spread")
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Weights of the losses (Eq. 11), and how they are evaluated.
+
+    adaptive: scale each loss by a power of ten into 0..10 (Section IV-D3).
+    change_l1: Charbonnier on the intensity changes beside Eq. 6 (its gradient vanishes
+        quadratically near the target, and most targets are ~.01).
+    confidence: weight L_P by the sample's share of the batch's events (lambda of Eq. 7).
+    inverse_flow: weight of L_F' (Eq. 10). It is minus the log-det part of L_F, so it cancels
+        or runs away unless small: 0 by default.
+    events: what L_E compares: "rate" the expected events, "edges" the paper's Eq. 9.
+    patches: side lengths of the local patches of Eq. 9; edge: the log-intensity gradient per
+        pixel at which a patch counts as an edge.
+    """
+
+    condition: float = 1.0
+    change_l1: float = 1.0
+    parameter: float = 1.0
+    flow: float = 0.05
+    event: float = 1.0
+    inverse_flow: float = 0.0
+    summary: float = 2.0
+    spread: float = 0.2
+    adaptive: bool = True
+    confidence: bool = False
+    dequantise: float = 0.01
+    events: Literal["rate", "edges"] = "rate"
+    patches: tuple[int, ...] = (4, 8)
+    edge: float = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class NuisanceConfig:
+    """What real recordings add to the model; drawn anew for every sequence or scene.
+
+    fresh: share of sequences whose pixel memory starts at the first frame, as in a simulation.
+    odd_pixels, odd_factor: share of pixels whose thresholds are off by a factor, whatever the
+        camera's mismatch.
+    hot_pixels, hot_hz: largest share of hot pixels per polarity (half of the cameras have
+        none), and their rates.
+    jitter_s: largest standard deviation of the frame times' error; exposure_s: longest
+        exposure, averaged over `exposures` instants.
+    frame_noise_dn: standard deviation of the frames' noise before rounding to 8 bits.
+    """
+
+    fresh: float = 0.3
+    odd_pixels: float = 0.0
+    odd_factor: tuple[float, float] = (0.4, 2.5)
+    hot_pixels: float = 0.002
+    hot_hz: tuple[float, float] = (5.0, 100.0)
+    jitter_s: float = 0.001
+    exposure_s: float = 0.01
+    exposures: int = 4
+    frame_noise_dn: float = 0.5
+
+    @property
+    def sharp(self) -> bool:
+        """Whether the frames show exactly the instants of their time stamps."""
+        return self.jitter_s == 0 and self.exposure_s == 0
+
+    @staticmethod
+    def none() -> NuisanceConfig:
+        """Sharp frames, with noise alone, of a camera that has been running."""
+        return NuisanceConfig(fresh=0.0, hot_pixels=0.0, jitter_s=0.0, exposure_s=0.0,
+                              exposures=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """One training run. Content of step i depends on (config, seed, i) alone.
+
+    scenes x cameras: sequences per step; cameras share a scene (rendering is the dearer part).
+    windows: windows per sequence; window_s: range of their length (log-uniform).
+    steps_per_window: rendered frames per window; motion stays near 1 px per frame.
+    block: pixels (h, w) of each crop that the flow sees; the summary sees the whole crop.
+    sensors: pixel models; a step draws as many neighbours among them as it has cameras, and
+        splits the cameras evenly.
+    parts: of the network that learn ("summary", "encoder", "flow", "spread"); the losses that
+        touch none of them are not computed. The pixels' parts train without the summary on the
+        true one plus N(0, summary_noise^2) in its coordinates y.
+    """
+
+    model: ModelConfig = ModelConfig()
+    loss: LossConfig = LossConfig()
+    prior: CameraPrior = CameraPrior(
+        theta=(0.05, 0.6), mismatch=(0.0, 0.15), noise="mixed", eta=(0.02, 2.0), eta_spread=0.1)
+    scene: SceneConfig = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
+    sensors: tuple[SensorModel, ...] = (
+        SensorModel(eta_intensity=True), SensorModel(noise_resets_memory=True),
+        SensorModel(timestamps="v2e", noise_resets_memory=True),
+        SensorModel(cutoff_hz=200.0, refractory_s=5e-4, leak_hz=0.1, noise_resets_memory=True))
+    nuisances: NuisanceConfig = NuisanceConfig()
+    parts: tuple[str, ...] = PARTS
+    summary_noise: float = 0.1
+    crop: int = 64
+    block: tuple[int, int] = (8, 16)
+    scenes: int = 8
+    cameras: int = 2
+    windows: int = 3
+    window_s: tuple[float, float] = (0.02, 0.1)
+    steps_per_window: int = 16
+    textures: int = 192
+    steps: int = 3000
+    warmup: int = 100
+    learning_rate: float = 1e-3
+    summary_rate: float = 2e-3
+    flow_rate: float = 5e-4
+    clip: float = 1.0
+    ema: float = 0.998
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        models, changes = len(self.sensors), self.model.changes
+        group, patch = max(1, min(self.cameras, models)), max(self.loss.patches, default=1)
+        for name, value, good, rule in (
+            ("parts", self.parts, bool(self.parts) and set(self.parts) <= set(PARTS),
+             f"some of {PARTS}"),
+            ("steps", self.steps, self.steps >= 0, ">= 0"),
+            ("sensors", models, models > 0 and models % group == 0,
+             "as many as the cameras, or a multiple"),
+            ("cameras", self.cameras, self.cameras > 0 and self.cameras % group == 0,
+             "as many as the sensors of a step, or a multiple"),
+            ("block", self.block, patch <= min(self.block) and max(self.block) <= self.crop,
+             f"at least {patch}, the largest patch, to {self.crop}, the crop"),
+            ("steps_per_window", self.steps_per_window, self.steps_per_window % changes == 0,
+             f"a multiple of the model's {changes} changes"),
+        ):
+            if not good:
+                raise EvflowDataError("EV020", f"TrainConfig: {name} {value!r}.",
+                                      f"It must be {rule}.")
+
+
+PRESETS: dict[str, TrainConfig] = {
+    "default": TrainConfig(),
+    # The default's parts that see pixels one by one: many small scenes rather than few large ones.
+    # Counts are compared pixel by pixel too, as a single one's thresholds may be asked for. They
+    # are those that a video and (theta, eta) tell: of a running camera without low-pass or dead
+    # time, whose light is followed between the bins.
+    "pixels": TrainConfig(
+        loss=LossConfig(event=3.0, dequantise=0.005, patches=(1, 4, 8)),
+        sensors=(*TrainConfig.sensors[:3], TrainConfig.sensors[0]),
+        nuisances=NuisanceConfig(fresh=0.0, odd_pixels=0.15),
+        parts=("encoder", "flow", "spread"), crop=32, block=(8, 8), windows=1, scenes=16,
+        steps_per_window=32, steps=4500),
+    "paper": TrainConfig(
+        model=PAPER_MODEL,
+        loss=LossConfig(
+            events="edges", change_l1=0.0, inverse_flow=0.5, flow=1.0, summary=0.0, spread=0.0,
+            confidence=True),
+        prior=CameraPrior(theta=(0.1, 0.5), mismatch=(0.15, 0.15), noise="eq12"),
+        scene=SceneConfig.preset("paper"),
+        sensors=(SensorModel(eta_intensity=True),), nuisances=NuisanceConfig.none(),
+        parts=("encoder", "flow", "spread"), window_s=(0.032, 0.032), steps_per_window=32,
+        windows=1, learning_rate=1e-4, flow_rate=1e-4),
+    "debug": TrainConfig(
+        model=ModelConfig(
+            flow=FlowConfig(condition=41, steps=2, hidden=16), summary_hidden=32,
+            encoder_hidden=32),
+        sensors=TrainConfig.sensors[:2], nuisances=NuisanceConfig.none(),
+        crop=32, scenes=2, cameras=2, windows=2, textures=16, steps=20, warmup=5),
+}
+
+
+def preset(name: str) -> TrainConfig:
+    """A named configuration; unknown names raise EV020 with the known ones."""
+    if name not in PRESETS:
+        raise EvflowDataError(
+            "EV020", f"no preset {name!r}.", f"Choose one of {sorted(PRESETS)}.")
+    return PRESETS[name]
+
+
+def as_dict(config: Any) -> dict[str, Any]:
+    """A configuration as JSON-ready nested dicts."""
+    return dataclasses.asdict(config)

@@ -1,0 +1,137 @@
+"""What every experiment shares: provenance of a result, where results go, names of files, how a
+script runs and ends."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import jax
+import tyro
+
+from evflow.errors import EvflowDataError
+from evflow.files.atomic import atomic_write
+from evflow.network.architecture import config_of
+from evflow.network.weights import load_weights, weights_hash
+from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
+
+HOW = ("out", "workers", "max_seconds")  # options that change nothing in a result
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
+
+
+def provenance() -> dict[str, Any]:
+    """Versions and machine, saved with every result."""
+    import evflow
+
+    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+    machine = {"platform": platform.platform(), "cpus": os.cpu_count(),
+               "device": jax.devices()[0].device_kind}
+    return {"evflow": evflow.__version__, "versions": versions, "machine": machine}
+
+
+def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> None:
+    """Save a result with its configuration, the hashes of the weights that this names, and
+    provenance as JSON."""
+    with atomic_write(path, overwrite=True) as temporary:
+        record = {"result": result, "config": config, "weights_sha256": hashes(config),
+                  **provenance()}
+        temporary.write_text(json.dumps(record, indent=2, default=str) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Save a table, whole or not at all."""
+    with atomic_write(path, overwrite=True) as temporary:
+        temporary.write_text(text + "\n")
+
+
+def hashes(config: dict[str, Any]) -> dict[str, str]:
+    """SHA-256 of the released or other weights under "weights" in a configuration."""
+    named = config.get("weights") or ()
+    found = {}
+    for name in named if isinstance(named, list | tuple) else (named,):
+        with contextlib.suppress(EvflowDataError, OSError):  # made by the experiment itself
+            found[str(name)] = weights_hash(name)
+    return found
+
+
+def slug(name: str) -> str:
+    """A name that is a file name everywhere."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", name)
+
+
+@contextlib.contextmanager
+def compiled_quickly(wanted: bool) -> Iterator[None]:
+    """Programs of this block are compiled without optimisation, in half of the time, if `wanted`:
+    where they run a few times only."""
+    jax.config.update("jax_disable_most_optimizations", wanted)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", False)
+
+
+def begin(options: Any, name: str) -> None:
+    """Before the work of a script that will write NAME.json into options.out: EV020 where a count
+    among its options is less than 1, EV013 where that file is the result of other options."""
+    at_least(1, **{field.name: value for field in dataclasses.fields(options)
+                   if type(value := getattr(options, field.name)) is int and field.name != "seed"})
+    path = options.out / f"{name}.json"
+    if not path.is_file():
+        return
+    before = json.loads(path.read_text())["config"]
+    wanted = json.loads(json.dumps(dataclasses.asdict(options), default=str))
+    differ = [k for k, v in wanted.items() if k not in HOW and before.get(k) != v]
+    if differ:
+        raise EvflowDataError("EV013", f"{path} is a result of other options "
+                              f"({', '.join(differ)}).", "Choose another --out.")
+
+
+def estimator(weights: str | Path) -> tuple[str, dict[str, Any]]:
+    """The name of the architecture in `weights`, and its network; EV018 for weights of anything
+    but an estimator."""
+    params = load_weights(weights)
+    config_of(params)
+    (name, net), = params.items()
+    return name, net
+
+
+def at_least(least: float, **options: float | None) -> None:
+    """EV020 where an option that is given is less; by its name: `save_every` is --save-every."""
+    for name, value in options.items():
+        if value is not None and value < least:
+            raise EvflowDataError("EV020", f"--{name.replace('_', '-')} {value}.",
+                                  f"Give {least} or more.")
+
+
+def run_script(main: Callable[[Any], object], options: type, doc: str | None) -> NoReturn:
+    """The process of an experiment: `main` of the options on its command line."""
+    end_with(lambda: main(tyro.cli(options, description=doc)))
+
+
+def end_with(work: Callable[[], object]) -> NoReturn:
+    """Do the work and end the process: by the number that it returns, or 0; by one line and 1 on
+    an error about the data; on Ctrl-C or SIGTERM by one line, that of the exception if it says
+    anything, and 130."""
+    print_anything()
+    try:
+        with stoppable():
+            code = work()
+            sys.stdout.flush()
+    except EvflowDataError as e:
+        raise SystemExit(str(e)) from None
+    except KeyboardInterrupt as e:
+        print(str(e) or "interrupted; no half-written file is left.", file=sys.stderr)
+        leave(INTERRUPTED)
+    except BrokenPipeError:
+        unread()
+        code = 0
+    raise SystemExit(code if isinstance(code, int) else 0)

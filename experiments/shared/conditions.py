@@ -1,0 +1,230 @@
+"""What networks are trained on: the cameras of each condition of `experiments.see_better`.
+
+Every condition gives maps of the same number K of cameras and of one size, so that one compiled
+training step serves them all: drawn ones, the target's own K times, or K draws from an estimate
+and its errors. Two have no maps: EventGAN's events, and the target's own recordings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow import Recording, estimate_camera, load_weights
+from evflow.baselines import SYSTEMS
+from evflow.camera import THETA_MIN, Camera, Summary, sample_pixels
+from evflow.downstream.prior import WidePrior
+from evflow.errors import EvflowDataError
+from evflow.estimation.pipeline import pool_recording, window_inputs
+from evflow.estimation.result import CameraEstimate
+from evflow.network.api import Params, config_of, estimate_y, finish
+from evflow.network.coordinates import squash
+from evflow.network.weights import weights_path
+from evflow.recordings import iter_windows
+from experiments.shared.targets import Target
+
+Array = jax.Array
+Shape = tuple[int, int]
+
+DEFAULT, WIDE, WIDE_LOG, E2V = "default", "wide", "wide-log", "e2vid"
+OURS, ORACLE, RAW = "evflow", "oracle", "raw"
+FREE = (DEFAULT, WIDE, WIDE_LOG, E2V)  # that do not depend on the target
+# Thresholds .1 to 1 as many at .9 as at .2, or, of the prior that serves unknown cameras, .05 to 1
+# as many at .05 to .1 as at .5 to 1.
+PRIORS = {WIDE: WidePrior(theta=(0.1, 1.0), uniform=True), WIDE_LOG: WidePrior()}
+DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
+E2V_THETA = (0.18, 0.03)  # mean and deviation over cameras (Rebecq et al., PAMI 2021)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Condition:
+    """label: its name in the tables; name: of the run, one for each thing that is trained;
+    targets: what it is tested on; make: maps of K cameras (K, H, W), or None where no simulated
+    camera makes the events; source: of the file that it rests on, so that another is not taken for
+    it; generator: weights of the EventGAN that makes the events."""
+
+    label: str
+    name: str
+    targets: tuple[Target, ...]
+    make: Callable[[], Camera | None]
+    source: str = ""
+    generator: Path | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Files:
+    """Conditions from files, by name: weights of estimators of ours, what they alone see; weights
+    of EventGAN's generator; camera files."""
+
+    estimators: dict[str, Path] = dataclasses.field(default_factory=dict)
+    generators: dict[str, Path] = dataclasses.field(default_factory=dict)
+    cameras: dict[str, Path] = dataclasses.field(default_factory=dict)
+
+
+NONE = Files()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Workshop:
+    """What conditions are made of. record: a target's recording; count: K; folder: where
+    estimates are kept; params: of evflow's estimator."""
+
+    shape: Shape
+    count: int
+    folder: Path
+    record: Callable[[Target], Recording]
+    params: Any
+
+    def default(self) -> Camera:
+        """Thresholds .2 with v2e's mismatch, no noise."""
+        theta, none = jnp.full(self.count, DEFAULT_THETA), jnp.zeros(self.count)
+        sigma = jnp.full(self.count, DEFAULT_MISMATCH)
+        return sample_pixels(jax.random.key(1), Summary(theta, theta, none, none, sigma, sigma),
+                             self.shape)
+
+    def wide(self, name: str) -> Camera:
+        """Cameras of a wide prior."""
+        keys = jax.random.split(jax.random.key(2), self.count)
+        return jax.vmap(lambda key: PRIORS[name].sample(key, self.shape))(keys)
+
+    def e2vid(self) -> Camera:
+        """Cameras of the original E2VID: one threshold a polarity for all pixels, no noise."""
+        mean, deviation = E2V_THETA
+        drawn = mean + deviation * jax.random.normal(jax.random.key(4), (2, self.count, 1, 1))
+        on, off = jnp.broadcast_to(
+            jnp.maximum(drawn, THETA_MIN), (2, self.count, *self.shape))
+        none = jnp.zeros_like(on)
+        return Camera(on, off, none, none)
+
+    def same(self, camera: Camera) -> Camera:
+        """One camera, K times."""
+        return jax.tree.map(
+            lambda m: jnp.broadcast_to(m, (self.count, *self.shape)), self.fitted(camera))
+
+    def fitted(self, camera: Camera) -> Camera:
+        """Maps of this size: repeated or cut."""
+        def fit(m: Array) -> Array:
+            wanted = [-(-n // have) for n, have in zip(self.shape, m.shape, strict=True)]
+            return jnp.tile(m, wanted)[:self.shape[0], :self.shape[1]]
+
+        return jax.tree.map(fit, camera)
+
+    def stored(self, path: Path) -> Camera:
+        """Draws from the estimate in a file, or the maps in it."""
+        camera, std = Camera.load_with_std(path)
+        if std is None:
+            return self.same(camera)
+        whole, error = self.fitted(camera), self.fitted(std)
+        keys = jax.random.split(jax.random.key(3), self.count)
+        return jax.vmap(lambda key: whole.drawn(key, error))(keys)
+
+    def estimated(self, target: Target) -> Camera:
+        """The target as `estimate_camera` sees its recording."""
+        return self.kept(target, OURS, lambda r: estimate_camera(r, self.params))
+
+    def mapped(self, target: Target, name: str, params: Params) -> Camera:
+        """The target as a network alone sees its recording."""
+        return self.kept(target, name, lambda r: network_maps(r, params))
+
+    def compared(self, target: Target, name: str) -> Camera:
+        """The target as a compared system sees its recording."""
+        return self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera)
+
+    def kept(
+        self, target: Target, name: str, measure: Callable[[Recording], Camera | CameraEstimate]
+    ) -> Camera:
+        """What was measured of the target's recording, now or before."""
+        path = self.folder / f"{target.name} {name}.npz"
+        if not path.is_file():
+            measured = measure(self.record(target))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            measured.save(path)
+        return self.stored(path)
+
+
+def network_maps(recording: Recording, params: Params) -> Camera:
+    """Maps (H, W) that the network gives of a recording, averaged over its windows in y: neither
+    refinement nor its own word on how little a pixel tells, which leaves most of a weak network's
+    maps to the summary, makes up for its faults."""
+    config, summary = config_of(params), None
+    if config.pool:
+        summary, _ = finish(params, pool_recording(params, recording)[0])
+    seen = []
+    for window in iter_windows(recording):
+        voxels, dlogI, given = window_inputs(window)
+        seen.append(estimate_y(params, voxels, dlogI, summary=summary, **given)[0])
+    return squash(jnp.mean(jnp.stack(seen), 0), config.output)
+
+
+def conditions(
+    shop: Workshop, targets: Sequence[Target], names: Sequence[str], files: Files = NONE
+) -> list[Condition]:
+    """Of the names (`default`, `wide`, `wide-log`, `e2vid`, `evflow`, `oracle`, `raw`, or a
+    compared system) and of files; raises EV020 for an unknown name or one used twice."""
+    counts = Counter((*names, *files.estimators, *files.generators, *files.cameras))
+    if twice := [name for name, count in counts.items() if count > 1]:
+        raise EvflowDataError("EV020", f"two conditions are called {twice}.", "Rename one.")
+    free: dict[str, Callable[[], Camera | None]] = {
+        DEFAULT: shop.default, E2V: shop.e2vid,
+        **{name: _bound(shop.wide, name) for name in PRIORS}}
+    found = []
+    for name in names:
+        if name in FREE:
+            found.append(Condition(name, name, tuple(targets), free[name]))
+        elif name == ORACLE:
+            by_camera = {t.camera_name: t for t in targets}
+            found += [_oracle(shop, targets, t) for t in by_camera.values()]
+        elif name == OURS:
+            found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.estimated, t))
+                      for t in targets]
+        elif name == RAW:
+            found += [Condition(name, f"{t.name} {name}", (t,), lambda: None) for t in targets]
+        elif name in SYSTEMS:
+            found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.compared, t, name))
+                      for t in targets]
+        else:
+            raise EvflowDataError("EV020", f"condition {name!r}.", "Choose of "
+                                  f"{[*FREE, OURS, ORACLE, RAW, *SYSTEMS]}.")
+    for name, path in files.estimators.items():
+        params = load_weights(path)
+        found += [Condition(name, f"{t.name} {name}", (t,),
+                            _bound(shop.mapped, t, name, params), digest(weights_path(path)))
+                  for t in targets]
+    found += [Condition(name, name, tuple(targets), lambda: None, digest(path), path)
+              for name, path in files.generators.items()]
+    return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path))
+                    for name, path in files.cameras.items()]
+
+
+def _oracle(shop: Workshop, targets: Sequence[Target], one: Target) -> Condition:
+    """True maps, which targets of one camera share."""
+    alike = tuple(t for t in targets if t.camera_name == one.camera_name)
+    return Condition(ORACLE, f"{one.camera_name} {ORACLE}", alike, _bound(shop.same, one.camera))
+
+
+def _bound(make: Callable[..., Camera], *arguments: Any) -> Callable[[], Camera | None]:
+    return lambda: make(*arguments)
+
+
+def digest(path: Path) -> str:
+    """Of a file's content; EV016 without the file."""
+    if not path.is_file():
+        raise EvflowDataError("EV016", f"no file at {path}.")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def told(camera: Camera) -> dict[str, float]:
+    """Medians over all cameras and pixels, and the thresholds' spread within a camera."""
+    medians = {k: float(np.median(v)) for k, v in dataclasses.asdict(camera).items()}
+    spread = {f"sigma_{p}": float(np.median(np.std(getattr(camera, f"theta_{p}"), (-2, -1))))
+              for p in ("on", "off")}
+    return medians | spread

@@ -1,0 +1,70 @@
+"""A score for each of many hidden recordings, in one process or several side by side."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+
+from evflow import load_weights
+from evflow.process.terminal import bar
+from evflow.process.workers import worker_pool
+from evflow.scenes import make_bank
+from evflow.training.config import PRESETS
+from experiments.shared.cameras import Hidden, Protocol, hidden_recording
+
+Result = TypeVar("Result")
+Score = Callable[[Any, Hidden, Protocol], Result]  # params, recording, what it is like
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What all recordings share. photos: whether the scenes show those of the training too."""
+
+    weights: str
+    seed: int
+    photos: bool = False
+
+
+_SHARED: dict[str, Any] = {}
+
+
+def prepare(setup: Setup) -> None:
+    """Load the weights and make the textures, once a process."""
+    if _SHARED.get("setup") == setup:
+        return
+    k_bank, k_data = jax.random.split(jax.random.key(setup.seed))
+    bank = make_bank(k_bank, PRESETS["default"].textures, photos=setup.photos)
+    _SHARED.update(setup=setup, params=load_weights(setup.weights), bank=bank, key=k_data)
+
+
+def one(score: Score[Result], job: tuple[int, Protocol]) -> Result:
+    number, protocol = job
+    key = jax.random.fold_in(_SHARED["key"], number)
+    return score(_SHARED["params"], hidden_recording(key, _SHARED["bank"], protocol), protocol)
+
+
+def scores(
+    score: Score[Result], setup: Setup, jobs: Sequence[tuple[int, Protocol]], workers: int,
+    title: str,
+) -> Iterator[Result]:
+    """score(params, hidden, protocol) for each job (number, protocol), in order. A recording
+    follows from the seed, its number and its protocol alone."""
+    with bar(title) as progress:
+        for done, result in enumerate(_scores(score, setup, jobs, workers), 1):
+            progress(done, len(jobs))
+            yield result
+
+
+def _scores(
+    score: Score[Result], setup: Setup, jobs: Sequence[tuple[int, Protocol]], workers: int
+) -> Iterator[Result]:
+    if workers == 1:
+        prepare(setup)
+        yield from map(partial(one, score), jobs)
+        return
+    with worker_pool(workers, prepare, setup) as pool:
+        yield from pool.map(partial(one, score), jobs)

@@ -1,0 +1,164 @@
+"""The command line, end to end, in this process; exit codes, messages, files."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.networks import hidden
+
+from evflow import Camera, Recording, cli, read_events, write_events
+from evflow.cli import main
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rec") / "flight.h5"
+    write_events(path, hidden(15, 440)[0])
+    return path
+
+
+def test_info(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(flight), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["size"] == [64, 48]
+    assert facts["frames"] == 11
+    assert facts["windows"] == 10
+
+
+def test_estimate_then_simulate(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "cam"
+    assert main(["estimate", str(flight), "-o", str(out), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["windows"] == 10
+    assert Camera.load(out / "camera.npz").shape == (48, 64)
+    assert json.loads((out / "camera.json").read_text())["summary"] == facts["summary"]
+    for name in ("maps.png", "histograms.png"):
+        assert cv2.imread(str(out / name)).std() > 5
+    made = tmp_path / "made.h5"
+    command = ["simulate", str(flight), "--camera", str(out / "camera.npz"), "-o", str(made)]
+    assert main(command) == 0
+    again, recorded = read_events(made), read_events(flight)
+    assert 0.6 < len(again) / len(recorded) < 1.6
+    assert main(command) == 1
+    assert "EV013" in capsys.readouterr().err
+    assert main([*command, "--overwrite"]) == 0
+    assert np.array_equal(read_events(made).t, again.t)
+
+
+def test_simulate_a_video(tmp_path: Path) -> None:
+    video = tmp_path / "disc.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 50.0, (64, 48))
+    for i in range(6):
+        frame = np.full((48, 64, 3), 60, np.uint8)
+        cv2.circle(frame, (12 + 5 * i, 24), 8, (220, 220, 220), -1)
+        writer.write(frame)
+    writer.release()
+    assert main(["simulate", str(video), "-o", str(tmp_path / "disc.h5")]) == 0
+    events = read_events(tmp_path / "disc.h5")
+    assert events.size == (64, 48)
+    assert len(events) > 500
+    assert events.t[-1] <= 100_000
+    # The disc moves right: ON ahead of it, OFF behind.
+    late = events.slice(60_000, 100_001)
+    assert late.x[late.p].mean() > late.x[~late.p].mean() + 5
+
+
+def test_data_errors_are_one_line_and_exit_1(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "nothing.txt"
+    empty.write_text("hello")
+    small = tmp_path / "small.npz"
+    Camera.constant((4, 4)).save(small)
+    bare = tmp_path / "bare.h5"
+    write_events(bare, Recording.of_events(read_events(flight)))
+    out = str(tmp_path / "out")
+    for code, command in (
+        ("EV016", ["info", str(tmp_path / "absent.aedat4")]),
+        ("EV008", ["info", str(empty)]),
+        ("EV011", ["estimate", str(bare), "-o", out]),
+        ("EV016", ["estimate", str(flight), "-o", out, "--weights", "absent"]),
+        ("EV015", ["simulate", str(flight), "--camera", str(small), "-o", out + ".h5"]),
+        ("EV014", ["simulate", str(flight), "--theta-on", "0", "-o", out + ".h5"]),
+        ("EV011", ["simulate", str(bare), "-o", out + ".h5"]),
+    ):
+        assert main(command) == 1
+        error = capsys.readouterr().err
+        assert code in error
+        assert "Traceback" not in error
+    assert not Path(out + ".h5").exists()
+
+
+def test_usage_errors_exit_2() -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["estimate"])
+    assert caught.value.code == 2
+
+
+@pytest.mark.parametrize("verb", ["info", "estimate", "simulate", "version"])
+def test_every_command_has_help_with_an_example(
+    verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([verb, "--help"])
+    assert caught.value.code == 0
+    assert f"Example: evflow {verb}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_help_loads_no_jax() -> None:
+    code = ("import sys; from evflow.cli import main\n"
+            "try: main(['--help'])\nexcept SystemExit: pass\n"
+            "assert 'jax' not in sys.modules and 'cv2' not in sys.modules")
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_words_that_the_terminal_has_no_letters_for() -> None:
+    ascii_only = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
+    subprocess.run([sys.executable, "-m", "evflow", "estimate", "--help"], check=True,
+                   capture_output=True, env=ascii_only)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["version"]) == 0
+    assert "evflow 0.1.0" in capsys.readouterr().out
+    assert main(["version", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["evflow"] == "0.1.0"
+
+
+@pytest.mark.parametrize("line", ["voxel -o {}/v.npz", "render -o {}/r.png"])
+def test_facts_for_programs(
+    line: str, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, *rest = line.format(tmp_path).split()
+    assert main([verb, str(flight), *rest, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert Path(facts["out"]).is_file()
+
+
+def test_an_interrupted_process_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While XLA compiles in another thread, the usual end is a segmentation fault."""
+    def end(code: int) -> None:
+        raise SystemExit(f"at once: {code}")
+
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os._exit", end)
+    monkeypatch.setattr("sys.argv", ["evflow", "version"])
+    with pytest.raises(SystemExit) as usual:
+        cli.run()
+    assert usual.value.code == 0
+    monkeypatch.setattr("evflow.commands.version.Version.run", interrupted)
+    with pytest.raises(SystemExit, match="at once: 130"):
+        cli.run()

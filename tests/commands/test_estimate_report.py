@@ -1,0 +1,70 @@
+"""`evflow estimate` writes the report, and long work begins only where it can be written."""
+
+from __future__ import annotations
+
+import builtins
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.networks import hidden
+
+from evflow import write_events
+from evflow.cli import main
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rec") / "flight.npz"
+    write_events(path, hidden(15, 440)[0], format="npz")
+    return path
+
+
+def test_estimate_writes_the_report(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "cam"
+    command = ["estimate", str(flight), "-o", str(out), "--no-plots"]
+    assert main(command) == 0
+    text = (out / "report.html").read_text()
+    assert text.count("<section") == 10
+    assert "flight.npz" in text
+    assert text.count("sha256 ") == 2  # of the weights and of the recording
+    assert sorted(p.name for p in out.iterdir()) == ["camera.json", "camera.npz", "report.html"]
+
+
+def test_without_a_report(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "cam"
+    assert main(["estimate", str(flight), "-o", str(out), "--no-plots", "--no-report"]) == 0
+    assert not (out / "report.html").exists()
+    assert json.loads((out / "camera.json").read_text())["windows"] > 0
+
+
+@pytest.mark.parametrize("command", [["estimate"], ["compare"]])
+def test_without_matplotlib_it_says_so_at_once(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    real = builtins.__import__
+
+    def missing(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.split(".")[0] == "matplotlib":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    inputs = [str(flight)] * (1 if command == ["estimate"] else 2)
+    assert main([*command, *inputs, "-o", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "EV010" in said
+    assert "--no-plots" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("verb", ["compare", "render"])
+def test_help_has_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([verb, "--help"])
+    assert caught.value.code == 0
+    assert f"Example: evflow {verb}" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,257 @@
+"""Bench calibration on simulated screens: steps of several sizes, rests, noise."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow import Recording, simulate
+from evflow.camera import Camera, CameraPrior
+from evflow.errors import EvflowDataError
+from evflow.estimation.bench.calibration import calibrate_step
+from evflow.estimation.bench.rests import find_rests
+from evflow.io import write_recording
+from evflow.types import Events
+
+SHAPE = (24, 32)
+CYCLES = [25, 225, 25, 225, 25, 225, 25]
+STAIRS = [25, 40, 64, 100, 160, 225, 160, 100, 64, 40, 25]
+
+
+def screen(levels: list[float], rest: int = 100, ramp: int = 20) -> np.ndarray:
+    """DN over time, a frame every ms: `rest` ms at each level, `ramp` ms (even in log) between."""
+    logs = [np.full(rest, np.log(levels[0]))]
+    for a, b in itertools.pairwise(levels):
+        logs += [np.linspace(np.log(a), np.log(b), ramp + 1)[1:], np.full(rest, np.log(b))]
+    return np.exp(np.concatenate(logs)).astype(np.float32)
+
+
+def bench(camera: Camera, levels: list[float], before: tuple[float, ...] = ()) -> Recording:
+    """Events of a screen and its frames every 10 ms. before: levels that the camera saw first."""
+    lead = len(screen([*before, levels[0]])) - 100 if before else 0
+    dn = screen([*before, *levels])
+    frames, times = np.broadcast_to(dn[:, None, None], (len(dn), *SHAPE)), 1000 * np.arange(len(dn))
+    events = simulate(jax.random.key(0), frames, times, camera)
+    kept = np.arange(lead, len(dn), 10)
+    events = events.slice(int(times[lead]) + 1, int(times[-1]) + 1)
+    return Recording(events, np.ascontiguousarray(frames[kept]), times[kept])
+
+
+def cameras(mismatch: float, noise: str = "none") -> Camera:
+    prior = CameraPrior(theta=(0.15, 0.35), mismatch=(mismatch, mismatch), noise=noise)
+    return Camera.sample(jax.random.key(3), SHAPE, prior)
+
+
+def errors(found, camera: Camera, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the valid pixels, and in units of the std."""
+    off = np.asarray(getattr(found.camera, name)) - np.asarray(getattr(camera, name))
+    return off[found.valid], (off / np.asarray(getattr(found.std, name)))[found.valid]
+
+
+@pytest.mark.parametrize("levels", [CYCLES, STAIRS, [25, 225, 25]], ids=["cycles", "stairs", "two"])
+@pytest.mark.parametrize("mismatch", [0.03, 0.1])
+def test_steps_tell_every_pixels_thresholds(levels: list[float], mismatch: float) -> None:
+    """Unbiased to .003, each pixel within its std; the literal ratio is biased by .02 and more."""
+    camera = cameras(mismatch)
+    recording = bench(camera, levels)
+    found = calibrate_step(recording, fresh=True)
+    literal = calibrate_step(recording, literal=True)
+    assert found.valid.mean() > 0.98
+    for name in ("theta_on", "theta_off"):
+        off, sigmas = errors(found, camera, name)
+        assert abs(off.mean()) < 0.003
+        assert np.abs(off).mean() < 0.015
+        assert 0.7 < np.sqrt((sigmas**2).mean()) < 1.4
+        assert errors(literal, camera, name)[0].mean() > 0.02
+        true = np.median(getattr(camera, name))
+        assert float(getattr(found.summary, name)) == pytest.approx(true, abs=0.012)
+        spread = float(getattr(found.summary, f"sigma_{name[6:]}"))
+        assert spread == pytest.approx(mismatch, abs=0.015)
+
+
+def test_a_running_camera_starts_anywhere() -> None:
+    """Light that came down before the first rest: up to theta_off to go back. The std covers it."""
+    camera = cameras(0.03)
+    found = calibrate_step(bench(camera, CYCLES, before=(150.0, 60.0)))
+    for name in ("theta_on", "theta_off"):
+        off, sigmas = errors(found, camera, name)
+        assert abs(off.mean()) < 0.006
+        assert np.sqrt((sigmas**2).mean()) < 1.4
+
+
+def test_quantisation_shrinks_with_the_step() -> None:
+    """One step: the error is that of a count of dlogI / theta, the std says so."""
+    camera = cameras(0.03)
+    stds = []
+    for top in (50, 100, 225):
+        found = calibrate_step(bench(camera, [25, top]), fresh=True)
+        _, sigmas = errors(found, camera, "theta_on")
+        assert 0.6 < np.sqrt((sigmas**2).mean()) < 1.4
+        stds.append(np.median(np.asarray(found.std.theta_on)[found.valid]))
+        assert "no step sends OFF events" in " ".join(found.warnings)
+    assert stds[0] > 1.5 * stds[1] > 1.5 * stds[2]
+
+
+def test_noise_is_taken_off_and_measured() -> None:
+    camera = cameras(0.03, "eq12")
+    found = calibrate_step(bench(camera, CYCLES), fresh=True)
+    for name in ("theta_on", "theta_off"):
+        off, sigmas = errors(found, camera, name)
+        assert abs(off.mean()) < 0.004
+        assert np.sqrt((sigmas**2).mean()) < 1.4
+    rest = 0.56 * SHAPE[0] * SHAPE[1]  # pixel seconds
+    for name in ("eta_on", "eta_off"):
+        true = float(np.mean(getattr(camera, name)))
+        seen = float(getattr(found.summary, name))
+        assert abs(seen - true) < 3.5 * np.sqrt(true / rest)
+
+
+def test_light_may_be_given_instead_of_frames() -> None:
+    camera = cameras(0.03)
+    recording = bench(camera, CYCLES)
+    times = recording.frame_times
+    rests = [(int(times[a]), int(times[b])) for a, b in find_rests(recording)]
+    assert len(rests) == len(CYCLES)
+    alone = calibrate_step(Recording.of_events(recording.events), rests_us=rests,
+                           light=[4.0 * x for x in CYCLES], fresh=True)
+    framed = calibrate_step(recording, fresh=True)
+    np.testing.assert_allclose(alone.camera.theta_on, framed.camera.theta_on, atol=1e-4)
+
+
+def test_results_are_written_like_an_estimate(tmp_path: Path) -> None:
+    found = calibrate_step(bench(cameras(0.03), [25, 225, 25]), fresh=True)
+    path = found.save(tmp_path / "camera.npz")
+    np.testing.assert_array_equal(Camera.load(path).theta_on, found.camera.theta_on)
+    assert found.as_dict()["windows"] == 2
+
+
+def test_what_is_no_bench_is_refused() -> None:
+    recording = bench(cameras(0.03), [25, 225])
+    none = np.zeros(0, np.int64)
+    empty = Events(none, none, none, none, (SHAPE[1], SHAPE[0]))
+    cases = {
+        "EV001": lambda: calibrate_step(Recording.of_events(empty)),
+        "EV011": lambda: calibrate_step(Recording.of_events(recording.events)),
+        "EV017": lambda: calibrate_step(bench(cameras(0.03, "eq12"), [100, 105])),
+        "EV020": lambda: calibrate_step(recording, rests_us=[(0, 10), (5, 20)], light=[1, 2]),
+    }
+    for code, call in cases.items():
+        with pytest.raises(EvflowDataError, match=code):
+            call()
+    with pytest.raises(EvflowDataError, match="EV020"):
+        calibrate_step(recording, rests_us=[(0, 10), (15, 20)], light=[1, 0])
+    swapped = dataclasses.replace(recording.events, p=~recording.events.p)
+    with pytest.raises(EvflowDataError, match="EV021"):
+        calibrate_step(dataclasses.replace(recording, events=swapped))
+
+
+def textured(shift_px: int, part: float = 1.0) -> Recording:
+    """A texture under CYCLES, which moves `shift_px` per frame; only `part` of it is the screen."""
+    base = bench(cameras(0.03), CYCLES)
+    texture = np.exp(0.2 * cv2.GaussianBlur(
+        np.random.default_rng(0).standard_normal((SHAPE[0], 4096)), (0, 0), 2.0) * 7.0)
+    light = np.asarray(base.frames)[:, 0, 0]
+    frames = np.stack([255 * np.roll(texture, i * shift_px, 1)[:, :SHAPE[1]] / texture.max()
+                       * light[i] / light.max() for i in range(len(light))])
+    frames[:, :, round(part * SHAPE[1]):] = 40.0
+    return dataclasses.replace(base, frames=frames.astype(np.float32))
+
+
+def test_frames_must_show_a_screen_that_steps() -> None:
+    """A still texture does as well; one that moves, or that most pixels do not see, does not."""
+    assert len(find_rests(textured(0))) == len(CYCLES)
+    assert calibrate_step(textured(0, part=0.7)).valid.any()
+    with pytest.raises(EvflowDataError, match=r"EV017.*the scene moves while the light rests"):
+        calibrate_step(textured(2))
+    with pytest.raises(EvflowDataError, match="EV017"):
+        calibrate_step(textured(0, part=0.3))
+    several = textured(0, part=0.3)
+    rests = [(0, 90_000), (120_000, 210_000)]
+    with pytest.raises(EvflowDataError, match=r"EV017.*step 1 of 1 is none of the whole view"):
+        calibrate_step(several, rests_us=rests)
+
+
+def dim(levels: list[float], noise_dn: float = 1.0, screen_part: float = 1.0) -> Recording:
+    """Whole grey levels of a screen that a lens darkens towards its corners, with frame noise."""
+    rng = np.random.default_rng(0)
+    base = bench(cameras(0.03), levels)
+    y, x = (np.linspace(-1, 1, n) for n in SHAPE)
+    lens = 1 / (1 + 0.6 * (y[:, None] ** 2 + x[None] ** 2)) ** 2
+    frames = np.asarray(base.frames) * lens
+    frames[:, :, round(screen_part * SHAPE[1]):] = 4.0
+    noisy = np.clip(frames + noise_dn * rng.standard_normal(frames.shape), 0, 255)
+    return dataclasses.replace(base, frames=np.round(noisy).astype(np.uint8))
+
+
+@pytest.mark.parametrize("recording", [
+    dim([8, 40, 8, 40, 8]), dim([4, 16, 4, 16, 4]), dim([25, 225, 25, 225, 25], 3.0),
+    dim([25, 225, 25, 225, 25], screen_part=0.6)], ids=["dim", "dark", "noisy", "part"])
+def test_few_grey_levels_and_a_lens_are_no_motion(recording: Recording) -> None:
+    """One DN is .15 log units at 6 DN: the median pixel jumps where the light rests."""
+    steps = len(find_rests(recording)) - 1
+    assert steps == 4
+    assert len(calibrate_step(recording).camera.shape) == 2
+
+
+def test_a_lamp_that_settles_is_no_motion() -> None:
+    base = bench(cameras(0.03), [25, 225, 25])
+    light = np.asarray(base.frames)[:, 0, 0]
+    since = np.arange(len(light)) - np.r_[0, 1 + np.flatnonzero(np.diff(light) > 20)][-1]
+    settling = light * np.where(since >= 0, 1 + 0.15 * np.exp(-np.maximum(since, 0) / 5.0), 1.0)
+    frames = np.broadcast_to(np.minimum(settling, 255)[:, None, None], base.frames.shape)
+    assert len(find_rests(dataclasses.replace(base, frames=frames.astype(np.float32)))) >= 2
+
+
+def test_light_that_changes_while_frames_rest_is_told() -> None:
+    """A camera that regulates its exposure shows rests where there are none."""
+    base = bench(cameras(0.03), CYCLES)
+    frames = np.asarray(base.frames).copy()
+    half = len(frames) // 2
+    frames[:half], frames[half:] = 100.0, 200.0
+    found = calibrate_step(dataclasses.replace(base, frames=frames))
+    assert "in company while the frames rest" in " ".join(found.warnings)
+    quiet = calibrate_step(bench(cameras(0.03, "eq12"), CYCLES))
+    assert "in company" not in " ".join(quiet.warnings)
+
+
+def test_few_measured_pixels_are_told() -> None:
+    """Steps of a threshold and a half: one event each, of which a direction needs two."""
+    found = calibrate_step(bench(Camera.constant(SHAPE, 0.45, 0.45), [60, 120, 60]), fresh=True)
+    assert not found.valid.any()
+    assert "0% of the pixels sent enough events" in " ".join(found.warnings)
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The bench by the command line: a screen's steps, and what its noise sends at rest."""
+    from evflow.cli import main
+
+    camera = Camera.constant(SHAPE, 0.2, 0.25, 1.0, 0.5)
+    source, still = tmp_path / "screen.npz", tmp_path / "still.npz"
+    write_recording(source, bench(camera, CYCLES))
+    dark = Recording(bench(camera, [100] * 20).events, np.zeros((0, *SHAPE), np.uint8), np.zeros(0))
+    write_recording(still, dark)
+
+    def run(path: Path, protocol: str, *more: str) -> tuple[int, str]:
+        code = main(["estimate", str(path), "-o", str(tmp_path / protocol), "--protocol", protocol,
+                     "--no-plots", "--json", *more])
+        return code, capsys.readouterr().out
+
+    code, out = run(source, "step")
+    assert (code, json.loads(out)["protocol"]) == (0, "step")
+    assert not (tmp_path / "step" / "report.html").exists()
+    found = Camera.load(tmp_path / "step" / "camera.npz")
+    assert abs(float(jnp.median(found.theta_on)) - 0.2) < 0.01
+    assert abs(float(jnp.median(found.theta_off)) - 0.25) < 0.01
+    code, out = run(still, "static")
+    assert code == 0
+    assert json.loads(out)["summary"]["eta_on"] == pytest.approx(1.0, rel=0.1)
+    assert run(source, "static")[0] == 1  # a screen that steps is no scene at rest
+    assert run(source, "step", "--overwrite", "--window-ms", "30")[0] == 2

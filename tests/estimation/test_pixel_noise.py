@@ -1,0 +1,101 @@
+"""Noise rates of single pixels: as uneven as their events show, with errors that say so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from evflow.estimation.pixel_noise import _shapes, pixel_rates, quiet_time
+
+SHAPE = (96, 128)
+NONE_HOT = np.zeros(SHAPE, bool)
+
+
+def drawn(spread: float, seconds: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Rates (H, W) around .4 Hz, and events in these seconds."""
+    rng = np.random.default_rng(seed)
+    rates = 0.4 * (rng.gamma(spread**-2, spread**2, SHAPE) if spread else np.ones(SHAPE))
+    return rates, rng.poisson(rates * seconds)
+
+
+@pytest.mark.parametrize("spread", [0.2, 0.5, 1.0])
+def test_intervals_hold_the_rates(spread: float) -> None:
+    seconds = np.random.default_rng(1).uniform(0.0, 20.0, SHAPE)
+    rates, events = drawn(spread, seconds)
+    found, std = pixel_rates(events, seconds, 0.4, NONE_HOT)
+    away = np.abs(found - rates) / std
+    # A gamma distribution is steeper than a normal one: of spread 1, 86 % lie within its std.
+    assert 0.64 < (away < 1).mean() < 0.78
+    assert 0.93 < (away < 1.96).mean() < 0.97
+    assert np.square(found - rates).mean() < 0.95 * rates.var()
+    assert np.square(found - rates).mean() == pytest.approx(np.square(std).mean(), rel=0.15)
+
+
+def test_equal_pixels_stay_equal() -> None:
+    rates, events = drawn(0.0, np.full(SHAPE, 5.0))
+    found, std = pixel_rates(events, np.full(SHAPE, 5.0), 0.4, NONE_HOT)
+    assert np.abs(found / rates - 1.0).max() < 0.1
+    assert std.max() < 0.07 * 0.4
+
+
+def test_pixels_that_were_not_watched_have_the_camera_s_rate() -> None:
+    seconds = np.where(np.arange(SHAPE[1]) < 64, 10.0, 0.0) * np.ones(SHAPE)
+    _, events = drawn(0.5, seconds)
+    found, std = pixel_rates(events, seconds, 0.3, NONE_HOT)
+    np.testing.assert_allclose(found[:, 64:], 0.3)
+    np.testing.assert_allclose(std[:, 64:], 0.3 * 0.5, rtol=0.1)
+    nothing, wide = pixel_rates(0 * events, 0 * seconds, 0.3, NONE_HOT)
+    np.testing.assert_allclose(nothing, 0.3)
+    assert 0.02 < wide.min() / 0.3 == wide.max() / 0.3 < 0.2
+
+
+def test_hot_pixels_have_their_own_rate_and_leave_the_others_alone() -> None:
+    seconds = np.full(SHAPE, 4.0)
+    _, events = drawn(0.3, seconds)
+    hot = NONE_HOT.copy()
+    hot[5, 7] = True
+    loud = events.copy()
+    loud[5, 7] = 400
+    found, std = pixel_rates(loud, seconds, 0.4, hot)
+    assert found[5, 7] == 100.0
+    assert std[5, 7] == pytest.approx(np.sqrt(401) / 4)
+    np.testing.assert_array_equal(
+        found[~hot], pixel_rates(events, seconds, 0.4, hot)[0][~hot])
+
+
+def test_spreads_are_as_likely_as_the_negative_binomial_says() -> None:
+    expected = np.random.default_rng(2).uniform(0.1, 4.0, 300)
+    n = np.random.default_rng(3).poisson(expected * 1.2)
+    shapes, weights = _shapes(n, expected)
+    likely = np.array([stats.nbinom.logpmf(n, a, a / (a + expected)).sum() for a in shapes])
+    prior = -0.5 * (np.log(shapes**-0.5 / 0.05) / 0.6) ** 2
+    np.testing.assert_allclose(np.log(weights[1:] / weights[:-1]), np.diff(likely + prior),
+                               rtol=1e-8, atol=1e-8)
+
+
+def watched(counts: np.ndarray, dlog: np.ndarray, hot: np.ndarray = NONE_HOT) -> np.ndarray:
+    return quiet_time(counts, dlog, np.ones(SHAPE, bool), hot, 0.05, np.array([0.1, 0.1]))
+
+
+def test_quiet_is_where_nothing_else_fires_or_changes() -> None:
+    counts, dlog = np.zeros((2, *SHAPE), int), np.zeros(SHAPE, np.float32)
+    counts[0, 40, 50] = 3
+    dlog[:, 100:] = 0.2
+    dlog[:20, :60] = 0.008  # a drift of .16 a second
+    on, off = watched(counts, dlog)
+    assert on[0].sum() == 3  # its own events are no company
+    assert on[1, 40, 50] == off[1, 40, 51] == np.float32(0.05)
+    assert on[1, 40, 51] == on[1, 44, 46] == 0.0  # but they are for its neighbours
+    assert on[1, 45, 50] == np.float32(0.05)
+    assert not off[:, :, 99:].any()
+    assert not off[1, :17, :57].any()
+    assert (off[1, 23:, :98] == np.float32(0.05)).all()
+
+
+def test_hot_pixels_are_no_company() -> None:
+    counts, hot = np.zeros((2, *SHAPE), int), NONE_HOT.copy()
+    counts[:, 40, 50], hot[40, 50] = 3, True
+    on, _ = watched(counts, np.zeros(SHAPE, np.float32), hot)
+    assert (on[1] == np.float32(0.05)).all()
+    assert on[0, 40, 50] == 3

@@ -1,0 +1,132 @@
+"""What experiment scripts refuse before any work, so that nothing is lost and none is in vain."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evflow.errors import EvflowDataError
+from evflow.training.checkpoint import Checkpoints
+from experiments import (
+    ablate,
+    calibrate,
+    changes,
+    combine,
+    compare_systems,
+    coverage,
+    curves,
+    evaluate,
+    fuse,
+    generate,
+    integrate,
+    limits,
+    noise_rates,
+    one_polarity,
+    quickstart,
+    see_better,
+    tell_apart,
+    train,
+)
+from experiments.shared.common import begin, estimator, write_result
+
+FITS: list[Any] = [calibrate, fuse, tell_apart]
+
+
+@pytest.mark.parametrize(("script", "option"), [
+    (ablate, "steps"), (changes, "batches"), (compare_systems, "sequences"),
+    (coverage, "recordings"), (coverage, "workers"), (curves, "recordings"),
+    (evaluate, "sequences"), (generate, "scenes"), (integrate, "seeds"), (limits, "sequences"),
+    (noise_rates, "seeds"), (one_polarity, "recordings"), (quickstart, "width"),
+    (quickstart, "milliseconds")], ids=lambda x: x if isinstance(x, str) else x.__name__)
+@pytest.mark.parametrize("count", [0, -1])
+def test_counts_below_one(script: Any, option: str, count: int, tmp_path: Path) -> None:
+    given: dict[str, Any] = {option: count, "out": tmp_path / "out"}
+    if script is ablate:
+        given["study"] = "losses"
+    with pytest.raises(EvflowDataError, match=rf"EV020.*--{option} {count}"):
+        script.main(script.Options(**given))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_result_of_other_options_is_not_replaced(tmp_path: Path) -> None:
+    options = generate.Options(out=tmp_path, scenes=3)
+    begin(options, "generate")
+    write_result(tmp_path / "generate.json", {}, dataclasses.asdict(options))
+    begin(options, "generate")
+    other = dataclasses.replace(options, scenes=4, seed=5)
+    with pytest.raises(EvflowDataError, match=r"EV013.*other options \(seed, scenes\)"):
+        begin(other, "generate")
+    workers = evaluate.Options(out=tmp_path, workers=2)
+    write_result(tmp_path / "evaluate.json", {}, dataclasses.asdict(workers))
+    begin(dataclasses.replace(workers, workers=1), "evaluate")
+
+
+@pytest.mark.parametrize("script", FITS, ids=lambda s: s.__name__)
+def test_existing_weights_are_seen_before_the_work(script: Any, tmp_path: Path) -> None:
+    out = tmp_path / "made.safetensors"
+    out.write_text("kept")
+    with pytest.raises(EvflowDataError, match="EV013"):
+        script.main(script.Options("default", out=out))
+    assert out.read_text() == "kept"
+    with pytest.raises(EvflowDataError, match=r"EV020.*\.safetensors"):  # could not be read again
+        script.main(script.Options("default", out=tmp_path / "made"))
+
+
+@pytest.mark.parametrize("script", FITS, ids=lambda s: s.__name__)
+def test_weights_of_event_networks_are_no_estimator(script: Any, tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match="EV018"):
+        script.main(script.Options("e2vid-small", out=tmp_path / "made.safetensors"))
+
+
+def test_parts_are_those_of_estimators(tmp_path: Path) -> None:
+    out = tmp_path / "made.safetensors"
+    for weights, given in (("e2vid-small", {"pixels": ("default",)}),
+                           ("default", {"summary": "e2vid-small"}),
+                           ("default", {"pixels": ("evflownet-small",)})):
+        with pytest.raises(EvflowDataError, match="EV018"):
+            combine.main(combine.Options(weights, out=out, **given))
+    assert estimator("default")[0] == "default"
+
+
+def test_a_run_starts_from_something() -> None:
+    fresh: Any = SimpleNamespace(params={"default": {"flow": {"kernel": np.zeros(3)}}})
+    for weights in ("e2vid-small", "default"):  # another network, and one of other sizes
+        with pytest.raises(EvflowDataError, match=r"EV018.*no part of the network"):
+            train.started_from(fresh, weights)
+
+
+def test_a_file_is_no_folder_of_a_run(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(EvflowDataError, match=r"EV019.*is a file"):
+        Checkpoints(tmp_path / "file")
+
+
+def test_a_refused_command_leaves_its_folder_to_the_next(tmp_path: Path) -> None:
+    for wrong in ({"names": ("foo",)}, {"cameras": (f"mine={tmp_path / 'absent.npz'}",)}):
+        with pytest.raises(EvflowDataError, match=r"EV020|EV016"):
+            see_better.main(see_better.Options(out=tmp_path / "sb", **wrong))
+    assert not (tmp_path / "sb").exists()
+
+
+def test_rows_are_those_of_this_command(tmp_path: Path) -> None:
+    path = tmp_path / "rows.npz"
+    for damaged in (b"no rows", b"PK\x03\x04 cut"):
+        path.write_bytes(damaged)
+        with pytest.raises(EvflowDataError, match="EV009"):
+            fuse.saved_rows(path, "0 a", 5)
+    np.savez(path, next=4, origin="0 a", y=np.arange(6.0).reshape(3, 2))
+    begun, rows = fuse.saved_rows(path, "0 a", 5)
+    assert (begun, [r["y"].tolist() for r in rows]) == (4, [[0, 1], [2, 3], [4, 5]])
+    for origin, most in (("1 a", 5), ("0 a", 3)):
+        with pytest.raises(EvflowDataError, match="EV013"):
+            fuse.saved_rows(path, origin, most)
+
+
+def test_real_recordings_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV016.*absent"):
+        compare_systems.main(compare_systems.Options(data=tmp_path / "absent", out=tmp_path))

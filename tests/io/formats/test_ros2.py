@@ -1,0 +1,98 @@
+"""ROS 2 bags: messages as another serialiser writes them come back exactly; damage only raises
+data errors."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+from helpers.bags import as_sent, holds
+from helpers.bags2 import SUFFIX, Store
+from helpers.recordings import SIZE, damage, equal, make, refused
+from helpers.streams import survives
+
+from evflow.io import read_events, read_recording
+from evflow.io.formats.ros.messages import Message
+from evflow.types import Events
+
+
+@pytest.mark.parametrize(("storage", "compression"), [
+    ("SQLITE3", None), ("SQLITE3", "MESSAGE"), ("SQLITE3", "FILE"), ("MCAP", None),
+    ("MCAP", "STORAGE")])
+def test_event_arrays_and_images(tmp_path: Path, storage: str, compression: str | None) -> None:
+    want, store = make(), Store.new()
+    path = store.write(tmp_path / "bag", {
+        "/dvs/events": store.arrays(want.events), "/dvs/image_raw": store.images(want)},
+        storage, compression)
+    holds(path, want)
+
+
+@pytest.mark.parametrize("storage", SUFFIX)
+def test_a_file_alone_is_a_bag(tmp_path: Path, storage: str) -> None:
+    want, store = make().events, Store.new()
+    folder = store.write(tmp_path / "bag", {"/cam/events": store.packets(want, "mono")}, storage)
+    file, = folder.glob(f"*{SUFFIX[storage]}")
+    equal(read_events(file), want)
+
+
+@pytest.mark.parametrize("encoding", ["evt3", "mono", "libcaer", "libcaer_cmp"])
+def test_event_packets(tmp_path: Path, encoding: str) -> None:
+    want, store = make().events, Store.new()
+    path = store.write(tmp_path / "bag", {
+        "/cam/events": store.packets(want, encoding), "/cam/image_raw": store.images(make())},
+        "MCAP")
+    got = read_recording(path)
+    equal(got.events, as_sent(want, encoding))
+    assert got.has_frames == encoding.startswith("libcaer")
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_few_events_are_packed_as_in_ros_1(count: int) -> None:
+    """An event takes 13 bytes, or 16 behind another."""
+    store, some = Store.new(), make().events
+    part = Events(some.x[:count], some.y[:count], some.t[:count], some.p[:count], SIZE)
+    kind, _, message = store.array(part, 5)
+    raw = bytes(store.types.serialize_cdr(message, kind))
+    packet = Message(raw, 0, aligned=True).events(kind)
+    assert packet.data == b"".join(
+        struct.pack("<2H2IB", x, y, t // 10**6, t % 10**6 * 1000, p)
+        for x, y, t, p in zip(part.x.tolist(), part.y.tolist(), part.t.tolist(), part.p.tolist(),
+                              strict=True))
+
+
+def test_what_is_no_message_of_ros_2_is_said(tmp_path: Path) -> None:
+    store, want = Store.new(), make()
+    only = store.write(tmp_path / "images", {"/dvs/image_raw": store.images(want)})
+    assert refused(only).code == "EV008"
+    big = store.write(tmp_path / "big", {"/dvs/events": store.arrays(want.events)})
+    file, = big.glob("*.db3")
+    kind, _, message = store.arrays(want.events)[2]
+    begin = bytes(store.types.serialize_cdr(message, kind))[:12]
+    assert file.read_bytes().count(begin) == 1
+    file.write_bytes(file.read_bytes().replace(begin, b"\0\0" + begin[2:]))
+    error = refused(big)
+    assert error.code == "EV009"
+    assert "message 2: it begins with 0000" in str(error)
+
+
+def test_a_database_that_is_cut_off_is_refused(tmp_path: Path) -> None:
+    """SQLite reads rows from what is left, in whatever order."""
+    store, want = Store.new(), make()
+    folder = store.write(tmp_path / "bag", {"/dvs/events": store.arrays(want.events)})
+    file, = folder.glob("*.db3")
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-4096])
+    error = refused(file)
+    assert error.code == "EV009"
+    assert f"has {len(whole) - 4096:,} of {len(whole):,} bytes" in str(error)
+
+
+@pytest.mark.parametrize("storage", SUFFIX)
+def test_damaged_copies_only_raise_data_errors(tmp_path: Path, storage: str) -> None:
+    store, want = Store.new(), make(300, 2)
+    folder = store.write(tmp_path / "bag", {
+        "/dvs/events": store.arrays(want.events), "/dvs/image_raw": store.images(want)}, storage)
+    file, = folder.glob(f"*{SUFFIX[storage]}")
+    damage(file, 100, lambda: survives(folder))
+    damage(folder / "metadata.yaml", 100, lambda: survives(folder))

@@ -1,0 +1,46 @@
+"""The encoder on columns of pixels is the module that is trained."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers.networks import jiggle
+
+from evflow.network import encoder
+from evflow.network.config import ModelConfig
+
+CONFIG = ModelConfig(changes=4, piece=6, encoder_hidden=24)
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("changes", [4, 1])
+def test_columns_are_the_module(outputs: int, changes: int) -> None:
+    config = dataclasses.replace(CONFIG, changes=changes)
+    module = encoder.IntensityEncoder(config, outputs)
+    x = 3.0 * jax.random.normal(jax.random.key(0), (50, 10)) + 1.0
+    params = jiggle(module.init(jax.random.key(1), x)["params"], 0.3)
+    expected: Any = module.apply({"params": params}, x)
+    logits, feature = expected
+    folded = encoder.fold(params)
+    got = encoder.feature_columns(folded, x.T)
+    np.testing.assert_allclose(got.T, feature, atol=2e-5)
+    columns = encoder.change_columns(folded, got, config)
+    assert columns.shape == (outputs * changes, len(x))
+    np.testing.assert_allclose(columns.T, encoder.changes_of_logits(logits), atol=5e-5)
+
+
+def test_folded_layers_have_no_mean_to_take_off() -> None:
+    module = encoder.IntensityEncoder(CONFIG, 2)
+    params = jiggle(module.init(jax.random.key(1), jnp.ones((1, 10)))["params"], 0.3)
+    folded = encoder.fold(params)
+    for index in range(encoder.NORMS):
+        layer = folded[f"Dense_{index}"]
+        np.testing.assert_allclose(layer["kernel"].mean(-1), 0.0, atol=1e-6)
+        np.testing.assert_allclose(layer["bias"].mean(), 0.0, atol=1e-6)
+    last = f"Dense_{encoder.NORMS}"
+    np.testing.assert_array_equal(folded[last]["kernel"], params[last]["kernel"])

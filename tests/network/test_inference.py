@@ -1,0 +1,86 @@
+"""The fast pass over pixels is encode and forward, in any chunks and shares."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers.networks import jiggle, seen, small_params
+
+from evflow.camera import Summary
+from evflow.errors import EvflowDataError
+from evflow.network import api, architecture, inference
+from evflow.network.config import MODELS
+from evflow.process import chunks
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+close = {"rtol": 0, "atol": 2e-5}
+
+
+def estimated(**given: Any) -> tuple[Any, Any]:
+    voxels, dL, _ = seen()
+    return api.estimate_y(small_params(), voxels, dL.sum(-1), **given)
+
+
+def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = estimated()
+    for name in ("SMALL", "LARGE", "HUGE"):
+        monkeypatch.setattr(chunks, name, 32)
+    jax.clear_caches()  # the sizes are not among the arguments
+    for a, b in zip(whole, estimated(), strict=True):
+        np.testing.assert_allclose(a, b, **close)
+    jax.clear_caches()
+
+
+@pytest.mark.slow
+def test_shares_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    voxels, dL, _ = seen()
+    images = jnp.stack([voxels, voxels[::-1]])
+    dlogI = jnp.stack([dL.sum(-1), dL.sum(-1)[::-1]])
+    intensity = 4.0 + 0.1 * dlogI
+    for given in ({}, {"intensity": intensity}):
+        whole = api.estimate_y(small_params(), images, dlogI, **given)
+        with monkeypatch.context() as m:
+            m.setattr(chunks, "executions", lambda *_: 7)  # of 120 pixels: 18 each, the last early
+            shared = api.estimate_y(small_params(), images, dlogI, **given)
+        for a, b in zip(whole, shared, strict=True):
+            np.testing.assert_allclose(a, b, **close)
+
+
+def test_shares_are_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks, "executions", lambda *_: 3)
+    estimated()
+    before = inference._share._cache_size()
+    estimated(window_s=0.03)
+    assert inference._share._cache_size() == before
+
+
+def test_context_of_all_pixels_is_that_of_each() -> None:
+    known = estimated(intensity=jnp.nan)  # unknown, but given pixel by pixel
+    for a, b in zip(estimated(), known, strict=True):
+        np.testing.assert_allclose(a, b, **close)
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_it_is_encode_and_forward(name: str) -> None:
+    voxels, dL, _ = seen()
+    params = small_params()
+    if name == "paper":
+        paper = MODELS["paper"]
+        small = dataclasses.replace(paper.flow, steps=2, hidden=16)
+        init = jax.jit(architecture.init, static_argnums=(1, 2))
+        params = jax.jit(jiggle)(init(
+            jax.random.key(0), dataclasses.replace(paper, flow=small), "paper"), 0.1)
+    known = Summary(*(jnp.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
+    given = {"summary": known, "intensity": 3.0 + dL[..., 0]}
+    code = api.encode(params, voxels, dL.sum(-1), **given)
+    y, _, _ = api.forward(params, voxels, code)
+    got, _ = api.estimate_y(params, voxels, dL.sum(-1), **given)
+    np.testing.assert_allclose(got, y, rtol=1e-4, atol=1e-4 * float(jnp.abs(y).max()))
+    if name == "paper":  # there is nothing around which y could be expected
+        with pytest.raises(EvflowDataError, match="EV018"):
+            api.log_prob(params, voxels, code)

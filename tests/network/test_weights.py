@@ -1,0 +1,67 @@
+"""Weights on disk: lossless, self-describing, refused when damaged; what ships fits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from helpers.networks import small_params
+from safetensors.numpy import save
+
+from evflow.errors import EvflowDataError
+from evflow.network.weights import (
+    load_weights,
+    model_card,
+    save_weights,
+    trained_steps,
+    weights_path,
+)
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "w.safetensors", small_params(), {"steps": 7})
+    jax.tree.map(np.testing.assert_array_equal, load_weights(path), small_params())
+    assert model_card(path) == {"steps": 7}
+    assert trained_steps(model_card(path)) == {"all": 7}
+
+
+def test_same_params_same_bytes(tmp_path: Path) -> None:
+    a, b = (save_weights(tmp_path / f"{n}.safetensors", small_params(), {"b": 1, "a": 2})
+            for n in "ab")
+    assert a.read_bytes() == b.read_bytes()
+
+
+def test_refusals(tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "w.safetensors", small_params(), {})
+    with pytest.raises(EvflowDataError, match="EV013"):
+        save_weights(path, small_params(), {})
+    with pytest.raises(EvflowDataError, match=r"EV016.*default"):
+        load_weights("nonsense")
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(EvflowDataError, match="EV009"):
+        load_weights(path)
+
+
+def test_names_and_cards_by_which_weights_can_be_read_again(tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*\.safetensors"):
+        save_weights(tmp_path / "weights", {"a": np.zeros(3)}, {})
+    path = tmp_path / "a.safetensors"
+    for card in ("[1]", "3", "null"):
+        path.write_bytes(save({"a": np.zeros(3, np.float32)}, metadata={"card": card}))
+        with pytest.raises(EvflowDataError, match=r"EV009.*no object"):
+            model_card(path)
+
+
+def test_shipped_weights_are_small_finite_and_explained() -> None:
+    assert weights_path().stat().st_size <= 6e6
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(load_weights()))
+    card = model_card()
+    for part in ("pixels", "summary"):
+        assert card[part]["steps"] > 100
+        assert {"config", "seed", "preset", "training_figures", "versions"} <= set(card[part])
+    assert card["fusion"]["recordings"] > 100
+    steps = trained_steps(card)
+    assert {"pixels", "summary"} <= set(steps)
+    assert all(count > 0 for count in steps.values())

@@ -1,0 +1,111 @@
+"""One way to stop: a signal ends the block, wherever it comes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from evflow.errors import EvflowDataError
+from evflow.process.terminal import INTERRUPTED, stoppable
+from experiments.shared import common
+
+
+def test_a_signal_ends_the_block_through_its_cleaning_up() -> None:
+    cleaned = []
+
+    def work() -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+            time.sleep(10)
+        finally:
+            cleaned.append(True)
+
+    with pytest.raises(KeyboardInterrupt), stoppable():
+        work()
+    assert cleaned
+
+
+def test_a_signal_where_exceptions_are_ignored_comes_again() -> None:
+    class Collected:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+            sys.getsizeof(self)  # the handler runs here at the latest, and raises
+
+    def endless() -> None:
+        Collected()
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    hook, handler = sys.unraisablehook, signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), stoppable():
+        endless()
+    assert (sys.unraisablehook, signal.getsignal(signal.SIGTERM)) == (hook, handler)
+
+
+def test_a_signal_amid_an_import_waits_for_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "interrupted_import.py").write_text(
+        "import signal\nsignal.raise_signal(signal.SIGTERM)\nwhole = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def work() -> None:
+        import interrupted_import
+
+        assert interrupted_import.whole
+        time.sleep(10)
+
+    with pytest.raises(KeyboardInterrupt), stoppable():
+        work()
+    # Of a block that is itself run by an import, no end of that import is waited for.
+    (tmp_path / "running_import.py").write_text(
+        "import signal, time\nfrom evflow.process.terminal import stoppable\n"
+        "with stoppable():\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(10)\n")
+    with pytest.raises(KeyboardInterrupt):
+        import running_import  # noqa: F401
+
+
+def test_scripts_whose_output_nobody_reads_end_quietly(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("from experiments.shared import common\n"
+                      "common.end_with(lambda: print('line\\n' * 100_000))\n")
+    run = subprocess.run(f"{sys.executable} {script} | head -n 1", shell=True, timeout=60,
+                         capture_output=True, text=True, cwd=Path(common.__file__).parents[2],
+                         env=os.environ | {"PYTHONPATH": str(Path(common.__file__).parents[2])})
+    assert (run.stdout, run.stderr) == ("line\n", "")
+
+
+def test_scripts_end_with_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def left(code: int) -> None:
+        raise SystemExit(code)
+
+    def told() -> None:
+        raise KeyboardInterrupt("stopped after step 3.")
+
+    def wrong() -> None:
+        raise EvflowDataError("EV001", "nothing.")
+
+    monkeypatch.setattr(common, "leave", left)
+    for work, code, line in (
+        (lambda: signal.raise_signal(signal.SIGTERM), INTERRUPTED, "interrupted; no half-"),
+        (told, INTERRUPTED, "stopped after step 3."), (wrong, "EV001 empty input: nothing.", ""),
+        (lambda: 1, 1, ""), (lambda: {"figure": 2.0}, 0, ""),
+    ):
+        with pytest.raises(SystemExit) as end:
+            common.end_with(work)
+        assert end.value.code == code
+        assert capsys.readouterr().err.startswith(line)
+
+
+def test_all_scripts_end_alike() -> None:
+    for path in Path(common.__file__).parents[1].glob("*.py"):
+        _, main, last = path.read_text().partition('if __name__ == "__main__":\n')
+        assert not main or last.startswith(("    run_script(main, ", "    end_with(")), path.name

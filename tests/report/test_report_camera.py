@@ -1,0 +1,231 @@
+"""The report on a camera: ten panels, nothing from outside, and words that follow the numbers."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import io
+import json
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers.networks import hidden
+from PIL import Image
+
+import evflow
+from evflow import CameraEstimate, EvflowDataError, Recording
+from evflow.report import camera, page
+from evflow.report.resimulate import busiest, usable_runs
+from evflow.report.verdict import judge_estimate, judge_stream, poorer, worst
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+PANELS = ("verdict", "maps", "on-off", "rates", "images", "counts", "intervals", "faults",
+          "held-out", "assumptions")
+
+
+@pytest.fixture(scope="module")
+def measured() -> tuple[CameraEstimate, Recording]:
+    """Of the first half alone: the programs are those that the held-out half runs again."""
+    recording = hidden(15, 440)[0]
+    times = recording.frame_times
+    half = Recording(recording.events.slice(int(times[0]), int(times[5])), recording.frames[:6],
+                     times[:6])
+    return evflow.estimate_camera(half), recording
+
+
+@pytest.fixture(scope="module")
+def report(
+    measured: tuple[CameraEstimate, Recording], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, Any]]:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    steps: list[tuple[int, int]] = []
+    numbers = evflow.write_report(
+        path, *measured, command="evflow estimate flight.h5 -o cam/",
+        progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(i, camera.STAGES) for i in range(1, camera.STAGES + 1)]
+    return path, numbers
+
+
+def test_all_panels_are_there_and_nothing_is_loaded(report: tuple[Path, dict[str, Any]]) -> None:
+    text = report[0].read_text()
+    assert re.findall(r'<section id="([\w-]+)">', text) == list(PANELS)
+    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert len(sources) >= 8 + 4 + 2 + 2 + 3 + 2 + 2 + 1  # maps, histograms, ...
+    assert all(s.startswith("data:") for s in sources)
+    assert not re.search(r"https?://|@import|url\(", text)
+    assert "evflow estimate flight.h5 -o cam/" in text
+    assert len(re.findall(r"sha256 [0-9a-f]{64}", text)) == 1  # the weights; no file was named
+    assert len(text) < 1_500_000
+
+
+def test_every_picture_opens(report: tuple[Path, dict[str, Any]]) -> None:
+    text = report[0].read_text()
+    kinds = {"png": 0, "svg+xml": 0}
+    for kind, data in re.findall(r'"data:image/(png|svg\+xml);base64,([^"]+)"', text):
+        kinds[kind] += 1
+        raw = base64.b64decode(data)
+        if kind == "png":
+            with Image.open(io.BytesIO(raw)) as image:
+                assert image.size == (64, 48)
+        else:
+            assert ET.fromstring(raw).tag.endswith("svg")
+            hrefs = re.findall(rb'href="([^"]*)"', raw)
+            assert all(h.startswith((b"#", b"data:")) for h in hrefs)
+    assert kinds["png"] == 8 + 3 + 1
+    assert kinds["svg+xml"] == 4 + 2 + 2 + 2 + 2
+
+
+def test_the_numbers_lie_in_the_page(report: tuple[Path, dict[str, Any]]) -> None:
+    path, numbers = report
+    inside = re.search(r'id="numbers">(.*?)</script>', path.read_text(), re.S)
+    assert inside
+    assert json.loads(inside[1]) == json.loads(json.dumps(numbers))
+    trial, held = numbers["trial"], numbers["held_out"]
+    assert 0.6 < trial["rate_hz"]["ratio"]["both"] < 1.6  # the right camera, interpolated frames
+    assert trial["counts"]["r"]["both"] > 0.5
+    assert trial["ceiling"]["both"] > trial["counts"]["r"]["both"]
+    assert held["span_us"][0] >= trial["span_us"][0]
+    assert numbers["grade"] in ("good", "fair", "poor")
+
+
+def test_it_opens_in_a_browser(report: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which(
+        "google-chrome")
+    if not browser:
+        pytest.skip("no chromium at hand")
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr",
+               f"--user-data-dir={tmp_path / 'profile'}", "--window-size=390,844"]
+    url = report[0].as_uri()
+    done = subprocess.run([*command, "--dump-dom", url], capture_output=True, text=True,
+                          timeout=120, check=True)
+    assert re.findall(r'<section id="([\w-]+)">', done.stdout) == list(PANELS)
+    assert "CONSOLE" not in done.stderr
+    shot = tmp_path / "shot.png"
+    subprocess.run([*command, f"--screenshot={shot}", url], capture_output=True, timeout=120,
+                   check=True)
+    with Image.open(shot) as image:
+        assert np.asarray(image.convert("L")).std() > 10
+
+
+def changed(found: CameraEstimate, **summary: float) -> CameraEstimate:
+    values = {k: jnp.float32(v) for k, v in summary.items()}
+    return dataclasses.replace(found, summary=dataclasses.replace(found.summary, **values))
+
+
+def test_without_frames_it_says_why(
+    measured: tuple[CameraEstimate, Recording], tmp_path: Path
+) -> None:
+    found, recording = measured
+    noise = dataclasses.replace(
+        found, windows=0, valid=np.zeros_like(found.valid), hot=np.zeros_like(found.hot),
+        warnings=("no frames: theta_on and theta_off are undetermined.",))
+    numbers = evflow.write_report(
+        tmp_path / "noise.html", noise, Recording.of_events(recording.events))
+    text = (tmp_path / "noise.html").read_text()
+    assert re.findall(r'<section id="([\w-]+)">', text) == list(PANELS)
+    assert numbers["trial"] is None
+    assert text.count("Absent: ") == 5
+    assert text.count("Undetermined: the recording does not tell.") == 2
+    assert "Not all of the camera is known." in text
+    assert "of a static scene" in text
+
+
+def test_too_short_for_halves_says_so(
+    measured: tuple[CameraEstimate, Recording], tmp_path: Path
+) -> None:
+    found, recording = measured
+    two = Recording(recording.events, recording.frames[:2], recording.frame_times[:2])
+    numbers = evflow.write_report(tmp_path / "short.html", found, two)
+    assert numbers["trial"] is not None
+    assert numbers["held_out"] is None
+    assert "cannot be halved" in (tmp_path / "short.html").read_text()
+
+
+def test_what_is_refused(measured: tuple[CameraEstimate, Recording], tmp_path: Path) -> None:
+    found, recording = measured
+    (tmp_path / "there.html").write_text("mine")
+    bare = Recording.of_events(recording.events)
+    noise = dataclasses.replace(found, windows=0)
+    with pytest.raises(EvflowDataError, match="EV013"):
+        evflow.write_report(tmp_path / "there.html", noise, bare)
+    other = Recording.of_events(dataclasses.replace(recording.events, size=(80, 48)))
+    with pytest.raises(EvflowDataError, match="EV015"):
+        evflow.write_report(tmp_path / "a.html", found, other)
+    assert (tmp_path / "there.html").read_text() == "mine"
+
+
+def stream(ratio: float | None, r: float | None) -> dict[str, Any]:
+    both = {"on": ratio, "off": ratio}
+    return {"rate_hz": {"ratio": both}, "counts": {"r": {"on": r, "off": r}}}
+
+
+@pytest.mark.parametrize(("ratio", "r", "grades"), [
+    (1.0, 0.9, ["good", "good"]), (1.3, 0.9, ["fair", "good"]), (1 / 1.3, 0.6, ["fair", "fair"]),
+    (0.4, 0.2, ["poor", "poor"]), (2.5, None, ["poor"]), (None, None, ["poor"]),
+    (0.0, None, ["poor"]),
+])
+def test_grades_follow_the_numbers(
+    ratio: float | None, r: float | None, grades: list[str]
+) -> None:
+    judged = judge_stream(stream(ratio, r), "on", "re-simulated", {"on": 1.0, "off": 1.0})
+    assert [j.grade for j in judged] == grades
+    assert all(bool(j.advice) == (j.grade != "good") for j in judged)
+    assert all(j.about == "ON" for j in judged)
+
+
+def test_r_is_held_against_what_is_possible() -> None:
+    judged = judge_stream(stream(1.0, 0.45), "on", "re-simulated", {"on": 0.5, "off": 0.5})
+    assert [j.grade for j in judged] == ["good", "good"]
+
+
+def test_the_poorer_polarity_is_named(measured: tuple[CameraEstimate, Recording]) -> None:
+    found = measured[0]
+    loose = dataclasses.replace(found, summary_std=dataclasses.replace(
+        found.summary_std, theta_off=0.5 * found.summary.theta_off))
+    judged = judge_estimate(loose, None, None)
+    assert poorer(judged) == "OFF"
+    assert worst(judged) == "poor"
+    far = dataclasses.replace(found, warnings=("theta_on = 0.91 lies outside the 0.1-0.5",))
+    assert poorer(judge_estimate(far, None, None)) == "ON"
+    lost = changed(found, theta_on=float("nan"))
+    assert next(iter(judge_estimate(lost, None, None))).short == "undetermined"
+
+
+def test_the_busiest_stretch_is_bounded_and_without_gaps() -> None:
+    recording = hidden(15, 440)[0]
+    runs = usable_runs(recording)
+    assert runs == [(0, len(recording.frames) - 1)]
+    first, last = busiest(recording, runs, seconds=0.1)
+    assert last - first == 2  # frames come every 40 ms
+    times = recording.frame_times
+    counts = [len(recording.events.slice(int(times[i]), int(times[i + 2])))
+              for i in range(len(times) - 2)]
+    assert first == int(np.argmax(counts))
+    assert busiest(recording, [(3, 5)]) == (3, 5)
+
+
+def test_words_and_tables_are_escaped() -> None:
+    assert page.text("<b>&") == "&lt;b&gt;&amp;"
+    assert "<script>" not in page.bullets(["<script>alert(1)</script>"])
+    assert page.number(None) == page.number(float("nan")) == "–"
+    assert page.number(0.01234) == "0.0123"
+    assert page.number(12345.6) == "12,346"
+    assert page.number(-0.25, 2) == "−0.25"
+    assert page.spread(0.3949, 0.0092) == "0.3949 ± 0.0092"
+    assert page.spread(0.448, 0.013) == "0.448 ± 0.013"
+
+
+def test_large_maps_are_shown_in_blocks() -> None:
+    small, k = page.blocks(np.arange(16.0).reshape(4, 4), 2)
+    assert k == 2
+    np.testing.assert_array_equal(small, [[2.5, 4.5], [10.5, 12.5]])
+    same, k = page.blocks(np.ones((3, 5)), 5)
+    assert (same.shape, k) == ((3, 5), 1)

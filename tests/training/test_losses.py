@@ -1,0 +1,104 @@
+"""Each equation against a calculation by hand."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow.training import losses
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+
+def test_condition_loss_is_least_at_the_target() -> None:
+    target = jnp.float32(0.02)
+    logits = jnp.linspace(-8.0, 0.0, 4001)
+    best = logits[jnp.argmin(losses.condition_loss(logits, target))]
+    assert float(jax.nn.sigmoid(best)) == pytest.approx(0.02, rel=0.02)
+    # Eq. 6 by hand: |0.5 - 0.2|^2 * ln 2 at logit 0, whatever the target's entropy split.
+    assert float(losses.condition_loss(jnp.zeros(()), jnp.float32(0.2))) == pytest.approx(
+        0.3**2 * np.log(2.0), rel=1e-5)
+
+
+def test_parameter_loss_by_hand() -> None:
+    a, b = jnp.array([0.3, 0.2, 0.0, 0.1]), jnp.array([0.1, 0.2, 0.0, 0.1])
+    assert float(losses.parameter_loss(a, b)) == pytest.approx(np.sqrt(0.04 + 1e-6), rel=1e-5)
+    assert float(losses.parameter_loss(a, a)) == pytest.approx(1e-3, rel=1e-4)
+    assert float(losses.parameter_loss(a, b, 0.5)) == pytest.approx(np.sqrt(0.01 + 1e-6), rel=1e-5)
+
+
+def test_confidence_weights_have_mean_one() -> None:
+    voxels = jnp.abs(jax.random.normal(jax.random.key(0), (5, 3, 3, 32)))
+    weights = losses.confidence_weight(voxels)
+    assert float(weights.mean()) == pytest.approx(1.0, rel=1e-5)
+    assert int(jnp.argmax(weights)) == int(jnp.argmax(voxels.sum((1, 2, 3))))
+
+
+def test_flow_losses_are_negatives() -> None:
+    assert float(losses.flow_loss(jnp.float32(1.0), jnp.float32(2.0), jnp.float32(4.0))) == -7.0
+    assert float(losses.inverse_flow_loss(jnp.float32(3.0))) == -3.0
+
+
+def test_event_loss_sees_edges_and_noise() -> None:
+    voxels = jnp.abs(jax.random.normal(jax.random.key(0), (8, 8, 32)))
+    exact = jnp.arcsinh(voxels)
+    moving, still = jnp.full((8, 8), 0.5), jnp.zeros((8, 8))
+    for dL in (moving, still):
+        assert float(losses.event_loss(exact, voxels, dL, (4, 8), 0.1)) < 3e-3
+        assert float(losses.event_loss(exact + 0.5, voxels, dL, (4, 8), 0.1)) > 0.02
+    # In a still patch only the number of events counts: shuffled in time costs nothing.
+    shuffled = jnp.arcsinh(jnp.concatenate([voxels[..., 15::-1], voxels[..., :15:-1]], -1))
+    assert float(losses.event_loss(shuffled, voxels, still, (4,), 0.1)) < 1e-5
+    assert float(losses.event_loss(shuffled, voxels, moving, (4,), 0.1)) > 0.1
+
+
+def test_event_loss_survives_wild_flows() -> None:
+    voxels = jnp.zeros((4, 4, 32))
+    grad = jax.grad(lambda g: losses.event_loss(g, voxels, voxels[..., 0], (4,), 0.1))
+    assert np.isfinite(grad(jnp.full((4, 4, 32), 200.0))).all()
+
+
+@pytest.mark.parametrize("mean", [0.05, 0.7, 20.0])
+def test_dispersion_is_least_at_the_mean(mean: float) -> None:
+    """Rare events have median 0, and weights that know the truth would favour fewer."""
+    true = jnp.asarray(np.random.default_rng(0).poisson(mean, 200_000), jnp.float32)
+    slope = jax.vmap(jax.grad(
+        lambda made: losses.dispersion(made, true, jax.nn.relu(made) + 0.1).mean()))
+    tried = jnp.linspace(0.5 * mean, 1.5 * mean, 201)
+    best = tried[jnp.argmin(jnp.abs(slope(tried)))]
+    assert float(best) == pytest.approx(mean, rel=0.03)
+
+
+def test_rate_loss_wants_expected_events_in_every_bin() -> None:
+    voxels = jnp.asarray(np.random.default_rng(1).poisson(0.3, (2000, 4, 4, 32)), jnp.float32)
+
+    def loss(made: jax.Array) -> jax.Array:
+        return losses.rate_loss(jnp.broadcast_to(jnp.arcsinh(made), voxels.shape), voxels,
+                                jnp.full(voxels.shape, 0.4), (4,)).mean()
+
+    even = jnp.full((32,), 0.3)
+    assert float(loss(even)) < float(loss(0.7 * even))
+    assert float(loss(even)) < float(loss(1.3 * even))
+    # The right total at the wrong times is worse.
+    assert float(loss(even)) < float(loss(even.at[:16].mul(0.5).at[16:].mul(1.5)))
+    assert np.isfinite(jax.grad(loss)(jnp.full((32,), 1e4))).all()
+
+
+@pytest.mark.parametrize(("loss", "weight"), [
+    (2.3e3, 1e-3), (-47.0, 0.1), (9.99, 1.0), (0.01, 1.0), (10.0, 0.1)])
+def test_adaptive_weight(loss: float, weight: float) -> None:
+    assert float(losses.adaptive_weight(jnp.float32(loss))) == pytest.approx(weight, rel=1e-5)
+
+
+def test_adaptive_weight_has_no_gradient() -> None:
+    scaled = jax.grad(lambda x: losses.adaptive_weight(x) * x)(jnp.float32(50.0))
+    assert float(scaled) == pytest.approx(0.1)
+
+
+def test_summary_loss_pulls_the_std_to_the_error() -> None:
+    y, target = jnp.full((6,), 0.3), jnp.zeros((6,))
+    stds = jnp.linspace(0.05, 1.0, 400)
+    values = jax.vmap(lambda s: losses.summary_loss(y, jnp.full((6,), s), target).mean())(stds)
+    assert float(stds[jnp.argmin(values)]) == pytest.approx(0.3, abs=0.01)
