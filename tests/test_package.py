@@ -15,8 +15,8 @@ import evflow
 ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
 FLOORS = (
-    ("errors", "checks", "files", "pickles", "folders", "chunks",
-     "workers"),
+    ("process",), ("errors", "checks", "moves", "whole", "files", "pickles", "folders", "chunks",
+                   "workers"),
     ("types", "progress", "distributed", "colour"), ("io",),
     ("camera", "camera_estimate", "sensors", "metrics", "faults"),
     ("pixels", "intensity", "stillness", "rates"),
