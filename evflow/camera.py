@@ -20,6 +20,7 @@ import numpy as np
 from evflow.errors import EvflowDataError, naming
 from evflow.files import atomic_write
 from evflow.io.archives import load_npz
+from evflow.whole import need_members
 
 Array = jax.Array
 
@@ -127,8 +128,10 @@ class Camera:
         units = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
         arrays: dict[str, Any] = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
         arrays |= {k: np.asarray(v) for k, v in extra.items()}
-        with atomic_write(path, overwrite=overwrite) as temporary, open(temporary, "wb") as f:
-            np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
+        with atomic_write(path, overwrite=overwrite) as temporary:
+            with open(temporary, "wb") as f:
+                np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
+            need_members(temporary, {f"{name}.npy": None for name in ("meta", *arrays)})
         return Path(path)
 
     @staticmethod

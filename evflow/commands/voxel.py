@@ -51,6 +51,7 @@ class Voxel(Reading):
         from evflow.files import atomic_write
         from evflow.progress import bar
         from evflow.voxel import voxelize
+        from evflow.whole import need_members
 
         check_finite(self)
         if self.bins < 2 or not self.window_ms >= 0.001:
@@ -70,13 +71,15 @@ class Voxel(Reading):
                 progress(i + 1, len(starts))
 
         with (bar("voxels") as progress,
-              atomic_write(self.out, overwrite=self.overwrite) as temporary,
-              zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive):
-            _store(archive, "voxels", shape, np.float32, grids())
-            _store(archive, "t0_us", starts.shape, np.int64, [starts])
-            _store(archive, "window_us", lengths.shape, np.int64, [lengths])
-            if len(pairs):
-                _store(archive, "dlogI", shape[:3], np.float32, _changes(recording, pairs))
+              atomic_write(self.out, overwrite=self.overwrite) as temporary):
+            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+                _store(archive, "voxels", shape, np.float32, grids())
+                _store(archive, "t0_us", starts.shape, np.int64, [starts])
+                _store(archive, "window_us", lengths.shape, np.int64, [lengths])
+                if len(pairs):
+                    _store(archive, "dlogI", shape[:3], np.float32, _changes(recording, pairs))
+                members = archive.namelist()
+            need_members(temporary, dict.fromkeys(members))
         for note in (*recording.notes, *notes):
             print(f"note: {note}", file=sys.stderr)
         gigabytes = 4e-9 * np.prod(shape, dtype=float)

@@ -20,6 +20,7 @@ from evflow.io.hints import Hints
 from evflow.io.stream import collect
 from evflow.io.writer import SECONDS_US, EventWriter, blocks
 from evflow.types import Events, Recording
+from evflow.whole import need_members, need_size
 
 NAME = "e2vid"
 EXTENSIONS: tuple[str, ...] = (".zip", ".txt")
@@ -94,10 +95,17 @@ class E2vidWriter(EventWriter):
                 temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1))
             name = f"{self.path.stem}.txt"
             self._file = stack.enter_context(archive.open(name, "w", force_zip64=True))
-        self._file.write(b"%d %d\n" % self.size)
+        self._bytes = self._file.write(b"%d %d\n" % self.size)
 
     def _write(self, events: Events) -> None:
         for part in blocks(events, LINES):
             seconds, us = np.divmod(part.t, 1_000_000)
             rows = np.stack([seconds, us, part.x, part.y, part.p], 1)
-            self._file.write(b"%d.%06d %d %d %d\n" * len(rows) % tuple(rows.ravel().tolist()))
+            self._bytes += self._file.write(
+                b"%d.%06d %d %d %d\n" * len(rows) % tuple(rows.ravel().tolist()))
+
+    def _verify(self, temporary: Path) -> None:
+        if self.path.suffix.lower() == ".txt":
+            need_size(temporary, self._bytes)
+        else:
+            need_members(temporary, {f"{self.path.stem}.txt": self._bytes})
