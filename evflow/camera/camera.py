@@ -23,6 +23,7 @@ from evflow.files.atomic import atomic_write
 
 if TYPE_CHECKING:
     from evflow.camera.prior import CameraPrior
+from evflow.files.whole import need_members
 
 Array = jax.Array
 
@@ -127,8 +128,10 @@ class Camera:
         units = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
         arrays: dict[str, Any] = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
         arrays |= {k: np.asarray(v) for k, v in extra.items()}
-        with atomic_write(path, overwrite=overwrite) as temporary, open(temporary, "wb") as f:
-            np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
+        with atomic_write(path, overwrite=overwrite) as temporary:
+            with open(temporary, "wb") as f:
+                np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
+            need_members(temporary, {f"{name}.npy": None for name in ("meta", *arrays)})
         return Path(path)
 
     @staticmethod

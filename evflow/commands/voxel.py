@@ -49,6 +49,7 @@ class Voxel(Reading):
 
     def run(self) -> None:
         from evflow.files.atomic import atomic_write
+        from evflow.files.whole import need_members
         from evflow.process.terminal import bar
         from evflow.voxel import voxelize
 
@@ -70,13 +71,15 @@ class Voxel(Reading):
                 progress(i + 1, len(starts))
 
         with (bar("voxels") as progress,
-              atomic_write(self.out, overwrite=self.overwrite) as temporary,
-              zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive):
-            _store(archive, "voxels", shape, np.float32, grids())
-            _store(archive, "t0_us", starts.shape, np.int64, [starts])
-            _store(archive, "window_us", lengths.shape, np.int64, [lengths])
-            if len(pairs):
-                _store(archive, "dlogI", shape[:3], np.float32, _changes(recording, pairs))
+              atomic_write(self.out, overwrite=self.overwrite) as temporary):
+            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+                _store(archive, "voxels", shape, np.float32, grids())
+                _store(archive, "t0_us", starts.shape, np.int64, [starts])
+                _store(archive, "window_us", lengths.shape, np.int64, [lengths])
+                if len(pairs):
+                    _store(archive, "dlogI", shape[:3], np.float32, _changes(recording, pairs))
+                members = archive.namelist()
+            need_members(temporary, dict.fromkeys(members))
         for note in (*recording.notes, *notes):
             print(f"note: {note}", file=sys.stderr)
         gigabytes = 4e-9 * np.prod(shape, dtype=float)

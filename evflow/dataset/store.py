@@ -12,14 +12,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from evflow.checks import COLUMNS
 from evflow.dataset.sequence import SPLITS, Arrays, EventSequence, truth_layout
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
+from evflow.files.folders import atomic_folder
+from evflow.files.whole import need_size
 from evflow.io import DsecWriter, read_recording
 from evflow.io.decode.hdf5 import DAMAGE, load_h5py, plausible
 from evflow.types import Events, Recording
@@ -78,7 +79,7 @@ def read_sequence(path: str | os.PathLike) -> EventSequence:
 def write_sequence(path: str | os.PathLike, sequence: EventSequence, format: Format) -> None:
     """Write a sequence to `path` (an .h5 file, or a folder that is made), which must not exist.
 
-    A file appears when it is complete; a folder is complete when this returns.
+    Either appears when it is complete.
     Raises EV010 (no h5py), EV013 (exists), EV019 (cannot be written).
     """
     {"dsec": _write_dsec, "npy": _write_npy}[format](Path(path), sequence)
@@ -92,8 +93,9 @@ class _SequenceWriter(DsecWriter):
         for name, array in truth.items():
             values = array.astype(np.uint8) if array.dtype == bool else array
             rows = 1 if array.ndim > 2 else len(array)
-            self._create(name, array.shape[1:], values.dtype, rows)
-            self._extend(name, values)
+            with self._guard():
+                self._create(name, array.shape[1:], values.dtype, rows)
+                self._extend(name, values)
 
 
 def _write_dsec(path: Path, sequence: EventSequence) -> None:
@@ -124,16 +126,19 @@ def _read_dsec(path: Path) -> EventSequence:
 def _write_npy(path: Path, sequence: EventSequence) -> None:
     events = {f"events/{name}": getattr(sequence.events, name) for name in COLUMNS}
     frames = {"frames": sequence.frames, "frame_times": sequence.frame_times}
-    for name, array in (events | frames | sequence.truth).items():
-        with atomic_write(_npy(path, name)) as temporary, open(temporary, "wb") as file:
-            _save(file, array)
+    with atomic_folder(path, names=()) as folder:
+        for name, array in (events | frames | sequence.truth).items():
+            _save(_npy(folder, name), array)
 
 
-def _save(file: BinaryIO, array: np.ndarray) -> None:
+def _save(path: Path, array: np.ndarray) -> None:
     """numpy.save, but for the error of a full disk, which tofile raises without its number."""
     npy = np.lib.format
-    npy.write_array_header_1_0(file, npy.header_data_from_array_1_0(array))
-    file.write(np.ascontiguousarray(array).data)
+    with open(path, "wb") as file:
+        npy.write_array_header_1_0(file, npy.header_data_from_array_1_0(array))
+        size = file.tell() + array.nbytes
+        file.write(np.ascontiguousarray(array).data)
+    need_size(path, size)
 
 
 def _read_npy(path: Path) -> EventSequence:

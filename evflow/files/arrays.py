@@ -14,6 +14,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.archives import npy_header
+from evflow.files.whole import need_size
 
 
 def mapped(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -72,10 +73,13 @@ class GrowingArray:
         self.rows += len(rows)
 
     def close(self) -> None:
-        """Write the number of rows into the header; without it the file says 0."""
+        """Write the number of rows into the header, without which the file says 0; EV019 where not
+        all rows are there."""
         self._file.seek(0)
         self._header()
+        size = self._file.tell() + self.rows * math.prod(self.item) * self.dtype.itemsize
         self._file.close()
+        need_size(Path(self._file.name), size)
 
     def _header(self) -> None:
         # NumPy leaves room for the first axis to grow: the header keeps its length.

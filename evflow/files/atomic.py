@@ -5,26 +5,61 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import secrets
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
+from evflow.files.moves import move_new, remove
+from evflow.process.alive import is_dead, mark
+from evflow.process.signals import uninterrupted
+
+NAME_BYTES = 180  # of a name, in that of its temporary file; file systems take 255 in all
+LEFTOVER = re.compile(r"([0-9a-f]+-[0-9a-f]+)\.[0-9a-f]{8}\.(tmp|part)(\.\w+)?")
+REASONS = {
+    errno.ENOSPC: "no space left", errno.EDQUOT: "the quota is used up",
+    errno.EFBIG: "larger than the file system takes", errno.EIO: "the disk failed",
+    errno.EPERM: "not permitted", errno.EACCES: "permission denied",
+    errno.EROFS: "read-only file system", errno.ENOENT: "no such folder",
+    errno.ENOTDIR: "its folder is a file", errno.EEXIST: "its folder is a file",
+    errno.EISDIR: "it is a folder", errno.ENAMETOOLONG: "the name is too long"}
 
 
 def aside(path: Path, ending: str) -> Path:
-    """A hidden name beside `path` that no other process has, on whatever machine it runs."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{ending}")
+    """A hidden name beside `path` that no other process has, on whatever machine it runs. One that
+    ends in tmp or part goes with the next writing of `path`, should this process be killed."""
+    return path.with_name(f"{_begin(path)}{mark()}.{secrets.token_hex(4)}.{ending}")
+
+
+def clear_leftovers(path: Path) -> None:
+    """Remove what killed processes left beside `path` for it; nothing of one that may live."""
+    begin = _begin(path)
+    with contextlib.suppress(OSError):
+        for name in os.listdir(path.parent):
+            found = LEFTOVER.fullmatch(name[len(begin):]) if name.startswith(begin) else None
+            if found and is_dead(found[1]):
+                remove(path.with_name(name))
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it into place only if the block succeeds.
 
-    Raises EV013 where `path` exists and `overwrite` is false, or is no file, EV019 where the disk
-    is full or the path cannot be written. The temporary file is removed on any failure, Ctrl-C
-    included.
+    Raises EV013 where `path` exists, or does by the end, and `overwrite` is false, or is no file,
+    EV019 where the disk is full or the path cannot be written. The temporary file is removed on any
+    failure, Ctrl-C included; that of a killed process, by the next one that writes `path`.
     """
+    with written_aside(path, _move, overwrite=overwrite) as temporary:
+        yield temporary
+
+
+@contextlib.contextmanager
+def written_aside(
+    path: str | os.PathLike, move: Callable[[Path, Path, bool], None], *, overwrite: bool
+) -> Iterator[Path]:
+    """`atomic_write` of a file or folder; move(temporary, path, overwrite) puts it in place."""
     path = Path(path)
     if os.path.exists(path) and not overwrite:  # false, not an error, for an impossible path
         raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).")
@@ -34,20 +69,35 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
     temporary = aside(path, "tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            os.lstat(path)  # a name that is too long, before the work
+        clear_leftovers(path)
         yield temporary
-        os.replace(temporary, path)
+        with uninterrupted():
+            move(temporary, path, overwrite)
     except OSError as e:
-        reasons = {errno.ENOSPC: "no space left", errno.EDQUOT: "the quota is used up",
-                   errno.EFBIG: "larger than the file system takes", errno.EIO: "the disk failed",
-                   errno.EPERM: "not permitted", errno.EACCES: "permission denied",
-                   errno.EROFS: "read-only file system", errno.ENOENT: "no such folder",
-                   errno.ENOTDIR: "its folder is a file", errno.EEXIST: "its folder is a file",
-                   errno.EISDIR: "it is a folder", errno.ENAMETOOLONG: "the name is too long"}
-        if e.errno in reasons:
+        if e.errno in REASONS:
             raise EvflowDataError(
-                "EV019", f"{path} was not written ({reasons[e.errno]}).",
+                "EV019", f"{path} was not written ({REASONS[e.errno]}).",
                 "Nothing is left behind; free space or choose another output.") from e
         raise
     finally:
-        with contextlib.suppress(OSError):  # where even the folder is missing
-            temporary.unlink()
+        with uninterrupted():
+            remove(temporary)
+
+
+def _move(temporary: Path, path: Path, overwrite: bool) -> None:
+    if overwrite:
+        os.replace(temporary, path)
+    else:
+        move_new(temporary, path)
+
+
+def _begin(path: Path) -> str:
+    """How the names of all temporary files of `path` begin; a long name is cut, and told from
+    others by its checksum."""
+    name = os.fsencode(path.name)
+    if len(name) > NAME_BYTES:
+        cut = name[:NAME_BYTES].decode(errors="ignore")
+        return f".{cut}~{zlib.crc32(name):08x}."
+    return f".{path.name}."

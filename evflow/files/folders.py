@@ -9,7 +9,9 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import aside, atomic_write
+from evflow.files.atomic import aside, atomic_write, clear_leftovers, written_aside
+from evflow.files.moves import move_new, swap_folders
+from evflow.process.signals import uninterrupted
 
 
 @contextlib.contextmanager
@@ -23,25 +25,27 @@ def atomic_folder(
     Raises EV013 and EV019 as `atomic_write`; nothing is left behind by any failure.
     """
     path = Path(path).resolve()
+
+    def move(temporary: Path, path: Path, overwrite: bool) -> None:
+        if overwrite and path.is_dir():
+            _refuse_foreign(path, names)  # again: the work may have taken hours
+            swap_folders(temporary, path, aside(path, "old"))
+        elif overwrite:
+            os.replace(temporary, path)
+        else:
+            move_new(temporary, path)
+
+    _refuse_foreign(path, names)
+    with written_aside(path, move, overwrite=overwrite) as temporary:
+        temporary.mkdir()
+        yield temporary
+
+
+def _refuse_foreign(path: Path, names: Collection[str]) -> None:
     old = sorted(p.name for p in path.iterdir()) if path.is_dir() else []
     if foreign := [name for name in old if name not in names]:
         raise EvflowDataError(
             "EV013", f"{path} is a folder that holds {foreign[:5]}.", "Choose another output.")
-    before = aside(path, "old")
-    temporary: Path | None = None
-    try:
-        with atomic_write(path, overwrite=overwrite) as temporary:
-            temporary.mkdir()
-            yield temporary
-            if path.is_dir():
-                os.replace(path, before)
-    except BaseException:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-        if before.exists():
-            os.replace(before, path)
-        raise
-    shutil.rmtree(before, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -63,15 +67,26 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     try:
         with atomic_write(folder / ".probe", overwrite=True) as probe:  # before any long work
             probe.touch()
-        (folder / ".probe").unlink()
+        (folder / ".probe").unlink(missing_ok=True)
+        clear_leftovers(folder / "stage")
         stage.mkdir()
         yield stage
+        with uninterrupted():
+            _unstage(stage, folder, names, overwrite=overwrite)
+    finally:
+        with uninterrupted():
+            shutil.rmtree(stage, ignore_errors=True)
+            if new:
+                with contextlib.suppress(OSError):  # unless something was written
+                    folder.rmdir()
+
+
+def _unstage(stage: Path, folder: Path, names: Sequence[str], *, overwrite: bool) -> None:
+    if overwrite:
         for name in names:
             (folder / name).unlink(missing_ok=True)
-        for path in stage.iterdir():
+    for path in sorted(stage.iterdir()):  # sorted: of two processes, one has the first and goes on
+        if overwrite:
             os.replace(path, folder / path.name)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
-        if new:
-            with contextlib.suppress(OSError):  # unless something was written
-                folder.rmdir()
+        else:
+            move_new(path, folder / path.name)

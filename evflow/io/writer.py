@@ -2,7 +2,8 @@
 
 A format's writer derives from `EventWriter`, says what it can hold, and stores what `_write` and
 `_write_frames` are given. Memory: `FLUSH` events, and what the caller appends at once. The file
-appears, under its name, when the `with` block ends well; nothing is left behind otherwise.
+appears, under its name, when the `with` block ends well and `_verify` finds it whole; nothing is
+left behind otherwise.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import abc
 import contextlib
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -20,9 +22,11 @@ import numpy as np
 from evflow.checks import COLUMNS, Size, check_frames, check_size, check_times
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
+from evflow.process.signals import uninterrupted
 from evflow.types import Events, Recording
 
-FLUSH = 1 << 20  # events gathered before they are written: what a compressor likes
+FLUSH = 1 << 20  # events gathered and written at a time: what a compressor likes
+FRAMES = 16  # written at a time: a signal may have to wait for them
 DEPTHS = ("uint8", "uint16", "float32")
 SECONDS_US = 2**31 * 10**6  # float64 seconds keep the microsecond up to here, the year 2038
 
@@ -54,23 +58,34 @@ class EventWriter(abc.ABC):
         self._waiting: list[Events] = []
         self._last_us = self._last_frame_us = np.zeros(0, np.int64)
         self._depth: np.dtype | None = None
-        self._stack = contextlib.ExitStack()
 
     def __enter__(self: Self) -> Self:
-        with contextlib.ExitStack() as stack:
-            self._open(stack.enter_context(self._place()), stack)
-            self._stack = stack.pop_all()
+        self._session = self._writing()
+        try:
+            with uninterrupted():
+                self._session.__enter__()
+        except BaseException:
+            self._session.__exit__(*sys.exc_info())
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, e: BaseException | None, tb: TracebackType | None
     ) -> None:
-        if e is not None:
-            self._stack.__exit__(kind, e, tb)
-            return
-        with self._stack:
-            self._flush()
-            self._finish()
+        self._session.__exit__(kind, e, tb)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """The file from its beginning to its name."""
+        with self._place() as temporary:
+            with contextlib.ExitStack() as self._stack:
+                with self._guard():
+                    self._open(temporary, self._stack)
+                yield
+                self._flush()
+                with self._guard():
+                    self._finish()
+            self._verify(temporary)
 
     def append(self, events: Events) -> None:
         """Add events that follow those appended before; EV003 (times), EV004 (order), EV015."""
@@ -106,7 +121,10 @@ class EventWriter(abc.ABC):
         check_times(np.append(self._last_frame_us, times), "frame_times", strict=True)
         self._check_times(times[[0, -1]], "frames")
         self._depth, self._last_frame_us = frames.dtype, times[-1:]
-        self._write_frames(frames, times)
+        for first in range(0, len(frames), FRAMES):
+            part = slice(first, first + FRAMES)
+            with self._guard():
+                self._write_frames(frames[part], times[part])
 
     @classmethod
     def refuses(cls, depth: np.dtype) -> str:
@@ -118,6 +136,10 @@ class EventWriter(abc.ABC):
 
     def _place(self) -> contextlib.AbstractContextManager[Path]:
         return atomic_write(self.path, overwrite=self.overwrite)
+
+    def _guard(self) -> contextlib.AbstractContextManager[None]:
+        """What each step of the format runs in."""
+        return contextlib.nullcontext()
 
     @abc.abstractmethod
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
@@ -134,6 +156,10 @@ class EventWriter(abc.ABC):
     def _finish(self) -> None:  # noqa: B027 (most have nothing)
         """Write what is known only at the end."""
 
+    @abc.abstractmethod
+    def _verify(self, temporary: Path) -> None:
+        """Refuse the closed file unless it is whole, before it gets its name; EV019."""
+
     def _check(self, events: Events) -> None:  # noqa: B027 (most have nothing)
         """Refuse events that the format cannot hold."""
 
@@ -148,7 +174,9 @@ class EventWriter(abc.ABC):
     def _flush(self) -> None:
         if self._waiting:
             events, self._waiting = Events.concatenate(self._waiting), []
-            self._write(events)
+            for part in blocks(events, FLUSH):
+                with self._guard():
+                    self._write(part)
 
 
 def copy(recording: Recording, out: EventWriter) -> None:

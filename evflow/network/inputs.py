@@ -1,7 +1,7 @@
 """The border of the network: arrays as they come, checked and made real.
 
 Wrong shapes, dtypes, values and units are `EvflowDataError`s that say what was seen; traced values
-have shapes alone, and pass. Behind it (architecture.py, pooling.py, inference.py) nothing is checked.
+have shapes alone, and pass. Behind it nothing is checked.
 """
 
 from __future__ import annotations

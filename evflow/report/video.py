@@ -6,8 +6,8 @@ read.
 
 from __future__ import annotations
 
+import contextlib
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -17,8 +17,9 @@ import numpy as np
 from PIL import Image
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import aside, atomic_write
 from evflow.files.folders import atomic_folder
+from evflow.files.moves import remove
 
 Codec = Literal["mpeg4", "vp9"]
 
@@ -47,9 +48,9 @@ def write_video(
     path = Path(path)
     kind = path.suffix.lower()
     check_within(FPS, "fps", fps)
-    with atomic_write(path, overwrite=overwrite) as temporary, \
-            tempfile.TemporaryDirectory(dir=temporary.parent, prefix=".render") as folder:
-        made = Path(folder) / f"film{kind}"
+    with atomic_write(path, overwrite=overwrite) as temporary, contextlib.ExitStack() as stack:
+        made = aside(path, f"part{kind}")  # OpenCV tells the kind of film by the ending
+        stack.callback(remove, made)
         if kind == ".gif":
             said = _write_gif(made, pictures, count, fps)
         else:

@@ -173,8 +173,8 @@ def test_damaged_sequences_are_refused(tmp_path: Path, format: Any) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_keeps_its_number() -> None:
     """numpy.save raises an OSError without errno for more than a buffer; so would we not know."""
-    with pytest.raises(OSError, match="No space") as raised, open("/dev/full", "wb") as file:
-        _save(file, sequence().flow)
+    with pytest.raises(OSError, match="No space") as raised:
+        _save(Path("/dev/full"), sequence().flow)
     assert raised.value.errno == errno.ENOSPC
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import json
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -203,6 +204,35 @@ def test_a_full_disk_is_a_coded_error_and_the_next_call_goes_on(
     assert_tidy(tmp_path)
     build(tmp_path, CONFIG)
     assert contents(tmp_path) == contents(whole)
+
+
+@pytest.mark.parametrize("call", [3, 40, 90, 125])
+def test_a_sequence_that_a_signal_broke_off_is_not_recorded(
+    tmp_path: Path, whole: Path, call: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It comes while HDF5 writes, which would drop it."""
+    calls = 0
+
+    def interrupted(self: Disk, data: Any) -> int:
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            signal.raise_signal(signal.SIGINT)
+        return write(self, data)
+
+    write = Disk.write
+    monkeypatch.setattr(Disk, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        build(tmp_path, CONFIG)
+    monkeypatch.undo()
+    assert_tidy(tmp_path)
+    made = contents(tmp_path)
+    assert made.items() <= contents(whole).items()
+    recorded = Manifests.read(tmp_path).claims
+    assert {f"{name}.h5" for name in recorded} == made.keys()
+    build(tmp_path, CONFIG)
+    assert contents(tmp_path) == contents(whole)
+    assert verify(tmp_path) == {}
 
 
 def test_folders_that_cannot_be_written(tmp_path: Path) -> None:

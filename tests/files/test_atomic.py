@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
-from evflow.files.folders import staged
+from evflow.files.atomic import atomic_write, moves
+from evflow.files.folders import atomic_folder, staged
+from evflow.process.alive import mark
 
 
 def write(path: Path, text: str, *, overwrite: bool = False) -> None:
@@ -97,13 +101,152 @@ def test_impossible_paths_are_ev019(tmp_path: Path, parts: tuple[str, ...]) -> N
     assert (tmp_path / "file").read_text() == "in the way"
 
 
-def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path: Path) -> None:
-    """Process ids repeat in containers and on the hosts of a shared disk."""
+linked = pytest.mark.parametrize("way", ["renameat2", "link", "neither"])
+
+
+def restrict(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    """A file system that knows no flags of rename, and no links either."""
+    def unknown(*_: object) -> None:
+        raise OSError(errno.EPERM, "no links here")
+
+    if way != "renameat2":
+        monkeypatch.setattr(moves, "_renameat2", lambda *_: False)
+    if way == "neither":
+        monkeypatch.setattr(os, "link", unknown)
+
+
+@linked
+def test_of_two_writers_of_one_name_the_first_stays(
+    tmp_path: Path, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    restrict(monkeypatch, way)
     path = tmp_path / "out.txt"
-    with atomic_write(path) as first, atomic_write(path) as second:
-        assert first != second
-        first.touch()
-        second.touch()
+
+    def both() -> None:
+        with atomic_write(path) as second:
+            second.write_text("second")
+            with atomic_write(path) as first:
+                assert first != second
+                first.write_text("first")
+
+    with pytest.raises(EvflowDataError, match=r"EV013.*out\.txt has appeared"):
+        both()
+    assert path.read_text() == "first"
+    assert os.listdir(tmp_path) == ["out.txt"]
+
+
+@linked
+@pytest.mark.parametrize("before", [["a.txt"], []])
+def test_of_two_writers_of_one_folder_the_first_stays(
+    tmp_path: Path, way: str, before: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    restrict(monkeypatch, way)
+    path = tmp_path / "out"
+
+    def both() -> None:
+        with atomic_folder(path, names=["a.txt"]) as second:
+            (second / "a.txt").write_text("second")
+            with atomic_folder(path, names=["a.txt"]) as first:
+                for name in before:
+                    (first / name).write_text("first")
+
+    with pytest.raises(EvflowDataError, match=r"EV013.*out has appeared"):
+        both()
+    assert os.listdir(path) == before
+    assert os.listdir(tmp_path) == ["out"]
+
+
+@linked
+def test_an_old_folder_is_replaced_whole(
+    tmp_path: Path, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    restrict(monkeypatch, way)
+    path = tmp_path / "out"
+    for text in ("old", "new"):
+        with atomic_folder(path, names=["a.txt"], overwrite=True) as folder:
+            (folder / "a.txt").write_text(text)
+    assert (path / "a.txt").read_text() == "new"
+    assert os.listdir(tmp_path) == ["out"]
+    with pytest.raises(EvflowDataError, match=r"EV013.*thesis"), \
+            atomic_folder(path, names=["a.txt"], overwrite=True):
+        (path / "thesis.tex").touch()  # somebody's, meanwhile
+    assert sorted(os.listdir(path)) == ["a.txt", "thesis.tex"]
+    assert os.listdir(tmp_path) == ["out"]
+
+
+@linked
+def test_of_two_stages_of_one_folder_the_first_stays(
+    tmp_path: Path, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    restrict(monkeypatch, way)
+    names = ("a.txt", "b.txt")
+
+    def both() -> None:
+        with staged(tmp_path / "out", names=names) as second:
+            for name in names:
+                (second / name).write_text("second")
+            with staged(tmp_path / "out", names=names) as first:
+                (first / "a.txt").write_text("first")
+
+    with pytest.raises(EvflowDataError, match=r"EV013.*a\.txt has appeared"):
+        both()
+    assert os.listdir(tmp_path / "out") == ["a.txt"]
+    assert (tmp_path / "out" / "a.txt").read_text() == "first"
+
+
+@pytest.mark.parametrize("name", [*("x" * n for n in (179, 181, 240, 252, 255)), "θ" * 127,
+                                  "x" + "流" * 84, "y" * 254 + "."])
+def test_long_names(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    write(path, "text")
+    write(path, "again", overwrite=True)
+    assert path.read_text() == "again"
+    assert refusal(tmp_path / f"{name}{'z' * (256 - len(os.fsencode(name)))}").code == "EV019"
+    path.unlink()
+    with atomic_folder(path, names=()) as folder:
+        assert len(os.fsencode(folder.name)) <= 255
+    assert os.listdir(tmp_path) == [name]
+
+
+@pytest.mark.parametrize("name", ["out.txt", "x" * 255])
+def test_what_a_killed_run_left_goes_with_the_next(tmp_path: Path, name: str) -> None:
+    """But nothing that a live process writes, or one that cannot be seen from here."""
+    program = ("import os, signal, sys\n"
+               "from evflow.files.atomic import aside, atomic_write\n"
+               "from pathlib import Path\n"
+               "path = Path(sys.argv[1])\n"
+               "with atomic_write(path, overwrite=True) as temporary:\n"
+               "    temporary.touch()\n"
+               "    aside(path, 'part').mkdir()\n"
+               "    aside(path, 'part.mp4').touch()\n"
+               "    (path.parent / 'begun').touch()\n"
+               "    signal.pause()\n")
+    path, begun = tmp_path / name, tmp_path / "begun"
+    def start() -> subprocess.Popen[bytes]:
+        process = subprocess.Popen([sys.executable, "-c", program, str(path)],
+                                   env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)})
+        while not begun.exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        begun.unlink()
+        return process
+
+    dead = start()
+    left = set(os.listdir(tmp_path))
+    assert len(left) == 3
+    write(path, "beside a live one")
+    assert set(os.listdir(tmp_path)) == {name, *left}
+    path.unlink()
+    dead.kill()
+    dead.wait()
+    elsewhere = [n.replace(f".{mark().partition('-')[0]}-", ".12345678-") for n in left]
+    old = f".{name[:200]}.12345678.tmp"  # of no known process
+    for other in (*elsewhere, old):
+        (tmp_path / other).touch()
+    write(tmp_path / "other.txt", "has another name")
+    assert left < set(os.listdir(tmp_path))
+    write(path, "new")
+    assert set(os.listdir(tmp_path)) == {name, "other.txt", old, *elsewhere}
 
 
 def test_a_folder_is_never_replaced(tmp_path: Path) -> None:

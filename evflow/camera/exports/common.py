@@ -12,6 +12,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.folders import atomic_folder
+from evflow.files.whole import need_members
 
 if TYPE_CHECKING:
     from evflow.camera import Camera
@@ -119,6 +120,7 @@ def write_export(
     with atomic_folder(folder, names=names, overwrite=overwrite) as new:
         with open(new / "maps.npz", "wb") as f:
             np.savez_compressed(f, allow_pickle=False, **maps)
+        need_members(new / "maps.npz", {f"{name}.npy": None for name in maps})
         for name, array in export.arrays.items():
             with open(new / name, "wb") as f:
                 np.lib.format.write_array(f, array)

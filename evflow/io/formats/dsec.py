@@ -101,7 +101,7 @@ class DsecWriter(Hdf5Writer):
         self._create("ms_to_idx", (), "u8", self.CHUNK)
 
     def _finish(self) -> None:
-        self._file.create_dataset("t_offset", data=np.int64(self.offset_us or 0))
+        self._store("t_offset", np.int64(self.offset_us or 0))
 
     def _check(self, events: Events) -> None:
         """EV004 where the events span more than ms_to_idx should."""

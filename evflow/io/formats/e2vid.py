@@ -15,6 +15,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.archives import unzipped
+from evflow.files.whole import need_members, need_size
 from evflow.io.decode import text
 from evflow.io.decode.stream import collect
 from evflow.io.hints import Hints
@@ -94,10 +95,17 @@ class E2vidWriter(EventWriter):
                 temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1))
             name = f"{self.path.stem}.txt"
             self._file = stack.enter_context(archive.open(name, "w", force_zip64=True))
-        self._file.write(b"%d %d\n" % self.size)
+        self._bytes = self._file.write(b"%d %d\n" % self.size)
 
     def _write(self, events: Events) -> None:
         for part in blocks(events, LINES):
             seconds, us = np.divmod(part.t, 1_000_000)
             rows = np.stack([seconds, us, part.x, part.y, part.p], 1)
-            self._file.write(b"%d.%06d %d %d %d\n" * len(rows) % tuple(rows.ravel().tolist()))
+            self._bytes += self._file.write(
+                b"%d.%06d %d %d %d\n" * len(rows) % tuple(rows.ravel().tolist()))
+
+    def _verify(self, temporary: Path) -> None:
+        if self.path.suffix.lower() == ".txt":
+            need_size(temporary, self._bytes)
+        else:
+            need_members(temporary, {f"{self.path.stem}.txt": self._bytes})

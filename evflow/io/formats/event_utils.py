@@ -121,8 +121,8 @@ class EventUtilsWriter(Hdf5Writer):
 
     def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
         for frame, second in zip(frames, times / 1e6, strict=True):
-            image = self._file.create_dataset(
-                f"images/image{len(self._image_s):09d}", data=frame, chunks=frame.shape,
+            image = self._store(
+                f"images/image{len(self._image_s):09d}", frame, chunks=frame.shape,
                 compression="gzip", compression_opts=1, shuffle=True)
             image.attrs.update(size=frame.shape, timestamp=second, type="greyscale")
             self._image_s = np.append(self._image_s, second)

@@ -8,7 +8,6 @@ columns are decompressed side by side, block by block.
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,9 @@ from evflow.checks import COLUMNS, Size, check_columns
 from evflow.errors import EvflowDataError
 from evflow.files.archives import DAMAGE, Member, members
 from evflow.files.arrays import GrowingArray
+from evflow.files.atomic import aside
+from evflow.files.moves import remove
+from evflow.files.whole import need_members
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
@@ -97,8 +99,10 @@ class NpzWriter(EventWriter):
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
         self._archive = stack.enter_context(zipfile.ZipFile(
             temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1))
-        self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory(
-            prefix=f".{self.path.name}.", dir=self.path.parent)))
+        self._folder = aside(self.path, "part")
+        stack.callback(remove, self._folder)
+        self._folder.mkdir()
+        self._sizes: dict[str, int | None] = {"size.npy": None}
         kinds = {"t": "i8", "x": "u2", "y": "u2", "p": "?"}
         self._columns = {name: self._column(name, kind, stack) for name, kind in kinds.items()}
 
@@ -122,6 +126,10 @@ class NpzWriter(EventWriter):
     def _finish(self) -> None:
         for name, column in self._columns.items():
             column.close()
+            self._sizes[f"{name}.npy"] = (self._folder / f"{name}.npy").stat().st_size
             self._archive.write(self._folder / f"{name}.npy", f"{name}.npy")
         with self._archive.open("size.npy", "w") as f:
             np.lib.format.write_array(f, np.array(self.size, np.int32))
+
+    def _verify(self, temporary: Path) -> None:
+        need_members(temporary, self._sizes)

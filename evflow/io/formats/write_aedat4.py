@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evflow.files.whole import need_size
 from evflow.io.writer import EventWriter, blocks
 from evflow.types import Events
 
@@ -62,9 +63,12 @@ class Aedat4Writer(EventWriter):
 
     def _finish(self) -> None:
         position = self._file.tell()
-        self._file.write(_table(np.array(self._entries, ENTRY)))
+        self._bytes = position + self._file.write(_table(np.array(self._entries, ENTRY)))
         self._file.seek(len(VERSION))
         self._file.write(_header(self.size, position))
+
+    def _verify(self, temporary: Path) -> None:
+        need_size(temporary, self._bytes)
 
 
 def _header(size: tuple[int, int], table: int) -> bytes:

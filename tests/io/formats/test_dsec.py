@@ -82,7 +82,7 @@ def test_dsec_writer_refuses_what_does_not_follow(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_disk_keeps_the_first_error() -> None:
-    with Disk("/dev/full", "w") as disk:
+    with Disk(Path("/dev/full")) as disk:
         disk.check()
         assert disk.write(b"abc") == 3  # HDF5 must not see it
         with pytest.raises(OSError, match="No space left"):

@@ -1,0 +1,44 @@
+"""Whether a file that was just written is whole, before it gets its name: errors that a library
+dropped on the way, and lost ends, show in sizes and tables of contents. Data are not read."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from evflow.errors import EvflowDataError
+
+
+def not_whole(path: Path, what: str) -> EvflowDataError:
+    """EV019 for a file that is not as it was written."""
+    return EvflowDataError("EV019", f"{path} was not written whole: {what}.",
+                           "It was not kept. Does the disk work? Write it again.")
+
+
+def need_size(path: Path, size: int) -> None:
+    """EV019 unless the file has as many bytes."""
+    if (found := os.path.getsize(path)) != size:
+        raise not_whole(path, f"it has {found:,} bytes of {size:,}")
+
+
+def need_members(path: Path, sizes: Mapping[str, int | None]) -> None:
+    """EV019 unless a zip holds just these files, of so many bytes each (None: any), one behind the
+    other."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            infos = archive.infolist()
+            for info in infos:
+                archive.open(info).close()  # its own header is there, and has its name
+            begins = [*sorted(info.header_offset for info in infos), archive.start_dir]
+    except (zipfile.BadZipFile, EOFError) as e:
+        raise not_whole(path, str(e)) from e
+    found = {info.filename: info.file_size for info in infos}
+    if found != {name: found.get(name, -1) if size is None else size
+                 for name, size in sizes.items()}:
+        raise not_whole(path, f"it holds {found} of {dict(sizes)}")
+    for info in infos:
+        end = info.header_offset + len(info.filename.encode()) + info.compress_size
+        if end > begins[begins.index(info.header_offset) + 1]:
+            raise not_whole(path, f"{info.filename} is cut off")
