@@ -1,4 +1,4 @@
-"""The camera: per-pixel contrast thresholds and noise rates, and what all its pixels share.
+"""The camera: per-pixel contrast thresholds and noise rates.
 
 `Camera` is a pytree of four float32 maps (..., H, W); it passes through jit, vmap and grad. What
 is *not* per pixel is the `SensorModel` (sensors.py); what cameras are drawn from, the
@@ -11,18 +11,16 @@ import dataclasses
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.camera.prior import CameraPrior, Summary, sample_nominal
 from evflow.errors import EvflowDataError, naming
 from evflow.files.archives import load_npz
 from evflow.files.atomic import atomic_write
-
-if TYPE_CHECKING:
-    from evflow.camera.prior import CameraPrior
 from evflow.files.whole import need_members
 
 Array = jax.Array
@@ -67,9 +65,12 @@ class Camera:
     @staticmethod
     def sample(key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None) -> Camera:
         """One camera with pixels (..., H, W); leading axes are independent cameras. EV002."""
-        from evflow.camera.prior import sample_camera
-
-        return sample_camera(key, shape, prior)
+        if len(shape) < 2:
+            raise EvflowDataError("EV002", f"shape is {shape}.", "Expected (..., H, W).")
+        prior = prior or CameraPrior()
+        k_nominal, k_pixels = jax.random.split(key)
+        nominal = sample_nominal(k_nominal, shape[:-2], prior)
+        return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)
 
     def drawn(self, key: Array, std: Camera) -> Camera:
         """A camera whose pixels are drawn from estimates and their std, both (..., H, W).
@@ -166,22 +167,6 @@ class Camera:
             return maps, std
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Summary:
-    """What a whole camera shares, each float32 (...,): the medians of the four maps and the
-    threshold mismatch (standard deviation over pixels, before the clamp) per polarity. The noise
-    rates of an estimate are the means over pixels, as noise adds up; where pixels differ by a
-    tenth the two differ by half a percent."""
-
-    theta_on: Array
-    theta_off: Array
-    eta_on: Array
-    eta_off: Array
-    sigma_on: Array
-    sigma_off: Array
-
-
 def _check_kind(path: Path) -> None:
     """EV016 where there is no file, EV008 where it is no .npz."""
     inside = path / "camera.npz"
@@ -205,3 +190,24 @@ def _check_std(values: Array, std: Array) -> None:
         raise EvflowDataError(
             "EV009", f"standard deviations of shape {std.shape} for maps of shape "
             f"{values.shape}, or negative or infinite ones.", "Make the file again.")
+
+
+def sample_pixels(
+    key: Array, nominal: Summary, shape: tuple[int, int], eta_spread: float = 0.0
+) -> Camera:
+    """Spread the camera-wide values over pixels: theta ~ N(median, sigma) clamped at .01 (v2e),
+    eta log-normal around its median. Returns maps (*batch, H, W)."""
+    k_on, k_off, k_eta = jax.random.split(key, 3)
+    size = (*jnp.shape(nominal.theta_on), *shape)
+
+    def theta(k: Array, median: Array, sigma: Array) -> Array:
+        draw = median[..., None, None] + sigma[..., None, None] * jax.random.normal(k, size)
+        return jnp.maximum(draw, THETA_MIN)
+
+    spread = jnp.exp(eta_spread * jax.random.normal(k_eta, (2, *size)))
+    return Camera(
+        theta(k_on, nominal.theta_on, nominal.sigma_on),
+        theta(k_off, nominal.theta_off, nominal.sigma_off),
+        nominal.eta_on[..., None, None] * spread[0],
+        nominal.eta_off[..., None, None] * spread[1],
+    )

@@ -1,5 +1,5 @@
-"""What cameras are drawn from: camera-wide values, then pixels around them (paper, Section IV-E,
-Eq. 12).
+"""What a whole camera shares, and the distribution that it is drawn from (paper, Section IV-E,
+Eq. 12). The pixels around it are camera.py's.
 """
 
 from __future__ import annotations
@@ -11,10 +11,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera.camera import THETA_MIN, Camera, Summary
 from evflow.errors import EvflowDataError
 
 Array = jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """What a whole camera shares, each float32 (...,): the medians of the four maps and the
+    threshold mismatch (standard deviation over pixels, before the clamp) per polarity. The noise
+    rates of an estimate are the means over pixels, as noise adds up; where pixels differ by a
+    tenth the two differ by half a percent."""
+
+    theta_on: Array
+    theta_off: Array
+    eta_on: Array
+    eta_off: Array
+    sigma_on: Array
+    sigma_off: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,18 +67,6 @@ class CameraPrior:
                                   "A standard deviation of log eta: >= 0.")
 
 
-def sample_camera(
-    key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None
-) -> Camera:
-    """One camera with pixels (..., H, W); leading axes are independent cameras. EV002."""
-    if len(shape) < 2:
-        raise EvflowDataError("EV002", f"shape is {shape}.", "Expected (..., H, W).")
-    prior = prior or CameraPrior()
-    k_nominal, k_pixels = jax.random.split(key)
-    nominal = sample_nominal(k_nominal, shape[:-2], prior)
-    return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)
-
-
 def noise_of_threshold(theta: Array) -> Array:
     """R(theta) = 4 / (90 theta - 5) of Eq. 12, clipped to the paper's range [.1, 1] Hz.
 
@@ -93,24 +96,3 @@ def sample_nominal(
     eta = {"eq12": tied, "independent": free, "mixed": either,
            "none": jnp.zeros_like(tied)}[prior.noise]
     return Summary(*theta, *eta, *sigma)
-
-
-def sample_pixels(
-    key: Array, nominal: Summary, shape: tuple[int, int], eta_spread: float = 0.0
-) -> Camera:
-    """Spread the camera-wide values over pixels: theta ~ N(median, sigma) clamped at .01 (v2e),
-    eta log-normal around its median. Returns maps (*batch, H, W)."""
-    k_on, k_off, k_eta = jax.random.split(key, 3)
-    size = (*jnp.shape(nominal.theta_on), *shape)
-
-    def theta(k: Array, median: Array, sigma: Array) -> Array:
-        draw = median[..., None, None] + sigma[..., None, None] * jax.random.normal(k, size)
-        return jnp.maximum(draw, THETA_MIN)
-
-    spread = jnp.exp(eta_spread * jax.random.normal(k_eta, (2, *size)))
-    return Camera(
-        theta(k_on, nominal.theta_on, nominal.sigma_on),
-        theta(k_off, nominal.theta_off, nominal.sigma_off),
-        nominal.eta_on[..., None, None] * spread[0],
-        nominal.eta_off[..., None, None] * spread[1],
-    )

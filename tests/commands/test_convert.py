@@ -17,7 +17,7 @@ from helpers.recordings import SIZE, T0, equal, make, write_ijrr
 from helpers.videos import drifting
 
 from evflow.camera import Camera, CameraPrior
-from evflow.camera.exports import export_camera, targets
+from evflow.camera.exports import TARGETS, export_camera
 from evflow.camera.exports.common import NOISE
 from evflow.camera.exports.iebcs import FREQUENCIES, spectrum
 from evflow.cli import main
@@ -386,7 +386,7 @@ def test_export_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     code, _, err = run(capsys, "export", tmp_path / "no.npz", "--to", "v2e", "-o", tmp_path / "x")
     assert (code, err[:5]) == (1, "EV016")
     assert not (tmp_path / "x").exists()
-    assert set(targets()) == {"v2e", "esim", "openeb", "iebcs"}
+    assert set(TARGETS) == {"v2e", "esim", "openeb", "iebcs"}
     from evflow.errors import EvflowDataError
 
     with pytest.raises(EvflowDataError, match="EV020"):

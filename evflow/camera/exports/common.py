@@ -1,21 +1,11 @@
-"""The registry of simulators, the scalars nearest to a camera, and how an export is written."""
+"""What all exports share: the scalars nearest to a camera, the noise, and what an export is."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
-
-from evflow.errors import EvflowDataError
-from evflow.files.folders import atomic_folder
-from evflow.files.whole import need_members
-
-if TYPE_CHECKING:
-    from evflow.camera import Camera
 
 Maps = Mapping[str, np.ndarray]
 GREY = 1 - 0.75 * (128 + 20) / 275  # shot noise of v2e and of OpenEB at 128 DN over that at 0 DN
@@ -88,50 +78,3 @@ class Export:
     text: str
     scripts: Mapping[str, str]
     arrays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-
-
-def export_camera(camera: Camera, to: str, std: Camera | None = None) -> tuple[Export, Maps]:
-    """A camera of maps (H, W) in the words of a simulator, and the maps as float32. std: of an
-    estimate's maps, which are more even than the camera.
-
-    Raises EV020 (no such simulator), EV002 (several cameras at once).
-    """
-    from evflow.camera import PARAMETERS
-
-    known = targets()
-    if to not in known:
-        raise EvflowDataError("EV020", f"to={to!r}.", f"Choose from {list(known)}.")
-    if len(camera.shape) != 2:
-        raise EvflowDataError(
-            "EV002", f"the camera's maps have shape {camera.shape}.", "Export one camera, (H, W).")
-    maps, errors = ({name: np.asarray(getattr(c, name), np.float32) for name in PARAMETERS}
-                    if c is not None else None for c in (camera, std))
-    assert maps is not None
-    return known[to](maps, Settings.of(maps, errors)), maps
-
-
-def write_export(
-    folder: str | os.PathLike, export: Export, maps: Maps, *, overwrite: bool = False
-) -> Path:
-    """maps.npz, README.txt, the scripts and arrays in a new folder; EV013, EV019."""
-    corner = {name: values[:1, :1] for name, values in maps.items()}  # files are named by no map
-    kinds = [make(corner, Settings.of(corner)) for make in targets().values()]
-    names = {"maps.npz", "README.txt"}.union(*(k.scripts.keys() | k.arrays.keys() for k in kinds))
-    with atomic_folder(folder, names=names, overwrite=overwrite) as new:
-        with open(new / "maps.npz", "wb") as f:
-            np.savez_compressed(f, allow_pickle=False, **maps)
-        need_members(new / "maps.npz", {f"{name}.npy": None for name in maps})
-        for name, array in export.arrays.items():
-            with open(new / name, "wb") as f:
-                np.lib.format.write_array(f, array)
-        for name, source in {"README.txt": export.text, **export.scripts}.items():
-            (new / name).write_text(source, "utf-8")
-    return Path(folder)
-
-
-def targets() -> dict[str, Callable[[Maps, Settings], Export]]:
-    """The simulators by name."""
-    from evflow.camera.exports import esim, iebcs, openeb, v2e
-
-    return {module.__name__.rpartition(".")[2]: module.export
-            for module in (v2e, esim, openeb, iebcs)}

@@ -1,0 +1,55 @@
+"""The simulators that a camera can be exported to, and how an export is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from evflow.camera.camera import PARAMETERS, Camera
+from evflow.camera.exports import esim, iebcs, openeb, v2e
+from evflow.camera.exports.common import Export, Maps, Settings
+from evflow.errors import EvflowDataError
+from evflow.files.folders import atomic_folder
+from evflow.files.whole import need_members
+
+TARGETS: Mapping[str, Callable[[Maps, Settings], Export]] = {
+    "v2e": v2e.export, "esim": esim.export, "openeb": openeb.export, "iebcs": iebcs.export}
+
+
+def export_camera(camera: Camera, to: str, std: Camera | None = None) -> tuple[Export, Maps]:
+    """A camera of maps (H, W) in the words of a simulator, and the maps as float32. std: of an
+    estimate's maps, which are more even than the camera.
+
+    Raises EV020 (no such simulator), EV002 (several cameras at once).
+    """
+    if to not in TARGETS:
+        raise EvflowDataError("EV020", f"to={to!r}.", f"Choose from {list(TARGETS)}.")
+    if len(camera.shape) != 2:
+        raise EvflowDataError(
+            "EV002", f"the camera's maps have shape {camera.shape}.", "Export one camera, (H, W).")
+    maps, errors = ({name: np.asarray(getattr(c, name), np.float32) for name in PARAMETERS}
+                    if c is not None else None for c in (camera, std))
+    assert maps is not None
+    return TARGETS[to](maps, Settings.of(maps, errors)), maps
+
+
+def write_export(
+    folder: str | os.PathLike, export: Export, maps: Maps, *, overwrite: bool = False
+) -> Path:
+    """maps.npz, README.txt, the scripts and arrays in a new folder; EV013, EV019."""
+    corner = {name: values[:1, :1] for name, values in maps.items()}  # files are named by no map
+    kinds = [make(corner, Settings.of(corner)) for make in TARGETS.values()]
+    names = {"maps.npz", "README.txt"}.union(*(k.scripts.keys() | k.arrays.keys() for k in kinds))
+    with atomic_folder(folder, names=names, overwrite=overwrite) as new:
+        with open(new / "maps.npz", "wb") as f:
+            np.savez_compressed(f, allow_pickle=False, **maps)
+        need_members(new / "maps.npz", {f"{name}.npy": None for name in maps})
+        for name, array in export.arrays.items():
+            with open(new / name, "wb") as f:
+                np.lib.format.write_array(f, array)
+        for name, source in {"README.txt": export.text, **export.scripts}.items():
+            (new / name).write_text(source, "utf-8")
+    return Path(folder)
