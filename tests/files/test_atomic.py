@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write, moves
+from evflow.files import moves
+from evflow.files.atomic import atomic_write
 from evflow.files.folders import atomic_folder, staged
 from evflow.process.alive import mark
 

@@ -18,7 +18,8 @@ import pytest
 from helpers.recordings import SIZE, equal, make
 
 from evflow.errors import EvflowDataError
-from evflow.io import hdf5, open_writer, read_events, write_recording
+from evflow.io import open_writer, read_events, write_recording
+from evflow.io.decode import hdf5
 from evflow.io.decode.hdf5 import Disk
 from evflow.io.registry import WRITERS
 from evflow.io.writer import EventWriter

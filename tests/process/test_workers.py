@@ -16,7 +16,7 @@ from evflow.process.workers import worker_pool
 
 PARENT = """
 import multiprocessing, time
-from evflow.workers import worker_pool
+from evflow.process.workers import worker_pool
 
 if __name__ == "__main__":
     with worker_pool(2, time.sleep, 0.01) as pool:
