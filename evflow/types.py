@@ -28,9 +28,9 @@ from evflow.checks import (
     need,
 )
 from evflow.errors import EvflowDataError
+from evflow.notes import Note
 
 BIT_DEPTHS = (8, 10, 12, 14, 16)  # of the converters in image sensors; 16-bit files hold any
-MADE = "made from the events by"  # in the note on frames that a network made of the events
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709 weights of R, G, B
 
 
@@ -131,16 +131,16 @@ class Recording:
     frames: (T, H, W) uint8, uint16 or float32 in DN; T may be 0. Float frames are 0..255.
     frame_times: (T,) any integer dtype, microseconds, mid-exposure, strictly increasing;
         kept as int64.
-    notes: what a reader assumed or converted, a sentence each.
+    notes: what a reader assumed, left out or converted.
 
     Raises EV002 (shape, colour), EV003 (dtype, range of float frames), EV004 (order),
-    EV007 (NaN), EV015 (frames and events of different size).
+    EV007 (NaN), EV015 (frames and events of different size), EV020 (notes that are none).
     """
 
     events: Events
     frames: np.ndarray
     frame_times: np.ndarray
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
         need(self.events, Events, "events", "Of a path: evflow.read_recording(path).")
@@ -151,11 +151,13 @@ class Recording:
                 "EV002", f"frame_times has shape {times.shape} for {len(frames)} frames.",
                 "Give one mid-exposure time in microseconds per frame.")
         times = check_times(times, "frame_times", strict=True)
+        for note in self.notes:
+            need(note, Note, "a note", "Of a sentence: evflow.notes.Note(code, sentence).")
         object.__setattr__(self, "frames", read_only(frames))
         object.__setattr__(self, "frame_times", read_only(times))
 
     @staticmethod
-    def of_events(events: Events, notes: tuple[str, ...] = ()) -> Recording:
+    def of_events(events: Events, notes: tuple[Note, ...] = ()) -> Recording:
         """A recording without frames."""
         need(events, Events, "events", "Of a recording: recording.events.")
         width, height = events.size
@@ -165,7 +167,7 @@ class Recording:
     @property
     def frames_were_made(self) -> bool:
         """Whether a network made the frames of the events, as a note on them says."""
-        return any(MADE in note for note in self.notes)
+        return any(note.code == "frames.made" for note in self.notes)
 
     def __repr__(self) -> str:
         return f"{self.events!r}, {len(self.frames)} frames ({self.frames.dtype})"

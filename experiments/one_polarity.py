@@ -76,7 +76,7 @@ def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, float] |
 
     true = float(getattr(hidden.nominal, f"theta_{name}"))
     return {
-        "said": any(f"theta_{other} is undetermined" in w for w in found.warnings),
+        "said": f"theta_{other}" in found.undetermined,
         "error": abs(float(getattr(found.summary, f"theta_{name}")) / true - 1),
         "network error": abs(float(getattr(network, f"theta_{name}")) / true - 1),
         "std": float(getattr(found.summary_std, f"theta_{name}")) / true,

@@ -30,6 +30,7 @@ from evflow.cli import Command, main
 from evflow.errors import CODES
 from evflow.io import write_recording
 from evflow.io.registry import FORMATS, WRITERS
+from evflow.notes import NOTES
 from experiments import make_dataset, see_better, train_network
 
 ROOT = Path(__file__).parents[1]
@@ -194,6 +195,12 @@ def test_every_code_is_explained() -> None:
     table = [row for row in rows("errors.md") if re.fullmatch(r"EV\d+", row[0])]
     assert [tuple(row[:2]) for row in table] == list(CODES.items())
     assert all(len(row) == 4 and all(row) for row in table)
+
+
+def test_every_code_of_a_note_is_explained() -> None:
+    table = [row for row in rows("errors.md") if re.fullmatch(r"`\w+\.\w+`", row[0])]
+    assert [(code.strip("`"), title) for code, title, _ in table] == list(NOTES.items())
+    assert all(all(row) for row in table)
 
 
 def test_every_format_is_listed_with_what_it_can() -> None:

@@ -16,6 +16,7 @@ ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
 FLOORS = (
     ("errors",),
+    ("notes",),
     ("files", "process"),
     ("checks",),
     ("types", "light"),

@@ -123,7 +123,8 @@ def usable(recording: Recording) -> list[int]:
     plan = plan_windows(recording, 1)
     found = [i for first, last in plan.pairs for i in range(first, last)]
     if not found:
-        raise EvflowDataError("EV017", f"no frame interval can be used ({plan.skipped[:2]}).")
+        raise EvflowDataError("EV017", "no frame interval can be used "
+                              f"({'; '.join(map(str, plan.skipped[:2]))}).")
     return found
 
 

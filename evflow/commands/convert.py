@@ -12,6 +12,7 @@ import tyro
 
 from evflow.commands.options import Reading, own_first
 from evflow.commands.writing import Format, named, need_absent
+from evflow.notes import Note, as_dicts
 
 
 @own_first
@@ -47,11 +48,12 @@ class Convert(Reading):
         recording = self.read(self.recording)
         notes = list(recording.notes)
         if recording.has_frames and (why := writer.refuses(recording.frames.dtype)):
-            notes.append(f"{why}: the {len(recording.frames)} frames were left out.")
+            notes.append(Note(
+                "frames.unused", f"{why}: the {len(recording.frames)} frames were left out."))
             recording = Recording.of_events(recording.events)
         io.write_recording(self.out, recording, writer.NAME, overwrite=self.overwrite)
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": len(recording.events),
-                 "frames": len(recording.frames), "notes": notes}
+                 "frames": len(recording.frames), "notes": as_dicts(notes)}
         print(json.dumps(facts) if self.json else f"{recording} -> {self.out} ({writer.NAME})")

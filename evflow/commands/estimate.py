@@ -14,13 +14,14 @@ import tyro
 from evflow.commands.options import Reading, check_finite, own_first, refuse, write_json
 from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
+from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
     from evflow.estimation.result import CameraEstimate
     from evflow.types import Recording
 
 FILES = ("camera.npz", "camera.json", "maps.png", "histograms.png", "report.html")
-SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate warns of these itself
+SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate notes these itself
 
 
 @own_first
@@ -82,10 +83,11 @@ class Estimate(Reading):
             doubts = self._checked(recording)
             recording = self._reconstructed(recording) if self.reconstruct else recording
             found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
-            found = dataclasses.replace(found, warnings=(*doubts, *found.warnings))
+            found = dataclasses.replace(found, notes=(*doubts, *found.notes))
             found.save(out / "camera.npz")
             facts = {**found.as_dict(), "recording": str(self.recording),
-                     "protocol": self.protocol, "notes": list(recording.notes), **facts}
+                     "protocol": self.protocol,
+                     "recording_notes": as_dicts(recording.notes), **facts}
             write_json(out / "camera.json", facts)
             if self.plots:
                 plots.camera_maps(found, out / "maps.png")
@@ -95,14 +97,15 @@ class Estimate(Reading):
         print(json.dumps(facts, indent=2) if self.json else describe(found))
         print(f"written to {self.out}/", file=sys.stderr)
 
-    def _checked(self, recording: Recording) -> list[str]:
+    def _checked(self, recording: Recording) -> list[Note]:
         """What `evflow check` doubts; raises its errors, unless told not to."""
         from evflow.recordings.check import check
 
         report = check(recording)
         if self.checks:
             report.raise_if_failed()
-        doubts = [str(f) for f in (*report.errors, *report.warnings) if f.code not in SAID_BELOW]
+        doubts = [finding.note() for finding in (*report.errors, *report.warnings)
+                  if finding.code not in SAID_BELOW]
         for doubt in doubts:
             print(f"warning: {doubt}", file=sys.stderr)
         return doubts

@@ -16,6 +16,7 @@ from evflow.commands.options import check_finite, note_idle, own_first, refuse, 
 from evflow.commands.windows import Windowed, frames_amid, lasting
 from evflow.commands.writing import need_absent
 from evflow.errors import EvflowDataError
+from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
     from evflow.downstream.flow import FlowTruth
@@ -62,10 +63,10 @@ class Flow(Windowed):
         result = scores.result()
         notes = list(recording.notes)
         if truth is not None and result.get("aee") is None:
-            notes.append(f"{self.truth} has no known flow at a pixel with events: nothing was "
-                         "measured against it")
+            notes.append(Note("truth.none", f"{self.truth} has no known flow at a pixel with "
+                              "events: nothing was measured against it"))
         facts = {"out": str(self.out), "weights": self.weights, "full_px": full_px,
-                 "scores": result, "notes": notes}
+                 "scores": result, "notes": as_dicts(notes)}
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         print(json.dumps(facts) if self.json else "\n".join(

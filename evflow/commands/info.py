@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from evflow.commands.options import Reading, own_first
+from evflow.notes import as_dicts
 
 if TYPE_CHECKING:
     from evflow.types import Recording
@@ -36,7 +37,8 @@ class Info(Reading):
             return
         print(recording)
         for name, value in facts.items():
-            lines = value if name in ("notes", "skipped") else [value]
+            lines = ([note["text"] for note in value] if name in ("notes", "skipped") else
+                     [value])
             for line in lines:
                 print(f"  {name:16} {'x'.join(map(str, line)) if name == 'size' else line}")
 
@@ -53,9 +55,10 @@ def _facts(recording: Recording) -> dict[str, Any]:
         "frames": len(times),
         "first_frame_us": int(times[0]) if len(times) else None,
         "last_frame_us": int(times[-1]) if len(times) else None,
-        "frame_dtype": str(recording.frames.dtype), "notes": list(recording.notes),
+        "frame_dtype": str(recording.frames.dtype), "notes": as_dicts(recording.notes),
     }
     if len(times) > 1 and len(events):
         plan = plan_windows(recording)
-        facts["windows"], facts["skipped"] = len(plan.pairs), condensed(plan.skipped)
+        facts["windows"] = len(plan.pairs)
+        facts["skipped"] = as_dicts(condensed(plan.skipped))
     return facts

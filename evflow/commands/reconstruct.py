@@ -15,6 +15,7 @@ from evflow.commands.options import check_finite, own_first, refuse
 from evflow.commands.windows import Windowed, frames_amid, lasting
 from evflow.commands.writing import need_absent, refuse_stdout
 from evflow.errors import EvflowDataError
+from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,8 +61,8 @@ class Reconstruct(Windowed):
         amid = frames_amid(recording, times) if seen else range(0)
         notes = list(recording.notes)
         if seen and (outside := len(times) - len(amid)):
-            notes.append(f"{outside} of {len(times)} frames lie outside the events and are not "
-                         "scored")
+            notes.append(Note("frames.unused", f"{outside} of {len(times)} frames lie outside the "
+                              "events and are not scored"))
         scores = self._scores(len(amid)) if seen else None
         with bar("reconstructing") as progress:
             images = reconstructions(
@@ -72,7 +73,7 @@ class Reconstruct(Windowed):
                     self._film(images, times, recording))
         result = scores.result() if scores else None
         facts = {"out": str(self.out), "weights": self.weights, "images": len(times),
-                 "scores": result, "notes": notes}
+                 "scores": result, "notes": as_dicts(notes)}
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         print(json.dumps(facts) if self.json else "\n".join(
@@ -113,8 +114,8 @@ class Reconstruct(Windowed):
                            overwrite=self.overwrite)
 
     def _folder(self, images: Iterator[np.ndarray], times: np.ndarray) -> str:
+        from evflow.io.images.folder import MADE
         from evflow.report.video import write_images
-        from evflow.types import MADE
 
         return write_images(self.out, images, times, overwrite=self.overwrite,
                             remark=f"images were {MADE} {Path(self.weights).name}")

@@ -12,6 +12,7 @@ import tyro
 
 from evflow.commands.options import Reading, check_finite, note_idle, own_first, refuse, value
 from evflow.commands.writing import need_absent
+from evflow.notes import as_dicts
 
 
 @own_first
@@ -69,6 +70,7 @@ class Render(Reading):
                 said = write_film(self.out, recording, film, overwrite=self.overwrite,
                                   progress=progress)
         if self.json:
-            print(json.dumps({"out": str(self.out), "said": said, "notes": list(recording.notes)}))
+            print(json.dumps({"out": str(self.out), "said": said,
+                              "notes": as_dicts(recording.notes)}))
         else:
             print(f"{said} -> {self.out}", file=sys.stderr)

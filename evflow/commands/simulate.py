@@ -14,6 +14,7 @@ import tyro
 from evflow.commands.options import check_finite, parse_bayer, refuse, value
 from evflow.commands.writing import Format, named, need_absent
 from evflow.errors import EvflowDataError
+from evflow.notes import as_dicts
 
 if TYPE_CHECKING:
     from evflow.camera.sensors import SensorModel
@@ -135,7 +136,7 @@ class Simulate:
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": count, "frames": frames,
-                 "sensor": self.sensor, "colour": self.colour, "notes": source.notes}
+                 "sensor": self.sensor, "colour": self.colour, "notes": as_dicts(source.notes)}
         print(json.dumps(facts) if self.json else
               f"{count:,} events of {frames:,} frames -> {self.out}")
 

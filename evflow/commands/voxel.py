@@ -16,6 +16,7 @@ import tyro
 from evflow.commands.options import Reading, check_finite, own_first
 from evflow.commands.writing import need_absent, need_suffix
 from evflow.errors import EvflowDataError
+from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
     from evflow.types import Recording
@@ -80,11 +81,12 @@ class Voxel(Reading):
                     _store(archive, "dlogI", shape[:3], np.float32, _changes(recording, pairs))
                 members = archive.namelist()
             need_members(temporary, dict.fromkeys(members))
-        for note in (*recording.notes, *notes):
+        notes = (*recording.notes, *notes)
+        for note in notes:
             print(f"note: {note}", file=sys.stderr)
         gigabytes = 4e-9 * np.prod(shape, dtype=float)
         facts = {"out": str(self.out), "windows": len(starts), "size": [width, height],
-                 "bins": self.bins, "gigabytes": gigabytes, "notes": [*recording.notes, *notes]}
+                 "bins": self.bins, "gigabytes": gigabytes, "notes": as_dicts(notes)}
         print(json.dumps(facts) if self.json else
               f"{len(starts)} windows, {width}x{height}, {self.bins} bins "
               f"({gigabytes:.3g} GB in memory) -> {self.out}")
@@ -92,7 +94,7 @@ class Voxel(Reading):
 
 def _windows(
     recording: Recording, window_us: int
-) -> tuple[tuple[tuple[int, int], ...], np.ndarray, np.ndarray, tuple[str, ...]]:
+) -> tuple[tuple[tuple[int, int], ...], np.ndarray, np.ndarray, tuple[Note, ...]]:
     """The frames that bound each window, their begins and lengths (N,) int64 us, and notes.
 
     Raises EV001, EV011, EV012 as `plan_windows`, EV017 where no window is left.
@@ -103,20 +105,19 @@ def _windows(
     if recording.has_frames:
         plan = plan_windows(recording, window_us)
         ends = recording.frame_times[np.array(plan.pairs, int).reshape(-1, 2)]
-        pairs, starts, lengths, notes = (
-            plan.pairs, ends[:, 0], ends[:, 1] - ends[:, 0], plan.skipped)
+        pairs, starts, lengths = plan.pairs, ends[:, 0], ends[:, 1] - ends[:, 0]
+        notes = tuple(Note("windows.skipped", str(window)) for window in plan.skipped)
     else:
         if not len(t):
             raise EvflowDataError("EV001", "the recording has no events.")
         starts = np.arange(t[0], t[-1] + 2 - window_us, window_us)
         pairs, lengths = (), np.full(len(starts), window_us)
-        notes = ("no frames: windows of equal length, without dlogI.",)
+        notes = (Note("frames.none", "no frames: windows of equal length, without dlogI."),)
     if not len(starts):
-        if not recording.has_frames:
-            notes = (f"the events span {(t[-1] - t[0]) / 1e3:g} ms",)
+        why = ("; ".join(map(str, notes[:3])) or "the frames span less than that"
+               if recording.has_frames else f"the events span {(t[-1] - t[0]) / 1e3:g} ms")
         raise EvflowDataError(
-            "EV017", f"no window of {window_us / 1e3:g} ms can be used "
-            f"({'; '.join(notes[:3]) or 'the frames span less than that'}).",
+            "EV017", f"no window of {window_us / 1e3:g} ms can be used ({why}).",
             "Record longer, or lower --window-ms.")
     return pairs, starts, lengths, notes
 

@@ -16,18 +16,20 @@ from evflow.downstream.sync import Sync, sync_times
 from evflow.downstream.tensor import reconstructions
 from evflow.errors import EvflowDataError
 from evflow.estimation.result import CameraEstimate
+from evflow.io.images.folder import MADE
 from evflow.metrics.image_scores import ImageProtocol, score_images
 from evflow.metrics.perceptual import Params
-from evflow.types import MADE, Recording
+from evflow.notes import Note
+from evflow.types import Recording
 
 FRAME_US = 30_000  # windows that the released networks were trained on
 WARM_UP = 5  # images until a network's memory holds the scene: .15 s
 # Of log(theta / truth): .65 on hidden cameras (a constant: .39), 1.2 on a Newton's cradle.
 GUESS_ERROR = 1.0
-GUESSED = (
-    "the frames were made from the events by a network: their contrast is its guess, not measured "
-    "light, and thresholds scale with it. Their errors are widened to what such guesses were off "
-    "by: as much as the thresholds themselves.")
+GUESSED = Note(
+    "theta.guessed", "the frames were made from the events by a network: their contrast is its "
+    "guess, not measured light, and thresholds scale with it. Their errors are widened to what "
+    "such guesses were off by: as much as the thresholds themselves.")
 SCORED_AT_ONCE = 64  # images held for scoring
 
 Progress = Callable[[int, int], None]
@@ -67,12 +69,12 @@ def with_reconstructed_frames(
             frames[i - warm_up] = 255.0 * np.clip(image, 0.0, 1.0)
         if progress:
             progress(i + 1, len(times))
-    note = f"{len(frames)} frames were {MADE} {name}"
+    note = Note("frames.made", f"{len(frames)} frames were {MADE} {name}")
     return Recording(recording.events, frames, times[warm_up:], (*recording.notes, note))
 
 
 def doubted(found: CameraEstimate) -> CameraEstimate:
-    """An estimate against made frames: a warning, and `GUESS_ERROR` of every threshold and
+    """An estimate against made frames: a note, and `GUESS_ERROR` of every threshold and
     mismatch in its std, which all pixels share."""
     def widened(std: Any, of: Any, names: Iterable[str]) -> Any:
         return dataclasses.replace(std, **{
@@ -83,7 +85,7 @@ def doubted(found: CameraEstimate) -> CameraEstimate:
     return dataclasses.replace(
         found, std=widened(found.std, found.camera, scaled),
         summary_std=widened(found.summary_std, found.summary, (*scaled, "sigma_on", "sigma_off")),
-        warnings=(GUESSED, *found.warnings))
+        notes=(GUESSED, *found.notes))
 
 
 class FrameScores:

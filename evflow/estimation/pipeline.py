@@ -39,6 +39,7 @@ from evflow.light.log_maps import lin_log
 from evflow.network import api, architecture
 from evflow.network.coordinates import SCALE, camera_std, per_channel, squash, unsquash_summary
 from evflow.network.weights import load_weights
+from evflow.notes import Note
 from evflow.recordings.check.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels
 from evflow.recordings.glitches import exposed
@@ -115,7 +116,8 @@ def estimate_camera(
     return CameraEstimate(
         camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         len(plan.pairs),
-        (*condensed(plan.skipped), *_warnings(stats, unknown, n_events, summary, hot, dead)))
+        (*condensed(plan.skipped), *_notes(stats, unknown, n_events, summary, hot, dead)),
+        tuple(f"theta_{name}" for name in unknown))
 
 
 def window_inputs(window: Window) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
@@ -248,10 +250,10 @@ def _by_regression(
             Camera(on, off, summary_std.eta_on * flat, summary_std.eta_off * flat))
 
 
-def _warnings(
+def _notes(
     stats: api.Stats, unknown: tuple[str, ...], n_events: np.ndarray, summary: Summary,
     hot: np.ndarray, dead: np.ndarray,
-) -> list[str]:
+) -> list[Note]:
     found = []
     for name, mask, what in (
         ("hot", hot, "they fire while nothing moves, and were left out of the refinement."),
@@ -260,22 +262,29 @@ def _warnings(
     ):
         if mask.any():
             y, x = np.argwhere(mask)[0]
-            found.append(f"{name} pixels ({mask.sum()}, the first at x={x}, y={y}): {what}")
+            found.append(Note(
+                f"pixels.{name}",
+                f"{name} pixels ({mask.sum()}, the first at x={x}, y={y}): {what}"))
     low, high = PRESETS["default"].prior.theta
     for name, events in (("on", stats.events_on), ("off", stats.events_off)):
         theta = float(getattr(summary, f"theta_{name}"))
         if name in unknown:
-            found.append(f"only {int(events)} {name.upper()} events, as noise sends: theta_{name} "
-                         "is undetermined, its value is the prior's, and the other threshold was "
-                         "measured alone, less precisely.")
+            found.append(Note(
+                f"theta_{name}.undetermined", f"only {int(events)} {name.upper()} events, as noise "
+                f"sends: theta_{name} is undetermined, its value is the prior's, and the other "
+                "threshold was measured alone, less precisely."))
         elif float(events) < FEW_EVENTS:
-            found.append(f"only {int(events)} {name.upper()} events: theta_{name} is uncertain.")
+            found.append(Note(
+                f"theta_{name}.uncertain",
+                f"only {int(events)} {name.upper()} events: theta_{name} is uncertain."))
         elif not low <= theta <= high:
-            found.append(f"theta_{name} = {theta:.3f} lies outside the {low}-{high} that the "
-                         "network was trained on: an extrapolation. Frames with a gamma or an "
-                         "offset stretch the scale.")
+            found.append(Note(
+                f"theta_{name}.extrapolated", f"theta_{name} = {theta:.3f} lies outside the "
+                f"{low}-{high} that the network was trained on: an extrapolation. Frames with a "
+                "gamma or an offset stretch the scale."))
     active = float((n_events >= VALID_EVENTS).mean())
     if active < ACTIVE_SHARE:
-        found.append(f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
-                     "elsewhere the maps show the camera's summary. Record more motion.")
+        found.append(Note(
+            "pixels.unsure", f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
+            "elsewhere the maps show the camera's summary. Record more motion."))
     return found

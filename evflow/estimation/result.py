@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 
 from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.notes import Note, as_dicts
+
+THRESHOLDS = ("theta_on", "theta_off")  # of whose measurement `undetermined` speaks
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -21,7 +24,8 @@ class CameraEstimate:
     events in the windows used whose frames are neither saturated nor black there; n_events:
     (H, W) uint32 events in the windows used; hot, dead: (H, W) bool, pixels that fire by
     themselves, and pixels that never do amid others that do; windows: how many were used, 0
-    of a static scene; warnings: what to know before trusting it, a sentence each.
+    of a static scene; notes: what to know before trusting it; undetermined: those of
+    `THRESHOLDS` that the recording does not tell: their values, and widths, are the prior's.
     """
 
     camera: Camera
@@ -33,7 +37,8 @@ class CameraEstimate:
     hot: np.ndarray
     dead: np.ndarray
     windows: int
-    warnings: tuple[str, ...]
+    notes: tuple[Note, ...]
+    undetermined: tuple[str, ...]
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead."""
@@ -42,7 +47,7 @@ class CameraEstimate:
                                 n_events=self.n_events, hot=self.hot, dead=self.dead)
 
     def as_dict(self) -> dict[str, Any]:
-        """Summary, std and warnings as JSON-ready values."""
+        """Summary, std and notes as JSON-ready values."""
         def floats(s: Summary) -> dict[str, float]:
             return {k: float(v) for k, v in dataclasses.asdict(s).items()}
 
@@ -52,4 +57,5 @@ class CameraEstimate:
         return {"summary": floats(self.summary), "summary_std": floats(self.summary_std),
                 "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
                 "hot_pixels": places(self.hot), "dead_pixels": places(self.dead),
-                "windows": self.windows, "warnings": list(self.warnings)}
+                "windows": self.windows, "undetermined": list(self.undetermined),
+                "notes": as_dicts(self.notes)}

@@ -11,7 +11,8 @@ import numpy as np
 from evflow.camera import Camera, Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.pixel_noise import pixel_rates
-from evflow.estimation.result import CameraEstimate
+from evflow.estimation.result import THRESHOLDS, CameraEstimate
+from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels
 from evflow.recordings.stillness import busy_pixels, unlike_noise
 from evflow.training.config import PRESETS
@@ -47,7 +48,7 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
     return CameraEstimate(
         camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
-        dead_pixels(total), 0, _warnings(hot, total, recording.has_frames))
+        dead_pixels(total), 0, _notes(hot, total, recording.has_frames), THRESHOLDS)
 
 
 def uniform(bounds: tuple[float, float]) -> tuple[float, float]:
@@ -80,13 +81,14 @@ def _rates(
     return rate, error, mean / seconds, float(mean_error) / seconds
 
 
-def _warnings(hot: np.ndarray, total: np.ndarray, frames: bool) -> tuple[str, ...]:
-    why = "nothing moves in frames and events" if frames else "no frames"
-    found = [f"{why}: theta_on and theta_off are undetermined, their values are the prior's; "
-             "the noise rates are those of a static scene."]
+def _notes(hot: np.ndarray, total: np.ndarray, frames: bool) -> tuple[Note, ...]:
+    code, why = (("scene.static", "nothing moves in frames and events") if frames else
+                 ("frames.none", "no frames"))
+    found = [Note(code, f"{why}: theta_on and theta_off are undetermined, their values are the "
+                  "prior's; the noise rates are those of a static scene.")]
     if hot.any():
         share = float(total[hot].sum()) / float(total.sum())
         y, x = np.unravel_index(int(np.argmax(np.where(hot, total, 0))), total.shape)
-        found.append(f"{hot.sum()} hot pixels send {share:.0%} of the events, most of them "
-                     f"x={x}, y={y}: left out of the summary.")
+        found.append(Note("pixels.hot", f"{hot.sum()} hot pixels send {share:.0%} of the events, "
+                          f"most of them x={x}, y={y}: left out of the summary."))
     return tuple(found)

@@ -13,6 +13,7 @@ import numpy as np
 
 from evflow.checks import Size, check_polarity, check_size
 from evflow.errors import EvflowDataError
+from evflow.notes import Note
 
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 POLARITIES = ("auto", "01", "pm1", "invert")
@@ -28,7 +29,7 @@ def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
 
 def known(given: dict[str, Any], fields_of: type, who: str) -> dict[str, Any]:
     """`given`; EV020 where it names what is no field of the dataclass. who: takes its fields."""
-    names = [field.name for field in dataclasses.fields(fields_of) if field.init]
+    names = [field.name for field in dataclasses.fields(fields_of)]
     unknown = sorted(set(given) - set(names))
     if unknown:
         raise EvflowDataError(
@@ -49,7 +50,6 @@ class Hints:
     partial: of a damaged or cut-off file take what lies before the damage; of HDF5 and npz, which
         are sound or not as a whole, only what lies before a time that goes back.
     drop_outside: leave out events outside the sensor instead of refusing them.
-    remarks: what obeying these cost, a sentence each; grows while a file is read.
     """
 
     start_s: float | None = None
@@ -59,7 +59,6 @@ class Hints:
     size: Size | None = None
     partial: bool = False
     drop_outside: bool = False
-    remarks: list[str] = dataclasses.field(default_factory=list, init=False, compare=False)
 
     def __post_init__(self) -> None:
         check_choices(self, time_unit=("auto", *UNITS_US), polarity=POLARITIES)
@@ -147,11 +146,13 @@ class Hints:
         on = check_polarity(p)
         return ~on if self.polarity == "invert" else on
 
-    def forgive(self, error: EvflowDataError, sound: bool) -> None:
-        """Raise the error, unless what is sound before the damage was asked for and is some."""
+    def forgive(self, error: EvflowDataError, sound: bool) -> Note:
+        """A note on the error where what is sound before the damage was asked for and is some;
+        else it is raised."""
         if not (self.partial and sound and error.code in ("EV004", "EV009")):
             raise error
-        self.remarks.append(f"only the part before the damage was read (--partial): {error.seen}")
+        return Note("events.partial",
+                    f"only the part before the damage was read (--partial): {error.seen}")
 
     def span_us(self, first_us: int) -> tuple[int, int]:
         """The absolute half-open range [start, stop) in us for a file that begins at first_us."""
@@ -177,10 +178,10 @@ def within(x: np.ndarray, y: np.ndarray, size: Size) -> np.ndarray:
     return (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
 
 
-def dropped(count: int, total: int, size: Size) -> str:
-    """The remark on events that were left out."""
-    return (f"{count:,} of {total:,} events lay outside {size[0]}x{size[1]} and were left out "
-            "(--drop-outside)")
+def dropped(count: int, total: int, size: Size) -> Note:
+    """What is said of events that were left out."""
+    return Note("events.outside", f"{count:,} of {total:,} events lay outside {size[0]}x{size[1]} "
+                "and were left out (--drop-outside)")
 
 
 def _too_late(t: np.ndarray, unit: str) -> EvflowDataError:

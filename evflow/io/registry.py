@@ -8,7 +8,6 @@ wrong with a file comes out as an `EvflowDataError`.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 from typing import Any, Protocol
@@ -114,9 +113,7 @@ def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
             "If it is sound, read a part: start_s, stop_s (--start, --stop).") from e
     except OSError as e:
         raise EvflowDataError("EV009", f"{path} cannot be read ({e}).", "Copy it again.") from e
-    if not told.remarks:
-        return recording
-    return dataclasses.replace(recording, notes=(*recording.notes, *told.remarks))
+    return recording
 
 
 def read_events(path: str | os.PathLike, **hints: Any) -> Events:

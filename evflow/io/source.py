@@ -14,6 +14,7 @@ from evflow.io.images.folder import open_folder
 from evflow.io.images.frames import FrameHints, Frames, FrameSource, Image, converted, existing
 from evflow.io.images.stacks import is_stack, open_stack
 from evflow.io.registry import find_format, read_recording
+from evflow.notes import Note
 
 
 def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
@@ -105,7 +106,7 @@ def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:
 
 
 def _source(size: tuple[int, int], count: int, images: Any, told: FrameHints,
-            notes: list[str]) -> FrameSource:
+            notes: list[Note]) -> FrameSource:
     def frames() -> Frames:
         return converted(_between(images(), told), told, notes)
 

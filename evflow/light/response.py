@@ -8,10 +8,12 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.light.colour import mosaic_luma
+from evflow.notes import Note
 
 FLIPS: dict[str, tuple[int, ...]] = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}  # axes
 RESPONSES = ("linear", "gamma", "srgb")
 GAMMA = 2.2
+LUMA = ("frames.luma", "frames.mosaic")  # codes of notes on frames that are luma of colours
 
 
 def linear_light(frame: np.ndarray, response: str) -> np.ndarray:
@@ -48,6 +50,17 @@ def luma_of_mosaic(frame: np.ndarray, pattern: str, where: str) -> np.ndarray:
     return mosaic_luma(frame, pattern)
 
 
-def remark(pattern: str) -> str:
+def of_mosaic(pattern: str) -> Note:
     """What is said of frames that were a mosaic."""
-    return f"frames were a colour mosaic ({pattern.upper()}) and are its luma"
+    return Note(
+        "frames.mosaic", f"frames were a colour mosaic ({pattern.upper()}) and are its luma")
+
+
+def linearised(response: str) -> Note:
+    """What is said of frames whose response was undone."""
+    return Note("frames.linearised", f"frames linearised ({response})")
+
+
+def flipped(side: str) -> Note:
+    """What is said of mirrored frames."""
+    return Note("frames.flipped", f"frames flipped ({side})")

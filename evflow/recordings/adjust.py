@@ -13,11 +13,11 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.io.source import open_frames
+from evflow.light import response as light
 from evflow.light.colour import mosaic_luma
-from evflow.light.response import FLIPS, linear_light, remark
+from evflow.notes import Note
 from evflow.types import Recording
 
-LUMA = ("colour frames", "frames were a colour mosaic")  # notes on frames that are luma already
 MARGIN_US = 1_000_000  # frames that far outside the events are kept: their clock may be off
 
 
@@ -28,38 +28,37 @@ def linearised(recording: Recording, response: str) -> Recording:
         return recording
     frames = np.empty(recording.frames.shape, np.float32)
     for i in range(len(frames)):
-        frames[i] = linear_light(recording.frame_dn(i), response)
-    return _changed(recording, f"frames linearised ({response})", frames=frames)
+        frames[i] = light.linear_light(recording.frame_dn(i), response)
+    return _changed(recording, light.linearised(response), frames=frames)
 
 
 def demosaiced(recording: Recording, pattern: str) -> Recording:
     """The recording whose frames are a raw mosaic, with their luma in its place, of the same size
     and dtype. EV020 where they were colour images already; errors of `colour.mosaic_luma`."""
-    if any(note.startswith(LUMA) for note in recording.notes):
+    if any(note.code in light.LUMA for note in recording.notes):
         raise EvflowDataError(
             "EV020", "the frames are luma of colour images already, and no "
             f"{pattern.upper()} mosaic.", "Leave out --bayer.")
     frames = np.empty(recording.frames.shape, recording.frames.dtype)
     for i, frame in enumerate(recording.frames):
         frames[i] = mosaic_luma(frame, pattern)
-    return _changed(recording, remark(pattern), frames=frames)
+    return _changed(recording, light.of_mosaic(pattern), frames=frames)
 
 
 def shifted(recording: Recording, offset_us: int) -> Recording:
     """The recording with offset_us added to its frame times."""
     if not offset_us:
         return recording
-    return _changed(recording, f"frame times moved by {offset_us / 1e3:+g} ms",
-                    frame_times=recording.frame_times + offset_us)
+    moved = Note("frames.moved", f"frame times moved by {offset_us / 1e3:+g} ms")
+    return _changed(recording, moved, frame_times=recording.frame_times + offset_us)
 
 
 def flipped(recording: Recording, side: str) -> Recording:
     """The recording with its frames mirrored: "horizontal", "vertical" or "both"; EV020."""
-    if side not in FLIPS:
-        raise EvflowDataError("EV020", f"side={side!r}.", f"Choose from {sorted(FLIPS)}.")
-    axes = tuple(1 + axis for axis in FLIPS[side])
-    return _changed(recording, f"frames flipped ({side})",
-                    frames=np.flip(recording.frames, axes))
+    if side not in light.FLIPS:
+        raise EvflowDataError("EV020", f"side={side!r}.", f"Choose from {sorted(light.FLIPS)}.")
+    axes = tuple(1 + axis for axis in light.FLIPS[side])
+    return _changed(recording, light.flipped(side), frames=np.flip(recording.frames, axes))
 
 
 def with_frames(
@@ -98,7 +97,8 @@ def with_frames(
             "On another clock? Pass --frames-offset-ms "
             f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; in another "
             "unit, --timestamps-unit.")
-    notes = (*recording.notes, f"frames are those of {path}", *map(_reworded, source.notes))
+    notes = (*recording.notes, Note("frames.replaced", f"frames are those of {path}"),
+             *(Note(note.code, _reworded(note.text)) for note in source.notes))
     return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes)
 
 
@@ -107,5 +107,5 @@ def _reworded(text: str) -> str:
     return text.replace("--time-unit", "--timestamps-unit").replace("--fps", "--frames-fps")
 
 
-def _changed(recording: Recording, note: str, **fields: Any) -> Recording:
+def _changed(recording: Recording, note: Note, **fields: Any) -> Recording:
     return dataclasses.replace(recording, notes=(*recording.notes, note), **fields)

@@ -14,6 +14,7 @@ import numpy as np
 
 from evflow.checks import need
 from evflow.errors import EvflowDataError
+from evflow.notes import Note
 from evflow.recordings.gaps import event_gaps
 from evflow.recordings.glitches import faulty_frames
 from evflow.types import Recording, Window
@@ -26,11 +27,27 @@ DROPPED = 3.0  # a frame interval beyond this many medians means that frames are
 
 
 @dataclasses.dataclass(frozen=True)
+class Skipped:
+    """A window left out, between the frames first and last, and why; its `str` is a sentence."""
+
+    first: int
+    last: int
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.frames}: {self.why}"
+
+    @property
+    def frames(self) -> str:
+        return f"frames {self.first}-{self.last}"
+
+
+@dataclasses.dataclass(frozen=True)
 class WindowPlan:
-    """pairs: (first, last) frame of each window. skipped: one sentence per window left out."""
+    """pairs: (first, last) frame of each window. skipped: the windows left out."""
 
     pairs: tuple[tuple[int, int], ...]
-    skipped: tuple[str, ...]
+    skipped: tuple[Skipped, ...]
 
 
 def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
@@ -48,7 +65,7 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     start, stop = _covered(recording)
     obstacles = _obstacles(recording, start, stop)
     pairs: list[tuple[int, int]] = []
-    skipped: list[str] = []
+    skipped: list[Skipped] = []
     first = 0
     while (last := int(np.searchsorted(times, times[first] + min_us))) < len(times):
         if found := obstacles.between(first, last):
@@ -60,7 +77,7 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
             why, following = "", last
             pairs.append((first, last))
         if why:
-            skipped.append(f"frames {first}-{last}: {why}")
+            skipped.append(Skipped(first, last, why))
         first = following
     return WindowPlan(tuple(pairs), tuple(skipped))
 
@@ -113,22 +130,22 @@ def iter_windows(
     """
     plan = plan_windows(recording, min_us) if plan is None else plan
     if not plan.pairs:
-        why = "; ".join(plan.skipped[:3]) or "the frames span less than that"
+        why = "; ".join(map(str, plan.skipped[:3])) or "the frames span less than that"
         raise EvflowDataError(
             "EV017", f"no window of {min_us / 1e3:g} ms or more can be used ({why}).",
             "Record longer, or take shorter windows (min_us, --window-ms).")
     return (_window(recording, pair, index) for index, pair in enumerate(plan.pairs))
 
 
-def condensed(skipped: tuple[str, ...]) -> list[str]:
-    """What was skipped, windows of one reason in one sentence ("frames 3-5: reason")."""
+def condensed(skipped: tuple[Skipped, ...]) -> tuple[Note, ...]:
+    """What was skipped, windows of one reason in one note."""
     reasons: dict[str, list[str]] = {}
-    for sentence in skipped:
-        frames, _, reason = sentence.partition(": ")
-        reasons.setdefault(reason, []).append(frames)
-    return [f"{frames[0]} skipped: {reason}" if len(frames) == 1 else
-            f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {reason}"
-            for reason, frames in reasons.items()]
+    for window in skipped:
+        reasons.setdefault(window.why, []).append(window.frames)
+    return tuple(Note(
+        "windows.skipped", f"{frames[0]} skipped: {why}" if len(frames) == 1 else
+        f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {why}")
+        for why, frames in reasons.items())
 
 
 def _window(recording: Recording, pair: tuple[int, int], index: int) -> Window:

@@ -19,6 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import Progress
 from evflow.estimation.result import CameraEstimate
 from evflow.network.weights import load_weights, weights_hash
+from evflow.notes import texts
 from evflow.process.provenance import sha256, versions
 from evflow.recordings.check import check
 from evflow.recordings.check.agreement import frame_steps
@@ -207,7 +208,7 @@ def _stretch(recording: Recording, trial: Trial) -> str:
         words += (f"The first {(trial.span_us[0] - t0) / 1e3:.0f} ms are left out: there the "
                   "simulation still remembers its first frame. ")
     return words + f"At most {SECONDS:g} s, the busiest, are simulated. " + " ".join(
-        note[0].upper() + note[1:] for note in trial.notes)
+        text[0].upper() + text[1:] for text in texts(trial.notes))
 
 
 def _held_panel(found: CameraEstimate, evidence: Evidence) -> Panel:
@@ -250,7 +251,8 @@ def _assumptions(
         "Alignment": "Frames and events on one clock; frame times taken as mid-exposure.",
         "Response": f"Frames taken as linear in light, {recording.frames.dtype} with white at "
                     f"{recording.full_scale}; logarithm as in v2e, linear below 20 of 255.",
-        "Read": " ".join(f"{n[0].upper()}{n[1:].rstrip('.')}." for n in recording.notes) or "–",
+        "Read": " ".join(
+            f"{text[0].upper()}{text[1:].rstrip('.')}." for text in texts(recording.notes)) or "–",
         "Re-simulation": f"At most {SECONDS:g} s and {PIXELS / 1e6:.0f} million pixels of frames; "
                          "noise resets a pixel's memory; two keys.",
         "Weights": f"{weights}, sha256 {weights_hash(weights)}",
@@ -262,10 +264,10 @@ def _assumptions(
     coded = {"Weights", "Recording", "Command"}
     rows = [[page.text(k), f"<code>{page.text(v)}</code>" if k in coded else page.text(v)]
             for k, v in facts.items()]
-    said = [*found.warnings, *map(str, report.findings)]
+    said = texts((*found.notes, *(finding.note() for finding in report.findings)))
     return Panel("assumptions", "What was assumed, and where it comes from",
                  table(["", ""], rows, numeric=False) + "<h3>Warnings</h3>"
-                 + (bullets(dict.fromkeys(said)) if said else paragraph("None.", "note")))
+                 + (bullets(said) if said else paragraph("None.", "note")))
 
 
 def _agreement(recording: Recording) -> str:

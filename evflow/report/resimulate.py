@@ -19,6 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import estimate_camera
 from evflow.estimation.result import CameraEstimate
 from evflow.metrics.streams import compare
+from evflow.notes import Note
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
@@ -50,7 +51,7 @@ class Trial:
     numbers: dict[str, Any]
     ceiling: dict[str, float | None]
     instant_us: int
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 def usable_runs(recording: Recording) -> list[Run]:
@@ -89,7 +90,7 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
 
 def resimulate(recording: Recording, camera: Camera, run: Run, seed: int) -> Trial:
     """Simulate the frames of `run` twice, interpolated to 1 px of motion, and compare."""
-    notes: list[str] = []
+    notes: list[Note] = []
     model = SensorModel(noise_resets_memory=True)
 
     def seen(key: jax.Array) -> Events:

@@ -21,5 +21,5 @@ def describe(found: CameraEstimate) -> str:
     windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
     lines.append(f"{events} in {windows}; {found.valid.mean():.0%} of the pixels have events of "
                  "their own" if found.windows else f"{events} of a static scene")
-    lines += [f"note: {warning}" for warning in found.warnings]
+    lines += [f"note: {note}" for note in found.notes]
     return "\n".join(lines)

@@ -90,7 +90,7 @@ def _threshold(found: CameraEstimate, key: str) -> Judged:
         return Judged("poor", name, 9.0, f"θ {name} is undetermined.", THRESHOLD,
                       "undetermined", "Record moving texture in good light, together with "
                       "frames: without it thresholds cannot be told.")
-    if any(f"theta_{key} = " in w for w in found.warnings):
+    if any(note.code == f"theta_{key}.extrapolated" for note in found.notes):
         return Judged("fair", name, 1.5, f"θ {name} lies outside what the network was trained on.",
                       THRESHOLD, f"{theta:.3f} ± {std:.3f}", "A threshold outside the trained "
                       "range is an extrapolation: are the frames linear in light (--response), "
@@ -105,8 +105,8 @@ def _threshold(found: CameraEstimate, key: str) -> Judged:
 def known(found: CameraEstimate, key: str) -> bool:
     """Whether the recording determined this polarity's threshold at all."""
     theta, std = (float(getattr(s, f"theta_{key}")) for s in (found.summary, found.summary_std))
-    said = not found.windows or any(f"theta_{key} is undetermined" in w for w in found.warnings)
-    return bool(np.isfinite(theta) and np.isfinite(std) and theta > 0 and not said)
+    return bool(np.isfinite(theta) and np.isfinite(std) and theta > 0
+                and f"theta_{key}" not in found.undetermined)
 
 
 def judge_stream(

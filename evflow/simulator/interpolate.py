@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.notes import Note
 
 MIN_SIDE = 12  # pixels on the longer side: smaller frames show no motion
 PATCHES = 16  # pixels: two of DIS' patches
@@ -25,7 +26,7 @@ MOTION_QUANTILE = 99.5  # per cent of pixels that must move less than the wanted
 
 def upsample(
     pairs: Iterable[tuple[np.ndarray, int]], *, max_motion_px: float = 1.0,
-    warn: Callable[[str], None] | None = None,
+    warn: Callable[[Note], None] | None = None,
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Yield (frame, time) with at most ~max_motion_px of motion between neighbours.
 
@@ -55,8 +56,9 @@ def upsample(
             steps = int(np.clip(wanted, 1, min(MAX_STEPS, max(1, t1 - t0))))
             if wanted > MAX_STEPS and warn and not told:
                 told = True
-                warn(f"motion of {motion:.0f} px between the frames at {t0} and {t1} us "
-                     f"is too fast to interpolate well; {steps} steps were used.")
+                warn(Note("frames.fast", f"motion of {motion:.0f} px between the frames at {t0} "
+                          f"and {t1} us is too fast to interpolate well; {steps} steps were "
+                          "used."))
             for k in range(1, steps):
                 s = k / steps
                 yield _between(previous, current, there, back, s), t0 + round(s * (t1 - t0))

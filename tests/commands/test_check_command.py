@@ -139,11 +139,11 @@ def test_estimate_stops_at_errors_and_keeps_warnings(
     assert run(*estimate, "--no-checks") == 0
     assert "warning: EV024" in capsys.readouterr().err
     saved = json.loads((out / "camera.json").read_text())
-    assert sum("EV024" in w for w in saved["warnings"]) == 1
+    assert [note["code"] for note in saved["notes"]].count("EV024") == 1
     assert run(*estimate, "--overwrite", "--frames-offset-ms", "auto") == 0
     saved = json.loads((out / "camera.json").read_text())
-    assert not any("EV0" in w for w in saved["warnings"])
-    assert "frame times moved by" in saved["notes"][-1]
+    assert not any(note["code"].startswith("EV0") for note in saved["notes"])
+    assert saved["recording_notes"][-1]["code"] == "frames.moved"
 
 
 def test_estimate_of_noise_alone(
@@ -163,5 +163,6 @@ def test_estimate_of_noise_alone(
     assert facts["summary"]["eta_on"] == pytest.approx(0.232, rel=0.2)
     assert facts["summary"]["eta_off"] == pytest.approx(0.198, rel=0.2)
     assert facts["valid_fraction"] == 0
-    assert any("undetermined" in w for w in facts["warnings"])
+    assert facts["undetermined"] == ["theta_on", "theta_off"]
+    assert "frames.none" in [note["code"] for note in facts["notes"]]
     assert (tmp_path / "cam" / "maps.png").stat().st_size > 10_000

@@ -61,7 +61,7 @@ def test_convert_there_and_back(
     assert facts["frames"] == len(got.frames) == (0 if name == "a.zip" else 6)
     if name == "a.zip":
         assert "holds events only: the 6 frames were left out" in err
-        assert facts["notes"] == [err.removeprefix("note: ").strip()]
+        assert [note["text"] for note in facts["notes"]] == [err.removeprefix("note: ").strip()]
     assert run(capsys, "convert", tmp_path / name, flight, "--overwrite")[0] == 0
     equal(read_events(flight), want.events)
 

@@ -87,7 +87,7 @@ def test_every_kind_of_input_gives_the_same_events(
     if "a.avi" in made:
         assert abs(len(made["a.avi"][0]) / len(events) - 1) < 0.05
     assert "read in ms (100 frames/s)" in made["a"][2]
-    assert made["a"][1]["notes"][0] in made["a"][2]
+    assert made["a"][1]["notes"][0]["text"] in made["a"][2]
 
 
 @pytest.mark.parametrize("interpolate", [True, False])
@@ -148,7 +148,7 @@ def test_interpolation_and_its_limit(tmp_path: Path, capsys: pytest.CaptureFixtu
     _, facts, err = simulate(capsys, tmp_path / "far.npy", tmp_path / "far.h5", "--fps", "25",
                              "--max-motion", "0.1")
     assert "too fast to interpolate well" in err
-    assert "too fast" in facts["notes"][-1]
+    assert facts["notes"][-1]["code"] == "frames.fast"
 
 
 def test_errors_leave_nothing_and_exit_1(

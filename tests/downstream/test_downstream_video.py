@@ -160,7 +160,7 @@ def test_frames_are_made_for_recordings_without() -> None:
     assert seen.frames.dtype == np.float32
     times = sync_times(bare, window_us=20_000)
     np.testing.assert_array_equal(seen.frame_times, times[video.WARM_UP:])
-    assert "made from the events" in seen.notes[-1]
+    assert seen.notes[-1].code == "frames.made"
     assert calls[-1] == (len(times), len(times))
     with pytest.raises(EvflowDataError, match="EV017"):
         video.with_reconstructed_frames(bare, even(), window_us=100_000)

@@ -11,7 +11,9 @@ import pytest
 
 from evflow.errors import EvflowDataError
 from evflow.io import read_recording
+from evflow.notes import Note
 from evflow.recordings import condensed, iter_windows, plan_windows
+from evflow.recordings.windows import Skipped
 from evflow.types import Events, Recording
 
 
@@ -63,7 +65,7 @@ def test_windows_outside_the_events_are_left_out() -> None:
     plan = plan_windows(recording([40 * i for i in range(10)], first_ms=100, last_ms=300))
     assert plan.pairs == ((3, 4), (4, 5), (5, 6), (6, 7))
     assert len(plan.skipped) == 5
-    assert all("not covered" in reason for reason in plan.skipped)
+    assert all("not covered" in window.why for window in plan.skipped)
 
 
 @pytest.mark.parametrize(("first_ms", "kept"), [(4.9, True), (5.2, False)])
@@ -76,7 +78,8 @@ def test_no_window_crosses_a_dropped_frame() -> None:
     times = [0, 20, 40, 60, 180, 200, 220, 240, 260]
     plan = plan_windows(recording(times))
     assert plan.pairs == ((0, 2), (4, 6), (6, 8))
-    assert plan.skipped == ("frames 2-4: no frame for 120.0 ms (dropped?)",)
+    assert plan.skipped == (Skipped(2, 4, "no frame for 120.0 ms (dropped?)"),)
+    assert str(plan.skipped[0]) == "frames 2-4: no frame for 120.0 ms (dropped?)"
 
 
 def test_no_window_crosses_a_gap_in_the_events() -> None:
@@ -87,9 +90,11 @@ def test_no_window_crosses_a_gap_in_the_events() -> None:
                     made.events.size)
     plan = plan_windows(Recording(events, made.frames, made.frame_times))
     assert plan.pairs == ((0, 1), (1, 2), (5, 6))
-    assert condensed(plan.skipped) == [
-        "3 windows skipped (frames 2-3 to frames 4-5): no events for 75.2 ms (lost packets, or a "
-        "scene that stood still?)"]
+    assert condensed(plan.skipped) == (Note(
+        "windows.skipped", "3 windows skipped (frames 2-3 to frames 4-5): no events for 75.2 ms "
+        "(lost packets, or a scene that stood still?)"),)
+    assert [note.text for note in condensed(plan.skipped[:1])] == [
+        f"frames 2-3 skipped: {plan.skipped[0].why}"]
 
 
 def test_a_long_window_begins_anew_right_behind_a_dropped_frame() -> None:
@@ -162,7 +167,7 @@ def test_windows_at_a_black_or_white_frame_are_left_out(level: int) -> None:
     plan = plan_windows(filmed(frames))
     assert plan.pairs == ((0, 1), (1, 2), (4, 5), (5, 6), (6, 7))
     assert len(plan.skipped) == 1
-    assert "glitch" in plan.skipped[0]
+    assert "glitch" in plan.skipped[0].why
 
 
 def test_exposure_changes_are_left_out_and_changes_of_light_are_not() -> None:
@@ -170,6 +175,6 @@ def test_exposure_changes_are_left_out_and_changes_of_light_are_not() -> None:
     frames[3:] = np.rint(frames[3:] * 1.2)
     plan = plan_windows(filmed(frames))
     assert plan.pairs == ((0, 1), (1, 2), (3, 4), (4, 5))
-    assert "+20%" in plan.skipped[0]
-    assert "auto-exposure" in plan.skipped[0]
+    assert "+20%" in plan.skipped[0].why
+    assert "auto-exposure" in plan.skipped[0].why
     assert len(plan_windows(filmed(frames, share=0.8)).pairs) == 5

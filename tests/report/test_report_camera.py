@@ -21,9 +21,10 @@ from PIL import Image
 
 import evflow
 from evflow import CameraEstimate, EvflowDataError, Recording
+from evflow.notes import Note
 from evflow.report import camera, page
 from evflow.report.resimulate import busiest, usable_runs
-from evflow.report.verdict import judge_estimate, judge_stream, poorer, worst
+from evflow.report.verdict import judge_estimate, judge_stream, known, poorer, worst
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -126,7 +127,7 @@ def test_without_frames_it_says_why(
     found, recording = measured
     noise = dataclasses.replace(
         found, windows=0, valid=np.zeros_like(found.valid), hot=np.zeros_like(found.hot),
-        warnings=("no frames: theta_on and theta_off are undetermined.",))
+        notes=(Note("frames.none", "no frames."),), undetermined=("theta_on", "theta_off"))
     numbers = evflow.write_report(
         tmp_path / "noise.html", noise, Recording.of_events(recording.events))
     text = (tmp_path / "noise.html").read_text()
@@ -193,10 +194,12 @@ def test_the_poorer_polarity_is_named(measured: tuple[CameraEstimate, Recording]
     judged = judge_estimate(loose, None, None)
     assert poorer(judged) == "OFF"
     assert worst(judged) == "poor"
-    far = dataclasses.replace(found, warnings=("theta_on = 0.91 lies outside the 0.1-0.5",))
+    far = dataclasses.replace(found, notes=(Note("theta_on.extrapolated", "far off"),))
     assert poorer(judge_estimate(far, None, None)) == "ON"
     lost = changed(found, theta_on=float("nan"))
     assert next(iter(judge_estimate(lost, None, None))).short == "undetermined"
+    half = dataclasses.replace(found, undetermined=("theta_off",))
+    assert [known(half, key) for key in ("on", "off")] == [True, False]
 
 
 def test_the_busiest_stretch_is_bounded_and_without_gaps() -> None:

@@ -26,8 +26,9 @@ from evflow.estimation.bench.steps import (
     regression,
     shrunk_rates,
 )
-from evflow.estimation.result import CameraEstimate
+from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.light.log_maps import lin_log
+from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels
 from evflow.recordings.stillness import LEAST_EVENTS, MOVING, busy_pixels, company
 from evflow.types import Events, Recording
@@ -50,7 +51,7 @@ class Steps:
     seconds: np.ndarray
     rest: np.ndarray
     rest_s: float
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 def calibrate_step(
@@ -77,11 +78,11 @@ def calibrate_step(
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
     hot = is_hot(steps.rest.sum(0), float(hz.sum()), steps.rest_s)
-    maps, stds, medians, spreads, notes = [], [], [], [], list(steps.notes)
-    for i, name in enumerate(("ON", "OFF")):
+    maps, stds, medians, spreads, untold = [], [], [], [], list[str]()
+    for i, name in enumerate(THRESHOLDS):
         good = sound[i] & ~hot
         if not good.any():
-            notes.append(f"no step sends {name} events: theta_{name.lower()} is the prior's.")
+            untold.append(name)
         median, spread, own = camera_wide(theta[i][good], error[i][good])
         medians.append((median, own))
         spreads.append(spread)
@@ -90,11 +91,24 @@ def calibrate_step(
     eta, eta_std = shrunk_rates(steps.rest, steps.rest_s)
     n_events = steps.counts.sum((0, 1)).astype(np.uint32)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & ~hot
-    if valid.mean() < MOST:
-        notes.append(f"{valid.mean():.0%} of the pixels sent enough events to be measured: take "
-                     "more steps, or larger ones.")
     return _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
-                     n_events, hot, len(steps.counts), notes)
+                     n_events, hot, len(steps.counts), _notes(steps, untold, valid, hot),
+                     tuple(untold))
+
+
+def _notes(
+    steps: Steps, untold: Sequence[str], valid: np.ndarray, hot: np.ndarray
+) -> tuple[Note, ...]:
+    notes = [*steps.notes, *(Note(
+        f"{name}.undetermined", f"no step sends {side} events: {name} is the prior's.")
+        for name, side in zip(THRESHOLDS, ("ON", "OFF"), strict=True) if name in untold)]
+    if valid.mean() < MOST:
+        notes.append(Note("pixels.unsure", f"{valid.mean():.0%} of the pixels sent enough events "
+                          "to be measured: take more steps, or larger ones."))
+    if hot.any():
+        notes.append(Note("pixels.hot", f"{hot.sum()} hot pixels: they fire while nothing "
+                          "changes."))
+    return tuple(notes)
 
 
 def _check_polarity(steps: Steps) -> None:
@@ -135,12 +149,14 @@ def _steps(
                  sum(b - a for a, b in quiet) * 1e-6, tuple(_restless(busiest)))
 
 
-def _restless(rest: Events) -> list[str]:
+def _restless(rest: Events) -> list[Note]:
     """What says that the light moved during a rest, if anything does."""
     if len(rest) < LEAST_EVENTS or company(rest, busy_pixels(rest.count_map().sum(0))) <= MOVING:
         return []
-    return ["events come in company while the frames rest: a light that flickers or still settles, "
-            "or a camera that regulates its exposure? Then noise rates, and thresholds, are wrong."]
+    return [Note(
+        "scene.restless", "events come in company while the frames rest: a light that flickers or "
+        "still settles, or a camera that regulates its exposure? Then noise rates, and thresholds, "
+        "are wrong.")]
 
 
 def _levels(
@@ -167,17 +183,16 @@ def _levels(
 def _estimate(
     theta: np.ndarray, theta_std: np.ndarray, medians: list[tuple[float, float]],
     spreads: list[float], eta: np.ndarray, of_eta: tuple[np.ndarray, list[tuple[float, float]]],
-    valid: np.ndarray, n_events: np.ndarray, hot: np.ndarray, count: int, notes: list[str],
+    valid: np.ndarray, n_events: np.ndarray, hot: np.ndarray, count: int, notes: tuple[Note, ...],
+    undetermined: tuple[str, ...],
 ) -> CameraEstimate:
     eta_std, rates = of_eta
     values = [*(m for m, _ in medians), *(m for m, _ in rates), *spreads]
     pixels = max(int(valid.sum()), 1)
     errors = [*(s for _, s in medians), *(s for _, s in rates),
               *(s / np.sqrt(2 * pixels) for s in spreads)]
-    if hot.any():
-        notes = [*notes, f"{hot.sum()} hot pixels: they fire while nothing changes."]
     return CameraEstimate(
         Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta, *eta))).validate(),
         Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta_std, *eta_std))),
         Summary(*(jnp.float32(v) for v in values)), Summary(*(jnp.float32(e) for e in errors)),
-        valid, n_events, hot, dead_pixels(n_events), count, tuple(notes))
+        valid, n_events, hot, dead_pixels(n_events), count, notes, undetermined)

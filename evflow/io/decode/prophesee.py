@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 from evflow.checks import Size
+from evflow.notes import Note
 
 MAX_HEADER = 1 << 16  # bytes; real ones have 200 to 600
 TEXT = re.compile(rb"%[ \t][\x20-\x7e\t]*\r?\n|%\r?\n")
@@ -43,7 +44,7 @@ class Header:
         """Byte order of the words, ">" where `% format` says endianness=big."""
         return ">" if "endianness=big" in self.fields.get("format", "").lower() else "<"
 
-    def size(self) -> tuple[Size | None, tuple[str, ...]]:
+    def size(self) -> tuple[Size | None, tuple[Note, ...]]:
         """(width, height) or None, and a note where it follows from the sensor's name."""
         layout = self.fields.get("format", "").lower()
         told = dict(re.findall(r"(width|height)=(\d{1,5})\b", layout))
@@ -57,7 +58,8 @@ class Header:
             name = self.fields.get(key, "").strip().lower()
             for pattern, size in SENSORS:
                 if re.search(pattern, name):
-                    return size, (f"the sensor is taken as {size[0]}x{size[1]} after {key} {name}",)
+                    return size, (Note("sensor.size", f"the sensor is taken as "
+                                       f"{size[0]}x{size[1]} after {key} {name}"),)
         return None, ()
 
 

@@ -20,6 +20,7 @@ from evflow.checks import COLUMNS, RESET_US, Size
 from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
 from evflow.io.hints import Hints, dropped, within
+from evflow.notes import Note
 from evflow.types import Events, Recording
 
 CHUNK = 1 << 18  # bytes decoded at a time: the temporaries of 64k words stay in a core's cache
@@ -36,6 +37,15 @@ class Chunk(NamedTuple):
     p: np.ndarray
     where: Callable[[int], int]
     unit: str = "byte"
+
+
+class Gathered(NamedTuple):
+    """events: those that were asked for; span: the range [start, stop) in us that was asked for;
+    notes: what obeying that cost."""
+
+    events: Events
+    span: tuple[int, int]
+    notes: tuple[Note, ...]
 
 
 class Damage(Exception):
@@ -116,40 +126,40 @@ def collect(
     chunks: Iterable[Chunk],
     hints: Hints,
     size: Size | None,
-    notes: Callable[[], tuple[str, ...]] = tuple,
+    notes: Callable[[], tuple[Note, ...]] = tuple,
     native: str = "us",
 ) -> Recording:
     """A recording without frames, as `gather` has it; `notes` is called at the end."""
-    events = gather(path, chunks, hints, size, native)[0]
-    return Recording.of_events(events, notes())
+    found = gather(path, chunks, hints, size, native)
+    return Recording.of_events(found.events, (*notes(), *found.notes))
 
 
 def gather(
     path: Path, chunks: Iterable[Chunk], hints: Hints, size: Size | None, native: str = "us",
     offset_us: int = 0,
-) -> tuple[Events, tuple[int, int]]:
-    """The events that `hints` ask for, and the range [start, stop) in us that they ask for.
+) -> Gathered:
+    """The events that `hints` ask for.
 
     size: what the file says of its sensor, None where it says nothing. native: unit of t.
     offset_us: added to t.
     Raises EV001 (no event in the range), EV003 and EV007 (not whole), EV004 (order), EV005
     (outside the sensor), EV006 (polarity), EV009 (damage), EV015 (size unknown).
     """
-    gathered = _Gathered(path, hints, hints.size or size, native, offset_us)
+    gathering = _Gathering(path, hints, hints.size or size, native, offset_us)
     try:
         for chunk in chunks:
-            if len(chunk.t) and gathered.add(chunk):
+            if len(chunk.t) and gathering.add(chunk):
                 break
     except Damage as e:
         error = EvflowDataError(
             "EV009", f"{path} is cut off or damaged at {_place(path, e.unit, e.byte)}: {e.seen}"
-            f"{gathered.so_far()}", "Copy it again" + gathered.sound_part())
+            f"{gathering.so_far()}", "Copy it again" + gathering.sound_part())
         error.__cause__ = e
-        hints.forgive(error, gathered.kept > 0)
-    return gathered.events(size), (gathered.start, gathered.stop)
+        gathering.notes.append(hints.forgive(error, gathering.kept > 0))
+    return gathering.result(size)
 
 
-class _Gathered:
+class _Gathering:
     """The events kept so far. first, last: times of all events seen, in us."""
 
     def __init__(
@@ -161,6 +171,7 @@ class _Gathered:
         self.signs: set[int] = set()  # values of p kept, where they are not bool
         self.seen = self.kept = self.first = self.last = self.outside = 0
         self.reach = (0, 0)
+        self.notes: list[Note] = []
         self.start, self.stop = hints.span_us(0)
 
     def add(self, chunk: Chunk) -> bool:
@@ -184,7 +195,7 @@ class _Gathered:
         wrong = self._first_wrong(chunk, t)
         self._keep(chunk, t[:wrong])
         if wrong < len(t) and self.last < self.stop:
-            self.hints.forgive(self._wrong(chunk, t, wrong), self.kept > 0)
+            self.notes.append(self.hints.forgive(self._wrong(chunk, t, wrong), self.kept > 0))
             return True
         return self.last >= self.stop and self.kept > 0
 
@@ -286,17 +297,18 @@ class _Gathered:
         return (f", or read the sound part: stop_s={until:.3f} (--stop), or --partial."
                 if until else ".")
 
-    def events(self, size: Size | None) -> Events:
+    def result(self, size: Size | None) -> Gathered:
         if self.seen and not self.kept:
             raise self.hints.empty(self.last - self.first)
         if self.outside and self.size:
-            self.hints.remarks.append(dropped(self.outside, self.seen + self.outside, self.size))
+            self.notes.append(dropped(self.outside, self.seen + self.outside, self.size))
         size = self.hints.sensor(size, reach=self.reach if self.seen else None)
         self.hints.on(np.array(sorted(self.signs), np.int8))  # is it one convention?
         x, y, t, on = (self.columns.pop(name).array() for name in COLUMNS)
         if self.hints.polarity == "invert":
             np.logical_not(on, out=on)
-        return Events.unchecked(x, y, t, on, size)
+        return Gathered(Events.unchecked(x, y, t, on, size), (self.start, self.stop),
+                        tuple(self.notes))
 
 
 def _place(path: Path, unit: str, number: int) -> str:

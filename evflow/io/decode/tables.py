@@ -20,6 +20,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode.hdf5 import DAMAGE, MAGIC, MAX_RATIO, load_h5py, need_filters, plausible
 from evflow.io.decode.stream import Chunk
 from evflow.io.images.frames import FrameStack
+from evflow.notes import Note
 from evflow.types import Events, Recording
 
 ROWS = 1 << 15  # events read at a time: 1 MiB of four float64 columns, which a cache holds
@@ -110,7 +111,7 @@ def with_frames(
     span: tuple[int, int],
     times: np.ndarray,
     images: Callable[[slice], Iterable[np.ndarray]],
-    notes: tuple[str, ...],
+    notes: tuple[Note, ...],
 ) -> Recording:
     """The recording with those frames whose times (T,) int64 us lie in [start, stop)."""
     times = check_times(times, f"{path}: frame times", strict=True)

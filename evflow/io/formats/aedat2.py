@@ -19,6 +19,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode.stream import Chunk, Clock, collect, words
 from evflow.io.hints import Hints
+from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "aedat2"
@@ -93,5 +94,6 @@ class Decoder:
             self.skipped[name] += int(np.count_nonzero(words_of))
         return ~(sample | sync)
 
-    def notes(self) -> tuple[str, ...]:
-        return tuple(f"{n:,} {name} were not read" for name, n in self.skipped.items() if n)
+    def notes(self) -> tuple[Note, ...]:
+        return tuple(Note("events.unread", f"{n:,} {name} were not read")
+                     for name, n in self.skipped.items() if n)

@@ -30,11 +30,12 @@ from evflow.errors import EvflowDataError
 from evflow.files.compressed import most_bytes
 from evflow.files.limits import FREE, RATIO
 from evflow.io.decode import tables
-from evflow.io.decode.stream import Chunk, Damage, gather
+from evflow.io.decode.stream import Chunk, Damage, Gathered, gather
 from evflow.io.hints import Hints
 from evflow.io.images.frames import FrameStack, cut
 from evflow.io.images.times import beside_events
-from evflow.types import Events, Recording
+from evflow.notes import Note
+from evflow.types import Recording
 
 NAME = "aedat4"
 EXTENSIONS: tuple[str, ...] = (".aedat4",)
@@ -69,12 +70,11 @@ def read(path: Path, hints: Hints) -> Recording:
     with _before(path, damage) as sound:
         reading = _Reading(path, sound, starts, damage, hints)
         chunks = reading.chunks()
-        events, span = gather(path, chunks, hints, (info["width"], info["height"]))
-        if reading.last >= span[1]:  # frames that are late
+        gathered = gather(path, chunks, hints, (info["width"], info["height"]))
+        if reading.last >= gathered.span[1]:  # frames that are late
             with contextlib.suppress(Damage):
                 collections.deque(chunks, 0)
-    hints.remarks.extend(sorted(reading.remarks))
-    return reading.beside(events, span)
+    return reading.beside(gathered)
 
 
 class _Reading:
@@ -90,7 +90,7 @@ class _Reading:
         self.stack, self.times = FrameStack(path), array.array("q")
         self.last, self.stop = 0, sys.maxsize
         self.begun = False
-        self.remarks: set[str] = set()
+        self.warned: set[str] = set()
 
     def chunks(self) -> Iterator[Chunk]:
         """All events up to `stop_s`, and up to the time when frames from before it have come."""
@@ -122,7 +122,7 @@ class _Reading:
                     elif "frame" in packet:
                         self.times.append(_mid_exposure(packet["frame"]))
                         self.stack.append(packet["frame"]["pixels"])
-            self.remarks |= {f"the decoder left something out: {w.message}" for w in said}
+            self.warned |= {str(w.message) for w in said}
         except (KeyboardInterrupt, SystemExit, EvflowDataError):
             raise
         except BaseException as e:  # a Rust panic derives from BaseException
@@ -137,13 +137,16 @@ class _Reading:
             if not self.begun:
                 self.begun, self.stop = True, self.hints.span_us(self.hints.instant(t[0], "us"))[1]
 
-    def beside(self, events: Events, span: tuple[int, int]) -> Recording:
-        """The recording of these events and the frames in [start, stop) us."""
+    def beside(self, found: Gathered) -> Recording:
+        """The recording of these events and the frames in their span."""
+        notes = (*found.notes, *(Note("events.unread", f"the decoder left something out: {said}")
+                                 for said in sorted(self.warned)))
         if not self.times:
-            return Recording.of_events(events)
-        times = beside_events(np.array(self.times), self.path, "us", self.hints, events)
-        recording = self.stack.beside(events, times, ("frame times are mid-exposure",))
-        return cut(recording, span)
+            return Recording.of_events(found.events, notes)
+        times, told = beside_events(
+            np.array(self.times), self.path, "us", self.hints, found.events)
+        notes = (Note("frames.clock", "frame times are mid-exposure"), *notes, *told)
+        return cut(self.stack.beside(found.events, times, notes), found.span)
 
 
 @contextlib.contextmanager

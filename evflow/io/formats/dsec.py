@@ -24,14 +24,15 @@ from evflow.io.decode.hdf5 import DAMAGE, MAGIC, Hdf5Writer, load_h5py, plausibl
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
 from evflow.io.images.times import beside_events
+from evflow.notes import Note
 from evflow.types import Events, Recording
 
 NAME = "dsec"
 EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5", "")
 
 EVENTS = "events.h5"
-RECTIFY = ("rectify_map.h5 is not applied: events stay at the sensor's own pixels, which have the "
-           "thresholds")
+RECTIFY = Note("sensor.unrectified", "rectify_map.h5 is not applied: events stay at the sensor's "
+               "own pixels, which have the thresholds")
 DSEC_SIZE = (640, 480)
 FLUSH = 1 << 20  # events rewritten at a time where t widens
 INDEX_MS = 1 << 20  # milliseconds indexed at a time: 8 MiB, however long the camera was silent
@@ -59,31 +60,33 @@ def read(path: Path, hints: Hints) -> Recording:
     `Recording` raise.
     """
     path = path / EVENTS if path.is_dir() else path
-    notes = (RECTIFY,) if path.with_name("rectify_map.h5").is_file() else ()
+    notes: tuple[Note, ...] = (RECTIFY,) if path.with_name("rectify_map.h5").is_file() else ()
     with tables.opened(path) as f:
         columns = _columns(path, f)
         size, assumed = _size(f)
         if assumed and hints.size is None:
-            notes = (*notes, assumed)
+            notes += (assumed,)
         offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
-        events, span = gather(path, _chunks(columns, hints), hints, size, "us", offset)
+        events, span, told = gather(path, _chunks(columns, hints), hints, size, "us", offset)
+        notes += told
         if "frames" not in f:
             return Recording.of_events(events, notes)
         frames = tables.dataset(path, f, "frames", (None, None, None))
         times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
-        us = beside_events(times, path, "us", hints, events)
+        us, told = beside_events(times, path, "us", hints, events)
         return tables.with_frames(path, events, span, us,
-                                  lambda keep: tables.stored_frames(frames, keep), notes)
+                                  lambda keep: tables.stored_frames(frames, keep), notes + told)
 
 
-def _size(f: Any) -> tuple[Size | None, str]:
+def _size(f: Any) -> tuple[Size | None, Note | None]:
     """Of the sensor, None where nothing tells; and what was assumed."""
     if "width" in f.attrs and "height" in f.attrs:
-        return (int(f.attrs["width"]), int(f.attrs["height"])), ""
+        return (int(f.attrs["width"]), int(f.attrs["height"])), None
     if "ms_to_idx" in f and "t_offset" in f:
-        return DSEC_SIZE, ("the sensor is taken as {}x{}, as DSEC's are: pass --size where it is "
-                           "another".format(*DSEC_SIZE))
-    return None, ""
+        return DSEC_SIZE, Note(
+            "sensor.size", "the sensor is taken as {}x{}, as DSEC's are: pass --size where it is "
+            "another".format(*DSEC_SIZE))
+    return None, None
 
 
 class DsecWriter(Hdf5Writer):

@@ -22,6 +22,7 @@ from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
 from evflow.io.images.times import beside_events
 from evflow.io.writer import FLUSH, SECONDS_US
+from evflow.notes import Note
 from evflow.types import Events, Recording
 
 NAME = "event_utils"
@@ -46,13 +47,15 @@ def read(path: Path, hints: Hints) -> Recording:
         native = "s" if ts.dtype.kind == "f" else "us"
         chunks = tables.blocks(n, lambda part: (xs[part], ys[part], ts[part], ps[part]),
                                max(tables.stored_rows(column) for column in columns.values()))
-        events, span = gather(path, chunks, hints, size, native)
+        events, span, told = gather(path, chunks, hints, size, native)
+        notes += told
         if not images:
             return Recording.of_events(events, notes)
         stamps = np.array([_time(path, image) for image in images])
-        times = beside_events(stamps, path, native, hints, events)
+        times, told = beside_events(stamps, path, native, hints, events)
         return tables.with_frames(path, events, span, times,
-                                  lambda keep: (_rgb(image[:]) for image in images[keep]), notes)
+                                  lambda keep: (_rgb(image[:]) for image in images[keep]),
+                                  notes + told)
 
 
 def _image(path: Path, group: Any, name: str) -> Any:
@@ -77,7 +80,7 @@ def _rgb(pixels: np.ndarray) -> np.ndarray:
 
 def _size(
     f: Any, images: list[Any], columns: dict[str, Any]
-) -> tuple[Size | None, tuple[str, ...]]:
+) -> tuple[Size | None, tuple[Note, ...]]:
     if images:
         return (int(images[0].shape[1]), int(images[0].shape[0])), ()
     told = np.asarray(f.attrs.get("sensor_resolution", ())).ravel()
@@ -91,9 +94,9 @@ def _size(
         for i, name in enumerate(("xs", "ys")):
             reach[i] = max(reach[i], int(columns[name][first : first + tables.ROWS].max()))
     if reach[0] >= width and reach[0] < height and reach[1] < width:
-        return (height, width), (
-            f"sensor_resolution {height}, {width} was taken as (width, height): events reach "
-            f"x={reach[0]}, y={reach[1]}",)
+        return (height, width), (Note(
+            "sensor.size", f"sensor_resolution {height}, {width} was taken as (width, height): "
+            f"events reach x={reach[0]}, y={reach[1]}"),)
     return (width, height), ()
 
 

@@ -16,6 +16,7 @@ from evflow.files.spool import Spool
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
+from evflow.notes import Note
 from evflow.types import Events, Recording
 
 NAME = "evimo2"
@@ -35,13 +36,14 @@ def read(path: Path, hints: Hints) -> Recording:
     xy = mapped(path / "dataset_events_xy.npy", (None, 2))
     n = tables.same_length(path, {"t": t, "p": p, "xy": xy})
     camera = next((part for part in reversed(path.resolve().parts) if part in SIZES), None)
-    events, _ = gather(
+    events, _, notes = gather(
         path, tables.blocks(n, lambda part: (xy[part, 0], xy[part, 1], t[part], p[part])), hints,
         SIZES.get(camera or ""), "s" if t.dtype.kind == "f" else "us")
     if camera != "samsung_mono":
-        return Recording.of_events(events)
-    return Recording.of_events(
-        _turned(events), ("polarity was turned: EVIMO2's Samsung camera stores brighter as 0",))
+        return Recording.of_events(events, notes)
+    turned = Note("events.turned",
+                  "polarity was turned: EVIMO2's Samsung camera stores brighter as 0")
+    return Recording.of_events(_turned(events), (turned, *notes))
 
 
 def _turned(events: Events) -> Events:

@@ -39,15 +39,15 @@ def read(path: Path, hints: Hints) -> Recording:
     n = tables.same_length(path, {"ts": ts, "p": ps, "xy": xy})
     images = _images(path)
     size = _told_size(path) if images is None else tables.frame_size(images)
-    events, span = gather(
+    events, span, notes = gather(
         path, tables.blocks(n, lambda part: (xy[part, 0], xy[part, 1], ts[part], ps[part])),
         hints, size, _unit(ts))
     if images is None:
-        return Recording.of_events(events)
+        return Recording.of_events(events, notes)
     stamps = mapped(path / "images_ts.npy", (len(images),))
-    times = beside_events(np.asarray(stamps), path, _unit(stamps), hints, events)
+    times, told = beside_events(np.asarray(stamps), path, _unit(stamps), hints, events)
     return tables.with_frames(path, events, span, times,
-                              lambda keep: map(_rgb, images[keep]), ())
+                              lambda keep: map(_rgb, images[keep]), notes + told)
 
 
 def _unit(times: np.ndarray) -> str:

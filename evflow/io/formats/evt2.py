@@ -17,6 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode import prophesee
 from evflow.io.decode.stream import Chunk, Clock, collect, typed, words
 from evflow.io.hints import Hints
+from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "evt2"
@@ -71,16 +72,16 @@ class Decoder:
         return Chunk(((events >> 11) & 0x7FF).astype(np.uint16), (events & 0x7FF).astype(np.uint16),
                      t, events >= 1 << 28, lambda i: byte + 4 * int(rows[i]))
 
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Note, ...]:
         return leftovers(self.timeless, self.triggers)
 
 
-def leftovers(timeless: int, triggers: int) -> tuple[str, ...]:
+def leftovers(timeless: int, triggers: int) -> tuple[Note, ...]:
     """Notes on what a RAW stream holds that is not in the recording."""
     notes = []
     if timeless:
-        notes.append(f"{timeless:,} events before the first time or row word were left out: the "
-                     "recording began amid the stream")
+        notes.append(Note("events.timeless", f"{timeless:,} events before the first time or row "
+                          "word were left out: the recording began amid the stream"))
     if triggers:
-        notes.append(f"{triggers:,} external triggers were not read")
+        notes.append(Note("events.unread", f"{triggers:,} external triggers were not read"))
     return tuple(notes)

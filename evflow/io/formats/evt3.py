@@ -18,6 +18,7 @@ from evflow.io.decode import prophesee
 from evflow.io.decode.stream import Chunk, Clock, collect, hold, typed, words
 from evflow.io.formats.evt2 import leftovers
 from evflow.io.hints import Hints
+from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "evt3"
@@ -143,5 +144,5 @@ class Decoder:
         return Chunk(x[of] + place, y[of], t[of], p[of],
                      lambda i: byte + 2 * int(rows[of[i]]), self.unit)
 
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Note, ...]:
         return leftovers(self.stateless, self.triggers)

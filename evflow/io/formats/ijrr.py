@@ -24,6 +24,7 @@ from evflow.io.formats import plain_text
 from evflow.io.hints import Hints
 from evflow.io.images.folder import decode
 from evflow.io.images.times import beside_events
+from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "ijrr"
@@ -89,13 +90,13 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
     size = _image(root, names[0]).shape[1::-1] if names else None
     with (root / name).open("rb") as f:
         chunks, native = plain_text.events(path, f, hints)
-        events, span = gather(path, _some(path, chunks, hints, size), hints, size, native)
+        events, span, notes = gather(path, _some(path, chunks, hints, size), hints, size, native)
     if not names:
-        return Recording.of_events(events)
-    times = beside_events(seconds, root / IMAGES, "s", hints, events)
+        return Recording.of_events(events, notes)
+    times, told = beside_events(seconds, root / IMAGES, "s", hints, events)
     return tables.with_frames(
         path, events, span, times, lambda keep: (_image(root, n) for n in names[keep]),
-        ("frame times are those of images.txt",))
+        (Note("frames.clock", "frame times are those of images.txt"), *notes, *told))
 
 
 def _some(

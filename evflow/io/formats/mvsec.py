@@ -17,6 +17,7 @@ from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
 from evflow.io.images.times import beside_events
+from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "mvsec"
@@ -47,12 +48,12 @@ def read(path: Path, hints: Hints) -> Recording:
             return x, y, t, p
 
         chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
-        events, span = gather(path, chunks, hints, SIZE, "s")
-        notes = (f"the {side} camera was read",)
+        events, span, told = gather(path, chunks, hints, SIZE, "s")
+        notes = (Note("sensor.camera", f"the {side} camera was read"), *told)
         if "image_raw" not in camera:
             return Recording.of_events(events, notes)
         frames = tables.dataset(path, camera, "image_raw", (None, None, None))
         times = tables.dataset(path, camera, "image_raw_ts", (len(frames),))[:]
-        us = beside_events(times, path, "s", hints, events)
+        us, told = beside_events(times, path, "s", hints, events)
         return tables.with_frames(path, events, span, us,
-                                  lambda keep: tables.stored_frames(frames, keep), notes)
+                                  lambda keep: tables.stored_frames(frames, keep), notes + told)

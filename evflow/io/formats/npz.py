@@ -22,7 +22,7 @@ from evflow.files.atomic import aside
 from evflow.files.moves import remove
 from evflow.files.whole import need_members
 from evflow.io.decode import tables
-from evflow.io.decode.stream import gather
+from evflow.io.decode.stream import Gathered, gather
 from evflow.io.hints import Hints
 from evflow.io.images.frames import cut
 from evflow.io.images.times import beside_events
@@ -57,18 +57,18 @@ def read(path: Path, hints: Hints) -> Recording:
                 "Expected the keys t, x, y, p, size, and optionally frames, frame_times.")
         stored = found.get("size", found.get("wh"))
         size: Any = None if stored is None else tuple(stored.whole().ravel().tolist())
-        events, span = _events(path, [found[name] for name in COLUMNS], hints, size)
+        events, span, notes = _events(path, [found[name] for name in COLUMNS], hints, size)
         if "frames" not in found:
-            return Recording.of_events(events)
+            return Recording.of_events(events, notes)
         if "frame_times" not in found:
             raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
-        times = beside_events(found["frame_times"].whole(), path, "us", hints, events)
-        return cut(Recording(events, found["frames"].spooled(), times), span)
+        times, told = beside_events(found["frame_times"].whole(), path, "us", hints, events)
+        return cut(Recording(events, found["frames"].spooled(), times, notes + told), span)
 
 
 def _events(
     path: Path, columns: list[Member], hints: Hints, size: Size | None
-) -> tuple[Events, tuple[int, int]]:
+) -> Gathered:
     """What `gather` makes of the columns; damage is told before what it makes of them."""
     check_columns(*(np.broadcast_to(np.int8(0), column.shape) for column in columns))
 

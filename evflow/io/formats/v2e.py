@@ -39,10 +39,10 @@ def read(path: Path, hints: Hints) -> Recording:
             return x, y, t, p
 
         chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
-        events, span = gather(path, chunks, hints, size)
+        events, span, notes = gather(path, chunks, hints, size)
         if frames is None:
-            return Recording.of_events(events)
+            return Recording.of_events(events, notes)
         times = tables.dataset(path, f, "frame_ts", (len(frames),))[:]
-        us = beside_events(times, path, "us", hints, events)
+        us, told = beside_events(times, path, "us", hints, events)
         return tables.with_frames(path, events, span, us,
-                                  lambda keep: tables.stored_frames(frames, keep), ())
+                                  lambda keep: tables.stored_frames(frames, keep), notes + told)

@@ -15,9 +15,10 @@ from evflow.files.limits import check_expansion
 from evflow.io.images.frames import FrameHints, Image
 from evflow.io.images.pictures import claimed_bytes
 from evflow.io.images.times import read_times
-from evflow.types import MADE
+from evflow.notes import Note
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
+MADE = "made from the events by"  # how `evflow reconstruct` marks images in their file of times
 TIMES = ("timestamps.txt", "images.txt", "image_timestamps.txt", "timestamp.txt", "times.txt",
          "info.txt", "rgb.txt", "data.csv", "timestamps.csv", "timestamps.npy")
 
@@ -28,7 +29,7 @@ class ImageFolder:
 
     files: tuple[Path, ...]
     times_us: np.ndarray
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
     def images(self) -> Iterator[Image]:
         for file, time in zip(self.files, self.times_us.tolist(), strict=True):
@@ -43,13 +44,13 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     times), and what `read_times` raises.
     """
     folder, files = _find(root)
-    made = _remark(folder)
+    made = _made(folder)
     if hints.fps is not None:
         times = np.array([hints.at_rate(i) for i in range(len(files))], np.int64)
         return ImageFolder(tuple(files), times, made)
     source = _times_file(root, folder, hints)
     by_name = {file.name: file for file in files}
-    us, names, note = read_times(source, hints.time_unit, by_name)
+    us, names, notes = read_times(source, hints.time_unit, by_name)
     missing = [name for name in names if name not in by_name]
     if missing:
         raise EvflowDataError(
@@ -61,7 +62,7 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
             f"{len(set(names)) if names else len(us)}.",
             "Images lost, or of another recording? Give each image one time, or pass --fps.")
     files = [by_name[name] for name in names] if names else files
-    return ImageFolder(tuple(files), us, ((note,) if note else ()) + made)
+    return ImageFolder(tuple(files), us, notes + made)
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -126,7 +127,7 @@ def _find(root: Path) -> tuple[Path, list[Path]]:
     raise EvflowDataError("EV008", f"{root} {seen}.", "Pass the one folder that has the frames.")
 
 
-def _remark(folder: Path) -> tuple[str, ...]:
+def _made(folder: Path) -> tuple[Note, ...]:
     """What the file of times that `evflow reconstruct` writes says at its head, wherever the times
     are taken from: that the images were made from events."""
     path = folder / TIMES[0]
@@ -137,7 +138,7 @@ def _remark(folder: Path) -> tuple[str, ...]:
             first = lines.readline(1000).lstrip("# ").strip()
     except OSError:
         return ()
-    return (first,) if MADE in first else ()
+    return (Note("frames.made", first),) if MADE in first else ()
 
 
 def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:

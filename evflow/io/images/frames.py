@@ -19,6 +19,7 @@ from evflow.files.spool import Spool
 from evflow.io.hints import UNITS_US, Hints, check_choices, known
 from evflow.light import response
 from evflow.light.colour import COLOURS, luma
+from evflow.notes import Note
 from evflow.types import Events, Recording
 from evflow.types import luma as rec709
 
@@ -96,14 +97,14 @@ class FrameHints:
 @dataclasses.dataclass(frozen=True)
 class FrameSource:
     """size (width, height); count: frames expected (0 = unknown); open(): a fresh iterator of
-    (frame, time in us), one decoded at a time. notes: what was assumed, a sentence each; it may
-    grow while frames are read. Frames are (H, W), or (H, W, 3) where a mosaic was asked for of
+    (frame, time in us), one decoded at a time. notes: what was assumed; it may grow while
+    frames are read. Frames are (H, W), or (H, W, 3) where a mosaic was asked for of
     colour input, uint8 or float32 DN on 0..255."""
 
     size: tuple[int, int]
     count: int
     open: Callable[[], Frames]
-    notes: list[str] = dataclasses.field(default_factory=list)
+    notes: list[Note] = dataclasses.field(default_factory=list)
 
     def watched(self, progress: Callable[[int, int], None]) -> Frames:
         """The frames, with progress(done, total) called after each."""
@@ -112,7 +113,7 @@ class FrameSource:
             progress(index, max(self.count, index))
 
 
-def converted(images: Iterable[Image], hints: FrameHints, notes: list[str]) -> Frames:
+def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> Frames:
     """(frame, time in us) of decoded images, one at a time.
 
     Raises EV002 (shape), EV003 (dtype, values above `full_scale`, floats on 0..1), EV004 (time
@@ -125,7 +126,7 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[str]) -> F
         depth = image.pixels.dtype
         if first is None:
             first = frame, depth
-            notes += [n for n in _remarks(image, frame, hints) if n not in notes]
+            notes += [n for n in _seen_first(image, frame, hints) if n not in notes]
         elif image.time_us <= last:
             raise EvflowDataError(
                 "EV004", f"{image.where} is at {image.time_us} us, the frame before at {last} us.",
@@ -188,19 +189,21 @@ def _frame(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, b
     return pixels.astype(np.float32) * np.float32(255 / white), bright or high > 1
 
 
-def _remarks(image: Image, frame: np.ndarray, hints: FrameHints) -> list[str]:
+def _seen_first(image: Image, frame: np.ndarray, hints: FrameHints) -> list[Note]:
     """What the user should know about the first frame."""
-    notes = [] if hints.bayer is None else [response.remark(hints.bayer)]
+    notes = [] if hints.bayer is None else [response.of_mosaic(hints.bayer)]
     if hints.response != "linear":
-        notes.append(f"frames linearised ({hints.response})")
+        notes.append(response.linearised(hints.response))
     if hints.flip != "none":
-        notes.append(f"frames flipped ({hints.flip})")
+        notes.append(response.flipped(hints.flip))
     if hints.colour != "luma" and frame.ndim == 2:
-        notes.append(f"frames have one channel: taken as a {hints.colour} mosaic as they are.")
+        notes.append(Note("frames.raw", f"frames have one channel: taken as a {hints.colour} "
+                          "mosaic as they are."))
     peak = int(image.pixels.max()) if image.pixels.dtype == np.uint16 else 0
     if hints.full_scale is None and 0 < peak < 2**14:
-        notes.append(f"16-bit frames, white at 65535, but the first reaches {peak} only; for "
-                     "10-, 12- or 14-bit data pass --full-scale 1023, 4095 or 16383.")
+        notes.append(Note("frames.depth", f"16-bit frames, white at 65535, but the first reaches "
+                          f"{peak} only; for 10-, 12- or 14-bit data pass --full-scale 1023, 4095 "
+                          "or 16383."))
     return notes
 
 
@@ -245,13 +248,13 @@ class FrameStack:
         self._spool.append(grey.ravel())
         self.count += 1
 
-    def beside(self, events: Events, times: np.ndarray, notes: tuple[str, ...]) -> Recording:
+    def beside(self, events: Events, times: np.ndarray, notes: tuple[Note, ...]) -> Recording:
         """The recording of these events and all frames, at `times` (T,); raises what it raises."""
         if self._first is None or self._spool is None:
             return Recording.of_events(events, notes)
         frames = self._spool.array().reshape(self.count, *self._first.shape[:2])
         if self._first.ndim == 3:
-            notes = (*notes, "colour frames were converted to Rec. 709 luma")
+            notes += (Note("frames.luma", "colour frames were converted to Rec. 709 luma"),)
         return Recording(events, frames, times, notes)
 
 

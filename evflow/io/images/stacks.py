@@ -20,6 +20,7 @@ from evflow.files.archives import BLOCK, DAMAGE, Member, is_zip, npy_header, unz
 from evflow.files.limits import check_expansion
 from evflow.io.images.frames import FrameHints, Image
 from evflow.io.images.times import read_times, to_us
+from evflow.notes import Note
 
 FRAMES = ("frames", "images", "imgs", "video", "arr_0")
 TIMES = ("frame_times", "timestamps", "times", "t")
@@ -50,7 +51,7 @@ class Stack:
     fortran: bool
     offset: int
     times_us: np.ndarray
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -101,8 +102,8 @@ def open_stack(path: Path, hints: FrameHints) -> Stack:
             "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
             "Copy or save it again.") from e
     _check(stack)
-    us, note = _times(stack, hints, times)
-    return dataclasses.replace(stack, times_us=us, notes=(note,) if note else ())
+    us, notes = _times(stack, hints, times)
+    return dataclasses.replace(stack, times_us=us, notes=notes)
 
 
 def cut_off(path: object, read: int, promised: int, why: str) -> EvflowDataError:
@@ -165,16 +166,16 @@ def _check(stack: Stack) -> None:
 
 def _times(
     stack: Stack, hints: FrameHints, times: np.ndarray | None
-) -> tuple[np.ndarray, str]:
+) -> tuple[np.ndarray, tuple[Note, ...]]:
     count = stack.shape[0]
     if hints.fps is not None:
-        return np.array([hints.at_rate(i) for i in range(count)], np.int64), ""
+        return np.array([hints.at_rate(i) for i in range(count)], np.int64), ()
     if hints.timestamps is not None:
         where: Any = Path(hints.timestamps)
-        us, _, note = read_times(where, hints.time_unit)
+        us, _, notes = read_times(where, hints.time_unit)
     elif times is not None:
         where = f"the times in {stack.path}"
-        us, note = to_us(times, where, hints.time_unit)
+        us, notes = to_us(times, where, hints.time_unit)
     else:
         raise EvflowDataError(
             "EV020", f"{stack.path} holds {count:,} frames but no times.",
@@ -183,4 +184,4 @@ def _times(
         raise EvflowDataError(
             "EV002", f"{stack.path} holds {count:,} frames, {where} {len(us):,} times.",
             "Give one time per frame, or pass --fps.")
-    return us[:count], note
+    return us[:count], notes

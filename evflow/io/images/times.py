@@ -22,6 +22,7 @@ from evflow.files.arrays import mapped
 from evflow.io.decode.text import is_float
 from evflow.io.hints import UNITS_US, Hints
 from evflow.io.images.frames import existing
+from evflow.notes import Note
 from evflow.types import Events
 
 MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
@@ -34,7 +35,8 @@ UNIT_WORDS = re.compile(
     r"(?:[\[(_]|in )(n(?:s|sec|anoseconds?)|[uµμ]s(?:ec)?|microseconds?|m(?:s|sec|illiseconds?)|"
     r"s(?:ec(?:onds?)?)?)\b", re.IGNORECASE)
 
-Times = tuple[np.ndarray, list[str], str]  # int64 us (T,); names (T,) or none; a note or ""
+Notes = tuple[Note, ...]
+Times = tuple[np.ndarray, list[str], Notes]  # int64 us (T,); names (T,) or none
 
 
 def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> Times:
@@ -45,15 +47,15 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> T
     not clear), EV004 (not increasing), EV007 (NaN), EV016 (not there).
     """
     if existing(path).suffix == ".npy":
-        us, note = to_us(np.array(mapped(path, (None,))), path, unit)
-        return us, [], note
+        us, notes = to_us(np.array(mapped(path, (None,))), path, unit)
+        return us, [], notes
     rows, written = _rows(path)
     times, labels = _columns(path, rows, names)
-    us, note = to_us(times, path, unit if unit != "auto" else written)
-    return us, labels, note
+    us, notes = to_us(times, path, unit if unit != "auto" else written)
+    return us, labels, notes
 
 
-def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndarray, str]:
+def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndarray, Notes]:
     """Strictly increasing times (T,) as int64 us, and a note where the unit was inferred.
 
     Raises EV001, EV002, EV003, EV004, EV007.
@@ -73,17 +75,18 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
         raise EvflowDataError(
             "EV004", f"{where}: time {at:,} is {times[at]}, the one before {times[at - 1]} "
             f"({len(back):,} such).", "Frame times must increase: lines out of order, or repeated?")
-    note = ""
+    notes: Notes = ()
     if unit == "auto":
-        unit, note = _plausible_unit(times, where)
+        unit, notes = _plausible_unit(times, where)
     us = Hints(time_unit=unit).microseconds(times, unit)
-    return check_times(us, f"{where}, read in {unit}", strict=True), note
+    return check_times(us, f"{where}, read in {unit}", strict=True), notes
 
 
 def beside_events(
     times: np.ndarray, where: object, native: str, hints: Hints, events: Events
-) -> np.ndarray:
-    """Times (T,) of the frames that a recording brings along with its events, as int64 us.
+) -> tuple[np.ndarray, Notes]:
+    """Times (T,) of the frames that a recording brings along with its events, as int64 us, and a
+    note where their unit was inferred.
 
     native: their unit in the format. That of `hints` is the events'; frames share it unless
     another makes them last as the events do: where clocks contradict each other it is passed.
@@ -93,17 +96,15 @@ def beside_events(
     odd = times.dtype.kind == "f" and native != "s"
     usual = told == "auto" and not odd
     if usual or times.ndim != 1 or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-        return hints.microseconds(times, native)
+        return hints.microseconds(times, native), ()
     units = [native, *UNITS_US] if told == "auto" else [told, native]
     unit = _lasting(times, events.t, units)
     if unit is None and told == "auto":
-        us, note = to_us(times, where)
-        hints.remarks.append(note)
-        return us
+        return to_us(times, where)
     unit = unit or _nearest(times, units)
-    if unit != told:
-        hints.remarks.append(f"frame times of {where} were read in {unit}.")
-    return Hints(time_unit=unit).microseconds(times, unit)
+    notes = () if unit == told else (
+        Note("frames.unit", f"frame times of {where} were read in {unit}."),)
+    return Hints(time_unit=unit).microseconds(times, unit), notes
 
 
 def _lasting(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | None:
@@ -129,8 +130,8 @@ def _nearest(times: np.ndarray, units: list[str]) -> str:
     return min(units, key=lambda unit: abs(math.log(step * UNITS_US[unit] / USUAL_US)))
 
 
-def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:
-    """The unit in which the times are those of a video, and the sentence that says so."""
+def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
+    """The unit in which the times are those of a video, and the note that says so."""
     step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
     seconds = {unit: 1e-6 * scale for unit, scale in UNITS_US.items()}
     whole = times.dtype.kind in "iu" or bool((times % 1 == 0).all())
@@ -141,8 +142,9 @@ def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, str]:
     for found in (set(epoch) & set(possible), possible, usual):
         if len(found) == 1:
             (unit,) = found
-            return unit, (f"times of {where} were read in {unit} "
-                          f"({1 / (step * seconds[unit]):.4g} frames/s); else {TELL}.")
+            rate = f"{1 / (step * seconds[unit]):.4g} frames/s"
+            return unit, (Note("frames.unit", f"times of {where} were read in {unit} ({rate}); "
+                               f"else {TELL}."),)
     would = ", ".join(f"{1 / (step * seconds[u]):.4g} frames/s in {u}" for u in possible)
     raise EvflowDataError(
         "EV003", f"{where}: steps of {step:g} (from {times[0]}) have no clear unit"

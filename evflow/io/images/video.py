@@ -21,6 +21,7 @@ from evflow.io.images.folder import SUFFIXES
 from evflow.io.images.frames import FrameHints, Image, existing
 from evflow.io.images.stacks import cut_off
 from evflow.io.images.times import read_times
+from evflow.notes import Note
 
 SLACK = 1.5  # frames; containers without a count have it from their duration, rounded
 SLACK_SHARE = 0.001
@@ -39,7 +40,7 @@ class Video:
     claimed: int
     hints: FrameHints
     times_us: np.ndarray | None
-    notes: list[str]
+    notes: list[Note]
 
     def images(self) -> Iterator[Image]:
         """The frames (H, W, 3) from first to last, B, G, R.
@@ -119,13 +120,13 @@ class Clock:
         self.last_us = now
         return round(now)
 
-    def notes(self) -> list[str]:
-        """A sentence where the frame rate varied by more than rounding."""
+    def notes(self) -> list[Note]:
+        """A note where the frame rate varied by more than rounding."""
         shortest, longest = self.steps
         if longest <= 1.1 * shortest + 2 * TICK_US:
             return []
-        return [f"{self.path} has a variable frame rate ({1e6 / longest:.4g} to "
-                f"{1e6 / shortest:.4g} frames/s); its own times were used."]
+        return [Note("frames.rate", f"{self.path} has a variable frame rate ({1e6 / longest:.4g} "
+                     f"to {1e6 / shortest:.4g} frames/s); its own times were used.")]
 
 
 def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Video:
@@ -153,10 +154,10 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
             _check_end(path, capture, claimed)
         if not hints.partial:
             _check_bytes(path)
-    times, notes = None, []
+    times, notes = None, list[Note]()
     if hints.timestamps is not None:
-        times, _, note = read_times(Path(hints.timestamps), hints.time_unit)
-        notes = [note] if note else []
+        times, _, told = read_times(Path(hints.timestamps), hints.time_unit)
+        notes += told
     if not (rate and 0 < rate < 1e6) and times is None and hints.fps is None:
         raise EvflowDataError("EV020", f"{path} states no frame rate ({rate:g}).", "Pass --fps.")
     return Video(path, first.shape[1::-1], float(rate), claimed, hints, times, notes)

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from evflow.errors import CODES, EvflowDataError
+from evflow.notes import Note
 
 Severity = Literal["error", "warning", "note"]
 
@@ -27,6 +28,10 @@ class Finding:
     def of(error: EvflowDataError) -> Finding:
         """What a reader or a constructor refused."""
         return Finding(error.code, "error", error.seen, error.fix)
+
+    def note(self) -> Note:
+        """The finding as a note of its code."""
+        return Note(self.code, str(self))
 
     def error(self) -> EvflowDataError:
         """The finding as an exception."""

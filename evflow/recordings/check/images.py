@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from evflow.light.response import LUMA
 from evflow.recordings.check.findings import Finding
 from evflow.types import Recording
 
@@ -64,7 +65,7 @@ def _depth(recording: Recording) -> list[Finding]:
             "EV031", "note", f"16-bit frames, kept whole; their largest value "
             f"{int(recording.frames.max()):,} makes them {DEPTHS[white]}-bit data, white at "
             f"{white:,}.", "If white lies elsewhere, rescale them to that."))
-    colour = [note for note in recording.notes if "colour" in note]
+    colour = [note.text for note in recording.notes if note.code in LUMA]
     if colour:
         found.append(Finding(
             "EV032", "note", f"{colour[0].rstrip('.')}.", "A pixel behind a colour filter sees "

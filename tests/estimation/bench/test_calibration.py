@@ -19,6 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
 from evflow.estimation.bench.rests import find_rests
 from evflow.io import write_recording
+from evflow.notes import texts
 from evflow.types import Events
 
 SHAPE = (24, 32)
@@ -96,7 +97,8 @@ def test_quantisation_shrinks_with_the_step() -> None:
         _, sigmas = errors(found, camera, "theta_on")
         assert 0.6 < np.sqrt((sigmas**2).mean()) < 1.4
         stds.append(np.median(np.asarray(found.std.theta_on)[found.valid]))
-        assert "no step sends OFF events" in " ".join(found.warnings)
+        assert found.undetermined == ("theta_off",)
+        assert "theta_off.undetermined" in [note.code for note in found.notes]
     assert stds[0] > 1.5 * stds[1] > 1.5 * stds[2]
 
 
@@ -217,16 +219,17 @@ def test_light_that_changes_while_frames_rest_is_told() -> None:
     half = len(frames) // 2
     frames[:half], frames[half:] = 100.0, 200.0
     found = calibrate_step(dataclasses.replace(base, frames=frames))
-    assert "in company while the frames rest" in " ".join(found.warnings)
+    assert "scene.restless" in [note.code for note in found.notes]
     quiet = calibrate_step(bench(cameras(0.03, "eq12"), CYCLES))
-    assert "in company" not in " ".join(quiet.warnings)
+    assert "scene.restless" not in [note.code for note in quiet.notes]
+    assert quiet.undetermined == ()
 
 
 def test_few_measured_pixels_are_told() -> None:
     """Steps of a threshold and a half: one event each, of which a direction needs two."""
     found = calibrate_step(bench(Camera.constant(SHAPE, 0.45, 0.45), [60, 120, 60]), fresh=True)
     assert not found.valid.any()
-    assert "0% of the pixels sent enough events" in " ".join(found.warnings)
+    assert "0% of the pixels sent enough events" in " ".join(texts(found.notes))
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ from helpers.tables import each, hint, want, write
 from evflow.io import read_events, read_recording
 from evflow.io.decode import tables
 from evflow.io.registry import find_format
+from evflow.notes import Note
 
 
 @each
@@ -147,7 +148,7 @@ def test_mvsec_right_camera(tmp_path: Path) -> None:
     path = edited(path, lambda f: f.copy("davis/right/x/events", "davis/right/events"))
     got = read_recording(path)
     equal(got.events, want("mvsec").events)
-    assert got.notes == ("the right camera was read",)
+    assert got.notes == (Note("sensor.camera", "the right camera was read"),)
     assert not got.has_frames
 
 
@@ -158,7 +159,7 @@ def test_event_utils_sizes_and_colour(tmp_path: Path) -> None:
     swapped = edited(path, lambda f: f.attrs.__setitem__("sensor_resolution", SIZE))
     got = read_recording(swapped)
     assert got.events.size == SIZE
-    assert "taken as (width, height)" in got.notes[0]
+    assert "taken as (width, height)" in got.notes[0].text
     assert refused(edited(path, lambda f: f.attrs.pop("sensor_resolution"))).code == "EV015"
     path = write(tmp_path, "event_utils")
     blue = np.zeros((48, 64, 3), np.uint8)

@@ -11,6 +11,7 @@ from helpers.recordings import equal, refused
 from helpers.streams import clustered, listed
 
 from evflow.io import read_events, read_recording
+from evflow.notes import Note, texts
 from evflow.types import Events
 
 
@@ -25,7 +26,8 @@ def test_dvs128_by_name_and_by_size(tmp_path: Path) -> None:
     path.write_bytes(b"#!AER-DAT2.0\r\n# AEChip: ch.unizh.ini.jaer.chip.retina.DVS128\r\n"
                      + data + sync)
     equal(read_events(path), events)
-    assert read_recording(path).notes == ("1 sync or special words were not read",)
+    assert read_recording(path).notes == (
+        Note("events.unread", "1 sync or special words were not read"),)
     path.write_bytes(b"#!AER-DAT2.0\r\n# Timestamps tick is 1 us\r\n" + data)
     assert "names no chip" in str(refused(path))
     equal(read_events(path, size=(128, 128)), events)
@@ -47,7 +49,7 @@ def test_words_beside_the_events(tmp_path: Path) -> None:
     got = read_recording(path)
     assert listed(got.events) == [(345 - 20, 259 - 10, 9, 1)]
     assert got.events.size == (346, 260)
-    assert got.notes == ("2 APS samples were not read", "1 IMU samples were not read",
+    assert tuple(texts(got.notes)) == ("2 APS samples were not read", "1 IMU samples were not read",
                          "1 sync or special words were not read")
 
 

@@ -100,7 +100,7 @@ def test_only_dsecs_own_layout_has_dsecs_size(tmp_path: Path, absent: str | None
         with pytest.raises(EvflowDataError, match=r"EV015.*--size"):
             read_recording(tmp_path / "a.h5")
     else:
-        assert any("640x480" in note for note in read_recording(tmp_path / "a.h5").notes)
+        assert any("640x480" in note.text for note in read_recording(tmp_path / "a.h5").notes)
     told = read_recording(tmp_path / "a.h5", size=SIZE)
     assert told.events.size == SIZE
     assert told.notes == ()
@@ -123,7 +123,7 @@ def test_dsec_folders_have_a_rectify_map_that_is_told(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "events.h5"):
         recording = read_recording(path)
         np.testing.assert_array_equal(recording.events.t, events.t)
-        assert "rectify_map.h5 is not applied" in recording.notes[0]
+        assert "rectify_map.h5 is not applied" in recording.notes[0].text
 
 
 def test_blosc_needs_hdf5plugin_which_loads_by_itself(

@@ -13,6 +13,7 @@ from helpers.streams import clustered, evt2, evt3
 
 from evflow.io import read_recording
 from evflow.io.decode.prophesee import parse
+from evflow.notes import Note
 from evflow.types import Events
 
 
@@ -27,8 +28,8 @@ def test_words_beside_the_events(tmp_path: Path) -> None:
     path.write_bytes(sound[:header] + early + sound[header:] + other)
     got = read_recording(path)
     equal(got.events, events)
-    assert got.notes[0].startswith("2 events before the first time")
-    assert got.notes[1] == "1 external triggers were not read"
+    assert got.notes[0].text.startswith("2 events before the first time")
+    assert got.notes[1] == Note("events.unread", "1 external triggers were not read")
     path.write_bytes(sound[:header] + early)  # and no time word at all
     assert len(read_recording(path).events) == 0
 

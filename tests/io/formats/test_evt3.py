@@ -12,6 +12,7 @@ from helpers.recordings import equal, refused
 from helpers.streams import SIZE, clustered, evt3
 
 from evflow.io import read_events, read_recording
+from evflow.notes import texts
 from evflow.types import Events
 
 HEADER = b"% evt 3.0\n% geometry 2048x2048\n"
@@ -93,7 +94,7 @@ def test_any_order_of_words(
     want, lost = word_by_word(words)
     got = read_recording(path)
     equal(got.events, Events(*np.array(want).T, (2048, 2048)))
-    notes = " ".join(got.notes)
+    notes = " ".join(texts(got.notes))
     assert (f"{lost:,} events before the first time or row word" in notes) == (lost > 0)
     triggers = sum(w >> 12 == 10 for w in words)
     assert f"{triggers} external triggers" in notes

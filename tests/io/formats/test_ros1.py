@@ -26,6 +26,7 @@ from evflow.io import read_events, read_recording
 from evflow.io.decode.stream import Damage
 from evflow.io.formats.ros import libcaer_words
 from evflow.io.formats.ros.messages import Packet
+from evflow.notes import Note
 
 
 @needs_rosbags
@@ -78,7 +79,7 @@ def test_several_topics_and_none(tmp_path: Path) -> None:
                  + array_messages(make(50).events, "/right/events"))
     got = read_recording(path)
     equal(got.events, want.events)
-    assert got.notes == ("topic /right/events was not read",)
+    assert got.notes == (Note("events.unread", "topic /right/events was not read"),)
     error = refused(write(path, image_messages(want)))
     assert error.code == "EV008"
     assert "/dvs/image_raw (sensor_msgs/msg/Image)" in str(error)

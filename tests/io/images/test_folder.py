@@ -63,7 +63,7 @@ def test_twelve_bits_in_sixteen(tmp_path: Path) -> None:
     frames = folder(tmp_path, 3) .astype(np.uint16) * 16
     for i, frame in enumerate(frames):
         cv2.imwrite(str(tmp_path / f"img{i + 1}.png"), frame)
-    assert "--full-scale" in read(tmp_path, fps=10)[2][0]
+    assert "--full-scale" in read(tmp_path, fps=10)[2][0].text
     np.testing.assert_allclose(read(tmp_path, fps=10, full_scale=4080)[0], frames / 16, rtol=1e-6)
     assert "EV003" in message(lambda: read(tmp_path, fps=10, full_scale=1023))
 
@@ -269,7 +269,7 @@ def test_the_frames_of_a_recording(tmp_path: Path) -> None:
     np.testing.assert_array_equal(seen, frames)
     assert times == [0, 40_000, 80_000, 120_000]
     assert code_of(lambda: open_frames(path, fps=10)) == "EV020"
-    assert "as they are" in read(path, colour="rggb")[2][0]
+    assert "as they are" in read(path, colour="rggb")[2][0].text
     write_events(tmp_path / "bare.h5", events)
     assert code_of(lambda: open_frames(tmp_path / "bare.h5")) == "EV011"
 
@@ -281,4 +281,4 @@ def test_a_real_folder(data_file: Callable[[str], Path]) -> None:
     np.testing.assert_array_equal(frames, recording)
     assert times == recorded
     assert len(times) == 87
-    assert "read in s (25.8 frames/s)" in notes[0]
+    assert "read in s (25.8 frames/s)" in notes[0].text

@@ -79,7 +79,7 @@ def test_a_variable_frame_rate_is_followed(tmp_path: Path) -> None:
     _, times, notes = read(path)
     steps = [20_000] * 4 + [60_000] * 4 + [20_000] * 3
     np.testing.assert_allclose(np.diff(times), steps, atol=1)
-    assert "variable frame rate (16.67 to 50 frames/s)" in notes[0]
+    assert "variable frame rate (16.67 to 50 frames/s)" in notes[0].text
     assert np.diff(read(path, fps=50)[1]).tolist() == [20_000] * 11
 
 

@@ -16,6 +16,7 @@ from helpers.networks import hidden
 
 from evflow import Events, Recording, Report, check, read_recording, write_events
 from evflow.errors import CODES, EvflowDataError
+from evflow.notes import Note
 from evflow.recordings.adjust import flipped, shifted
 from evflow.recordings.check import frames_offset
 
@@ -89,7 +90,7 @@ def test_mistake_4_frames_misaligned(sound: Recording, offset_ms: int) -> None:
     assert finding.code == "EV024"
     assert "--frames-offset-ms" in finding.fix
     assert frames_offset(moved) == pytest.approx(-offset_ms * 1000, abs=6_000)
-    assert moved.notes == (f"frame times moved by {offset_ms:+g} ms",)
+    assert moved.notes == (Note("frames.moved", f"frame times moved by {offset_ms:+g} ms"),)
 
 
 def test_mistake_4_small_offsets_are_within_the_latency(sound: Recording) -> None:
@@ -126,7 +127,11 @@ def test_mistake_7_nan(sound: Recording) -> None:
 def test_mistake_8_colour_frames(sound: Recording) -> None:
     colour = np.repeat(sound.frames[..., None], 3, -1)
     assert refused(lambda: dataclasses.replace(sound, frames=colour)).code == "EV002"
-    noted = dataclasses.replace(sound, notes=("colour frames were converted to Rec. 709 luma",))
+    elsewhere = Note("frames.replaced", "frames are those of colour.mp4")
+    noted = dataclasses.replace(sound, notes=(elsewhere,))
+    assert not check(noted).notes
+    noted = dataclasses.replace(
+        sound, notes=(Note("frames.luma", "colour frames were converted to Rec. 709 luma"),))
     (note,) = check(noted).notes
     assert note.code == "EV032"
 
@@ -193,7 +198,8 @@ def test_mistake_13_outside_the_sensor(sound: Recording, tmp_path: Path) -> None
     assert refused(lambda: read_recording(path, size=(40, 48))).code == "EV005"
     kept = read_recording(path, size=(40, 48), drop_outside=True)
     assert len(kept.events) == (sound.events.x < 40).sum()
-    assert "--drop-outside" in kept.notes[0]
+    assert kept.notes[0].code == "events.outside"
+    assert "--drop-outside" in kept.notes[0].text
 
 
 def test_mistake_14_empty(sound: Recording, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from helpers.networks import hidden
 from evflow import Camera, Recording, check, estimate_camera, linearised, read_recording
 from evflow.errors import EvflowDataError
 from evflow.io.images.times import read_times
+from evflow.notes import Note
 from evflow.recordings.adjust import flipped, shifted, with_frames
 from evflow.recordings.glitches import exposed
 
@@ -48,7 +49,7 @@ def test_a_response_is_undone(watched: tuple[Recording, Camera]) -> None:
         assert linear.frames.dtype == np.float32
         away = linear.frames - recording.frames
         assert np.abs(away).max() < 1.3  # half a code value at the steep, bright end
-        assert linear.notes == (f"frames linearised ({response})",)
+        assert linear.notes == (Note("frames.linearised", f"frames linearised ({response})"),)
     assert linearised(recording, "linear") is recording
     with pytest.raises(EvflowDataError, match="EV020"):
         linearised(recording, "log")
@@ -69,7 +70,7 @@ def test_frames_move_and_turn(watched: tuple[Recording, Camera]) -> None:
     recording = watched[0]
     moved = shifted(recording, 12_500)
     assert (moved.frame_times == recording.frame_times + 12_500).all()
-    assert moved.notes == ("frame times moved by +12.5 ms",)
+    assert moved.notes == (Note("frames.moved", "frame times moved by +12.5 ms"),)
     assert shifted(recording, 0) is recording
     for side, axis in (("horizontal", 2), ("vertical", 1)):
         turned = flipped(recording, side)
@@ -97,7 +98,8 @@ def test_frames_come_from_a_folder_with_begin_and_end_of_exposure(
     found = with_frames(bare, folder, timestamps=times)
     assert (found.frames == recording.frames).all()
     assert (found.frame_times == recording.frame_times).all()
-    assert "--timestamps-unit" in found.notes[1]
+    assert "--timestamps-unit" in found.notes[1].text
+    assert [note.code for note in found.notes] == ["frames.replaced", "frames.unit"]
     assert check(found).errors == ()
 
 
@@ -174,7 +176,8 @@ def test_a_cut_off_file_is_read_in_part(
         sound = read_recording(whole).events
         assert 0.3 < n / len(sound) < 0.7
         assert (part.events.t == sound.t[:n]).all()
-        assert "--partial" in part.notes[-1]
+        assert part.notes[-1].code == "events.partial"
+        assert "--partial" in part.notes[-1].text
 
 
 def test_a_cut_off_text_and_aedat4_are_read_in_part(

@@ -62,8 +62,9 @@ def test_thresholds_are_said_to_be_undetermined() -> None:
     for name in ("theta_on", "theta_off"):
         assert float(getattr(found.summary_std, name)) > 0.1
         assert (np.asarray(getattr(found.std, name)) > 0.1).all()
-    assert "undetermined" in found.warnings[0]
-    assert "4 hot pixels" in found.warnings[1]
+    assert found.undetermined == ("theta_on", "theta_off")
+    assert [note.code for note in found.notes] == ["frames.none", "pixels.hot"]
+    assert "4 hot pixels" in found.notes[1].text
     assert len(found.as_dict()["hot_pixels"]) == 4
 
 
@@ -81,7 +82,8 @@ def test_frames_that_stand_still_change_nothing() -> None:
     events = static()[0].events
     found = estimate_camera(seen(events))
     jax.tree.map(np.testing.assert_array_equal, found.camera, estimate_camera(static()[0]).camera)
-    assert "nothing moves" in found.warnings[0]
+    assert found.notes[0].code == "scene.static"
+    assert found.undetermined == ("theta_on", "theta_off")
     assert not found.valid.any()
     assert check(seen(events)).errors == ()
 

@@ -12,6 +12,7 @@ from helpers.recordings import write_ijrr
 
 from evflow import Events, Recording, check
 from evflow.io import read_recording
+from evflow.notes import texts
 
 SIZE = (64, 48)
 MS = 1000
@@ -109,7 +110,8 @@ def test_the_events_unit_leaves_plausible_frame_times_alone(
     made = watched(20_000, 500 * MS)
     np.testing.assert_array_equal(found.events.t, made.events.t)
     np.testing.assert_array_equal(found.frame_times, made.frame_times)
-    said = [n for n in found.notes if "frame times of" in n and f"read in {frames_unit}" in n]
+    said = [n for n in found.notes
+            if n.code == "frames.unit" and f"read in {frames_unit}" in n.text]
     assert len(said) == (frames_unit != "ns")
     part = read_recording(
         mixed(tmp_path / "part", layout, frames_unit), time_unit="ns", start_s=0.2, stop_s=0.3)
@@ -123,7 +125,7 @@ def test_frame_times_in_seconds_beside_whole_events(tmp_path: Path) -> None:
              frame_times=1e-6 * made.frame_times)
     found = read_recording(path)
     np.testing.assert_array_equal(found.frame_times, made.frame_times)
-    assert "were read in s" in " ".join(found.notes)
+    assert "were read in s" in " ".join(texts(found.notes))
 
 
 @pytest.mark.parametrize(("hz", "unit"), [(2000, "ns"), (5000, "ms"), (1, "ms"), (0.5, "ns")])

@@ -22,6 +22,7 @@ from evflow.io.formats.ros.messages import EVENT_TYPES, IMAGE, Message, Packet
 from evflow.io.formats.ros.packets import OTHER_CLOCK, decoder
 from evflow.io.hints import Hints
 from evflow.io.images.frames import FrameStack
+from evflow.notes import Note
 from evflow.types import Recording
 
 
@@ -34,17 +35,18 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
             "EV008", f"{bag.path} holds no topic of events, but {sorted(bag.all())[:8]}.",
             f"Known messages: {', '.join(EVENT_TYPES)}.")
     topic, kind = topics[0]
-    notes = tuple(f"topic {other} was not read" for other, _ in topics[1:])
+    notes = tuple(Note("events.unread", f"topic {other} was not read") for other, _ in topics[1:])
     first = bag.first(topic, kind)
     chunks, native = decoder(bag.path, first, bag.packets(topic, kind))
-    events, span = gather(bag.path, chunks, hints, first.size, native)
+    events, span, told = gather(bag.path, chunks, hints, first.size, native)
     image_topic = bag.image_beside(topic)
     if image_topic is None:
-        return Recording.of_events(events, notes)
+        return Recording.of_events(events, notes + told)
     if first.encoding in OTHER_CLOCK:
-        return Recording.of_events(events, (
-            *notes, f"images of {image_topic} were not read: events are on another clock"))
-    return bag.with_images(image_topic, events, span, hints, notes)
+        return Recording.of_events(events, (*notes, Note(
+            "frames.unused", f"images of {image_topic} were not read: events are on another "
+            "clock"), *told))
+    return bag.with_images(image_topic, events, span, hints, notes + told)
 
 
 class Bag:
@@ -138,7 +140,7 @@ class Bag:
             "EV009", f"{self.path}, topic {topic}, message {e.byte:,}: {e.seen}.", "Copy it again.")
 
     def with_images(
-        self, topic: str, events: Any, span: tuple[int, int], hints: Hints, notes: tuple[str, ...]
+        self, topic: str, events: Any, span: tuple[int, int], hints: Hints, notes: tuple[Note, ...]
     ) -> Recording:
         times, images = [], FrameStack(self.path)
         try:
@@ -151,4 +153,4 @@ class Bag:
             raise self._wrong(topic, e) from e
         return images.beside(
             events, np.array(times, np.int64),
-            (*notes, f"frame times are the header times of {topic}"))
+            (*notes, Note("frames.clock", f"frame times are the header times of {topic}")))

@@ -1,0 +1,78 @@
+"""What a result is to be read with: notes, each a code to act on and a sentence to read.
+
+A reader notes what it assumed, left out or converted; an estimate, what to know before trusting
+it. Code asks for codes, people read texts: nothing else in evflow looks into a text.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+from evflow.errors import CODES
+
+NOTES: dict[str, str] = {
+    "events.outside": "events outside the sensor were left out",
+    "events.partial": "only the part before the damage was read",
+    "events.timeless": "events before the first time word were left out",
+    "events.turned": "polarity was turned",
+    "events.unread": "something of the file was not read",
+    "sensor.camera": "which of several cameras was read",
+    "sensor.size": "the size of the sensor was inferred",
+    "sensor.unrectified": "events stay at the sensor's own pixels",
+    "frames.clock": "where the times of the frames come from",
+    "frames.depth": "16-bit frames that do not reach white",
+    "frames.fast": "motion too fast to interpolate well",
+    "frames.flipped": "frames were mirrored",
+    "frames.linearised": "a response was undone",
+    "frames.luma": "colour frames were converted to luma",
+    "frames.made": "a network made the frames of the events",
+    "frames.mosaic": "a colour mosaic was converted to luma",
+    "frames.moved": "frame times were moved",
+    "frames.none": "there are no frames",
+    "frames.rate": "the frame rate varies",
+    "frames.raw": "grey frames were taken as a colour mosaic",
+    "frames.replaced": "frames are those of another file",
+    "frames.unit": "the unit of the frame times was inferred",
+    "frames.unused": "frames were left out",
+    "scene.static": "nothing moves: the noise alone was measured",
+    "scene.restless": "the light moves while it should rest",
+    "theta.guessed": "thresholds scale with a network's guess of contrast",
+    "theta_on.extrapolated": "θ ON lies outside what the network was trained on",
+    "theta_on.uncertain": "few ON events tell θ ON",
+    "theta_on.undetermined": "θ ON is the prior's",
+    "theta_off.extrapolated": "θ OFF lies outside what the network was trained on",
+    "theta_off.uncertain": "few OFF events tell θ OFF",
+    "theta_off.undetermined": "θ OFF is the prior's",
+    "pixels.dead": "pixels never fire",
+    "pixels.hot": "pixels fire by themselves",
+    "pixels.unsure": "most pixels have no events of their own",
+    "windows.skipped": "windows between frames were left out",
+    "truth.none": "no pixel has both events and known flow",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Note:
+    """One thing to know. code: one of `NOTES`, or of `errors.CODES` where a check found it; text:
+    a sentence, which is `str(note)`. Another code is a ValueError."""
+
+    code: str
+    text: str
+
+    def __post_init__(self) -> None:
+        if self.code not in NOTES and self.code not in CODES:
+            raise ValueError(f"{self.code!r} is no code of a note.")
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def texts(notes: Iterable[Note]) -> list[str]:
+    """Their sentences, each once."""
+    return list(dict.fromkeys(note.text for note in notes))
+
+
+def as_dicts(notes: Iterable[Note]) -> list[dict[str, str]]:
+    """Of each {"code", "text"}, for JSON."""
+    return [dataclasses.asdict(note) for note in notes]
