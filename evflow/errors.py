@@ -49,10 +49,20 @@ CODES: dict[str, str] = {
 
 
 class EvflowDataError(Exception):
-    """Bad input data.
+    """Bad input: something about the user's file, arrays or options.
 
-    `code` is one of `CODES`; `seen` says what was found and where; `fix` says what to do.
-    `str(error)` is "EV004 timestamps not sorted: <seen> <fix>" on one line.
+    `str(error)` is one line, "EV004 timestamps not sorted: <seen> <fix>".
+
+    Attributes:
+        code: one of `CODES`, "EV001" and so on; stable, so programs may branch on it.
+        seen: what was found, and where.
+        fix: what to do about it; "" where there is nothing to say.
+
+    Example:
+        >>> try:
+        ...     recording = ef.read_recording("flight.h5")
+        ... except ef.EvflowDataError as error:
+        ...     print(error.code, error.fix)
     """
 
     def __init__(self, code: str, seen: str, fix: str = "") -> None:

@@ -38,13 +38,21 @@ LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709 weights of R, 
 class Events:
     """Events of one camera in time order; N may be 0 (a silent camera).
 
-    x, y: (N,) any integer dtype, inside `size`; kept as uint16.
-    t: (N,) any integer dtype, microseconds, non-decreasing; kept as int64.
-    p: (N,) bool, or integers in {0, 1} or {-1, 1}; kept as bool, True = ON (brighter).
-    size: (width, height) of the sensor in pixels.
+    Attributes:
+        x: (N,) column of the pixel, any integer dtype, 0..width-1; kept as uint16.
+        y: (N,) row of the pixel, any integer dtype, 0..height-1; kept as uint16.
+        t: (N,) any integer dtype, microseconds, non-decreasing; kept as int64.
+        p: (N,) bool, or integers in {0, 1} or {-1, 1}; kept as bool, True = ON (brighter).
+        size: (width, height) of the sensor in pixels.
 
-    Raises EV002 (shape), EV003 (dtype), EV004 (order), EV005 (coordinates), EV006 (polarity),
-    EV007 (NaN), EV020 (size).
+    Raises:
+        EvflowDataError: EV002 (columns are not 1-D, or differ in length), EV003 (dtype), EV004
+            (times go back), EV005 (outside the sensor), EV006 (polarity), EV007 (NaN), EV020
+            (size).
+
+    Example:
+        >>> events = ef.Events([3, 5], [1, 1], [10, 40], [1, 0], size=(346, 260))
+        >>> events.slice(0, 20), events.count_map().shape  # 1 event; (2, 260, 346)
     """
 
     x: np.ndarray
@@ -69,7 +77,18 @@ class Events:
     def unchecked(
         cls, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, size: Size
     ) -> Events:
-        """Wrap columns that are canonical and valid by construction; O(1), nothing is checked."""
+        """Wrap columns that are canonical and valid by construction; O(1), nothing is checked.
+
+        Args:
+            x: (N,) uint16, column.
+            y: (N,) uint16, row.
+            t: (N,) int64, microseconds, non-decreasing.
+            p: (N,) bool, True = ON.
+            size: (width, height) in pixels.
+
+        Returns:
+            The events; the columns are not copied.
+        """
         events = object.__new__(cls)
         events._set(x, y, t, p, size)
         return events
@@ -78,8 +97,15 @@ class Events:
     def concatenate(parts: Sequence[Events]) -> Events:
         """Join consecutive parts of one camera.
 
-        Raises EV001 (no part), EV015 (different sizes), EV004 (a part begins before the end of
-        the one before it).
+        Args:
+            parts: events of one size, in time order.
+
+        Returns:
+            All events of the parts, copied.
+
+        Raises:
+            EvflowDataError: EV001 (no part), EV004 (a part begins before the end of the one before
+                it), EV015 (different sizes).
         """
         if not parts:
             raise EvflowDataError("EV001", "there are no events to concatenate.")
@@ -104,7 +130,15 @@ class Events:
         return int(self.t[-1] - self.t[0]) if len(self) else 0
 
     def slice(self, t0_us: int, t1_us: int) -> Events:
-        """The events with t0_us <= t < t1_us, as views (no copy, nothing is checked again)."""
+        """The events with t0_us <= t < t1_us, as views (no copy, nothing is checked again).
+
+        Args:
+            t0_us: first time, integer microseconds.
+            t1_us: end of the range, integer microseconds, not included.
+
+        Returns:
+            The events of that range; none where it is empty.
+        """
         whole = np.iinfo(np.int64)
         bounds = np.array([min(max(operator.index(t), whole.min), whole.max)
                            for t in (t0_us, t1_us)])
@@ -128,13 +162,21 @@ class Events:
 class Recording:
     """Events and intensity frames of one camera on one clock.
 
-    frames: (T, H, W) uint8, uint16 or float32 in DN; T may be 0. Float frames are 0..255.
-    frame_times: (T,) any integer dtype, microseconds, mid-exposure, strictly increasing;
-        kept as int64.
-    notes: what a reader assumed, left out or converted.
+    Attributes:
+        events: the events.
+        frames: (T, H, W) uint8, uint16 or float32 in DN; T may be 0. Float frames are on 0..255.
+        frame_times: (T,) any integer dtype, microseconds, mid-exposure, strictly increasing; kept
+            as int64.
+        notes: what a reader assumed, left out or converted.
 
-    Raises EV002 (shape, colour), EV003 (dtype, range of float frames), EV004 (order),
-    EV007 (NaN), EV015 (frames and events of different size), EV020 (notes that are none).
+    Raises:
+        EvflowDataError: EV002 (shape, or colour), EV003 (dtype, or range of float frames), EV004
+            (times do not increase), EV007 (NaN), EV015 (frames and events of different size),
+            EV020 (`events` are no `Events`, or notes that are none).
+
+    Example:
+        >>> recording = ef.Recording(events, frames, frame_times)
+        >>> recording.frame_dn(0)  # float32, white at 255
     """
 
     events: Events
@@ -158,7 +200,18 @@ class Recording:
 
     @staticmethod
     def of_events(events: Events, notes: tuple[Note, ...] = ()) -> Recording:
-        """A recording without frames."""
+        """A recording without frames.
+
+        Args:
+            events: the recording's events.
+            notes: as in `Recording`.
+
+        Returns:
+            The recording; its frames are (0, H, W) uint8.
+
+        Raises:
+            EvflowDataError: EV020 (`events` are no `Events`, or notes that are none).
+        """
         need(events, Events, "events", "Of a recording: recording.events.")
         width, height = events.size
         return Recording(
@@ -174,6 +227,7 @@ class Recording:
 
     @property
     def has_frames(self) -> bool:
+        """Whether there is any frame."""
         return len(self.frames) > 0
 
     @functools.cached_property
@@ -187,16 +241,28 @@ class Recording:
         return next(2**bits - 1 for bits in BIT_DEPTHS if peak < 2**bits)
 
     def frame_dn(self, index: int) -> np.ndarray:
-        """Frame `index` as float32 (H, W), scaled so that `full_scale` is 255 DN."""
+        """One frame on the common scale.
+
+        Args:
+            index: of the frame, 0..T-1.
+
+        Returns:
+            float32 (H, W), scaled so that `full_scale` is 255 DN.
+        """
         return self.frames[index].astype(np.float32) * np.float32(255 / self.full_scale)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Window:
-    """What a camera saw between two of its frames.
+    """What a camera saw between two of its frames: the input of one estimate.
 
-    events: those with t0_us <= t < t1_us. frame0, frame1: float32 (H, W) in DN 0..255, taken at
-    t0_us and t1_us (microseconds, mid-exposure). index: its place among the windows, from 0.
+    Attributes:
+        events: those with t0_us <= t < t1_us.
+        frame0: float32 (H, W), DN on 0..255, the frame taken at t0_us.
+        frame1: float32 (H, W), DN on 0..255, the frame taken at t1_us.
+        t0_us: beginning in microseconds, the mid-exposure of frame0.
+        t1_us: end in microseconds, the mid-exposure of frame1.
+        index: its place among the windows of the recording, from 0.
     """
 
     events: Events
@@ -208,6 +274,7 @@ class Window:
 
     @property
     def window_s(self) -> float:
+        """Length in seconds, the `window_s` of `estimate`."""
         return (self.t1_us - self.t0_us) / 1e6
 
 

@@ -21,8 +21,27 @@ BINS = 16
 
 
 def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np.ndarray:
-    """Host events -> float32 (H, W, 2*bins) for the window [t0_us, t0_us + window_us), integer
-    microseconds. Raises EV003, EV020."""
+    """Events of one time window as a voxel grid, one per polarity (Eq. 2 of the paper).
+
+    An event adds weight 1, shared linearly between the two time bins next to it. Counts are not
+    normalised: their size is what tells the threshold.
+
+    Args:
+        events: of the whole recording or a part; only those in [t0_us, t0_us + window_us) enter.
+        t0_us: beginning of the window, integer microseconds.
+        window_us: length of the window, integer microseconds, > 0.
+        bins: time bins B per polarity, >= 2. The released network takes 16.
+
+    Returns:
+        float32 (H, W, 2*bins), channels [ON 0..B-1, OFF 0..B-1], in events.
+
+    Raises:
+        EvflowDataError: EV003 (times are not integers), EV020 (an empty window, too few bins, or
+            no `Events`).
+
+    Example:
+        >>> voxels = ef.voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
+    """
     need(events, Events, "events", "Of a path: evflow.read_events(path).")
     for name, value in (("t0_us", t0_us), ("window_us", window_us)):
         if not isinstance(value, int | np.integer):

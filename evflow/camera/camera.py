@@ -34,11 +34,20 @@ EXPECTED = ("Expected the camera.npz of evflow estimate (or Camera.save): maps (
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """Per-pixel parameters, each float32 (..., H, W).
+    """An event camera, pixel by pixel: four float32 maps (..., H, W), a pytree.
 
-    theta_on, theta_off: contrast thresholds in natural-log units, > 0.
-    eta_on, eta_off: noise events per second (Hz) and pixel, >= 0, at the recording's mean
-    intensity (`SensorModel(eta_intensity=True)` lets the rate follow Eq. 12 with intensity).
+    It passes through jit, vmap and grad. What all pixels share is in `SensorModel`.
+
+    Attributes:
+        theta_on: contrast thresholds for ON events, natural-log units, > 0.
+        theta_off: contrast thresholds for OFF events, natural-log units, > 0.
+        eta_on: ON noise events per second (Hz) and pixel, >= 0, at the recording's mean
+            intensity; with `SensorModel(eta_intensity=True)` the rate follows intensity (Eq. 12).
+        eta_off: the same for OFF.
+
+    Example:
+        >>> camera = ef.Camera.sample(jax.random.key(0), (260, 346))
+        >>> camera.save("camera.npz")
     """
 
     theta_on: Array
@@ -48,6 +57,7 @@ class Camera:
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Shape of the maps, (..., H, W)."""
         return tuple(np.shape(self.theta_on))
 
     @staticmethod
@@ -58,13 +68,39 @@ class Camera:
         eta_on: float = 0.0,
         eta_off: float = 0.0,
     ) -> Camera:
-        """The same parameters at every pixel of `shape` = (..., H, W)."""
+        """The same parameters at every pixel.
+
+        Args:
+            shape: (..., H, W) of the maps.
+            theta_on: ON threshold, natural-log units, > 0.
+            theta_off: OFF threshold, natural-log units, > 0.
+            eta_on: ON noise rate in Hz per pixel, >= 0.
+            eta_off: OFF noise rate in Hz per pixel, >= 0.
+
+        Returns:
+            A camera of float32 maps.
+
+        Raises:
+            EvflowDataError: EV002 (fewer than two axes), EV014 (a value out of range).
+        """
         values = (theta_on, theta_off, eta_on, eta_off)
         return Camera(*(jnp.full(shape, v, jnp.float32) for v in values)).validate()
 
     @staticmethod
     def sample(key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None) -> Camera:
-        """One camera with pixels (..., H, W); leading axes are independent cameras. EV002."""
+        """Draw cameras from a prior, nominal values first, then pixels (Section IV-E of the paper).
+
+        Args:
+            key: of jax.random.
+            shape: (..., H, W); leading axes are independent cameras.
+            prior: their distribution; None is `CameraPrior()`.
+
+        Returns:
+            The cameras, maps of that shape, thresholds clamped at .01 as in v2e.
+
+        Raises:
+            EvflowDataError: EV002 (fewer than two axes).
+        """
         if len(shape) < 2:
             raise EvflowDataError("EV002", f"shape is {shape}.", "Expected (..., H, W).")
         prior = prior or CameraPrior()
@@ -73,10 +109,17 @@ class Camera:
         return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)
 
     def drawn(self, key: Array, std: Camera) -> Camera:
-        """A camera whose pixels are drawn from estimates and their std, both (..., H, W).
+        """A camera drawn from an estimate: each pixel from N(estimate, std^2), kept in range.
 
-        The most likely value of every pixel makes a camera more even than the one measured: what
-        was not seen of a pixel is the camera's median.
+        The estimates themselves make a camera more even than the one that was measured, as a
+        pixel of which little was seen has the camera's median.
+
+        Args:
+            key: of jax.random.
+            std: standard deviations (..., H, W) of this camera's maps, as `CameraEstimate.std`.
+
+        Returns:
+            A camera of the same shape, thresholds >= .01, noise rates >= 0.
         """
         draws = jax.random.normal(key, (len(PARAMETERS), *self.shape))
         least = {"theta_on": THETA_MIN, "theta_off": THETA_MIN}
@@ -86,7 +129,15 @@ class Camera:
             for name, draw in zip(PARAMETERS, draws, strict=True)})
 
     def validate(self) -> Camera:
-        """Return self, or raise EV002, EV014, EV015 (host side; skipped on traced arrays)."""
+        """Refuse an impossible camera (on the host; traced arrays pass unchecked).
+
+        Returns:
+            Self.
+
+        Raises:
+            EvflowDataError: EV002 (fewer than two axes), EV014 (a value out of range or not
+                finite), EV015 (maps of different shapes).
+        """
         self.check_values()
         if len(self.shape) < 2 and not self._traced():
             raise EvflowDataError("EV002", f"the camera's maps have shape {self.shape}.",
@@ -121,7 +172,20 @@ class Camera:
         return any(isinstance(getattr(self, name), jax.core.Tracer) for name in PARAMETERS)
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: Any) -> Path:
-        """Write an .npz with the four maps, `extra` arrays beside them, and the units."""
+        """Write an .npz with the four maps and their units; all or nothing.
+
+        Args:
+            path: of the file; `evflow simulate --camera` and `load` read it.
+            overwrite: replace a file that exists.
+            **extra: arrays to store beside the maps, by name.
+
+        Returns:
+            The path.
+
+        Raises:
+            EvflowDataError: EV002, EV014, EV015 (no valid camera), EV013 (exists), EV019 (cannot be
+                written), EV020 (an extra array has the name of a map, or "meta").
+        """
         self.validate()
         if taken := {*PARAMETERS, "meta"} & set(extra):
             raise EvflowDataError("EV020", f"extra arrays named {', '.join(sorted(taken))}.",
@@ -137,12 +201,33 @@ class Camera:
 
     @staticmethod
     def load(path: str | os.PathLike) -> Camera:
-        """Read the maps written by `save` (pickled arrays are refused)."""
+        """Read the maps written by `save` (pickled arrays are refused).
+
+        Args:
+            path: of an .npz.
+
+        Returns:
+            The camera, maps (..., H, W).
+
+        Raises:
+            EvflowDataError: EV002, EV014, EV015 (its maps make no valid camera), EV008 (no .npz, or
+                one without these maps), EV009 (damaged), EV016 (no such file).
+        """
         return Camera.load_with_std(path)[0]
 
     @staticmethod
     def load_with_std(path: str | os.PathLike) -> tuple[Camera, Camera | None]:
-        """The maps and their standard deviations, where the file holds an estimate."""
+        """Read the maps and, where the file holds an estimate, their standard deviations.
+
+        Args:
+            path: of an .npz written by `save` or `CameraEstimate.save`.
+
+        Returns:
+            The camera, and a camera of standard deviations of the same shape or None.
+
+        Raises:
+            EvflowDataError: as `load`; EV009 also where the standard deviations are none.
+        """
         path = Path(path)
         _check_kind(path)
         data = load_npz(path)

@@ -29,12 +29,24 @@ def with_faults(
     key: Array, camera: Camera, hot: float = 1e-3, hot_hz: tuple[float, float] = (5.0, 100.0),
     dead: float = 1e-3,
 ) -> Camera:
-    """The camera with a share `hot` of its pixels hot and a share `dead` dead, drawn apart.
+    """The camera with a few of its pixels hot and a few dead, chosen at random.
 
-    A hot pixel keeps its thresholds; its noise rates, ON and OFF apart, are log-uniform in
-    hot_hz (Hz). A dead pixel has thresholds of 1e3 and no noise: neither light nor leak makes it
-    fire. camera: maps (..., H, W).
-    Raises EV020 for impossible shares or rates.
+    A hot pixel keeps its thresholds, and its noise rates are log-uniform in hot_hz, ON and OFF
+    independently. A dead pixel has thresholds of 1e3 and no noise: neither light nor leak makes
+    it fire.
+
+    Args:
+        key: of jax.random.
+        camera: maps (..., H, W).
+        hot: share of the pixels that are hot, 0..1.
+        hot_hz: (low, high) of their noise rates in Hz, 0 < low <= high.
+        dead: share of the pixels that are dead, 0..1; hot + dead <= 1.
+
+    Returns:
+        A camera of the same shape.
+
+    Raises:
+        EvflowDataError: EV020 (impossible shares or rates).
     """
     if not (hot >= 0 and dead >= 0 and hot + dead <= 1):
         raise EvflowDataError("EV020", f"hot={hot}, dead={dead}.",
@@ -63,8 +75,9 @@ def with_faults(
 class NoiseHistogram:
     """Noise events of one polarity, measured in N pixels at rest.
 
-    counts: (N, 71) float64, how many intervals between two events of the pixel had an
-    instantaneous frequency (1 / interval) in [AXIS_HZ[b], AXIS_HZ[b + 1]).
+    Attributes:
+        counts: (N, 71) float64, how many intervals between two events of the pixel had an
+            instantaneous frequency (1 / interval) in [AXIS_HZ[b], AXIS_HZ[b + 1]).
     """
 
     counts: np.ndarray
@@ -78,12 +91,22 @@ class NoiseHistogram:
 
 
 def read_noise_histogram(path: str | os.PathLike, name: str | None = None) -> NoiseHistogram:
-    """Read a noise file of IEBCS: a .npy of (H, W, 72) or (N, 72), or an .npz that holds several.
+    """Read measured noise of one polarity, a file in the layout of IEBCS (Joubert et al. 2021).
 
     Each row is a cumulative histogram over `AXIS_HZ`, the edges of 71 bins: column b counts the
-    intervals below AXIS_HZ[b + 1], the last column is unused (0, or the total again). name: which
-    array of an .npz. Raises EV016 (no file), EV009 (unreadable, or not a cumulative histogram),
-    EV008 (another frequency axis), EV020 (name), EV001, EV002, EV003, EV007.
+    intervals below AXIS_HZ[b + 1] Hz, the last column is unused (0, or the total again).
+
+    Args:
+        path: a .npy of (H, W, 72) or (N, 72) numbers, or an .npz that holds such an array.
+        name: of the array in an .npz; may be left out where there is only one.
+
+    Returns:
+        The histogram of each pixel; `.rates()` are its noise rates in Hz.
+
+    Raises:
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (dtype), EV007 (NaN), EV008
+            (another frequency axis), EV009 (unreadable, or not a cumulative histogram), EV016 (no
+            such file), EV020 (no array of that name, or several and no name).
     """
     path = Path(path)
     if not path.is_file():
@@ -144,9 +167,18 @@ def with_noise_histogram(
 ) -> Camera:
     """The camera with the noise rates of measured pixels, drawn with replacement.
 
-    Where both files hold as many pixels, ON and OFF of a pixel come from the same measured one:
-    in the dark they go together (correlation .95 at .1 lux in the files of IEBCS). Else they are
-    drawn apart. camera: maps (..., H, W); thresholds stay as they are.
+    Where both histograms hold as many pixels, ON and OFF of a pixel come from the same measured
+    one: in the dark they go together (correlation .95 at .1 lux in the files of IEBCS). Otherwise
+    they are drawn independently.
+
+    Args:
+        key: of jax.random.
+        camera: maps (..., H, W); its thresholds stay.
+        on: ON noise, of `read_noise_histogram`.
+        off: OFF noise.
+
+    Returns:
+        A camera of the same shape, eta in Hz.
     """
     sizes = [len(h.counts) for h in (on, off)]
     k_on, k_off = jax.random.split(key)

@@ -19,10 +19,20 @@ Array = jax.Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """What a whole camera shares, each float32 (...,): the medians of the four maps and the
-    threshold mismatch (standard deviation over pixels, before the clamp) per polarity. The noise
-    rates of an estimate are the means over pixels, as noise adds up; where pixels differ by a
-    tenth the two differ by half a percent."""
+    """What a whole camera shares, each float32 (...,): a scalar per camera, a pytree.
+
+    Noise rates of an estimate are means over pixels rather than medians, as noise adds up; where
+    pixels differ by a tenth the two differ by half a percent.
+
+    Attributes:
+        theta_on: median ON threshold over pixels, natural-log units.
+        theta_off: median OFF threshold over pixels, natural-log units.
+        eta_on: ON noise rate in Hz per pixel.
+        eta_off: OFF noise rate in Hz per pixel.
+        sigma_on: threshold mismatch, the standard deviation of theta_on over pixels (before the
+            clamp at .01), natural-log units.
+        sigma_off: the same of theta_off.
+    """
 
     theta_on: Array
     theta_off: Array
@@ -34,15 +44,23 @@ class Summary:
 
 @dataclasses.dataclass(frozen=True)
 class CameraPrior:
-    """The distribution of cameras.
+    """The distribution that cameras are drawn from (Section IV-E of the paper, Eq. 12).
 
-    theta: range of the nominal threshold, uniform, drawn apart for ON and OFF (paper: .1-.5).
-    mismatch: range of the per-pixel standard deviation (v2e's default .03; the paper .15).
-    noise: "eq12" ties the rate to the threshold, eta = g R(theta) with the intensity factor g
-        of Eq. 12, uniform in [F, 1] where the scene's intensity is not known; "independent"
-        draws it log-uniform in `eta`; "mixed" takes either with equal chance, and a g that is
-        not the scene's in half of the tied cameras; "none" is silent.
-    eta_spread: standard deviation of log eta from pixel to pixel.
+    Attributes:
+        theta: range of the nominal threshold, natural-log units, uniform, drawn separately for ON
+            and OFF (paper: .1-.5).
+        mismatch: range of the standard deviation of the threshold over pixels, natural-log units
+            (v2e's default .03; the paper .15).
+        noise: "eq12" ties the rate to the threshold, eta = g R(theta) with the intensity factor g
+            of Eq. 12, uniform in [F, 1] (F = .25) where the scene's intensity is not known;
+            "independent" draws it log-uniform in `eta`; "mixed" takes either with equal chance,
+            and in half of the tied cameras a g that is not the scene's; "none" is silent.
+        eta: range of the noise rate in Hz per pixel and polarity, > 0, for "independent" and
+            "mixed".
+        eta_spread: standard deviation of log eta over pixels.
+
+    Raises:
+        EvflowDataError: EV020 (an unknown `noise`, a range that is none).
     """
 
     theta: tuple[float, float] = (0.1, 0.5)

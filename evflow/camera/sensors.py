@@ -57,25 +57,39 @@ DVS240 = Voltmeter(4.4241, 23.0, 2e-4, 1e-7, 5e-8, 1e-5)
 
 @dataclasses.dataclass(frozen=True)
 class SensorModel:
-    """What is not per pixel. The default is v2e's noise-free pixel with true crossing times.
+    """The pixel circuit: what is not per pixel. Frozen and hashable, a static argument of jit.
 
-    kind: the pixel circuit. "v2e": all of the below; "esim": log-eps intensity, and events that
-        come within the refractory period are lost; "voltmeter": Brownian motion with drift, its
-        constants in `voltmeter`; "paper": thresholds and noise rates alone (Section IV-E).
-        Whatever the kind, the camera's eta is added.
-    timestamps: "crossing" = the instant at which the (linearly interpolated) log intensity
-        crosses the threshold; "v2e" = v2e's slots, shared by the k-th event of every pixel.
-    log_map: "linlog" (v2e: linear below 20 DN) or "log_eps" (ESIM: log(I/255 + 1e-3));
-        "auto" becomes the kind's own.
-    cutoff_hz: corner of the intensity-dependent first-order low-pass at 255 DN; 0 = off.
-    refractory_s: dead time after an event; the contrast is kept and fires later (v2e).
-    leak_hz, leak_jitter, leak_fpn_decades: ON leak events per second, the relative jitter of
-        each step, and the spread of the fixed pattern in decades.
-    shot_hz: v2e's shot-noise rate R, both polarities together, on top of the camera's eta.
-    eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
-        of the first frame.
-    noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
-        False adds it to the stream (the paper).
+    The default is v2e's noise-free pixel with true crossing times.
+
+    Attributes:
+        kind: "v2e": all of the below; "esim": log-eps intensity, and events that come within the
+            refractory period are lost; "voltmeter": Brownian motion with drift (DVS-Voltmeter),
+            its constants in `voltmeter`; "paper": thresholds and noise rates alone (Section
+            IV-E). Whatever the kind, the camera's eta is added.
+        timestamps: "crossing" = the instant at which the (linearly interpolated) log intensity
+            crosses the threshold; "v2e" = v2e's slots, shared by the k-th event of every pixel.
+        log_map: "linlog" (v2e: linear below 20 DN) or "log_eps" (ESIM: log(I/255 + 1e-3));
+            "auto" becomes the kind's own.
+        cutoff_hz: corner frequency of the intensity-dependent first-order low-pass at 255 DN;
+            0 = off.
+        refractory_s: dead time after an event in seconds; with "v2e" the contrast is kept and
+            fires later.
+        leak_hz: ON leak events per second.
+        leak_jitter: relative jitter of each leak step.
+        leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.
+        shot_hz: v2e's shot-noise rate in Hz, both polarities together, on top of the camera's eta.
+        eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
+            of the first frame.
+        noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
+            False adds it to the stream (the paper).
+        voltmeter: constants of kind "voltmeter".
+
+    Raises:
+        EvflowDataError: EV020 (an unknown choice, a negative value, or an option that a pixel of
+            this kind has no part for).
+
+    Example:
+        >>> model = ef.SensorModel(cutoff_hz=200.0, refractory_s=5e-4, leak_hz=0.1)
     """
 
     kind: Literal["v2e", "esim", "voltmeter", "paper"] = "v2e"
@@ -119,8 +133,14 @@ class SensorModel:
 
 @dataclasses.dataclass(frozen=True)
 class KnownSensor:
-    """A model, and the thresholds (natural log) that go with it: median of both polarities and
-    standard deviation from pixel to pixel."""
+    """A published sensor: the model, and the thresholds that go with it.
+
+    Attributes:
+        model: its pixel circuit.
+        theta: median threshold of both polarities, natural-log units.
+        mismatch: standard deviation of the threshold over pixels, natural-log units.
+        source: where the values come from.
+    """
 
     model: SensorModel
     theta: float

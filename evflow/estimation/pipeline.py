@@ -60,17 +60,34 @@ def estimate_camera(
     refine: Literal["auto", "off"] = "auto", min_window_us: int = 40_000,
     progress: Progress | None = None,
 ) -> CameraEstimate:
-    """Estimate a camera from a recording with frames; of a scene that stands still its noise
-    alone (static.py), thresholds undetermined. Without frames only that is possible.
+    """Measure a camera, pixel by pixel, from a recording with frames.
 
-    Windows run from frame to frame until at least min_window_us long. refine: "auto" simulates
-    stretches of the recording with the estimate and corrects it, which takes the error of
-    theta on held-out cameras from .022 to .011; "off" leaves it to the network alone. Where
-    nothing moves the noise is counted, and no threshold is told, either way.
-    progress(done, total) is called after every window and stretch. What usually goes wrong with
-    a recording is not looked for here: `check(recording).raise_if_failed()` before.
-    Raises EV011 (no frames, and the scene moves), EV012, EV017 where the recording cannot tell,
-    EV020 on a bad option.
+    Of a scene that stands still the noise alone is measured, and the thresholds are undetermined;
+    without frames only that is possible. What usually goes wrong with a recording is not looked for
+    here: `check(recording).raise_if_failed()` before.
+
+    Args:
+        recording_or_path: events and frames on one clock, or the path of a file that holds them.
+        params: of `load_weights`; None loads the released ones.
+        refine: "auto" simulates stretches of the recording with the estimate and corrects it, which
+            takes the error of theta on held-out cameras from .022 to .011; "off" leaves it to the
+            network alone.
+        min_window_us: shortest window, integer microseconds: windows run from frame to frame until
+            at least this long.
+        progress: progress(done, total) is called after every window and stretch.
+
+    Returns:
+        The maps, their standard deviations, the camera's summary, and what to know about them.
+
+    Raises:
+        EvflowDataError: EV001 (no events), EV011 (no frames, and the scene moves), EV012 (frames
+            and events do not overlap), EV017 (too little to tell), EV018 (no weights), EV020 (a
+            bad option); of a path also what `read_recording` raises.
+
+    Example:
+        >>> found = ef.estimate_camera("flight.h5")
+        >>> found.summary.theta_on, found.summary_std.theta_on
+        >>> found.save("camera.npz")
     """
     if refine not in ("auto", "off"):
         raise EvflowDataError("EV020", f"refine={refine!r}.", 'Choose "auto" or "off".')

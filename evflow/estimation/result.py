@@ -17,15 +17,22 @@ THRESHOLDS = ("theta_on", "theta_off")  # of whose measurement `undetermined` sp
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CameraEstimate:
-    """What was measured.
+    """A measured camera: maps with their errors, what all pixels share, and what to know about it.
 
-    camera, std: maps (H, W) and their standard deviations; summary, summary_std: the camera's
-    medians and mismatch (scalars); valid: (H, W) bool, pixels that are not hot, with at least 3
-    events in the windows used whose frames are neither saturated nor black there; n_events:
-    (H, W) uint32 events in the windows used; hot, dead: (H, W) bool, pixels that fire by
-    themselves, and pixels that never do amid others that do; windows: how many were used, 0
-    of a static scene; notes: what to know before trusting it; undetermined: those of
-    `THRESHOLDS` that the recording does not tell: their values, and widths, are the prior's.
+    Attributes:
+        camera: maps (H, W), theta in natural-log units, eta in Hz.
+        std: their standard deviations, in the same units.
+        summary: the camera's medians, noise rates and mismatch, scalars.
+        summary_std: their standard deviations.
+        valid: (H, W) bool, pixels that are not hot and have at least 3 events in the windows used,
+            counted where the frames are neither saturated nor black.
+        n_events: (H, W) uint32, events in the windows used.
+        hot: (H, W) bool, pixels that fire while nothing moves.
+        dead: (H, W) bool, pixels that never fire while those around them do.
+        windows: how many windows were used; 0 of a static scene.
+        notes: what to know before trusting it.
+        undetermined: those of `THRESHOLDS` that the recording does not tell: their values, and
+            widths, are the prior's.
     """
 
     camera: Camera
@@ -41,7 +48,18 @@ class CameraEstimate:
     undetermined: tuple[str, ...]
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
-        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead."""
+        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead.
+
+        Args:
+            path: of the file; `Camera.load` reads it.
+            overwrite: replace a file that exists.
+
+        Returns:
+            The path.
+
+        Raises:
+            EvflowDataError: EV013 (exists), EV014 (maps out of range), EV019 (cannot be written).
+        """
         extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
         return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
                                 n_events=self.n_events, hot=self.hot, dead=self.dead)

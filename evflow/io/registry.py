@@ -89,11 +89,28 @@ def find_format(path: str | os.PathLike) -> Format:
 
 
 def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
-    """Read events and frames of any known format; without frames the stack is (0, H, W).
+    """Read events and frames of a file or folder; its format is recognised by content.
 
-    hints: start_s, stop_s, time_unit, polarity, size, partial, drop_outside (see `Hints`).
-    Raises EV008 (unknown format), EV009 (damaged), EV010 (a package is missing), EV016 (not
-    there), EV020 (unknown hint), EV023 (whole seconds), and what `Events` and `Recording` raise.
+    Args:
+        path: AEDAT2, AEDAT4, Prophesee RAW and DAT, DSEC, MVSEC, ROS bags, text and others: see
+            docs/formats.md.
+        **hints: what the file does not tell. start_s, stop_s: the part to read, seconds from its
+            first event; time_unit: "s", "ms", "us" or "ns"; polarity: "01", "pm1" or "invert";
+            size: (width, height); partial: of a damaged file, what lies before the damage;
+            drop_outside: leave out events outside the sensor.
+
+    Returns:
+        The recording; without frames in the file they are (0, H, W). Its notes say what was
+        assumed or converted.
+
+    Raises:
+        EvflowDataError: EV001 (no event), EV008 (unknown format), EV009 (damaged), EV010 (a
+            package is missing), EV016 (not there), EV020 (unknown or bad hint), EV023 (whole
+            seconds), and what `Events` and `Recording` raise.
+
+    Example:
+        >>> recording = ef.read_recording("flight.aedat4", stop_s=5.0)
+        >>> recording.events, recording.frames.shape
     """
     if not isinstance(path, str | os.PathLike):
         raise EvflowDataError(
@@ -117,7 +134,19 @@ def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
 
 
 def read_events(path: str | os.PathLike, **hints: Any) -> Events:
-    """The events alone; hints and errors as in `read_recording`."""
+    """Read the events of a file or folder, without its frames.
+
+    Args:
+        path: as in `read_recording`.
+        **hints: as in `read_recording`.
+
+    Returns:
+        The events.
+
+    Raises:
+        EvflowDataError: EV001, EV008, EV009, EV010, EV016, EV020, EV023 and others, as in
+            `read_recording`.
+    """
     return read_recording(path, **hints).events
 
 
@@ -128,11 +157,19 @@ def write_events(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write events, and the frames of a `Recording`, in one of `WRITERS`; all or nothing.
+    """Write events, and the frames of a `Recording`, to a file; all or nothing.
 
-    Raises EV003 (what the format cannot hold), EV010 (a package is missing), EV013 (exists),
-    EV019 (cannot be written), EV020 (unknown format, one that the extension does not stand for, or
-    one without frames for a recording with).
+    Args:
+        path: of the file, with an ending of the format.
+        events: events or, with frames, a recording.
+        format: one of `WRITERS`: "dsec" (HDF5: events/{x, y, t, p}, ms_to_idx, t_offset), "npz",
+            "aedat4", "e2vid", "event_utils", "evreal".
+        overwrite: replace a file that exists.
+
+    Raises:
+        EvflowDataError: EV003 (what the format cannot hold), EV010 (a package is missing), EV013
+            (exists), EV019 (cannot be written), EV020 (unknown format, one that the path's ending
+            does not stand for, or one without frames for a recording with).
     """
     if not isinstance(events, Recording):
         need(events, Events, "events", "The path comes first: write_events(path, events).")
@@ -147,7 +184,18 @@ def write_recording(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write events and frames; format None: what the extension stands for. Errors as above."""
+    """Write a recording to a file or folder; all or nothing.
+
+    Args:
+        path: of the file; a folder where it has no ending.
+        recording: events and frames.
+        format: as in `write_events`; None is what the ending of the path stands for (.h5: "dsec",
+            .npz: "npz", .aedat4: "aedat4", .zip and .txt: "e2vid", none: "evreal").
+        overwrite: replace what exists.
+
+    Raises:
+        EvflowDataError: EV003, EV010, EV013, EV019, EV020 as in `write_events`.
+    """
     need(recording, Recording, "recording", "Of events: Recording.of_events(events).")
     with open_writer(path, recording.events.size, format, overwrite=overwrite) as out:
         copy(recording, out)
@@ -156,7 +204,25 @@ def write_recording(
 def open_writer(
     path: str | os.PathLike, size: Size, format: str | None = None, *, overwrite: bool = False
 ) -> EventWriter:
-    """A writer for events and frames in parts, to be used in a `with`; errors as above."""
+    """A writer for a recording that comes in parts; all or nothing, at the end of the `with` block.
+
+    Args:
+        path: as in `write_recording`.
+        size: (width, height) of the sensor.
+        format: as in `write_recording`.
+        overwrite: replace what exists.
+
+    Returns:
+        A context manager with append(events) and append_frames(frames, frame_times).
+
+    Raises:
+        EvflowDataError: EV003 (a larger sensor than the format holds), EV020 (size or format); and
+            from its block EV003, EV004 (order), EV010, EV013, EV015 (another size), EV019.
+
+    Example:
+        >>> with ef.open_writer("out.npz", (346, 260)) as out:
+        ...     out.append(events)
+    """
     return writer_of(path, format)(path, size, overwrite=overwrite)
 
 

@@ -113,10 +113,23 @@ def noise_factor(i01: Values) -> Values:
 
 
 def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
-    """Change of lin-log intensity between two frames (..., H, W) of DN 0..255 -> float32.
+    """Change of log intensity between two frames: the dlogI of `estimate`.
 
-    uint8, floats on 0..255, or uint16 on 0..65535 (`to_dn` for fewer bits). Raises EV002 (shape,
-    colour), EV003 (range), EV007 (NaN).
+    The logarithm is v2e's lin-log, I ln(20)/20 up to 20 DN and ln I above.
+
+    Args:
+        frame0: (..., H, W) grey frames at the window's beginning: uint8, floats on 0..255 DN, or
+            uint16 on 0..65535 (`evflow.light.log_maps.to_dn` for fewer bits).
+        frame1: frames at its end, of the same shape.
+
+    Returns:
+        float32 (..., H, W), natural-log units, > 0 where it became brighter.
+
+    Raises:
+        EvflowDataError: EV002 (shapes differ, or colour), EV003 (dtype or range), EV007 (NaN).
+
+    Example:
+        >>> dlogI = ef.delta_log_intensity(window.frame0, window.frame1)
     """
     before, after = _native(frame0), _native(frame1)
     for name, frame in (("frame0", before), ("frame1", after)):

@@ -30,23 +30,34 @@ ASKED_EVENTS = 400_000  # events whose neighbourhood is looked at, evenly taken 
 def compare(
     real: Events, synthetic: Events, *, span_us: tuple[int, int] | None = None
 ) -> dict[str, Any]:
-    """How alike a recorded and a synthetic stream are; a JSON-ready dict.
+    """How alike a recorded and a synthetic event stream are.
 
-    span_us: (t0, t1), the time [t0, t1) that is compared; without it, what both streams cover.
+    Args:
+        real: the recorded stream.
+        synthetic: the simulated stream, of the same sensor size.
+        span_us: (t0, t1), integer microseconds: the time [t0, t1) that is compared; None is what
+            both streams cover, and no stream is moved where it is given.
 
-    size, duration_s, span_us, aligned_at ("clock", or "beginnings" where the streams share
-    hardly any time and the synthetic one was moved to begin with the real one), events;
-    rate_hz: events per second and pixel, per polarity, and their ratio synthetic / real;
-    on_off: ON events per OFF event; curve: the rates over time and their correlation r;
-    counts: correlation r of the events per pixel; net_r: of ON less OFF events over cells of 8x8
-    pixels and 20 ms, negative where polarity is swapped; active: share of pixels that fire, and
-    `common`, those in both over those in either;
-    intervals: between successive events of a pixel; neighbours: since the latest event of the
-    eight pixels around, with `alone`, the share of events without one within 5 ms (mostly noise).
-    Both have ks (Kolmogorov-Smirnov, 0..1), wasserstein_decades (of log10 time), median_s and
-    a histogram; same_polarity: share of a pixel's events that repeat the polarity before.
+    Returns:
+        A JSON-ready dict, None where a number is undefined.
 
-    Raises EV001 (a stream is empty), EV015 (different sizes), EV020 (an empty span).
+        size, duration_s, span_us, events (numbers of events); aligned_at: "clock", or
+        "beginnings" where the streams share hardly any time and the synthetic one was moved by
+        shift_us to begin with the real one;
+        rate_hz: events per second and pixel, per polarity, and their ratio synthetic / real;
+        on_off: ON events per OFF event; curve: the rates over time and their correlation r;
+        counts: correlation r of the events per pixel; net_r: of ON less OFF events over cells of
+        8x8 pixels and 20 ms, negative where polarity is swapped; active: share of pixels that
+        fire, and `common`, those in both over those in either;
+        intervals: between successive events of a pixel; neighbours: since the latest event of the
+        eight pixels around, with `alone`, the share of events without one within 5 ms (mostly
+        noise). Both have ks (Kolmogorov-Smirnov, 0..1), wasserstein_decades (of log10 time),
+        median_s and a histogram; same_polarity: share of a pixel's events that repeat the
+        polarity before.
+
+    Raises:
+        EvflowDataError: EV001 (a stream is empty), EV015 (different sizes), EV020 (an empty span,
+            or no `Events`).
     """
     for name, events in (("real", real), ("synthetic", synthetic)):
         need(events, Events, name, "Of a path: evflow.read_events(path).")

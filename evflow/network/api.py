@@ -61,7 +61,18 @@ DEFAULT_WINDOW_S = 0.05
 
 
 def squash(y: ArrayLike, output: Output = "log") -> Camera:
-    """y (..., 4) -> Camera of maps (...). Raises EV002, EV007."""
+    """Camera of the flow's coordinates y (inverse of `unsquash`).
+
+    Args:
+        y: (..., 4), (log theta_on, log theta_off, log eta_on, log eta_off), standardised.
+        output: "log", or "tanh" for the paper's network, whose y is arctanh of the parameters.
+
+    Returns:
+        A camera of maps (...): theta in natural-log units, eta in Hz.
+
+    Raises:
+        EvflowDataError: EV002 (shape), EV003 (no real numbers), EV007 (NaN).
+    """
     if np.ndim(y) < 1 or np.shape(y)[-1] != 4:
         raise EvflowDataError("EV002", f"y has shape {np.shape(y)}.", "Expected (..., 4).")
     check_finite("y", y)
@@ -69,8 +80,18 @@ def squash(y: ArrayLike, output: Output = "log") -> Camera:
 
 
 def unsquash(camera: Camera, output: Output = "log") -> Array:
-    """Camera of maps (...) -> y (..., 4); eta below 1e-3 Hz is taken as 1e-3 Hz. Raises EV014,
-    EV015."""
+    """Coordinates y of a camera, in which the flow works (inverse of `squash`).
+
+    Args:
+        camera: maps (...). A noise rate below 1e-3 Hz is taken as 1e-3 Hz.
+        output: as in `squash`.
+
+    Returns:
+        float32 (..., 4).
+
+    Raises:
+        EvflowDataError: EV014 (a parameter out of range), EV015 (maps of different shapes).
+    """
     camera.check_values()
     return coordinates.unsquash(camera, output)
 
@@ -78,11 +99,13 @@ def unsquash(camera: Camera, output: Output = "log") -> Array:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Code:
-    """The condition of the flow.
+    """The condition of the flow: what the bijection between events and (y, z) holds fixed.
 
-    changes: (..., H, W, 2m) relu(+dL_j), relu(-dL_j), natural log (the paper's preset: the
-    encoder's feature); summary: of the camera, (...,); context: (..., H, W, 3) window length
-    and intensity.
+    Attributes:
+        changes: (..., H, W, 2m), the changes of log intensity dL_j in the window's m = 16 equal
+            parts, as relu(+dL_j), then relu(-dL_j); of the paper's network the encoder's feature.
+        summary: of the camera, (...,).
+        context: (..., H, W, 3), window length and mean log intensity.
     """
 
     changes: Array
@@ -98,7 +121,30 @@ def summarize(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None,
 ) -> Stats:
-    """Additive statistics (...,) of the pixels; add those of windows and tiles of one camera."""
+    """Additive statistics of all pixels: the pooled evidence for the camera's summary.
+
+    Statistics of windows and tiles of one camera are added: `sum(summarize(...) for ...)`.
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin, of `voxelize`.
+        dlogI: (..., H, W), natural-log units, of `delta_log_intensity`.
+        window_s: length of the window in seconds, a number or (...,).
+        intensity: mean log intensity (lin-log of DN), (..., H, W) or (...,), NaN where it is
+            unknown; None is unknown everywhere.
+
+    Returns:
+        Statistics (...,), pooled over (H, W) only.
+
+    Raises:
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that are no counts, no
+            logarithms), EV007 (NaN), EV018 (weights of the paper's network, which pools nothing,
+            or no weights), EV020 (window_s).
+
+    Example:
+        >>> stats = sum(ef.summarize(params, v, d) for v, d in windows)
+        >>> summary, std = ef.finish(params, stats)
+    """
     config, net = _net(params)
     if not config.pool:
         raise EvflowDataError(
@@ -117,7 +163,19 @@ def _pool(
 
 
 def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
-    """The camera's summary and its standard deviation, natural units, each (...,)."""
+    """The camera's summary from pooled statistics.
+
+    Args:
+        params: of `load_weights`.
+        stats: of `summarize`, one or a sum.
+
+    Returns:
+        The summary and its standard deviation, (...,) each, in natural units (natural log, Hz);
+        the std falls with the amount of data.
+
+    Raises:
+        EvflowDataError: EV018 (no weights).
+    """
     config, net = _net(params)
     y, y_std = _finish(net["summary"], stats, config=config)
     result = squash_summary(y)
@@ -133,8 +191,23 @@ def encode(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, summary: Summary | None = None,
     window_s: Any = DEFAULT_WINDOW_S, intensity: Any = None,
 ) -> Code:
-    """Code of what was seen: intensity changes predicted per pixel, and the camera's summary
-    (estimated from these very pixels unless given)."""
+    """Code of what was seen: the intensity changes, predicted from the events, and the summary.
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin.
+        dlogI: (..., H, W), natural-log units.
+        summary: of the camera, (...,) or scalars; None estimates it from these very pixels.
+        window_s: length of the window in seconds, a number or (...,).
+        intensity: as in `summarize`.
+
+    Returns:
+        The code, for `forward`, `inverse` and `generate`.
+
+    Raises:
+        EvflowDataError: EV001, EV002, EV003, EV007, EV020 as in `summarize`; EV014 (a summary out
+            of range), EV018 (no weights).
+    """
     config, net = _net(params)
     voxels, dlogI, window_s, intensity = prepare(config, voxels, dlogI, window_s, intensity)
     y, _ = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
@@ -174,9 +247,28 @@ def code_from_video(
     params: Params, dL: ArrayLike, camera: Camera, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None,
 ) -> Code:
-    """Code without any events: true log-intensity changes dL (..., H, W, m) of the window's m
-    equal parts, and the summary of `camera` (maps (..., H, W) or (H, W)). Raises EV002, EV003,
-    EV007, EV014, EV015."""
+    """Code without any events, from a video and a camera: what `generate` needs.
+
+    Args:
+        params: of `load_weights`.
+        dL: (..., H, W, 16), change of log intensity in each of the window's 16 equal parts,
+            natural-log units.
+        camera: maps (..., H, W) or (H, W), whose summary enters the code.
+        window_s: length of the window in seconds, a number or (...,).
+        intensity: as in `summarize`.
+
+    Returns:
+        The code.
+
+    Raises:
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014
+            (camera out of range), EV015 (camera of other pixels), EV018 (weights of the paper's
+            network, whose condition holds the events, or no weights), EV020 (window_s).
+
+    Example:
+        >>> dL = jnp.moveaxis(jnp.diff(log_frames, axis=0), 0, -1)  # of 17 frames (17, H, W)
+        >>> code = ef.code_from_video(params, dL, camera)
+    """
     config, _ = _net(params)
     if config.code == "feature":
         raise EvflowDataError(
@@ -201,8 +293,21 @@ def _flow_condition(config: ModelConfig, code: Code) -> tuple[Array, Array]:
 
 
 def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array, Array]:
-    """voxels (..., H, W, 32) -> y (..., H, W, 4), z (..., H, W, 28), log_det (..., H, W) of
-    d(y, z)/d voxels at fixed code (Eqs. 3-5). Raises EV002 for voxels of other pixels, EV007."""
+    """Events -> camera coordinates and latents, exactly invertible at a fixed code (Eqs. 3-5).
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin.
+        code: of `encode` or `code_from_video`, for the same pixels.
+
+    Returns:
+        y (..., H, W, 4), `squash(y)` is the camera; z (..., H, W, 28), the latents; log_det
+        (..., H, W), the log determinant of d(y, z) / d voxels.
+
+    Raises:
+        EvflowDataError: EV002 (voxels of other pixels than the code's), EV003 (no real numbers),
+            EV007 (NaN), EV018 (no weights).
+    """
     config, net = _net(params)
     check_shape("voxels", voxels, (*code.context.shape[:-1], 2 * config.bins))
     voxels = real(voxels)
@@ -219,7 +324,20 @@ def _forward(
 
 
 def inverse(params: Params, y: Array, z: Array, code: Code) -> Array:
-    """(y, z) -> voxels, the exact inverse of `forward` at the same code; EV002, EV007 as there."""
+    """Camera coordinates and latents -> events: the exact inverse of `forward` at the same code.
+
+    Args:
+        params: of `load_weights`.
+        y: (..., H, W, 4), of `forward` or `unsquash`.
+        z: (..., H, W, 28).
+        code: the code of `forward`.
+
+    Returns:
+        Voxels (..., H, W, 32).
+
+    Raises:
+        EvflowDataError: EV002, EV003, EV007, EV018 as in `forward`.
+    """
     config, net = _net(params)
     pixels = code.context.shape[:-1]
     for name, values, channels in (("y", y, 4), ("z", z, 2 * config.bins - 4)):
@@ -235,13 +353,25 @@ def _inverse(net: Params, y: Array, z: Array, code: Code, *, config: ModelConfig
 
 
 def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
-    """Voxels (..., H, W, 32) as `camera` would see the scene of `code`, z ~ N(0, 1).
+    """Events of the scene of a code as another camera would see it, z ~ N(0, 1).
 
-    The code's summary is replaced by the camera's, which has been running: its pixels' memory is
-    anywhere between the thresholds. A simulation that starts at the window's first frame sends
-    about a tenth fewer events, and a fifth where thresholds are high. Values are not clipped:
-    noise of the latents leaves small negative weights. Raises EV014, and EV015 for a camera of
-    other pixels.
+    The code's summary is replaced by the camera's. The camera has been running: its pixels' memory
+    is anywhere between the thresholds, whereas a simulation that starts at the window's first frame
+    sends about a tenth fewer events (a fifth where thresholds are high). Values are not clipped:
+    noise of the latents leaves small negative weights.
+
+    Args:
+        params: of `load_weights`.
+        key: of jax.random, for z.
+        camera: maps (..., H, W) or (H, W).
+        code: of `code_from_video`, or of `encode`.
+
+    Returns:
+        Voxels (..., H, W, 32).
+
+    Raises:
+        EvflowDataError: EV002, EV014 (no valid camera), EV015 (camera of other pixels), EV018 (no
+            weights).
     """
     config, _ = _net(params)
     shape = code.context.shape[:-1]
@@ -252,10 +382,23 @@ def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
 
 
 def log_prob(params: Params, voxels: ArrayLike, code: Code) -> Array:
-    """Log density (..., H, W) of the voxels given the code (Eq. 3): y ~ N(summary, mismatch^2),
-    z ~ N(0, 1), plus the log-det. A density only where the code came from a true video and a
-    camera; with an encoded code it is a score. Raises EV018 for weights of the paper's network,
-    which knows no summary."""
+    """Log density of events given a code (Eq. 3): y ~ N(summary, mismatch^2), z ~ N(0, 1).
+
+    A density only where the code came from a true video and a camera (`code_from_video`); with an
+    encoded code, which depends on the events, it is a score.
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin.
+        code: for the same pixels.
+
+    Returns:
+        Natural-log density of each pixel, (..., H, W).
+
+    Raises:
+        EvflowDataError: EV002, EV003, EV007 as in `forward`; EV018 (weights of the paper's
+            network, which has no summary, or no weights).
+    """
     if not config_of(params).pool:
         raise EvflowDataError("EV018", "the weights have no summary, around which y is expected.",
                               "Take those of the default network.")
@@ -269,10 +412,31 @@ def estimate(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None, summary: Summary | None = None,
 ) -> Camera:
-    """Camera maps (..., H, W) from one window: voxels (..., H, W, 32), dlogI (..., H, W).
+    """Camera maps from one window of events and the change of intensity over it.
 
-    Jitted; compiles once per shape. A `summary` pooled over more windows replaces the one of
-    this window.
+    Jitted; compiles once per shape. Of a whole recording `estimate_camera` knows more.
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin, of `voxelize`.
+        dlogI: (..., H, W), natural-log units, of `delta_log_intensity`.
+        window_s: length of the window in seconds, a number or (...,).
+        intensity: mean log intensity (lin-log of DN), (..., H, W) or (...,), NaN where it is
+            unknown; None is unknown everywhere.
+        summary: of the camera, (...,) or scalars, pooled over more windows; None estimates it from
+            this window.
+
+    Returns:
+        The camera, maps (..., H, W).
+
+    Raises:
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that are no counts, no
+            logarithms), EV007 (NaN), EV014 (a summary out of range), EV018 (no weights), EV020
+            (window_s).
+
+    Example:
+        >>> params = ef.load_weights()
+        >>> camera = ef.estimate(params, voxels, dlogI, window_s=0.05)
     """
     return estimate_with_std(params, voxels, dlogI, window_s=window_s, intensity=intensity,
                              summary=summary)[0]
@@ -282,7 +446,23 @@ def estimate_with_std(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: Any = DEFAULT_WINDOW_S,
     intensity: Any = None, summary: Summary | None = None,
 ) -> tuple[Camera, Camera]:
-    """`estimate` and the standard deviation of every value, in the same units."""
+    """`estimate`, with the standard deviation of every value.
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin.
+        dlogI: (..., H, W), natural-log units.
+        window_s: length of the window in seconds, a number or (...,).
+        intensity: as in `estimate`.
+        summary: as in `estimate`; the std is then that of a pixel in a camera so described, and
+            otherwise includes the summary's own.
+
+    Returns:
+        The camera and its standard deviations, maps (..., H, W) in the same units.
+
+    Raises:
+        EvflowDataError: EV001, EV002, EV003, EV007, EV014, EV018, EV020 as in `estimate`.
+    """
     y, y_std = estimate_y(params, voxels, dlogI, window_s=window_s, intensity=intensity,
                           summary=summary)
     output = config_of(params).output

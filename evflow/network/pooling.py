@@ -34,12 +34,18 @@ SIGNAL_UNIT, EXPOSURE_UNIT = 1000.0, 100.0  # pixels with events, pixel seconds:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Stats:
-    """Additive statistics of one camera, each (..., channels) or (...,) float32.
+    """Additive statistics of one camera, float32: `a + b` is of both windows or tiles. A pytree.
 
-    active: features summed over pixels with events; rates: positive features over all pixels;
-    normal: (..., gates, 5) weighted normal equations; balance: (..., gates, 2, 3) weighted
-    n_on, n_off, dL over brighter and darker pixels; pixels, pixels_active, exposure
-    (pixel seconds), events_on, events_off: plain counts. `a + b` adds two windows or tiles.
+    Attributes:
+        active: (..., A) features summed over pixels with events.
+        rates: (..., R) positive features summed over all pixels.
+        normal: (..., gates, 5) weighted normal equations of the event model.
+        balance: (..., gates, 2, 3) weighted n_on, n_off, dL over brighter and darker pixels.
+        pixels: (...,) number of pixels.
+        pixels_active: (...,) number of pixels with events.
+        exposure: (...,) pixel seconds.
+        events_on: (...,) number of ON events.
+        events_off: (...,) number of OFF events.
     """
 
     active: Array

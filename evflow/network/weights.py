@@ -46,7 +46,18 @@ def weights_hash(name_or_path: str | os.PathLike = "default") -> str:
 
 
 def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
-    """Parameters as a nested dict of float32 arrays, for `estimate` and the rest of the API."""
+    """Parameters of the network, for `estimate` and the rest of the API.
+
+    Args:
+        name_or_path: a released name ("default" ships with the package), or a .safetensors file.
+
+    Returns:
+        A nested dict of float32 arrays under one key, the architecture's name.
+
+    Raises:
+        EvflowDataError: EV009 (damaged), EV016 (no such file or name), EV018 (tensors that are not
+            float32, or nest badly), EV020 (neither a name nor a path).
+    """
     path = weights_path(name_or_path)
     params: Params = {}
     try:
@@ -79,8 +90,21 @@ def _check_tensors(path: Path, file: Any) -> None:
 def save_weights(
     path: str | os.PathLike, params: Params, card: dict[str, Any], *, overwrite: bool = False
 ) -> Path:
-    """Write params and a model card (any JSON-ready dict) as one .safetensors file; EV020 where it
-    has another name, by which it could not be read again."""
+    """Write parameters and a model card as one .safetensors file; all or nothing.
+
+    Args:
+        path: of the file, which ends in .safetensors.
+        params: nested dict of arrays; stored as float32.
+        card: any JSON-ready dict: command, seed, steps, data, figures.
+        overwrite: replace a file that exists.
+
+    Returns:
+        The path.
+
+    Raises:
+        EvflowDataError: EV013 (exists), EV019 (cannot be written), EV020 (another ending, by which
+            it could not be read again).
+    """
     if Path(path).suffix != ".safetensors":
         raise EvflowDataError("EV020", f"{path} does not end in .safetensors.",
                               f"Name it {Path(path).with_suffix('.safetensors')}.")

@@ -22,8 +22,22 @@ MARGIN_US = 1_000_000  # frames that far outside the events are kept: their cloc
 
 
 def linearised(recording: Recording, response: str) -> Recording:
-    """The recording with frames proportional to light, float32 DN on 0..255; response and errors
-    as in `linear_light`."""
+    """The recording with frames proportional to light: the camera's tone curve undone.
+
+    Thresholds are measured against the log of light. Of frames with a gamma of 2.2 they come out
+    2.2 times too small.
+
+    Args:
+        recording: with frames as they were stored.
+        response: "linear" (returned as it is), "gamma" (code = light^(1/2.2)) or "srgb"
+            (IEC 61966-2-1).
+
+    Returns:
+        A recording with float32 frames on 0..255 DN and a note of what was done.
+
+    Raises:
+        EvflowDataError: EV020 (another response).
+    """
     if response == "linear":
         return recording
     frames = np.empty(recording.frames.shape, np.float32)

@@ -123,10 +123,27 @@ def _obstacles(recording: Recording, start: int, stop: int) -> _Obstacles:
 def iter_windows(
     recording: Recording, min_us: int = MIN_US, plan: WindowPlan | None = None
 ) -> Iterator[Window]:
-    """The windows of `plan_windows` (or of a plan made before), in time order, their events as
-    views.
+    """The windows of a recording from which a camera is estimated, in time order.
 
-    Raises what `plan_windows` raises, and EV017 where no window is left.
+    A window runs from one frame to the first that is at least min_us later. Left out are windows
+    that the events do not cover, or that contain a gap in the events, a dropped frame or a faulty
+    one.
+
+    Args:
+        recording: events and frames on one clock.
+        min_us: shortest window, integer microseconds.
+        plan: of `plan_windows`, made before; None makes it.
+
+    Returns:
+        An iterator over the windows; their events are views. Errors are raised by the call.
+
+    Raises:
+        EvflowDataError: EV001 (no events), EV011 (fewer than two frames), EV012 (frames and events
+            do not overlap), EV017 (no window is left), EV020 (min_us, or no `Recording`).
+
+    Example:
+        >>> for window in ef.iter_windows(ef.read_recording("flight.h5")):
+        ...     dlogI = ef.delta_log_intensity(window.frame0, window.frame1)
     """
     plan = plan_windows(recording, min_us) if plan is None else plan
     if not plan.pairs:

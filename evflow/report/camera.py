@@ -80,18 +80,31 @@ def write_report(
     command: str = "", min_window_us: int = 40_000, seed: int = 0, overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write a self-contained HTML report on an estimate and return its numbers.
+    """Write a self-contained HTML report on an estimated camera, and return its numbers.
 
-    found: of `estimate_camera(recording)`; weights: those it was made with, for the held-out
-    half; source: the file or folder of the recording, whose sha256 is shown; command: the command
-    line, shown; min_window_us: as given to `estimate_camera`; seed: of the re-simulations.
-    At most 3 s of the recording are simulated, in its busiest part, and at most the 5 s before its
-    middle are estimated again. progress(done, total) is called after each stage.
-    The numbers, JSON-ready: "grade" ("good", "fair", "poor"), "trial" and "held_out" (each None,
-    or what `compare` says, with the "ceiling" of the counts' r), which also lie in the page.
+    The camera is put to the test: the recording's own frames are simulated with it (at most 3 s,
+    the busiest) and compared with what was recorded, and an estimate from the first half (at most
+    its last 5 s) is tried on the second.
 
-    Raises EV010 (matplotlib is missing), EV013 (exists), EV015 (the recording's size is not that
-    of the estimate), EV019 (cannot be written).
+    Args:
+        path: of the HTML file.
+        found: of `estimate_camera(recording)`.
+        recording: the one that the camera was estimated from.
+        weights: those it was estimated with, for the held-out half; as in `load_weights`.
+        source: file or folder of the recording, whose name and sha256 are shown.
+        command: the command line, shown.
+        min_window_us: as given to `estimate_camera`, integer microseconds.
+        seed: of the re-simulations.
+        overwrite: replace a file that exists.
+        progress: progress(done, total) is called after each stage.
+
+    Returns:
+        JSON-ready numbers, which also lie in the page: "grade" ("good", "fair", "poor"), "trial"
+        and "held_out" (each None, or what `compare` says, with the "ceiling" of the counts' r).
+
+    Raises:
+        EvflowDataError: EV010 (matplotlib is missing), EV013 (exists), EV015 (a recording of
+            another size than the estimate), EV016 (no such weights), EV019 (cannot be written).
     """
     require()
     if recording.events.size != found.n_events.shape[::-1]:

@@ -31,14 +31,26 @@ def simulate_counts(
     key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: Array | float,
     model: SensorModel | None = None, smooth: float = 0.0,
 ) -> Array:
-    """Events per pixel (H, W, 2) = [ON, OFF] of a video, float32; jit, vmap, differentiate it.
+    """Events per pixel and polarity of a video; jit, vmap and differentiate it.
 
-    log_frames: (T, H, W) natural-log intensity in the map of `model.log_map`, or uint8 DN that
-    pass through it, frame_dt_s apart.
-    camera: maps (H, W). smooth: width of the ramps in thresholds, 0 (exact counts, no gradient)
-    to 1; above 0 the noise is its expectation, and the key only draws the leak's pattern. Raises
-    EV002, EV003, EV007 (frames), EV014 (camera, more noise than an interval holds), EV015, EV020
-    (options; a model that has no smooth counts).
+    Args:
+        key: of jax.random; with smooth > 0 it only draws the leak's pattern.
+        log_frames: (T, H, W), T >= 2: natural-log intensity in the map of `model.log_map`, or
+            uint8 DN that pass through that map.
+        camera: maps (H, W).
+        frame_dt_s: seconds from frame to frame; may be traced.
+        model: the pixel circuit; None is `SensorModel()`.
+        smooth: 0 gives exact counts without gradient; up to 1, each threshold becomes a ramp of
+            this width (in thresholds), noise its expectation, and counts have gradients in theta,
+            eta and light.
+
+    Returns:
+        (H, W, 2) = [ON, OFF] events, float32 (float64 where log_frames are).
+
+    Raises:
+        EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
+            range, or more noise than an interval holds), EV015 (frames and camera of different
+            size), EV020 (options, or a model that has no such counts).
     """
     model = model or SensorModel()
     log_frames = as_log(model, jnp.asarray(log_frames))

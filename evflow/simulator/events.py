@@ -45,12 +45,33 @@ def simulate(
 ) -> Events | Labelled:
     """Events of a video seen by a camera.
 
-    frames: (T, H, W) uint8, or float DN on 0..255, or uint16 on 0..65535 (convert 10- and
-    12-bit data with `intensity.to_dn`). times_us: (T,) int, strictly increasing; the first
-    may be anything. camera: maps (H, W). Returns sorted `Events` with integer us times in
-    (times_us[0], times_us[-1]]; with `labels`, also (N,) bool: which of them are noise (eta
-    and shot noise; what leaks crosses the threshold as light does, and counts as signal).
-    Not for jit, vmap or grad (EV020): how many events there will be is not known beforehand.
+    Not for jit, vmap or grad: how many events there will be is not known beforehand. There take
+    `simulate_voxels` or `simulate_counts`.
+
+    Args:
+        key: of jax.random; noise, leak pattern and crossings of the Brownian pixel come of it.
+        frames: (T, H, W), T >= 2: uint8, float DN on 0..255, or uint16 on 0..65535 (convert 10-
+            and 12-bit data with `evflow.light.log_maps.to_dn`). Between frames log intensity is
+            interpolated linearly.
+        times_us: (T,) integer microseconds, strictly increasing; the first may be anything.
+        camera: maps (H, W).
+        model: the pixel circuit; None is `SensorModel()`.
+        labels: also tell which events are noise.
+
+    Returns:
+        Sorted `Events`, integer microseconds in (times_us[0], times_us[-1]]. With `labels`, also
+        bool (N,): which are noise (eta and shot noise; what leaks crosses the threshold as light
+        does, and counts as signal).
+
+    Raises:
+        EvflowDataError: EV001 (fewer than two frames), EV002 (shapes), EV003 (dtype or range),
+            EV004 (times do not increase), EV007 (NaN), EV014 (camera out of range, or more noise
+            than an interval holds), EV015 (frames and camera of different size), EV020 (called
+            within jit, vmap or grad).
+
+    Example:
+        >>> camera = ef.Camera.sample(jax.random.key(0), frames.shape[1:])
+        >>> events = ef.simulate(jax.random.key(1), frames, times_us, camera)
     """
     if any(isinstance(leaf, jax.core.Tracer)
            for leaf in jax.tree.leaves((key, frames, times_us, camera))):
@@ -85,11 +106,28 @@ def simulate_stream(
 ) -> Iterator[Events] | Iterator[Labelled]:
     """Events of a video that arrives piece by piece, in bounded memory.
 
-    frames_iter yields single frames (H, W) or blocks (T, H, W), times_iter the matching
-    scalars or (T,) arrays in us; a source may write its next frames over the last. Yields
-    `Events` of eight frames at a time, each later than the one before, after reading 8 or 16
-    frames more; together they are the same bytes as `simulate` for any cut of the input.
-    labels: as in `simulate`.
+    Args:
+        key: of jax.random.
+        frames_iter: yields single frames (H, W) or blocks (T, H, W), values as in `simulate`; a
+            source may write its next frames over the last.
+        times_iter: yields the matching times, scalars or (T,), integer microseconds.
+        camera: maps (H, W).
+        model: the pixel circuit; None is `SensorModel()`.
+        labels: also tell which events are noise.
+
+    Returns:
+        An iterator over `Events` of eight frames at a time, each later than the one before, after
+        reading 8 or 16 frames more; together they are the same bytes as of `simulate`, for any cut
+        of the input. With `labels`, pairs of them and bool (N,) as in `simulate`.
+
+    Raises:
+        EvflowDataError: EV001, EV002, EV003, EV004, EV007, EV014, EV015 as in `simulate`, while
+            the iterator is read.
+
+    Example:
+        >>> with ef.open_writer("out.h5", size) as out:
+        ...     for events in ef.simulate_stream(key, frames, times_us, camera):
+        ...         out.append(events)
     """
     video = blocks(frames_iter, times_iter, camera.shape, BLOCK, copy=True)
     packed = _packed(key, video, camera, model or SensorModel())

@@ -93,16 +93,34 @@ def simulate_voxels(
     key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: Array | float,
     model: SensorModel | None = None, bins: int = BINS,
 ) -> Array:
-    """Voxel grid of a video seen by a camera, on the device (Eq. 2).
+    """Voxel grid of a video seen by a camera, on the device (Eq. 2 of the paper); jit and vmap it.
 
-    log_frames: float32 (..., T, H, W) natural-log intensity in the map of `model.log_map`, or
-    uint8 DN, which pass through that map on the way, take a quarter of the memory and, outside
-    of jit on a CPU, half the time; frame_dt_s seconds apart, the window is their span. camera:
-    maps (H, W), or (..., H, W) with the same leading axes. Returns float32 (..., H, W, 2*bins).
-    One key serves all leading axes, split among them. Without leading axes the grid equals
-    `simulate` followed by `voxelize` (same key, noise included) up to the microsecond rounding of
-    event times; it also holds the few events that round to the last instant itself, where the
-    half-open window of `voxelize` ends. frame_dt_s may be traced.
+    Without leading axes the grid equals `simulate` followed by `voxelize` (same key, noise
+    included) up to the microsecond rounding of event times; it also holds the few events that round
+    to the last instant itself, where the half-open window of `voxelize` ends.
+
+    Args:
+        key: of jax.random; one serves all leading axes, split among them.
+        log_frames: (..., T, H, W), T >= 2: float32 natural-log intensity in the map of
+            `model.log_map`, or uint8 DN, which pass through that map, take a quarter of the memory
+            and, outside of jit on a CPU, half the time.
+        camera: maps (H, W), or (..., H, W) with the same leading axes.
+        frame_dt_s: seconds from frame to frame, one number; may be traced. The window is the span
+            of the frames.
+        model: the pixel circuit; None is `SensorModel()`.
+        bins: time bins B per polarity, >= 2.
+
+    Returns:
+        float32 (..., H, W, 2*bins), channels [ON 0..B-1, OFF 0..B-1], in events.
+
+    Raises:
+        EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
+            range, or more noise than an interval holds), EV015 (frames and camera of different
+            size), EV020 (bins, frame_dt_s).
+
+    Example:
+        >>> log_frames = to_log(frames)  # of evflow.light.log_maps
+        >>> voxels = ef.simulate_voxels(key, log_frames, camera, frame_dt_s=1e-3)
     """
     model = model or SensorModel()
     log_frames = jnp.asarray(log_frames)

@@ -15,9 +15,15 @@ Severity = Literal["error", "warning", "note"]
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One thing to know. code: one of `CODES`; severity: "error" = results would be wrong,
-    "warning" = a part is lost or doubtful, "note" = good to know; seen: what and where; fix: what
-    to do. `str(finding)` is one line, as that of an `EvflowDataError`."""
+    """One thing to know about a recording. `str(finding)` is one line, as of an `EvflowDataError`.
+
+    Attributes:
+        code: one of `CODES`.
+        severity: "error" = results would be wrong, "warning" = a part is lost or doubtful,
+            "note" = good to know.
+        seen: what was found, and where.
+        fix: what to do about it; may be "".
+    """
 
     code: str
     severity: Severity
@@ -26,7 +32,14 @@ class Finding:
 
     @staticmethod
     def of(error: EvflowDataError) -> Finding:
-        """What a reader or a constructor refused."""
+        """A finding of what a reader or a constructor refused.
+
+        Args:
+            error: the refusal.
+
+        Returns:
+            A finding of severity "error".
+        """
         return Finding(error.code, "error", error.seen, error.fix)
 
     def note(self) -> Note:
@@ -43,7 +56,11 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What `check` found in a recording, in the order of its rules."""
+    """What `check` found in a recording. `str(report)` has one line per finding.
+
+    Attributes:
+        findings: all of them; `errors`, `warnings` and `notes` are those of one severity.
+    """
 
     findings: tuple[Finding, ...] = ()
 
@@ -63,7 +80,11 @@ class Report:
         return self._only("note")
 
     def raise_if_failed(self) -> None:
-        """Raise the first error as an `EvflowDataError` of its code."""
+        """Raise the first error, if there is any.
+
+        Raises:
+            EvflowDataError: of that finding's code.
+        """
         if self.errors:
             raise self.errors[0].error()
 

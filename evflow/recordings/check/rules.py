@@ -22,15 +22,28 @@ from evflow.types import Recording
 def check(recording_or_path: Recording | str | os.PathLike, **hints: Any) -> Report:
     """Look for what usually goes wrong with a recording, before any estimate.
 
-    Of a path, what the reader refuses is the one finding; hints as in `read_recording`. A
-    recording without frames is checked for what can be told from events alone. Never raises
-    about the data; `report.raise_if_failed()` does.
+    A recording without frames is checked for what can be told from events alone. Faults of the
+    data are findings, never exceptions; `report.raise_if_failed()` raises the first error.
 
-    Codes: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events or no window, EV021
-    polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned, EV025 gaps,
-    EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029 mirrored
-    frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034 unrelated
-    frames.
+    Codes of the findings: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events or no
+    window, EV021 polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned,
+    EV025 gaps, EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029
+    mirrored frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034
+    unrelated frames; and, of a path, whatever the reader refuses.
+
+    Args:
+        recording_or_path: the recording, or a file or folder of any known format.
+        **hints: for the reader of a path, as in `read_recording`.
+
+    Returns:
+        The report: what was found, with the option that fixes it.
+
+    Raises:
+        EvflowDataError: EV020 (neither a recording nor a path).
+
+    Example:
+        >>> report = ef.check("flight.h5")
+        >>> print(report)
     """
     if not isinstance(recording_or_path, Recording):
         need(recording_or_path, str | os.PathLike, "recording_or_path",
