@@ -51,8 +51,8 @@ class Events:
             (size).
 
     Example:
-        >>> events = ef.Events([3, 5], [1, 1], [10, 40], [1, 0], size=(346, 260))
-        >>> events.slice(0, 20), events.count_map().shape  # 1 event; (2, 260, 346)
+        >>> events = ef.Events(x, y, t, p, size=(346, 260))
+        >>> on, off = events.slice(0, 50_000).count_map()  # (260, 346) each
     """
 
     x: np.ndarray

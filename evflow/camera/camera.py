@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evflow.camera.prior import CameraPrior, Summary, sample_nominal
 from evflow.errors import EvflowDataError, naming
@@ -171,7 +172,7 @@ class Camera:
     def _traced(self) -> bool:
         return any(isinstance(getattr(self, name), jax.core.Tracer) for name in PARAMETERS)
 
-    def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: Any) -> Path:
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: ArrayLike) -> Path:
         """Write an .npz with the four maps and their units; all or nothing.
 
         Args:

@@ -7,7 +7,8 @@ so units, polarity, size and time range mean the same for every format.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -27,7 +28,7 @@ def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
                 "EV020", f"{name}={getattr(options, name)!r}.", f"Choose from {allowed}.")
 
 
-def known(given: dict[str, Any], fields_of: type, who: str) -> dict[str, Any]:
+def known(given: Mapping[str, Any], fields_of: type, who: str) -> Mapping[str, Any]:
     """`given`; EV020 where it names what is no field of the dataclass. who: takes its fields."""
     names = [field.name for field in dataclasses.fields(fields_of)]
     unknown = sorted(set(given) - set(names))
@@ -35,6 +36,18 @@ def known(given: dict[str, Any], fields_of: type, who: str) -> dict[str, Any]:
         raise EvflowDataError(
             "EV020", f"unknown option {', '.join(unknown)}.", f"{who} know {names}.")
     return given
+
+
+class Told(TypedDict, total=False):
+    """The keyword arguments that become `Hints`."""
+
+    start_s: float | None
+    stop_s: float | None
+    time_unit: str
+    polarity: str
+    size: Size | None
+    partial: bool
+    drop_outside: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +88,7 @@ class Hints:
             object.__setattr__(self, "size", check_size(self.size))
 
     @staticmethod
-    def parse(given: dict[str, Any]) -> Hints:
+    def parse(given: Mapping[str, Any]) -> Hints:
         """Hints of keyword arguments; an unknown one raises EV020."""
         return Hints(**known(given, Hints, "Readers"))
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol, Unpack
 
 from evflow.checks import Size, need
 from evflow.errors import EvflowDataError, naming
@@ -36,7 +36,7 @@ from evflow.io.formats import (
 )
 from evflow.io.formats.ros import ros1, ros2
 from evflow.io.formats.write_aedat4 import Aedat4Writer
-from evflow.io.hints import Hints
+from evflow.io.hints import Hints, Told
 from evflow.io.writer import EventWriter, copy
 from evflow.types import Events, Recording
 
@@ -88,7 +88,7 @@ def find_format(path: str | os.PathLike) -> Format:
         "decimal points, and a header where the order is another.")
 
 
-def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
+def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
     """Read events and frames of a file or folder; its format is recognised by content.
 
     Args:
@@ -133,7 +133,7 @@ def read_recording(path: str | os.PathLike, **hints: Any) -> Recording:
     return recording
 
 
-def read_events(path: str | os.PathLike, **hints: Any) -> Events:
+def read_events(path: str | os.PathLike, **hints: Unpack[Told]) -> Events:
     """Read the events of a file or folder, without its frames.
 
     Args:

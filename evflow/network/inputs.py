@@ -64,7 +64,8 @@ def check_shape(name: str, values: ArrayLike, expected: tuple[int, ...]) -> None
 
 
 def prepare(
-    config: ModelConfig, voxels: ArrayLike, dlogI: ArrayLike, window_s: Any, intensity: Any
+    config: ModelConfig, voxels: ArrayLike, dlogI: ArrayLike, window_s: ArrayLike,
+    intensity: ArrayLike | None,
 ) -> tuple[Array, Array, Array, Array | None]:
     """Checked real inputs; window_s (...,), intensity (..., H, W) or None."""
     channels = 2 * config.bins
@@ -97,7 +98,7 @@ def prepare(
     return voxels, dlogI, window_s, intensity
 
 
-def _intensity(values: Any, shape: tuple[int, ...]) -> Array:
+def _intensity(values: ArrayLike, shape: tuple[int, ...]) -> Array:
     if not isinstance(values, jax.core.Tracer):
         given = np.asarray(values)
         if not is_real(given.dtype):

@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
@@ -28,7 +29,7 @@ Array = jax.Array
 
 
 def simulate_counts(
-    key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: Array | float,
+    key: Array, log_frames: ArrayLike, camera: Camera, *, frame_dt_s: Array | float,
     model: SensorModel | None = None, smooth: float = 0.0,
 ) -> Array:
     """Events per pixel and polarity of a video; jit, vmap and differentiate it.

@@ -14,6 +14,7 @@ from typing import Literal, overload
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
@@ -31,16 +32,16 @@ Labelled = tuple[Events, np.ndarray]
 
 @overload
 def simulate(
-    key: Array, frames: np.ndarray, times_us: np.ndarray, camera: Camera, *,
+    key: Array, frames: ArrayLike, times_us: ArrayLike, camera: Camera, *,
     model: SensorModel | None = None, labels: Literal[False] = False,
 ) -> Events: ...
 @overload
 def simulate(
-    key: Array, frames: np.ndarray, times_us: np.ndarray, camera: Camera, *,
+    key: Array, frames: ArrayLike, times_us: ArrayLike, camera: Camera, *,
     model: SensorModel | None = None, labels: Literal[True],
 ) -> Labelled: ...
 def simulate(
-    key: Array, frames: np.ndarray, times_us: np.ndarray, camera: Camera, *,
+    key: Array, frames: ArrayLike, times_us: ArrayLike, camera: Camera, *,
     model: SensorModel | None = None, labels: bool = False,
 ) -> Events | Labelled:
     """Events of a video seen by a camera.
@@ -92,16 +93,16 @@ def simulate(
 
 @overload
 def simulate_stream(
-    key: Array, frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
+    key: Array, frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     camera: Camera, *, model: SensorModel | None = None, labels: Literal[False] = False,
 ) -> Iterator[Events]: ...
 @overload
 def simulate_stream(
-    key: Array, frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
+    key: Array, frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     camera: Camera, *, model: SensorModel | None = None, labels: Literal[True],
 ) -> Iterator[Labelled]: ...
 def simulate_stream(
-    key: Array, frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
+    key: Array, frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     camera: Camera, *, model: SensorModel | None = None, labels: bool = False,
 ) -> Iterator[Events] | Iterator[Labelled]:
     """Events of a video that arrives piece by piece, in bounded memory.

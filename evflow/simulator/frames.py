@@ -6,12 +6,13 @@ import itertools
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evflow.errors import EvflowDataError
 
 
 def blocks(
-    frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
+    frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     shape: tuple[int, ...], length: int, *, copy: bool,
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
     """Flat frames, bytes or float32 DN, and their int64 times, however the input is cut: first
@@ -41,7 +42,7 @@ def _flat(frame: np.ndarray, copy: bool) -> np.ndarray:
 
 
 def _single_frames(
-    frames_iter: Iterable[np.ndarray], times_iter: Iterable[np.ndarray | int],
+    frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     shape: tuple[int, ...],
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Validated (frame, time) pairs, whatever the blocks they came in."""

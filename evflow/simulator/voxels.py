@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
@@ -90,7 +91,7 @@ def _tiled(
 
 
 def simulate_voxels(
-    key: Array, log_frames: Array, camera: Camera, *, frame_dt_s: Array | float,
+    key: Array, log_frames: ArrayLike, camera: Camera, *, frame_dt_s: Array | float,
     model: SensorModel | None = None, bins: int = BINS,
 ) -> Array:
     """Voxel grid of a video seen by a camera, on the device (Eq. 2 of the paper); jit and vmap it.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Literal
 
 from evflow.errors import CODES, EvflowDataError
 from evflow.notes import Note
@@ -94,7 +94,7 @@ class Report:
             dataclasses.replace(f, severity="error") if f.severity == "warning" else f
             for f in self.findings))
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, list[dict[str, str]]]:
         """{"errors", "warnings", "notes"}: lists of {"code", "title", "seen", "fix"}."""
         def rows(findings: Iterable[Finding]) -> list[dict[str, str]]:
             return [{"code": f.code, "title": CODES[f.code], "seen": f.seen, "fix": f.fix}

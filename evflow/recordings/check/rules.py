@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 from evflow import io
 from evflow.checks import need
 from evflow.errors import EvflowDataError
+from evflow.io.hints import Told
 from evflow.recordings.check.agreement import agreement
 from evflow.recordings.check.clocks import clocks
 from evflow.recordings.check.contents import contents
@@ -19,7 +20,7 @@ from evflow.recordings.windows import check_overlap, iter_windows
 from evflow.types import Recording
 
 
-def check(recording_or_path: Recording | str | os.PathLike, **hints: Any) -> Report:
+def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told]) -> Report:
     """Look for what usually goes wrong with a recording, before any estimate.
 
     A recording without frames is checked for what can be told from events alone. Faults of the

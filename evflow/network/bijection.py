@@ -1,0 +1,230 @@
+"""The bijection: events <-> (camera coordinates, latents) at a fixed code.
+
+    forward : voxels -> (y, z) at fixed code          an exact bijection (Eqs. 3-5)
+    inverse : (y, z) -> voxels at fixed code
+
+A `Code` is what both hold fixed: of a video and a camera (`code_from_video`), or of the events
+(`api.encode`). Shapes: voxels (..., H, W, 32), y (..., H, W, 4), z (..., H, W, 28).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from evflow.camera import Camera, Summary
+from evflow.errors import EvflowDataError
+from evflow.network import architecture, coordinates, encoder, flow, pooling
+from evflow.network.architecture import Params, config_of
+from evflow.network.config import ModelConfig
+from evflow.network.coordinates import unsquash_summary
+from evflow.network.inputs import (
+    check_change,
+    check_finite,
+    check_shape,
+    prepare,
+    real,
+    same_precision,
+    summary_of_pixels,
+)
+
+Array = jax.Array
+
+DEFAULT_WINDOW_S = 0.05
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Code:
+    """The condition of the flow: what the bijection between events and (y, z) holds fixed.
+
+    Attributes:
+        changes: (..., H, W, 2m), the changes of log intensity dL_j in the window's m = 16 equal
+            parts, as relu(+dL_j), then relu(-dL_j); of the paper's network the encoder's feature.
+        summary: of the camera, (...,).
+        context: (..., H, W, 3), window length and mean log intensity.
+    """
+
+    changes: Array
+    summary: Summary
+    context: Array
+
+
+def parts(params: Params) -> tuple[ModelConfig, Params]:
+    """The static structure, and the parts of the network."""
+    return config_of(params), next(iter(params.values()))
+
+
+def pixel_context(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
+    """The code's context, `shape` + (3,), of window lengths (...,)."""
+    return pooling.window_features(window_s[..., None, None], intensity, shape)
+
+
+def code_from_video(
+    params: Params, dL: ArrayLike, camera: Camera, *, window_s: ArrayLike = DEFAULT_WINDOW_S,
+    intensity: ArrayLike | None = None,
+) -> Code:
+    """Code without any events, from a video and a camera: what `generate` needs.
+
+    Args:
+        params: of `load_weights`.
+        dL: (..., H, W, 16), change of log intensity in each of the window's 16 equal parts,
+            natural-log units.
+        camera: maps (..., H, W) or (H, W), whose summary enters the code.
+        window_s: length of the window in seconds, a number or (...,).
+        intensity: as in `summarize`.
+
+    Returns:
+        The code.
+
+    Raises:
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014
+            (camera out of range), EV015 (camera of other pixels), EV018 (weights of the paper's
+            network, whose condition holds the events, or no weights), EV020 (window_s).
+
+    Example:
+        >>> dL = jnp.moveaxis(jnp.diff(log_frames, axis=0), 0, -1)  # of 17 frames (17, H, W)
+        >>> code = ef.code_from_video(params, dL, camera)
+    """
+    config, _ = parts(params)
+    if config.code == "feature":
+        raise EvflowDataError(
+            "EV018", "the paper's condition contains the events; a video cannot make it.",
+            'Use load_weights("default").')
+    if np.ndim(dL) < 3 or np.shape(dL)[-1] != config.changes:
+        raise EvflowDataError("EV002", f"dL has shape {np.shape(dL)}.",
+                              f"Expected (..., H, W, {config.changes}).")
+    check_finite("dL", dL)
+    check_change("dL", dL)
+    dL = real(dL)
+    _, _, window_s, intensity = prepare(
+        config, jnp.zeros((*dL.shape[:-1], 2 * config.bins)), dL[..., 0], window_s, intensity)
+    known = summary_of_pixels(camera, dL.shape[:-1])
+    return Code(encoder.split_sign(dL), known, pixel_context(window_s, intensity, dL.shape[:-1]))
+
+
+def _flow_condition(config: ModelConfig, code: Code) -> tuple[Array, Array]:
+    y = architecture.over_pixels(unsquash_summary(code.summary), code.context.shape[:-1])
+    u = architecture.condition(config, code.changes, code.context, y)
+    return u, architecture.centre(config, y)
+
+
+def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array, Array]:
+    """Events -> camera coordinates and latents, exactly invertible at a fixed code (Eqs. 3-5).
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin.
+        code: of `encode` or `code_from_video`, for the same pixels.
+
+    Returns:
+        y (..., H, W, 4), `squash(y)` is the camera; z (..., H, W, 28), the latents; log_det
+        (..., H, W), the log determinant of d(y, z) / d voxels.
+
+    Raises:
+        EvflowDataError: EV002 (voxels of other pixels than the code's), EV003 (no real numbers),
+            EV007 (NaN), EV018 (no weights).
+    """
+    config, net = parts(params)
+    check_shape("voxels", voxels, (*code.context.shape[:-1], 2 * config.bins))
+    voxels = real(voxels)
+    return _forward(net, voxels, same_precision(voxels, code), config=config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _forward(
+    net: Params, voxels: Array, code: Code, *, config: ModelConfig
+) -> tuple[Array, Array, Array]:
+    u, centre = _flow_condition(config, code)
+    y, z, log_det = flow.forward(net["flow"], voxels, u, config.flow)
+    return y + centre, z, log_det
+
+
+def inverse(params: Params, y: ArrayLike, z: ArrayLike, code: Code) -> Array:
+    """Camera coordinates and latents -> events: the exact inverse of `forward` at the same code.
+
+    Args:
+        params: of `load_weights`.
+        y: (..., H, W, 4), of `forward` or `unsquash`.
+        z: (..., H, W, 28).
+        code: the code of `forward`.
+
+    Returns:
+        Voxels (..., H, W, 32).
+
+    Raises:
+        EvflowDataError: EV002, EV003, EV007, EV018 as in `forward`.
+    """
+    config, net = parts(params)
+    pixels = code.context.shape[:-1]
+    for name, values, channels in (("y", y, 4), ("z", z, 2 * config.bins - 4)):
+        check_shape(name, values, (*pixels, channels))
+    y, z = real(y), real(z)
+    return _inverse(net, y, z, same_precision(y, code), config=config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _inverse(net: Params, y: Array, z: Array, code: Code, *, config: ModelConfig) -> Array:
+    u, centre = _flow_condition(config, code)
+    return flow.inverse(net["flow"], y - centre, z, u, config.flow)[0]
+
+
+def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
+    """Events of the scene of a code as another camera would see it, z ~ N(0, 1).
+
+    The code's summary is replaced by the camera's. The camera has been running: its pixels' memory
+    is anywhere between the thresholds, whereas a simulation that starts at the window's first frame
+    sends about a tenth fewer events (a fifth where thresholds are high). Values are not clipped:
+    noise of the latents leaves small negative weights.
+
+    Args:
+        params: of `load_weights`.
+        key: of jax.random, for z.
+        camera: maps (..., H, W) or (H, W).
+        code: of `code_from_video`, or of `encode`.
+
+    Returns:
+        Voxels (..., H, W, 32).
+
+    Raises:
+        EvflowDataError: EV002, EV014 (no valid camera), EV015 (camera of other pixels), EV018 (no
+            weights).
+    """
+    config, _ = parts(params)
+    shape = code.context.shape[:-1]
+    known = summary_of_pixels(camera, shape)
+    y = jnp.broadcast_to(coordinates.unsquash(camera, config.output), (*shape, 4))
+    z = jax.random.normal(key, (*shape, 2 * config.bins - 4))
+    return inverse(params, y, z, dataclasses.replace(code, summary=known))
+
+
+def log_prob(params: Params, voxels: ArrayLike, code: Code) -> Array:
+    """Log density of events given a code (Eq. 3): y ~ N(summary, mismatch^2), z ~ N(0, 1).
+
+    A density only where the code came from a true video and a camera (`code_from_video`); with an
+    encoded code, which depends on the events, it is a score.
+
+    Args:
+        params: of `load_weights`.
+        voxels: (..., H, W, 32), events per pixel and bin.
+        code: for the same pixels.
+
+    Returns:
+        Natural-log density of each pixel, (..., H, W).
+
+    Raises:
+        EvflowDataError: EV002, EV003, EV007 as in `forward`; EV018 (weights of the paper's
+            network, which has no summary, or no weights).
+    """
+    if not config_of(params).pool:
+        raise EvflowDataError("EV018", "the weights have no summary, around which y is expected.",
+                              "Take those of the default network.")
+    y, z, log_det = forward(params, voxels, code)
+    y6 = architecture.over_pixels(unsquash_summary(code.summary), y.shape[:-1])
+    prior = architecture.log_normal(y, y6[..., :4], architecture.base_std(y6)).sum(-1)
+    return prior + architecture.log_normal(z, 0.0, jnp.ones(())).sum(-1) + log_det
