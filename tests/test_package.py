@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import importlib.util
 import inspect
 import pickle
+import re
+import textwrap
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 import evflow
+from evflow.errors import CODES
 
 ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
@@ -46,6 +51,54 @@ def test_public_names_exist_and_are_documented(name: str) -> None:
     assert inspect.getdoc(found)
     # A module of that name would take its place as soon as anything imports it.
     assert importlib.util.find_spec(f"evflow.{name}") is None
+
+
+def sections(doc: str) -> dict[str, str]:
+    """The parts of a docstring in Google style by their titles; "" before the first."""
+    parts = re.split(r"^(\w+):$", doc, flags=re.M)
+    return {"": parts[0], **dict(zip(parts[1::2], parts[2::2], strict=True))}
+
+
+def public_functions() -> Iterator[tuple[str, Callable]]:
+    """Public functions, and the public methods of public classes, by name."""
+    for name in evflow.__all__:
+        found = getattr(evflow, name)
+        if inspect.isfunction(found):
+            yield name, found
+        elif inspect.isclass(found):
+            for method, _ in inspect.getmembers(found, callable):
+                if not method.startswith("_") and method in vars(found):
+                    yield f"{name}.{method}", getattr(found, method)
+
+
+@pytest.mark.parametrize(("name", "function"), [*public_functions()])
+def test_what_functions_take_give_and_refuse_is_documented(name: str, function: Callable) -> None:
+    parts = sections(inspect.getdoc(function) or "")
+    assert parts[""].strip()
+    taken = [("**" if p.kind is p.VAR_KEYWORD else "") + p.name
+             for p in inspect.signature(function).parameters.values() if p.name != "self"]
+    documented = re.findall(r"^    (\**\w+): \S", parts.get("Args", ""), re.M)
+    assert documented == taken
+    gives = inspect.signature(function).return_annotation not in ("None", None)
+    if taken or "." not in name:  # the one line of a method without arguments tells what it gives
+        assert ("Returns" in parts) == gives
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    raised = {c.args[0].value for c in ast.walk(tree)
+              if isinstance(c, ast.Call) and getattr(c.func, "id", "") == "EvflowDataError"
+              and isinstance(c.args[0], ast.Constant)}
+    told = set(re.findall(r"EV\d{3}", parts.get("Raises", "")))
+    assert raised <= told <= set(CODES)
+    if "Raises" in parts:
+        assert parts["Raises"].strip().startswith("EvflowDataError: ")
+
+
+def test_attributes_of_public_classes_are_documented() -> None:
+    for name in evflow.__all__:
+        found = getattr(evflow, name)
+        if dataclasses.is_dataclass(found):
+            told = re.findall(r"^    (\w+): \S", sections(inspect.getdoc(found) or "").get(
+                "Attributes", ""), re.M)
+            assert told == [field.name for field in dataclasses.fields(found)], name
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))

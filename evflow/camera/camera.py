@@ -35,9 +35,7 @@ EXPECTED = ("Expected the camera.npz of evflow estimate (or Camera.save): maps (
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """An event camera, pixel by pixel: four float32 maps (..., H, W), a pytree.
-
-    It passes through jit, vmap and grad. What all pixels share is in `SensorModel`.
+    """An event camera, pixel by pixel: four float32 maps (..., H, W), a pytree for jit and grad.
 
     Attributes:
         theta_on: contrast thresholds for ON events, natural-log units, > 0.
@@ -112,8 +110,7 @@ class Camera:
     def drawn(self, key: Array, std: Camera) -> Camera:
         """A camera drawn from an estimate: each pixel from N(estimate, std^2), kept in range.
 
-        The estimates themselves make a camera more even than the one that was measured, as a
-        pixel of which little was seen has the camera's median.
+        Estimates alone are too even: pixels of which little was seen have the camera's median.
 
         Args:
             key: of jax.random.
@@ -136,8 +133,7 @@ class Camera:
             Self.
 
         Raises:
-            EvflowDataError: EV002 (fewer than two axes), EV014 (a value out of range or not
-                finite), EV015 (maps of different shapes).
+            EvflowDataError: EV002 (shape), EV014 (out of range), EV015 (different shapes).
         """
         self.check_values()
         if len(self.shape) < 2 and not self._traced():
@@ -146,7 +142,11 @@ class Camera:
         return self
 
     def check_values(self) -> None:
-        """EV014, EV015 for parameters (...) of any shape; traced arrays pass."""
+        """Like `validate`, for parameters of any shape.
+
+        Raises:
+            EvflowDataError: EV014 (out of range or not finite), EV015 (different shapes).
+        """
         if self._traced():
             return
         leaves = {name: getattr(self, name) for name in PARAMETERS}
@@ -176,7 +176,7 @@ class Camera:
         """Write an .npz with the four maps and their units; all or nothing.
 
         Args:
-            path: of the file; `evflow simulate --camera` and `load` read it.
+            path: of the file.
             overwrite: replace a file that exists.
             **extra: arrays to store beside the maps, by name.
 
@@ -227,7 +227,7 @@ class Camera:
             The camera, and a camera of standard deviations of the same shape or None.
 
         Raises:
-            EvflowDataError: as `load`; EV009 also where the standard deviations are none.
+            EvflowDataError: as `load` (EV008, ...); EV009 also for impossible deviations.
         """
         path = Path(path)
         _check_kind(path)
