@@ -62,32 +62,25 @@ def estimate_camera(
 ) -> CameraEstimate:
     """Measure a camera, pixel by pixel, from a recording with frames.
 
-    Of a scene that stands still the noise alone is measured, and the thresholds are undetermined;
-    without frames only that is possible. What usually goes wrong with a recording is not looked for
-    here: `check(recording).raise_if_failed()` before.
+    Of a scene that stands still, or without frames, the noise alone is measured. What usually goes
+    wrong with a recording is not looked for here: `check(recording).raise_if_failed()` before.
 
     Args:
         recording_or_path: events and frames on one clock, or the path of a file that holds them.
         params: of `load_weights`; None loads the released ones.
-        refine: "auto" simulates stretches of the recording with the estimate and corrects it, which
-            takes the error of theta on held-out cameras from .022 to .011; "off" leaves it to the
-            network alone.
-        min_window_us: shortest window, integer microseconds: windows run from frame to frame until
-            at least this long.
+        refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .011).
+        min_window_us: windows run from frame to frame until at least this long, microseconds.
         progress: progress(done, total) is called after every window and stretch.
 
     Returns:
         The maps, their standard deviations, the camera's summary, and what to know about them.
 
     Raises:
-        EvflowDataError: EV001 (no events), EV011 (no frames, and the scene moves), EV012 (frames
-            and events do not overlap), EV017 (too little to tell), EV018 (no weights), EV020 (a
-            bad option); of a path also what `read_recording` raises.
+        EvflowDataError: EV001 (no events), EV011 (no frames, and no scene at rest), EV012 (no
+            overlap in time), EV017 (too little), EV018 (weights), EV020; also `read_recording`'s.
 
     Example:
-        >>> found = ef.estimate_camera("flight.h5")
-        >>> found.summary.theta_on, found.summary_std.theta_on
-        >>> found.save("camera.npz")
+        >>> ef.estimate_camera("flight.h5").save("camera.npz")
     """
     if refine not in ("auto", "off"):
         raise EvflowDataError("EV020", f"refine={refine!r}.", 'Choose "auto" or "off".')

@@ -4,9 +4,11 @@ bad file.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
+import typing
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,7 @@ import evflow
 from evflow import io
 from evflow.errors import EvflowDataError
 from evflow.io import DsecWriter, read_events, read_recording, write_events
+from evflow.io.hints import Hints, Told
 from evflow.io.registry import find_format
 from evflow.recordings.windows import iter_windows
 from evflow.types import Events, Recording
@@ -275,3 +278,8 @@ def test_reading_imports_neither_jax_nor_optional_packages(sources: dict[str, Pa
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
                           timeout=120, check=True, env={**os.environ})
     assert done.stdout.strip() == "[]"
+
+
+def test_the_typed_hints_are_those_that_readers_know() -> None:
+    fields, told = typing.get_type_hints(Hints), typing.get_type_hints(Told)
+    assert told == {f.name: fields[f.name] for f in dataclasses.fields(Hints) if f.init}
