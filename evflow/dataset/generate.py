@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import Camera, Summary
+from evflow.camera import Camera
 from evflow.dataset.config import DatasetConfig
 from evflow.dataset.sequence import EventSequence
 from evflow.light.log_maps import to_log
@@ -114,7 +114,7 @@ def _events(key: Array, film: Film, camera: Camera, config: DatasetConfig) -> Ev
     return Events.concatenate([part.slice(0, int(times[-1])) for part in parts])
 
 
-def _at_mean(values: Camera | Summary, gain: float) -> dict[str, np.ndarray]:
+def _at_mean(values: watch.Parameters, gain: float) -> dict[str, np.ndarray]:
     """The fields by name, noise rates times `gain`."""
     values = watch.with_noise(values, gain)
     return {f.name: np.asarray(getattr(values, f.name)) for f in dataclasses.fields(values)}

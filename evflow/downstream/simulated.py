@@ -153,8 +153,8 @@ def _draw(key: Array, prior: CameraPrior | WidePrior, frame: Array) -> Camera:
     height, width = frame.shape
     if isinstance(prior, WidePrior):
         return prior.sample(key, (height, width))
-    return watch.draw_camera(
-        *jax.random.split(key), prior, (height, width), watch.light(frame))[1]
+    k_nominal, k_pixels = jax.random.split(key)
+    return watch.draw_camera(k_nominal, k_pixels, prior, (height, width), watch.light(frame))[1]
 
 
 def _crop(key: Array, camera: Camera, shape: tuple[int, int]) -> Camera:
