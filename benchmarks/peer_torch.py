@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from evflow.network.config import ModelConfig
 from evflow.network.coordinates import CENTRE, SCALE
 from evflow.network.encoder import LOG_RANGE
-from evflow.network.flow import FlowConfig, shuffle
+from evflow.network.flow import FlowConfig, actnorm, injector, shuffle
 
 Tensor = torch.Tensor
 Weights = dict[str, Any]
@@ -37,7 +37,7 @@ def weights(params: Any) -> Weights:
 
 
 def flow(net: Weights, x: Tensor, u: Tensor, config: FlowConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """x (N, channels), u (N, condition) -> y (N, 4), z (N, 28), log-det (N,); additive coupling."""
+    """x (N, channels), u (N, condition) -> y (N, 4), z (N, 28), log-det (N,); as `forward`."""
     log_det = x.new_zeros(len(x))
     if config.asinh:
         x = torch.asinh(x)
@@ -52,10 +52,10 @@ def flow(net: Weights, x: Tensor, u: Tensor, config: FlowConfig) -> tuple[Tensor
             part = level["injector"]
             hidden = F.relu(linear(part["w_1"], part["b_1"], u))
             raw, shift = linear(part["w_2"], part["b_2"], hidden).chunk(2, 1)
-            s = config.injector_limit * torch.tanh(raw)
+            s = injector.LOG_SCALE_BOUND * torch.tanh(raw)
             x, log_det = x * torch.exp(s) + shift, log_det + s.sum(1)
         norm = level["actnorm"]
-        s = norm["base"] + config.log_scale_bound * torch.tanh(norm["raw"])
+        s = norm["base"] + actnorm.LOG_SCALE_BOUND * torch.tanh(norm["raw"])
         log_det = log_det + s.sum()
         for k in range(config.steps):
             x = x * torch.exp(s[k]) + norm["bias"][k]

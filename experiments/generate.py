@@ -28,15 +28,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow import Camera, code_from_video, generate, load_weights, log_prob
-from evflow.camera import THETA_MIN, CameraPrior, sample_nominal, sample_pixels
+from evflow.camera import THETA_MIN, CameraPrior
 from evflow.camera.sensors import SensorModel
-from evflow.light.log_maps import lin_log, noise_factor, normalised_intensity
+from evflow.light.log_maps import lin_log
 from evflow.network.api import Params
 from evflow.process.terminal import bar
-from evflow.scenes import TextureBank, make_bank, render, sample_scene
+from evflow.scenes import TextureBank, make_bank, render, sample_scene, watch
 from evflow.scenes.config import SceneConfig
-from evflow.simulator import noise, sensor
-from evflow.simulator.voxels import simulate_window
 from experiments.shared.common import begin, run_script, write_result, write_text
 
 Array = jax.Array
@@ -79,9 +77,9 @@ def scene_of(key: Array, bank: TextureBank, options: Options) -> tuple[Array, Ca
     steps = 4 * BINS
     times = (jnp.arange(steps + 1) / steps - 0.5) * options.window_s
     frames = render(scene, times, options.shape)
-    light = noise_factor(jnp.mean(normalised_intensity(frames[0])))
-    nominal = sample_nominal(k_nominal, (), options.prior, light)
-    return lin_log(frames), sample_pixels(k_pixels, nominal, options.shape)
+    light = watch.light(frames[0])
+    _, camera = watch.draw_camera(k_nominal, k_pixels, options.prior, options.shape, light)
+    return lin_log(frames), camera
 
 
 @partial(jax.jit, static_argnames="window_s")
@@ -91,12 +89,9 @@ def simulated(
     """voxels (H, W, 2 BINS) of a camera that has been running: its memory is anywhere between
     the thresholds. running 0: it is at the first frame."""
     k_phase, k_sim = jax.random.split(key)
-    phase = jax.random.uniform(k_phase, camera.theta_on.shape)
-    phase = running * (phase * (camera.theta_on + camera.theta_off) - camera.theta_off)
-    nominal = noise.nominal_thresholds(MODEL, camera)
-    pixels, state = sensor.start(k_sim, frames[0], camera, MODEL, nominal, phase)
     dt = jnp.float32(window_s / (len(frames) - 1))
-    return simulate_window(MODEL, pixels, state, frames[1:], dt, BINS)[1]
+    phase = running * watch.memory(k_phase, camera)
+    return watch.voxels(k_sim, frames, camera, MODEL, 1, dt, BINS, phase)[0]
 
 
 def scaled(camera: Camera, on: Array | float, off: Array | float) -> Camera:

@@ -18,8 +18,7 @@ import numpy as np
 from evflow.baselines.resimulate import Scene
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
-from evflow.simulator import noise, sensor
-from evflow.simulator.voxels import simulate_window
+from evflow.scenes import watch
 
 Array = jax.Array
 
@@ -111,15 +110,10 @@ def simulate_run(
     camera = Camera(on, off, *(eta[:, None, None] * jnp.ones_like(theta)))
     phase: Array | float = 0.0
     if blind is not None:
-        u = jax.random.uniform(k_phase, on.shape)
-        phase = BLIND_START * u if blind else u * (on + off) - off
-    nominal = noise.nominal_thresholds(MODEL, camera)
-    whole, state = sensor.start(key, path[0, 0], camera, MODEL, nominal, phase)
-
-    def clip(state: sensor.SimState, frames: Array) -> tuple[sensor.SimState, Array]:
-        state, grid = simulate_window(MODEL, whole, state, frames, dt_s, BINS)
-        # An event's weights add up to one but for rounding.
-        counts = jnp.round(grid.reshape(*on.shape, 2, BINS).sum(-1))
-        return state, jnp.moveaxis(counts, -1, 0)
-
-    return jax.lax.scan(clip, state, path[:, 1:])[1]
+        phase = (BLIND_START * jax.random.uniform(k_phase, on.shape) if blind
+                 else watch.memory(k_phase, camera))
+    frames = jnp.concatenate([path[0], *path[1:, 1:]])
+    grids = watch.voxels(key, frames, camera, MODEL, len(path), dt_s, BINS, phase)
+    # An event's weights add up to one but for rounding.
+    counts = jnp.round(grids.reshape(*grids.shape[:-1], 2, BINS).sum(-1))
+    return jnp.moveaxis(counts, -1, 1)

@@ -24,7 +24,7 @@ from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import lin_log
 from evflow.recordings import plan_windows
-from evflow.scenes import make_bank, render, sample_scene
+from evflow.scenes import make_bank, render, watch
 from evflow.scenes.config import SceneConfig
 from evflow.simulator import simulate_counts
 from evflow.types import Recording
@@ -86,9 +86,6 @@ def invert(rate: float, rates: np.ndarray) -> tuple[float, bool]:
     return float(theta), bool(falling[0] <= np.log(rate) <= falling[-1])
 
 
-_scene = jax.jit(sample_scene, static_argnames=("config", "shape"))
-
-
 @functools.lru_cache(maxsize=4)
 def generic_rates(count: int, seed: int) -> np.ndarray:
     """Events per pixel and second (len(GRID), 2) over generic scenes of textures and photographs
@@ -98,7 +95,7 @@ def generic_rates(count: int, seed: int) -> np.ndarray:
     times = (jnp.arange(FRAMES + 1) - FRAMES / 2) * FRAME_S
     total = np.zeros((len(GRID), 2))
     for i in range(count):
-        scene = _scene(jax.random.fold_in(k_scene, i), bank, SceneConfig(), SHAPE)
+        scene = watch.draw_scene(jax.random.fold_in(k_scene, i), bank, SceneConfig(), SHAPE)
         frames = lin_log(render(scene, times, SHAPE))
         factor = 1.0 + SPREAD * float(jax.random.normal(jax.random.fold_in(k_theta, i)))
         pair = (1.0, factor) if i % 2 == 0 else (factor, 1.0)

@@ -15,13 +15,12 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
+from evflow.camera import Camera
 from evflow.dataset.config import DatasetConfig
 from evflow.dataset.sequence import EventSequence
-from evflow.light.log_maps import noise_factor, normalised_intensity, to_log
-from evflow.scenes import Scene, TextureBank, load_photos, make_bank, render, sample_scene
+from evflow.light.log_maps import to_log
+from evflow.scenes import Scene, TextureBank, load_photos, make_bank, watch
 from evflow.scenes.motion import optical_flow
 from evflow.simulator import simulate_stream
 from evflow.types import Events
@@ -42,22 +41,21 @@ def make_sequence(config: DatasetConfig, seed: int, number: int) -> EventSequenc
     k_bank, k_scene, k_camera, k_events, k_noise = jax.random.split(
         jax.random.fold_in(jax.random.key(seed), number), 5)
     bank = _bank(k_bank, config, test=number >= config.train)
-    scene = _sample_scene(k_scene, bank, config.scene, config.shape)
+    scene = watch.draw_scene(k_scene, bank, config.scene, config.shape)
     film = Film(scene, config)
-    nominal, camera = _draw_camera(k_camera, film.light[0], config.prior, config.shape)
+    nominal, camera = _draw_camera(
+        *jax.random.split(k_camera), config.prior, config.shape, jnp.float32(film.light[0]))
     events = _events(k_events, film, camera, config)
     # The simulator takes the noise rates at the first frame's mean intensity; what is told are
     # those at the sequence's.
-    gain = 1.0
-    if config.model.eta_intensity:
-        gain = float(np.mean(film.light[config.lead :])) / film.light[0]
+    light = np.array(film.light[config.lead :])
+    gain = float(watch.noise_gain(config.model, light, film.light[0]))
     video = np.stack(film.kept)
     log = np.asarray(to_log(video, config.model.log_map))
-    noise = config.frame_noise_dn * np.asarray(jax.random.normal(k_noise, video.shape))
     flow, visible = _flows(scene, _instants(config)[config.lead :: config.every], config.shape)
     return EventSequence(
         events=events,
-        frames=np.clip(np.rint(video + noise), 0, 255).astype(np.uint8),
+        frames=np.asarray(watch.recorded(k_noise, video, config.frame_noise_dn), np.uint8),
         frame_times=_times_us(config)[config.lead :: config.every],
         flow=np.asarray(flow), flow_visible=np.asarray(visible), changes=np.diff(log, axis=0),
         camera=_at_mean(camera, gain),
@@ -81,15 +79,13 @@ class Film:
 
     def _render(self) -> Iterator[np.ndarray]:
         config, instants = self._config, _instants(self._config)
-        length = block_length(config)
-        for first in range(0, len(instants), length):
-            part = instants[first : first + length]
-            padded = np.pad(part, (0, length - len(part)), mode="edge")  # one compiled program
-            block = np.asarray(render(self._scene, padded, config.shape))[: len(part)]
-            self.light += noise_factor(normalised_intensity(
-                block.mean((1, 2), dtype=np.float64))).tolist()
-            index = np.arange(first, first + len(part)) - config.lead
+        first = -config.lead
+        for block in watch.film(self._scene, instants, config.shape, block_length(config)):
+            mean = block.mean((1, 2), keepdims=True, dtype=np.float64)
+            self.light += watch.light(mean).tolist()
+            index = np.arange(first, first + len(block))
             self.kept += list(block[(index >= 0) & (index % config.every == 0)])
+            first += len(block)
             yield block
 
 
@@ -118,23 +114,13 @@ def _events(key: Array, film: Film, camera: Camera, config: DatasetConfig) -> Ev
     return Events.concatenate([part.slice(0, int(times[-1])) for part in parts])
 
 
-def _at_mean(values: Camera | Summary, gain: float) -> dict[str, np.ndarray]:
+def _at_mean(values: watch.Parameters, gain: float) -> dict[str, np.ndarray]:
     """The fields by name, noise rates times `gain`."""
-    fields = {f.name: np.asarray(getattr(values, f.name)) for f in dataclasses.fields(values)}
-    return {k: v * np.float32(gain) if k.startswith("eta") else v for k, v in fields.items()}
+    values = watch.with_noise(values, gain)
+    return {f.name: np.asarray(getattr(values, f.name)) for f in dataclasses.fields(values)}
 
 
-_sample_scene = jax.jit(sample_scene, static_argnames=("config", "shape"))
-
-
-@functools.partial(jax.jit, static_argnames=("prior", "shape"))
-def _draw_camera(
-    key: Array, light: ArrayLike, prior: CameraPrior, shape: tuple[int, int]
-) -> tuple[Summary, Camera]:
-    """light: the intensity factor of Eq. 12 that noise rates follow."""
-    k_nominal, k_pixels = jax.random.split(key)
-    nominal = sample_nominal(k_nominal, (), prior, jnp.asarray(light, jnp.float32))
-    return nominal, sample_pixels(k_pixels, nominal, shape, prior.eta_spread)
+_draw_camera = jax.jit(watch.draw_camera, static_argnames=("prior", "shape"))
 
 
 @functools.partial(jax.jit, static_argnames="shape")

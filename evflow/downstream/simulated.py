@@ -17,17 +17,15 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from evflow.camera import Camera, CameraPrior, sample_nominal, sample_pixels
+from evflow.camera import Camera, CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.downstream.prior import WidePrior
 from evflow.downstream.tensor import BINS, normalise, signed
 from evflow.errors import EvflowDataError
-from evflow.light.log_maps import lin_log, noise_factor, normalised_intensity
-from evflow.scenes import Scene, TextureBank, render, sample_scene
+from evflow.light.log_maps import lin_log
+from evflow.scenes import Scene, TextureBank, render, sample_scene, watch
 from evflow.scenes.config import SceneConfig
 from evflow.scenes.motion import optical_flow
-from evflow.simulator import noise, sensor
-from evflow.simulator.voxels import simulate_window
 
 Array = jax.Array
 
@@ -156,9 +154,7 @@ def _draw(key: Array, prior: CameraPrior | WidePrior, frame: Array) -> Camera:
     if isinstance(prior, WidePrior):
         return prior.sample(key, (height, width))
     k_nominal, k_pixels = jax.random.split(key)
-    light = noise_factor(jnp.mean(normalised_intensity(frame)))
-    nominal = sample_nominal(k_nominal, (), prior, light)
-    return sample_pixels(k_pixels, nominal, (height, width), prior.eta_spread)
+    return watch.draw_camera(k_nominal, k_pixels, prior, (height, width), watch.light(frame))[1]
 
 
 def _crop(key: Array, camera: Camera, shape: tuple[int, int]) -> Camera:
@@ -176,19 +172,10 @@ def _crop(key: Array, camera: Camera, shape: tuple[int, int]) -> Camera:
 def _simulate(key: Array, frames: Array, camera: Camera, config: SequenceConfig) -> Array:
     """Event tensors (T, H, W, bins) of a camera that has been running for a while."""
     k_phase, k_sim = jax.random.split(key)
-    shape = frames.shape[1:]
-    log_frames = lin_log(frames)
-    phase = jax.random.uniform(k_phase, shape) * (camera.theta_on + camera.theta_off)
-    medians = noise.nominal_thresholds(config.model, camera)
-    pixels, state = sensor.start(
-        k_sim, log_frames[0], camera, config.model, medians, phase - camera.theta_off)
-    windows = log_frames[1:].reshape(config.windows, config.steps_per_window, *shape)
     dt = config.window_s / config.steps_per_window
-
-    def window(state: sensor.SimState, part: Array) -> tuple[sensor.SimState, Array]:
-        return simulate_window(config.model, pixels, state, part, dt, config.bins)
-
-    return signed(jax.lax.scan(window, state, windows)[1])
+    return signed(watch.voxels(
+        k_sim, lin_log(frames), camera, config.model, config.windows, dt, config.bins,
+        watch.memory(k_phase, camera)))
 
 
 def draw_noise(key: Array, config: SequenceConfig) -> Array:

@@ -13,8 +13,8 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.pixel_noise import pixel_rates
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.notes import Note
-from evflow.recordings.faulty_pixels import dead_pixels
-from evflow.recordings.stillness import busy_pixels, unlike_noise
+from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
+from evflow.recordings.stillness import unlike_noise
 from evflow.training.config import PRESETS
 from evflow.types import Recording
 
@@ -29,7 +29,7 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
     """
     events = recording.events
     counts = events.count_map()
-    hot = busy_pixels(counts.sum(0))
+    hot = hot_at_rest(counts.sum(0))
     _require_static(recording, hot)
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(

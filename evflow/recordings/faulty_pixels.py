@@ -1,4 +1,11 @@
-"""Pixels that do not measure the scene: hot ones fire by themselves, dead ones never."""
+"""Pixels that do not measure the scene: hot ones fire by themselves, dead ones never.
+
+One rule says that a pixel fires by itself: it sends several times what it is expected to send,
+and more than that by chance (`fires_alone`). What is expected is the noise while nothing happens
+(`hot_pixels`, of `quiet` times), the mean of the other pixels where all are at rest
+(`hot_at_rest`), or the neighbours' events where the scene may move (`hot_among_neighbours`).
+NumPy and OpenCV only.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +13,21 @@ import cv2
 import numpy as np
 
 HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
-AROUND = 5  # pixels: side of the neighbourhood that a dead pixel is compared with
+AROUND = 5  # pixels: side of the neighbourhood that a pixel is compared with
+PASSES = 10
+MOVING_FACTOR = 10.0  # edges and thresholds make neighbours differ more than noise rates do
 RESTLESS = 1.5  # times the noise that neighbours are expected to send: more, and edges went by
 LEAST_FIRED, LASTING = 2, 0.75  # times with events, and their share of those expected
 MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, itself included
 DEAD_EVENTS = 12  # median there: e^-12 by chance alone, and room for a high threshold
+
+
+def fires_alone(
+    events: np.ndarray, expected: np.ndarray | float, factor: float = HOT_FACTOR
+) -> np.ndarray:
+    """Where events exceed `factor` times what a pixel is expected to send, and by chance."""
+    most = factor * np.asarray(expected)
+    return events > most + 5.0 * np.sqrt(most) + HOT_EVENTS
 
 
 def hot_pixels(quiet: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -32,19 +49,34 @@ def hot_pixels(quiet: np.ndarray, rate_hz: float) -> np.ndarray:
     return busy & (_around(busy) <= MOST_HOT_NEAR) & (at_rest | lasting)
 
 
+def hot_at_rest(counts: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels far above the mean of the others, of a scene at rest."""
+    hot = np.zeros(counts.shape, bool)
+    for _ in range(PASSES):  # hot pixels raise the mean that they are judged by
+        more = fires_alone(counts, float(counts[~hot].mean()))
+        if (more == hot).all():
+            break
+        hot = more
+    return hot
+
+
+def hot_among_neighbours(counts: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels far above the median around them, of any scene. Where that is 0, one
+    event is expected, as few events come in clumps."""
+    return fires_alone(counts, np.maximum(_median_around(counts), 1.0), MOVING_FACTOR)
+
+
+def dead_pixels(n_events: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels without a single event amid pixels with many; n_events (H, W)."""
+    return (n_events == 0) & (_median_around(n_events) >= DEAD_EVENTS)
+
+
 def _around(values: np.ndarray) -> np.ndarray:
     """Sums over the neighbourhood (H, W) of each pixel, itself included."""
     return cv2.boxFilter(values.astype(np.float32), -1, (AROUND, AROUND), normalize=False,
                          borderType=cv2.BORDER_CONSTANT)
 
 
-def fires_alone(events: np.ndarray, expected: np.ndarray | float) -> np.ndarray:
-    """Where events exceed what a pixel's noise is expected to send, and by chance."""
-    most = HOT_FACTOR * np.asarray(expected)
-    return events > most + 5.0 * np.sqrt(most) + HOT_EVENTS
-
-
-def dead_pixels(n_events: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels without a single event amid pixels with many; n_events (H, W)."""
-    around = cv2.medianBlur(np.minimum(n_events, 255).astype(np.uint8), AROUND)
-    return (n_events == 0) & (around >= DEAD_EVENTS)
+def _median_around(counts: np.ndarray) -> np.ndarray:
+    """Medians over the neighbourhood (H, W) of each pixel, itself included."""
+    return cv2.medianBlur(counts.astype(np.float32), AROUND)

@@ -12,14 +12,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from evflow.recordings.faulty_pixels import fires_alone
+from evflow.recordings.faulty_pixels import hot_at_rest
 from evflow.types import Events, Recording
 
 CELL, BIN_US = 8, 2_000  # pixels, us: what counts as near by
 MOVING = 0.05  # excess pairs per event
 LEAST_US, LEAST_EVENTS = 500_000, 1_000
 MOST_EVENTS = 4_000_000  # looked at for company: the first ones
-HOT_PASSES = 10
 MOST_HOT, MOST_SCATTERED = 0.01, 0.1  # of the pixels: faults, gathered anywhere or at random
 STILL = 0.1  # log units: what frames may change by, their noise averaged over 9x9 pixels
 SMOOTH, DARK_DN = 9, 15.0
@@ -36,7 +35,7 @@ def stands_still(recording: Recording) -> bool:
     if any((np.abs(smooth(recording.frame_dn(i)) - first) > STILL).any()
            for i in range(1, len(recording.frame_times))):
         return False
-    return not unlike_noise(events, busy_pixels(events.count_map().sum(0)))
+    return not unlike_noise(events, hot_at_rest(events.count_map().sum(0)))
 
 
 def unlike_noise(events: Events, hot: np.ndarray) -> str:
@@ -90,14 +89,3 @@ def _squares(key: np.ndarray) -> float:
     """Sum of squares of how often each value occurs."""
     counts = np.unique(key, return_counts=True)[1].astype(np.float64)
     return float(counts @ counts)
-
-
-def busy_pixels(counts: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels far above the mean of the others."""
-    hot = np.zeros(counts.shape, bool)
-    for _ in range(HOT_PASSES):
-        more = fires_alone(counts, float(counts[~hot].mean()))
-        if (more == hot).all():
-            break
-        hot = more
-    return hot

@@ -8,23 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import THETA_MIN, Camera, Summary, sample_nominal, sample_pixels
+from evflow.camera import THETA_MIN, Camera, Summary
 from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import lin_log, noise_factor, normalised_intensity
 from evflow.process.devices import by_shard
-from evflow.scenes import TextureBank, render, sample_scene
-from evflow.simulator import noise, sensor
-from evflow.simulator.voxels import simulate_window
+from evflow.scenes import TextureBank, render, sample_scene, watch
 from evflow.training.config import NuisanceConfig, TrainConfig
 
 Array = jax.Array
-Parameters = TypeVar("Parameters", Camera, Summary)
 
 
 @jax.tree_util.register_dataclass
@@ -74,9 +70,9 @@ def _sample_scenes(key: Array, bank: TextureBank, numbers: Array, config: TrainC
         frames, edges = render(scene, times, shape), slice(None, None, config.steps_per_window)
         if config.nuisances.sharp:
             return frames, frames[edges]
-        exposed = _exposures(k_seen, times[edges], config.nuisances)
-        seen = render(scene, exposed.reshape(-1), shape).reshape(*exposed.shape, *shape).mean(1)
-        return frames, seen
+        n = config.nuisances
+        exposures = watch.exposures(k_seen, times[edges], n.exposures, n.exposure_s, n.jitter_s)
+        return frames, watch.exposed(scene, exposures, shape)
 
     frames, seen = jax.vmap(scene_frames)(each(k_scene, numbers), window_s)
     group = min(config.cameras, len(config.sensors))
@@ -98,18 +94,6 @@ def _sample_scenes(key: Array, bank: TextureBank, numbers: Array, config: TrainC
     return jax.lax.switch(index, [partial(look, *models) for models in groups])
 
 
-def _exposures(key: Array, times: Array, nuisances: NuisanceConfig) -> Array:
-    """Instants (T, E) that the frames at `times` (T,) average: exposed for a while, and not quite
-    when their time stamps say. Half of the scenes have neither fault."""
-    k_some, k_span, k_late, k_frame = jax.random.split(key, 4)
-    some = jax.random.bernoulli(k_some, 0.5, (2,))
-    span = some[0] * nuisances.exposure_s * jax.random.uniform(k_span)
-    late = some[1] * nuisances.jitter_s * jax.random.uniform(k_late)
-    inside = (jnp.arange(nuisances.exposures) + 0.5) / nuisances.exposures - 0.5
-    centre = times + late * jnp.clip(jax.random.normal(k_frame, times.shape), -2.0, 2.0)
-    return centre[:, None] + span * inside[None]
-
-
 def _sequence(
     key: Array, frames: Array, seen: Array, window_s: Array, *, model: SensorModel,
     config: TrainConfig,
@@ -118,9 +102,8 @@ def _sequence(
     what the frame camera makes of them."""
     k_nominal, k_pixels, k_phase, k_sim, k_frame, k_odd, k_hot = jax.random.split(key, 7)
     shape = (frames.shape[1], frames.shape[2])
-    reference = noise_factor(jnp.mean(normalised_intensity(frames[0])))
-    nominal = sample_nominal(k_nominal, (), config.prior, reference)
-    camera = sample_pixels(k_pixels, nominal, shape, config.prior.eta_spread)
+    first = watch.light(frames[0])
+    nominal, camera = watch.draw_camera(k_nominal, k_pixels, config.prior, shape, first)
     camera = _with_odd_pixels(k_odd, camera, config.nuisances)
     camera = _with_hot_pixels(k_hot, camera, config.nuisances)
     log_frames = lin_log(frames)
@@ -128,28 +111,20 @@ def _sequence(
     # is the start of a simulation, whose memory is the first frame.
     k_phase, k_fresh = jax.random.split(k_phase)
     running = jax.random.bernoulli(k_fresh, 1.0 - config.nuisances.fresh).astype(jnp.float32)
-    phase = jax.random.uniform(k_phase, shape)
-    phase = running * (phase * (camera.theta_on + camera.theta_off) - camera.theta_off)
-    medians = noise.nominal_thresholds(model, camera)
-    pixels, state = sensor.start(k_sim, log_frames[0], camera, model, medians, phase)
-    windows = log_frames[1:].reshape(config.windows, config.steps_per_window, *shape)
-    dt = window_s / config.steps_per_window
-
-    def window(state: sensor.SimState, log_frames: Array) -> tuple[sensor.SimState, Array]:
-        return simulate_window(model, pixels, state, log_frames, dt, config.model.bins)
-
-    _, voxels = jax.lax.scan(window, state, windows)
-    seen = seen + config.nuisances.frame_noise_dn * jax.random.normal(k_frame, seen.shape)
-    seen = lin_log(jnp.clip(jnp.round(seen), 0.0, 255.0))
-    gain = _noise_gain(frames, model)  # targets are rates at the sequence's mean intensity
+    voxels = watch.voxels(
+        k_sim, log_frames, camera, model, config.windows, window_s / config.steps_per_window,
+        config.model.bins, running * watch.memory(k_phase, camera))
+    seen = lin_log(watch.recorded(k_frame, seen, config.nuisances.frame_noise_dn))
+    # Targets are rates at the sequence's mean intensity.
+    gain = watch.noise_gain(model, noise_factor(normalised_intensity(frames)), first)
     return Batch(
         voxels=voxels,
         dlogI=seen[1:] - seen[:-1],
         changes=_changes(log_frames, config),
         intensity=0.5 * (seen[1:] + seen[:-1]),
         window_s=window_s,
-        camera=_scale_noise(camera, gain),
-        nominal=_scale_noise(nominal, gain),
+        camera=watch.with_noise(camera, gain),
+        nominal=watch.with_noise(nominal, gain),
     )
 
 
@@ -184,16 +159,3 @@ def _changes(log_frames: Array, config: TrainConfig) -> Array:
     parts = jnp.diff(knots, axis=0).reshape(config.windows, config.model.changes,
                                             *log_frames.shape[1:])
     return jnp.moveaxis(parts, 1, -1)
-
-
-def _noise_gain(frames: Array, model: SensorModel) -> Array:
-    """Mean noise rate over the sequence relative to the simulator's reference, its first frame."""
-    if not model.eta_intensity:
-        return jnp.ones(())
-    i01 = normalised_intensity(frames)
-    return jnp.mean(noise_factor(i01)) / noise_factor(jnp.mean(i01[0]))
-
-
-def _scale_noise(parameters: Parameters, gain: Array) -> Parameters:
-    return dataclasses.replace(parameters, eta_on=parameters.eta_on * gain,
-                               eta_off=parameters.eta_off * gain)

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow import Recording, simulate
-from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
+from evflow.camera import Camera, CameraPrior, Summary, sample_pixels
 from evflow.camera.sensors import SensorModel
-from evflow.light.log_maps import noise_factor, normalised_intensity
-from evflow.scenes import Scene, TextureBank, render, sample_scene
+from evflow.scenes import TextureBank, watch
 from evflow.scenes.config import SceneConfig
 from evflow.training.config import PRESETS
 from evflow.types import Events
@@ -69,18 +68,6 @@ class Hidden:
 
 BLACK, WHITE = 20.0, 250.0  # DN of a fade: its black when darkest, its white when brightest
 UNREACHED = 8.0  # a threshold beyond every change of 8-bit frames
-BLOCK = 64  # frames rendered at a time: one compiled program for recordings of any length
-
-
-_scene = jax.jit(sample_scene, static_argnames=("config", "shape"))
-
-
-def _frames(scene: Scene, shape: tuple[int, int], count: int) -> np.ndarray:
-    """(count, H, W) DN at 1000 frames/s, the scene's reference instant in the middle."""
-    blocks = -(-count // BLOCK)
-    times = (np.arange(blocks * BLOCK, dtype=np.float32) - 0.5 * count) * 1e-3
-    parts = [np.asarray(render(scene, t, shape)) for t in times.reshape(blocks, BLOCK)]
-    return np.concatenate(parts)[:count]
 
 
 def _faded(image: np.ndarray, factor: float, count: int) -> np.ndarray:
@@ -94,17 +81,18 @@ def _faded(image: np.ndarray, factor: float, count: int) -> np.ndarray:
 def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidden:
     """Draw a scene and a camera; simulate the recording."""
     k_scene, k_nominal, k_pixels, k_events, k_noise = jax.random.split(key, 5)
-    lead = 0 if protocol.fresh else 20
+    lead = 0 if protocol.fresh else watch.LEAD_MS
     length = lead + protocol.frame_ms * protocol.intervals + 1
-    scene = _scene(k_scene, bank, protocol.scene, protocol.shape)
-    frames = _frames(scene, protocol.shape, length)
+    scene = watch.draw_scene(k_scene, bank, protocol.scene, protocol.shape)
+    instants = (np.arange(length, dtype=np.float32) - 0.5 * length) * 1e-3
+    frames = np.concatenate(list(watch.film(scene, instants, protocol.shape)))
     if protocol.fade != 1.0:
         frames = _faded(frames[length // 2], protocol.fade, length)
-    light = noise_factor(normalised_intensity(jnp.asarray(frames)).mean((1, 2)))
-    nominal = sample_nominal(k_nominal, (), protocol.prior, light[0])
+    light, prior = watch.light(jnp.asarray(frames)), protocol.prior
+    nominal, camera = watch.draw_camera(k_nominal, k_pixels, prior, protocol.shape, light[0])
     if protocol.off == "unreached":
         nominal = dataclasses.replace(nominal, theta_off=jnp.float32(UNREACHED))
-    camera = sample_pixels(k_pixels, nominal, protocol.shape, protocol.prior.eta_spread)
+        camera = sample_pixels(k_pixels, nominal, protocol.shape, prior.eta_spread)
     times = np.arange(length) * 1000
     events, labels = simulate(k_events, frames, times, camera, model=protocol.model, labels=True)
     if protocol.off == "dropped":
@@ -112,14 +100,10 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
         labels = labels[on]
         events = Events(events.x[on], events.y[on], events.t[on], events.p[on], events.size)
     kept = np.arange(lead, length, protocol.frame_ms)
-    noise = protocol.frame_noise_dn * jax.random.normal(k_noise, (len(kept), *protocol.shape))
-    gray = np.clip(np.rint(frames[kept] + np.asarray(noise)), 0, 255).astype(np.uint8)
-    gain = light.mean() / light[0] if protocol.model.eta_intensity else 1.0
-    seen = {n: getattr(nominal, n) * gain for n in ("eta_on", "eta_off")}
-    return Hidden(
-        Recording(events, gray, times[kept]),
-        dataclasses.replace(camera, eta_on=camera.eta_on * gain, eta_off=camera.eta_off * gain),
-        dataclasses.replace(nominal, **seen), frames, kept, labels)
+    gray = np.asarray(watch.recorded(k_noise, frames[kept], protocol.frame_noise_dn), np.uint8)
+    gain = watch.noise_gain(protocol.model, light, light[0])
+    return Hidden(Recording(events, gray, times[kept]), watch.with_noise(camera, gain),
+                  watch.with_noise(nominal, gain), frames, kept, labels)
 
 
 FRAME_MS = (10, 20, 25, 25, 33, 40)

@@ -21,7 +21,7 @@ from evflow.camera.perturb import with_faults
 from evflow.camera.sensors import SensorModel
 from evflow.downstream.simulated import SequenceConfig, scene_clock
 from evflow.downstream.tensor import BINS, event_tensor, windows_between
-from evflow.scenes import Scene, TextureBank, make_bank, render, sample_scene
+from evflow.scenes import Scene, TextureBank, make_bank, watch
 from evflow.scenes.config import SceneConfig
 from evflow.scenes.motion import optical_flow
 from evflow.types import Events
@@ -43,11 +43,8 @@ CIRCUITS = {
 SCENES = SceneConfig(contrast=(0.3, 1.0), static_fraction=0.0, speed_px_s=(20.0, 350.0))
 HOT = 2e-3  # share of hot pixels
 STEP_US = 1000  # between rendered frames
-LEAD = 20  # frames before the first window: the camera has been running
+LEAD = watch.LEAD_MS * 1000 // STEP_US  # frames before the first window
 FRAME_STEPS, FRAME_NOISE_DN = 25, 0.5  # of the recording that is estimated from
-BLOCK = 64  # frames rendered at a time: one compiled program for any length
-
-_scene = jax.jit(sample_scene, static_argnames=("config", "shape"))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,14 +99,13 @@ def recording(seen: Target, bank: TextureBank, data: SequenceConfig, seconds: fl
     shape = (seen.camera.shape[0], seen.camera.shape[1])
     steps = round(seconds * 1e6 / STEP_US)
     times = (np.arange(steps + 1, dtype=np.float32) - 0.5 * steps) * (STEP_US * 1e-6)
-    scene = _scene(_key("recorded scene"), bank, data.scene, shape)
-    video = filmed(scene, times, shape)
+    scene = watch.draw_scene(_key("recorded scene"), bank, data.scene, shape)
+    video = np.concatenate(list(watch.film(scene, times, shape)))
     stamps = STEP_US * np.arange(len(video))
     k_events, k_noise = jax.random.split(_key("recording", seen.name))
     events = simulate(k_events, video, stamps, seen.camera, model=seen.circuit)
     kept = np.arange(LEAD, len(video), FRAME_STEPS)
-    noise = FRAME_NOISE_DN * np.asarray(jax.random.normal(k_noise, (len(kept), *shape)))
-    frames = np.clip(np.rint(video[kept] + noise), 0, 255).astype(np.uint8)
+    frames = np.asarray(watch.recorded(k_noise, video[kept], FRAME_NOISE_DN), np.uint8)
     return Recording(events, frames, stamps[kept])
 
 
@@ -124,10 +120,11 @@ def clips(
     data = dataclasses.replace(data, windows=windows, steps_per_window=steps)
     for i in range(count):
         k_scene, k_pause = jax.random.split(jax.random.fold_in(_key("clips", *others), i))
-        scene = _scene(k_scene, bank, data.scene, shape)
+        scene = watch.draw_scene(k_scene, bank, data.scene, shape)
         clock = np.asarray(scene_clock(k_pause, data))
         lead = STEP_US * 1e-6 * np.arange(-LEAD, 0, dtype=np.float32)
-        video = filmed(scene, np.concatenate([lead, clock]), shape)
+        instants = np.concatenate([lead, clock])
+        video = np.concatenate(list(watch.film(scene, instants, shape)))
         times = STEP_US * np.arange(len(video))
         k_events = jax.random.fold_in(_key("events", seen.name, *others), i)
         events = simulate(k_events, video, times, seen.camera, model=seen.circuit)
@@ -150,10 +147,3 @@ def flows(scene: Scene, edges_s: np.ndarray, shape: tuple[int, int]) -> np.ndarr
         return optical_flow(scene, start, stop, shape)[0]
 
     return np.asarray(jax.vmap(window)(jnp.asarray(edges_s[:-1]), jnp.asarray(edges_s[1:])))
-
-
-def filmed(scene: Scene, times_s: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(T, H, W) float32 DN at the scene's instants."""
-    spare = -len(times_s) % BLOCK
-    blocks = np.pad(times_s, (0, spare), mode="edge").reshape(-1, BLOCK)
-    return np.concatenate([np.asarray(render(scene, t, shape)) for t in blocks])[:len(times_s)]

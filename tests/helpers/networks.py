@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow import Recording, simulate
-from evflow.camera import Camera, CameraPrior, sample_nominal, sample_pixels
+from evflow.camera import Camera, CameraPrior
 from evflow.network import architecture
-from evflow.scenes import SceneConfig, make_bank, render, sample_scene
+from evflow.scenes import SceneConfig, make_bank, sample_scene, watch
 from evflow.simulator import simulate_voxels
 from evflow.training.config import PRESETS, TrainConfig
 
@@ -59,10 +59,10 @@ def hidden(seed: int, ms: int = 280) -> tuple[Recording, Camera]:
     scenes = SceneConfig(speed_px_s=(60.0, 200.0), static_fraction=0.0, contrast=(0.6, 1.0))
     scene = sample_scene(k_scene, make_bank(k_bank, 8, photos=False), scenes, SHAPE)
     times = np.arange(ms + 1)
-    frames = np.asarray(jax.jit(lambda t: render(scene, t, SHAPE))(jnp.asarray(times / 1e3)))
-    nominal = sample_nominal(k_nominal, (), CameraPrior(theta=(0.15, 0.4)))
-    camera = sample_pixels(k_pixels, nominal, SHAPE)
+    frames = np.concatenate(list(watch.film(scene, np.float32(times / 1e3), SHAPE)))
+    prior = CameraPrior(theta=(0.15, 0.4))
+    _, camera = watch.draw_camera(k_nominal, k_pixels, prior, SHAPE, None)
     events = simulate(k_events, frames, times * 1000, camera)
-    kept = slice(20, None, 40)
+    kept = slice(watch.LEAD_MS, None, 40)
     gray = np.clip(np.rint(frames[kept]), 0, 255).astype(np.uint8)
     return Recording(events, gray, times[kept] * 1000), camera

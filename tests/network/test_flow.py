@@ -17,15 +17,12 @@ from evflow.network.flow import FlowConfig, actnorm, asinh, shuffle
 from evflow.network.flow.config import Array, Params
 
 DEFAULT = FlowConfig()
-AFFINE = FlowConfig(coupling="affine")
 N = 512  # pixels; one size throughout saves compilations
 SMALL = FlowConfig(channels=8, levels=2, steps=3, hidden=16, condition=5)
-ONE_LEVEL = dataclasses.replace(SMALL, levels=1, remat=False)
-VARIANTS = {
-    f"{coupling}{'' if injector else '-noinjector'}{'' if front else '-noasinh'}":
-        dataclasses.replace(SMALL, coupling=coupling, injector=injector, asinh=front)
-    for coupling in ("additive", "affine") for injector in (True, False) for front in (True, False)
-}
+ONE_LEVEL = dataclasses.replace(SMALL, levels=1)
+BARE = dataclasses.replace(SMALL, injector=False, asinh=False)  # as the paper has it
+VARIANTS = {"whole": SMALL, "noinjector": dataclasses.replace(SMALL, injector=False),
+            "noasinh": dataclasses.replace(SMALL, asinh=False), "bare": BARE}
 variants = pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
 
 data_init = jax.jit(flow.data_init, static_argnums=3)
@@ -89,9 +86,8 @@ def to_x64(tree: Params) -> Params:
 
 
 @pytest.mark.parametrize(("make", "config"), [
-    (new_params, DEFAULT), (trained_params, DEFAULT), (new_params, AFFINE),
-    (trained_params, AFFINE), (trained_params, ONE_LEVEL),
-], ids=["new", "trained", "new affine", "trained affine", "one level"])
+    (new_params, DEFAULT), (trained_params, DEFAULT), (trained_params, ONE_LEVEL),
+], ids=["new", "trained", "one level"])
 def test_inverse_undoes_forward(make, config):
     params, width = make(config), config.level_channels[-1]
     x, u = counts((N, config.channels), 3), condition((N, config.condition), 4)
@@ -107,7 +103,7 @@ def test_inverse_undoes_forward(make, config):
     np.testing.assert_allclose(z, target[1], rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("config", [DEFAULT, VARIANTS["affine"]], ids=["additive", "affine"])
+@pytest.mark.parametrize("config", [DEFAULT, BARE], ids=["default", "bare"])
 def test_inverse_undoes_forward_in_double_precision(config):
     params = trained_params(config)
     x, u = counts((N, config.channels)), condition((N, config.condition))
@@ -136,7 +132,7 @@ def test_log_det_is_that_of_the_jacobian(config):
         expected = np.linalg.slogdet(jacobian)[1]
         np.testing.assert_allclose(log_det, expected, rtol=0, atol=1e-10)
         assert np.abs(expected).min() > 1e-3  # a log-det of 0 would be right by accident
-        varies = config.injector or config.asinh or config.coupling == "affine"
+        varies = config.injector or config.asinh
         assert np.ptp(log_det) > 0.01 if varies else np.ptp(log_det) == 0.0
 
 
@@ -177,7 +173,7 @@ def test_silent_channels_are_magnified_once():
     silent, u = counts((N, 32)).at[:, ::3].set(0.0), condition((N, 40))
     params = data_init(flow.init(jax.random.key(0), DEFAULT), silent, u, DEFAULT)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
-    # An event on a channel that never had one: 1/min_std = 20 times its asinh, not 20^16.
+    # An event on a channel that never had one: 1/MIN_STD = 20 times its asinh, not 20^16.
     x = silent.at[0].set(1.0)
     y, z, _ = forward(params, x, u, DEFAULT)
     assert float(jnp.maximum(jnp.abs(y).max(), jnp.abs(z).max())) < 1.01 * 20 * np.arcsinh(1.0)
@@ -185,8 +181,8 @@ def test_silent_channels_are_magnified_once():
 
 
 @pytest.mark.parametrize(("config", "chunk"), [
-    (DEFAULT, 100), (SMALL, None), (VARIANTS["affine-noinjector-noasinh"], 128),
-], ids=["default", "chunk by platform", "affine"])
+    (DEFAULT, 100), (SMALL, None), (BARE, 128),
+], ids=["default", "chunk by platform", "bare"])
 def test_folded_is_the_same_function(config, chunk):
     params = trained_params(config)
     x, u = counts((16, 32, config.channels)), condition((16, 32, config.condition))
@@ -198,10 +194,9 @@ def test_folded_is_the_same_function(config, chunk):
     np.testing.assert_allclose(got_z, z, rtol=0, atol=5e-6 * size)
 
 
-@pytest.mark.parametrize("name", ["additive", "affine-noinjector"])
+@pytest.mark.parametrize("config", [SMALL, BARE], ids=["whole", "bare"])
 @pytest.mark.parametrize("at", [0, 2, 3])
-def test_what_all_pixels_share_of_a_condition_can_be_settled(name, at):
-    config = VARIANTS[name]
+def test_what_all_pixels_share_of_a_condition_can_be_settled(config, at):
     folded = fold(trained_params(config), config)
     values, x, own = condition((2,), 3), counts((N, 8)), condition((N, 3))
     u = jnp.concatenate([own[:, :at], jnp.tile(values[None], (N, 1)), own[:, at:]], axis=1)
@@ -241,10 +236,9 @@ def scalar_loss_inverse(params: Params, x: Array, u: Array, config: FlowConfig) 
     return jnp.sum(again * condition(again.shape, 7)) + jnp.sum(log_det)
 
 
-@pytest.mark.parametrize(("name", "loss"), [
-    ("additive", scalar_loss), ("affine", scalar_loss_inverse)], ids=["forward", "inverse"])
-def test_every_parameter_learns_but_the_buffer(name, loss):
-    config, plain = VARIANTS[name], dataclasses.replace(VARIANTS[name], remat=False)
+@pytest.mark.parametrize("loss", [scalar_loss, scalar_loss_inverse], ids=["forward", "inverse"])
+def test_every_parameter_learns_but_the_buffer(loss):
+    config = SMALL
     x, u = condition((64, 8), 9), condition((64, 5))
     gradient = jax.jit(jax.grad(loss), static_argnums=3)
     grads = gradient(trained_params(config), x, u, config)
@@ -257,10 +251,6 @@ def test_every_parameter_learns_but_the_buffer(name, loss):
             assert grad.any(), where
         else:  # every one of the stacked steps
             assert all(step.any() for step in grad), where
-    if loss is scalar_loss:
-        stored = gradient(trained_params(config), x, u, plain)
-        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4),
-                     grads, stored)
 
 
 def test_new_flow_only_reorders():
@@ -281,7 +271,7 @@ def test_init_draws_every_step_apart():
     assert {leaf.dtype for leaf in jax.tree.leaves(one)} == {jnp.dtype("float32")}
 
 
-def test_orders_are_permutations_fixed_by_the_seed():
+def test_orders_are_permutations_fixed_for_good():
     orders = shuffle.orders(DEFAULT)
     assert [o.shape for o in orders] == [(16, 32), (16, 16), (16, 8), (16, 4)]
     for order in orders:
@@ -294,7 +284,6 @@ def test_orders_are_permutations_fixed_by_the_seed():
     assert orders[0][0].tolist() == [
         11, 3, 20, 13, 2, 21, 15, 1, 18, 25, 31, 19, 17, 8, 6, 24, 0, 23, 29, 22, 28, 30, 7, 14, 4,
         10, 12, 16, 5, 9, 27, 26]
-    assert not np.array_equal(shuffle.orders(FlowConfig(seed=1))[0], orders[0])
 
 
 def test_orders_mix_every_channel():
@@ -311,8 +300,7 @@ def test_orders_mix_every_channel():
 
 @pytest.mark.parametrize("bad", [
     {"channels": 30}, {"channels": 0}, {"levels": 6}, {"levels": 0}, {"steps": 0}, {"hidden": -1},
-    {"condition": 0}, {"coupling": "spline"}, {"min_std": 0.0}, {"log_scale_bound": -0.1},
-    {"injector_bound": float("inf")},
+    {"condition": 0},
 ], ids=str)
 def test_config_refuses(bad):
     with pytest.raises(EvflowDataError, match="EV020") as error:

@@ -21,7 +21,6 @@ from evflow.estimation.bench.rests import check_steps, find_rests
 from evflow.estimation.bench.steps import (
     camera_rate,
     camera_wide,
-    is_hot,
     ratio,
     regression,
     shrunk_rates,
@@ -29,8 +28,8 @@ from evflow.estimation.bench.steps import (
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.light.log_maps import lin_log
 from evflow.notes import Note
-from evflow.recordings.faulty_pixels import dead_pixels
-from evflow.recordings.stillness import LEAST_EVENTS, MOVING, busy_pixels, company
+from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
+from evflow.recordings.stillness import LEAST_EVENTS, MOVING, company
 from evflow.types import Events, Recording
 
 Span = tuple[int, int]
@@ -70,17 +69,16 @@ def calibrate_step(
     """
     steps = _steps(recording, rests_us, light)
     _check_polarity(steps)
-    hz, _ = camera_rate(steps.rest, steps.rest_s)
+    hz, kept = camera_rate(steps.rest, steps.rest_s)
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
     theta, error = (ratio if literal else regression)(steps.levels, clean, strays, fresh)
     events = steps.counts.sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
-    hot = is_hot(steps.rest.sum(0), float(hz.sum()), steps.rest_s)
     maps, stds, medians, spreads, untold = [], [], [], [], list[str]()
     for i, name in enumerate(THRESHOLDS):
-        good = sound[i] & ~hot
+        good = sound[i] & kept
         if not good.any():
             untold.append(name)
         median, spread, own = camera_wide(theta[i][good], error[i][good])
@@ -90,9 +88,9 @@ def calibrate_step(
         stds.append(np.where(sound[i], error[i], np.hypot(spread, own)))
     eta, eta_std = shrunk_rates(steps.rest, steps.rest_s)
     n_events = steps.counts.sum((0, 1)).astype(np.uint32)
-    valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & ~hot
+    valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
     return _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
-                     n_events, hot, len(steps.counts), _notes(steps, untold, valid, hot),
+                     n_events, ~kept, len(steps.counts), _notes(steps, untold, valid, ~kept),
                      tuple(untold))
 
 
@@ -151,7 +149,7 @@ def _steps(
 
 def _restless(rest: Events) -> list[Note]:
     """What says that the light moved during a rest, if anything does."""
-    if len(rest) < LEAST_EVENTS or company(rest, busy_pixels(rest.count_map().sum(0))) <= MOVING:
+    if len(rest) < LEAST_EVENTS or company(rest, hot_at_rest(rest.count_map().sum(0))) <= MOVING:
         return []
     return [Note(
         "scene.restless", "events come in company while the frames rest: a light that flickers or "

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import THETA_MIN
-from evflow.recordings.faulty_pixels import HOT_EVENTS, HOT_FACTOR
+from evflow.recordings.faulty_pixels import hot_at_rest
 
 THETA_PRIOR, THETA_PRIOR_STD = 0.3, 0.115  # of U(.1, .5), where nothing was measured
 THETA_TOP = 2.0
@@ -88,18 +88,8 @@ def camera_wide(theta: np.ndarray, error: np.ndarray) -> tuple[float, float, flo
 
 def camera_rate(counts: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean rates (2,) in Hz of counts (2, H, W) without hot pixels, and which are kept."""
-    kept = np.ones(counts.shape[1:], bool)
-    if seconds <= 0:
-        return np.zeros(2), kept
-    for _ in range(2):  # hot pixels raise the mean that they are judged by
-        rate = counts[:, kept].mean(1) / seconds if kept.any() else np.zeros(2)
-        kept = ~is_hot(counts.sum(0), float(rate.sum()), seconds)
-    return rate, kept
-
-
-def is_hot(events: np.ndarray, rate_hz: float, seconds: float) -> np.ndarray:
-    expected = HOT_FACTOR * rate_hz * seconds
-    return events > expected + 5.0 * np.sqrt(expected) + HOT_EVENTS
+    kept = ~hot_at_rest(counts.sum(0))
+    return counts[:, kept].mean(1) / seconds if seconds > 0 else np.zeros(2), kept
 
 
 def shrunk_rates(
@@ -112,7 +102,7 @@ def shrunk_rates(
         flat = np.zeros(counts.shape)
         return flat, (flat, [(0.0, 0.0)] * 2)
     mean = np.maximum(hz, 1e-12)
-    variance = np.array([c[kept].var() / seconds**2 if kept.any() else 0.0 for c in counts])
+    variance = np.array([c[kept].var() / seconds**2 for c in counts])
     variance = np.maximum(variance - mean / seconds, 1e-4 * mean**2)
     rate, shape = (v[:, None, None] for v in (mean / variance, mean**2 / variance))
     eta = (counts + shape) / (seconds + rate)

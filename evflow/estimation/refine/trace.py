@@ -69,6 +69,8 @@ def trace_of_camera(
     per pixel, polarity and interval is drawn (rates are ~.1 Hz, intervals ~25 ms); it stores the
     brightness of its instant.
     """
+    # A pixel of its own, without low-pass, leak or dead time: by simulator/pixel.py the same counts
+    # take 2.4 times the CPU time at 48x64 (20.4 ms against 8.4) and 2.3 times at 346x260.
     k_phase, k_noise, k_when = jax.random.split(key, 3)
     shape, intervals = path.shape[1:], dt_s.shape[0]
     below, above = start[0] * camera.theta_off, start[1] * camera.theta_on

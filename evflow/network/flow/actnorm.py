@@ -1,6 +1,6 @@
 """Actnorm: one scale and one bias per channel, set from data before training.
 
-params: base, raw and bias (C,), stacked over steps in a level. scale = exp(base + bound tanh(raw)):
+params: base, raw and bias (C,), stacked over steps in a level. scale = exp(base + .1 tanh(raw)):
 `base` is what data_init found and stays (a buffer: its gradient is exactly zero; keep it out of
 weight decay), `raw` is trained from 0. So log-scales cannot drift and the float32 inverse stays
 accurate.
@@ -13,6 +13,9 @@ import jax.numpy as jnp
 
 from evflow.network.flow.config import Array, FlowConfig, Params
 
+# How far training moves a log-scale. The float32 inverse is lost once they spread: measured round
+# trip over 64 steps 5e-4 at a standard deviation of .2, 5e2 at .5.
+LOG_SCALE_BOUND = 0.1
 
 def init(channels: int, config: FlowConfig) -> Params:
     """One level's steps, stacked: the identity."""
@@ -26,10 +29,10 @@ def data_init(h: Array, min_std: Array) -> Params:
     return {"base": -jnp.log(std), "raw": jnp.zeros_like(std), "bias": -jnp.mean(h, axis=1) / std}
 
 
-def log_scale(params: Params, config: FlowConfig) -> Array:
+def log_scale(params: Params) -> Array:
     """log of the scale, (..., C). The log-det of one actnorm is its sum."""
     base = jax.lax.stop_gradient(params["base"])
-    return base + config.log_scale_bound * jnp.tanh(params["raw"])
+    return base + LOG_SCALE_BOUND * jnp.tanh(params["raw"])
 
 
 def forward(scale: Array, bias: Array, h: Array) -> Array:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.network.flow import actnorm, coupling, injector, shuffle
+from evflow.network.flow import actnorm, injector, shuffle
 from evflow.network.flow.config import Array, FlowConfig, Params
 from evflow.network.flow.dense import dense
 from evflow.process import chunks
@@ -29,7 +29,7 @@ def fold(params: Params, config: FlowConfig) -> Params:
         level = params[f"level_{index}"]
         before, after = _channel_at(order)
         position = np.argsort(before, axis=1)  # where a step's actnorm finds each channel
-        log_scale = actnorm.log_scale(level["actnorm"], config)
+        log_scale = actnorm.log_scale(level["actnorm"])
         scale = jnp.exp(jnp.cumsum(jnp.take_along_axis(log_scale, position, axis=1), axis=0))
         bias = jnp.take_along_axis(level["actnorm"]["bias"], position, axis=1)
         offset = jnp.cumsum(bias / scale, axis=0)
@@ -92,9 +92,9 @@ def forward_columns(
             z = jnp.concatenate([z, left])
         level = folded[f"level_{index}"]
         if config.injector:
-            h, _ = injector.forward(level["injector"], h, u, config)
+            h, _ = injector.forward(level["injector"], h, u)
         gu, _ = jax.lax.scan(
-            lambda gu, w: (_step(w, gu, config), None), jnp.concatenate([h, u]), level["coupling"])
+            lambda gu, w: (_step(w, gu), None), jnp.concatenate([h, u]), level["coupling"])
         h = actnorm.forward(**level["actnorm"], h=gu[:len(h)])
         h = shuffle.apply(h, _channel_at(order)[1][-1])
     return h, z
@@ -112,11 +112,9 @@ def _fold_step(params: Params, scale: Array, offset: Array, channel: Array) -> P
     """One coupling's weights on the level's own channels; scale, offset, channel (C,)."""
     a, b = jnp.split(channel, 2)
     w_h = params["w_h"] * scale[a][:, None]
-    last = jnp.concatenate([params["w_3"], params["b_3"][None]])  # (hidden + 1, outputs)
-    shift, *raw = jnp.split(last, last.shape[1] // len(b), axis=1)
+    last = jnp.concatenate([params["w_3"], params["b_3"][None]])  # (hidden + 1, C/2)
     nothing = jnp.zeros((len(last), len(channel)), last.dtype)
-    wide = [nothing.at[:, b].set(part) for part in (shift / scale[b][None], *raw)]
-    last = jnp.concatenate(wide, axis=1)
+    last = nothing.at[:, b].set(last / scale[b][None])
     w_g = jnp.zeros((len(channel), w_h.shape[1]), w_h.dtype).at[a].set(w_h)
     return {
         "w_1": jnp.concatenate([w_g, params["w_u"]]),
@@ -129,14 +127,9 @@ def _fold_step(params: Params, scale: Array, offset: Array, channel: Array) -> P
     }
 
 
-def _step(params: Params, gu: Array, config: FlowConfig) -> Array:
+def _step(params: Params, gu: Array) -> Array:
     """[g, u] -> [g + f'(g, u), u]: a coupling that reads A and moves B by zeros in its weights."""
     hidden = jax.nn.relu(dense(params["w_1"], params["b_1"], gu))
     hidden = jax.nn.relu(dense(params["w_2"], params["b_2"], hidden))
     out = dense(params["w_3"], params["b_3"], hidden)
-    channels = len(params["offset"])
-    if config.coupling == "affine":
-        out, raw = jnp.split(out, 2)
-        scaled = gu[:channels] + params["offset"][:, None]
-        out += scaled * jnp.expm1(coupling.LOG_SCALE_BOUND * jnp.tanh(raw))
-    return gu.at[:channels].add(out)
+    return gu.at[:len(out)].add(out)

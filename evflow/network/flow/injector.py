@@ -1,8 +1,8 @@
 """Conditional injector: h exp(s(u)) + t(u), at the head of a level.
 
 With additive couplings the volume is the same at every pixel; the injector alone lets it differ
-between empty and active pixels. s = limit tanh(.) and t come from one MLP u -> hidden -> 2C
-whose last layer starts at zero (the identity).
+between empty and active pixels. s = 2 tanh(.) and t come from one MLP u -> hidden -> 2C whose last
+layer starts at zero (the identity).
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import jax.numpy as jnp
 
 from evflow.network.flow.config import Array, FlowConfig, Params
 from evflow.network.flow.dense import dense, he_normal
+
+LOG_SCALE_BOUND = 2.0  # the voxels of empty pixels vary a hundredth as much as those of active ones
 
 
 def init(key: Array, channels: int, config: FlowConfig) -> Params:
@@ -24,19 +26,19 @@ def init(key: Array, channels: int, config: FlowConfig) -> Params:
     }
 
 
-def forward(params: Params, h: Array, u: Array, config: FlowConfig) -> tuple[Array, Array]:
+def forward(params: Params, h: Array, u: Array) -> tuple[Array, Array]:
     """h (C, n), u (condition, n) -> h (C, n), log-det (n,)."""
-    s, t = _scale_and_shift(params, u, config)
+    s, t = _scale_and_shift(params, u)
     return h * jnp.exp(s) + t, jnp.sum(s, axis=0)
 
 
-def inverse(params: Params, h: Array, u: Array, config: FlowConfig) -> tuple[Array, Array]:
+def inverse(params: Params, h: Array, u: Array) -> tuple[Array, Array]:
     """Undo `forward`; same shapes, the log-det of the inverse."""
-    s, t = _scale_and_shift(params, u, config)
+    s, t = _scale_and_shift(params, u)
     return (h - t) * jnp.exp(-s), -jnp.sum(s, axis=0)
 
 
-def _scale_and_shift(params: Params, u: Array, config: FlowConfig) -> tuple[Array, Array]:
+def _scale_and_shift(params: Params, u: Array) -> tuple[Array, Array]:
     hidden = jax.nn.relu(dense(params["w_1"], params["b_1"], u))
     raw, t = jnp.split(dense(params["w_2"], params["b_2"], hidden), 2)
-    return config.injector_limit * jnp.tanh(raw), t
+    return LOG_SCALE_BOUND * jnp.tanh(raw), t

@@ -1,7 +1,7 @@
 """Channel shuffle: a fixed random order per step, h'[j] = h[order[j]]. Log-det 0.
 
-The orders follow from `FlowConfig.seed` alone. They are NumPy constants: nothing to train, to save
-or to decay.
+The orders follow from `SEED` alone. They are NumPy constants: nothing to train, to save or to
+decay.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ import numpy as np
 
 from evflow.network.flow.config import Array, FlowConfig
 
+SEED = 0  # part of the network, not of its initialisation
+
 
 def orders(config: FlowConfig) -> tuple[np.ndarray, ...]:
     """One int32 (steps, C) array per level; every row is a permutation of the C channels."""
     # Trained weights are worth nothing under another order, and NumPy promises only the raw
     # stream of a bit generator for good, not what Generator.permutation makes of it.
-    stream = np.random.PCG64(config.seed)
+    stream = np.random.PCG64(SEED)
     return tuple(
         np.argsort(stream.random_raw((config.steps, channels)), axis=1).astype(np.int32)
         for channels in config.level_channels

@@ -21,6 +21,7 @@ import numpy as np
 from evflow.network.flow import actnorm, asinh, coupling, injector, shuffle
 from evflow.network.flow.config import Array, FlowConfig, Params
 
+MIN_STD = 0.05  # floor of a channel's standard deviation in data_init, in units of the flow's input
 
 def init(key: Array, config: FlowConfig) -> Params:
     """New float32 params: a linear flow with identity actnorms. Follow with `data_init`."""
@@ -39,8 +40,8 @@ def data_init(params: Params, x: Array, u: Array, config: FlowConfig) -> Params:
     """Set every actnorm from a batch x (..., channels), u (..., condition); the rest stays.
 
     Each actnorm sees the batch as the steps before it left it. A channel's deviation is floored
-    at `min_std` in units of the flow's input, not of the step's: else an all-zero channel would
-    be magnified by 1/min_std at every step (20^16) and lose its inverse.
+    at MIN_STD in units of the flow's input, not of the step's: else an all-zero channel would
+    be magnified by 1/MIN_STD at every step (20^16) and lose its inverse.
     """
     h, u = _columns(x), _columns(u)
     if config.asinh:
@@ -49,17 +50,17 @@ def data_init(params: Params, x: Array, u: Array, config: FlowConfig) -> Params:
 
     def step(carry: tuple[Array, Array], xs: Any) -> tuple[tuple[Array, Array], Params]:
         (h, gain), (weights, order) = carry, xs
-        norm = actnorm.data_init(h, config.min_std * gain)
+        norm = actnorm.data_init(h, MIN_STD * gain)
         scale = jnp.exp(norm["base"])
         h = shuffle.apply(actnorm.forward(scale, norm["bias"], h), order)
-        h, _ = coupling.forward(weights, h, u, config)
+        h = coupling.forward(weights, h, u)
         return (h, shuffle.apply(gain * scale, order)), norm
 
     ready: Params = {}
     for index, order in enumerate(shuffle.orders(config)):
         level = params[f"level_{index}"]
         if config.injector:
-            h, _ = injector.forward(level["injector"], h, u, config)
+            h, _ = injector.forward(level["injector"], h, u)
         (h, gain), norms = jax.lax.scan(step, (h, gain), (level["coupling"], order))
         ready[f"level_{index}"] = {**level, "actnorm": norms}
         h, gain = jnp.split(h, 2)[0], jnp.split(gain, 2)[0]
@@ -109,17 +110,17 @@ def _level_forward(
     """Injector, then steps of actnorm, shuffle, coupling: h (C, n) -> h (C, n), log-det (n,)."""
     log_det = jnp.zeros_like(h[0])
     if config.injector:
-        h, log_det = injector.forward(params["injector"], h, u, config)
+        h, log_det = injector.forward(params["injector"], h, u)
 
-    def step(h: Array, xs: tuple[Array, Array, Array, Params]) -> tuple[Array, Array]:
+    def step(h: Array, xs: tuple[Array, Array, Array, Params]) -> tuple[Array, None]:
         scale, bias, order, weights = xs
         h = shuffle.apply(actnorm.forward(scale, bias, h), order)
-        return coupling.forward(weights, h, u, config)
+        return coupling.forward(weights, h, u), None
 
-    s = actnorm.log_scale(params["actnorm"], config)
+    s = actnorm.log_scale(params["actnorm"])
     xs = (jnp.exp(s), params["actnorm"]["bias"], order, params["coupling"])
-    h, changes = jax.lax.scan(_remat(step, config), h, xs)
-    return h, log_det + jnp.sum(s) + jnp.sum(changes, axis=0)
+    h, _ = jax.lax.scan(_remat(step), h, xs)
+    return h, log_det + jnp.sum(s)
 
 
 def _level_inverse(
@@ -127,26 +128,28 @@ def _level_inverse(
 ) -> tuple[Array, Array]:
     """Undo `_level_forward`: h (C, n) -> h (C, n), log-det (n,) of the inverse."""
 
-    def step(h: Array, xs: tuple[Array, Array, Array, Params]) -> tuple[Array, Array]:
+    def step(h: Array, xs: tuple[Array, Array, Array, Params]) -> tuple[Array, None]:
         scale, bias, order, weights = xs
-        h, change = coupling.inverse(weights, h, u, config)
-        return actnorm.inverse(scale, bias, shuffle.apply(h, order)), change
+        h = shuffle.apply(coupling.inverse(weights, h, u), order)
+        return actnorm.inverse(scale, bias, h), None
 
     # exp outside the scan: beside the division XLA would make it h exp(-s), whose rounding is the
     # same at every step. Measured round trip of a new flow: 5e-7, against 4e-5.
-    s = actnorm.log_scale(params["actnorm"], config)
+    s = actnorm.log_scale(params["actnorm"])
     xs = (jnp.exp(s), params["actnorm"]["bias"], shuffle.inverted(order), params["coupling"])
-    h, changes = jax.lax.scan(_remat(step, config), h, xs, reverse=True)
-    log_det = jnp.sum(changes, axis=0) - jnp.sum(s)
+    h, _ = jax.lax.scan(_remat(step), h, xs, reverse=True)
+    log_det = -jnp.sum(s)
     if not config.injector:
         return h, log_det + jnp.zeros_like(h[0])
-    h, change = injector.inverse(params["injector"], h, u, config)
+    h, change = injector.inverse(params["injector"], h, u)
     return h, log_det + change
 
 
-def _remat(step: Callable[..., Any], config: FlowConfig) -> Callable[..., Any]:
+def _remat(step: Callable[..., Any]) -> Callable[..., Any]:
+    """The step, recomputed in the backward pass rather than stored. Gradient of an NLL at 4096
+    pixels, 2 cores: .155 s and 35 MB, against .205 s and 210 MB stored."""
     # Inside a scan XLA cannot merge the recomputation away, so no barrier is needed.
-    return jax.checkpoint(step, prevent_cse=False) if config.remat else step
+    return jax.checkpoint(step, prevent_cse=False)
 
 
 def _columns(a: Array) -> Array:

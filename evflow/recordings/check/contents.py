@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.recordings.check.findings import Finding
+from evflow.recordings.faulty_pixels import MOVING_FACTOR, hot_among_neighbours
 from evflow.types import Recording
 
 LEAST_EVENTS = 1_000  # of which one polarity alone is no accident
 ONE_SHARE = 0.99
 VALID_EVENTS = 3  # fewer say next to nothing about a pixel
 ACTIVE_SHARE = 0.05  # of the pixels should have as many
-AROUND = 5  # pixels: side of the neighbourhood that a hot pixel is compared with
-HOT_FACTOR, HOT_LEAST, HOT_SHARE = 10.0, 10, 0.05  # times the median there, events, share of all
+HOT_SHARE = 0.05  # of the events
 
 
 def contents(recording: Recording) -> list[Finding]:
@@ -52,16 +52,13 @@ def _few(counts: np.ndarray) -> list[Finding]:
 
 
 def _hot(counts: np.ndarray) -> list[Finding]:
-    import cv2
-
-    around = cv2.medianBlur(np.minimum(counts, 255).astype(np.uint8), AROUND)
-    hot = counts > np.maximum(HOT_FACTOR * (around + 1.0), HOT_LEAST)
+    hot = hot_among_neighbours(counts)
     share = float(counts[hot].sum()) / float(counts.sum())
     if share <= HOT_SHARE:
         return []
     y, x = np.unravel_index(int(np.argmax(np.where(hot, counts, 0))), counts.shape)
     return [Finding(
         "EV033", "note", f"{hot.sum():,} pixels ({hot.mean():.2%}) send {share:.0%} of the events, "
-        f"each {HOT_FACTOR:g} times as many as those around; most of them x={x}, y={y} "
+        f"each {MOVING_FACTOR:g} times as many as those around; most of them x={x}, y={y} "
         f"({counts[y, x]:,}): hot, or of very low threshold.",
         "An estimate lists hot pixels in camera.json and leaves them out of its summary.")]

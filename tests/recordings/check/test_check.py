@@ -19,6 +19,7 @@ from evflow.errors import CODES, EvflowDataError
 from evflow.notes import Note
 from evflow.recordings.adjust import flipped, shifted
 from evflow.recordings.check import frames_offset
+from evflow.recordings.faulty_pixels import hot_among_neighbours
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -282,6 +283,13 @@ def test_hot_pixels_are_noted(sound: Recording) -> None:
     found = check(changed(sound, **new, t=t[order])).findings
     assert [f.code for f in found if f.severity == "note"] == ["EV033"]
     assert "x=3, y=5" in found[-1].seen
+
+
+def test_only_what_exceeds_its_neighbours_is_hot_however_busy_all_are() -> None:
+    counts = np.full((32, 40), 3_000)
+    assert not hot_among_neighbours(counts).any()
+    counts[4, 7] = 40_000
+    assert np.argwhere(hot_among_neighbours(counts)).tolist() == [[4, 7]]
 
 
 def test_codes_are_stable() -> None:
