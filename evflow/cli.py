@@ -6,11 +6,11 @@ Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory, 130 i
 from __future__ import annotations
 
 import sys
-from typing import Annotated, NoReturn, Union
+from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
-from evflow.commands.bench import Bench
+from evflow.commands.bench import Bench, at_hand, forwarded
 from evflow.commands.check import Check
 from evflow.commands.compare import Compare
 from evflow.commands.convert import Convert
@@ -21,7 +21,6 @@ from evflow.commands.info import Info
 from evflow.commands.reconstruct import Reconstruct
 from evflow.commands.render import Render
 from evflow.commands.simulate import Simulate
-from evflow.commands.source_tree import forwarded
 from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
@@ -30,22 +29,18 @@ from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppabl
 
 EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
 
-Command = Union[  # noqa: UP007 - tyro reads the subcommand names from these annotations
-    Annotated[Info, tyro.conf.subcommand("info")],
-    Annotated[Check, tyro.conf.subcommand("check")],
-    Annotated[Estimate, tyro.conf.subcommand("estimate")],
-    Annotated[Compare, tyro.conf.subcommand("compare")],
-    Annotated[Render, tyro.conf.subcommand("render")],
-    Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")],
-    Annotated[Flow, tyro.conf.subcommand("flow")],
-    Annotated[Simulate, tyro.conf.subcommand("simulate")],
-    Annotated[Convert, tyro.conf.subcommand("convert")],
-    Annotated[Voxel, tyro.conf.subcommand("voxel")],
-    Annotated[Export, tyro.conf.subcommand("export")],
-    Annotated[Train, tyro.conf.subcommand("train")],
-    Annotated[Bench, tyro.conf.subcommand("bench")],
-    Annotated[Version, tyro.conf.subcommand("version")],
-]
+COMMANDS: dict[str, type] = {
+    "info": Info, "check": Check, "estimate": Estimate, "compare": Compare, "render": Render,
+    "reconstruct": Reconstruct, "flow": Flow, "simulate": Simulate, "convert": Convert,
+    "voxel": Voxel, "export": Export, "train": Train, "version": Version}
+
+
+def offered() -> Any:
+    """The type of the command line: a command by its name. `bench` is one where there are
+    benchmarks."""
+    found = COMMANDS | ({"bench": Bench} if at_hand() else {})
+    named = tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in found.items())
+    return Union[named]  # noqa: UP007 - of types that are not known beforehand
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -54,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
         with stoppable():
             arguments = forwarded(sys.argv[1:] if argv is None else argv)
             tyro.cli(
-                Command, args=arguments, prog="evflow",
+                offered(), args=arguments, prog="evflow",
                 description="Measure an event camera from its recording; simulate any video as it "
                 "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/").run()
             sys.stdout.flush()

@@ -13,19 +13,18 @@ on. evflow.dataset.read_sequence and iter_sequences read the set as NumPy arrays
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import importlib.metadata
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from evflow.dataset.config import PRESETS, DatasetConfig
 from evflow.dataset.manifest import MERGED, verify
 from evflow.dataset.shards import build
 from evflow.errors import EvflowDataError
+from evflow.process.provenance import provenance
 from evflow.process.terminal import bar
-from experiments.shared.common import provenance, run_script
+from experiments.shared.common import run_script
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +71,7 @@ def main(options: Options) -> int:
         made = build(
             options.out, configuration(options), options.seed, shard=shard,
             workers=options.workers, format=options.format, only_missing=options.only_missing,
-            made_by=maker(), progress=progress)
+            made_by=provenance(), progress=progress)
     total = json.loads((options.out / MERGED).read_text())["total"]
     print(f"{len(made)} sequences made; {options.out} holds {total['sequences']}: "
           f"{total['events_on'] + total['events_off']:,} events, {total['bytes'] / 1e6:,.0f} MB.")
@@ -92,15 +91,6 @@ def parse_shard(text: str) -> tuple[int, int]:
     if not (slash and index.isdecimal() and count.isdecimal() and int(index) < int(count)):
         raise EvflowDataError("EV020", f"--shard {text}.", "Give i/N, from 0/N to N-1/N.")
     return int(index), int(count)
-
-
-def maker() -> dict[str, Any]:
-    """Versions and machine, those of the packages that draw and write included."""
-    known = provenance()
-    names = ("scikit-image", "opencv-python-headless", "h5py")
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        known["versions"] |= {name: importlib.metadata.version(name) for name in names}
-    return known
 
 
 if __name__ == "__main__":

@@ -40,10 +40,11 @@ from evflow.downstream.simulated import SequenceConfig
 from evflow.downstream.train import LearningConfig
 from evflow.errors import EvflowDataError
 from evflow.network.weights import weights_path
+from evflow.process.provenance import provenance
 from evflow.report import plots
 from evflow.training.config import as_dict
 from experiments.shared import gains, held_out
-from experiments.shared.common import at_least, provenance, run_script, write_result, write_text
+from experiments.shared.common import at_least, run_script, write_result, write_text
 from experiments.shared.conditions import E2V, RAW, Condition, Files, digest
 from experiments.shared.targets import CAMERAS, SCENES
 from experiments.shared.trainings import SIMULATED, Setting, Trainings

@@ -26,13 +26,15 @@ from evflow.baselines.eventgan import GANS, GanConfig, generate, init_state, run
 from evflow.downstream.tensor import signed
 from evflow.light.log_maps import lin_log_inverse
 from evflow.network.weights import save_weights
+from evflow.process.provenance import provenance
 from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import make_bank
 from evflow.training.config import as_dict
+from evflow.training.loop import train
+from evflow.training.options import RunOptions
 from experiments import generate as inverse
-from experiments.shared.common import at_least, provenance, run_script, write_result, write_text
-from experiments.shared.loop import train
+from experiments.shared.common import at_least, run_script, write_result, write_text
 
 Array = jax.Array
 
@@ -41,22 +43,13 @@ COLUMNS = ("on", "off", "empty", "correlation", "two simulations", "relative")
 SHOWN = 8  # scenes in the picture
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options(RunOptions):
     """Train EventGAN."""
 
-    out: Path
-    """Folder of the run."""
     preset: Literal["published", "small", "small paired", "debug"] = "small"
     steps: int | None = None
     """Number of steps (default: the preset's)."""
-    seed: int = 0
-    max_seconds: float = math.inf
-    """Stop after this long, with a checkpoint."""
-    resume: Literal["auto", "never", "must"] = "auto"
-    """Go on with the run in --out: if there is one, never, or always."""
-    save_every: int = 200
-    """Steps between checkpoints."""
     scenes: int = 40
     """Held-out scenes to measure on."""
 
@@ -69,7 +62,8 @@ def main(options: Options) -> dict[str, Any]:
     if options.steps is not None:
         config = dataclasses.replace(config, steps=options.steps)
     bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.data.textures)
-    state = train(lambda state: run_step(state, bank, config), init_state(config), config, options)
+    state = train(lambda: (lambda state: run_step(state, bank, config), init_state(config)),
+                  config, options).completed()
     params = state.params["generator"]
     result = measure(params, config, options.scenes) | {"steps": int(state.step)}
     card = {"preset": options.preset, "steps": int(state.step), "seed": config.seed,

@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,31 +36,30 @@ from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import frame_scores
 from evflow.metrics.perceptual import load_lpips
 from evflow.network.weights import weights_path
+from evflow.process.provenance import provenance
 from evflow.scenes import make_bank
 from evflow.training.config import as_dict
-from experiments.shared.common import at_least, provenance, run_script, write_result
+from evflow.training.loop import train
+from evflow.training.options import RunOptions
+from experiments.shared.common import at_least, run_script, write_result
 from experiments.shared.conditions import digest
 from experiments.shared.held_out import ENDPOINTS, PROTOCOL, scored_by
-from experiments.shared.loop import train
 
 Array = jax.Array
 
 HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options(RunOptions):
     """Train a network that turns events into video or optical flow."""
 
-    out: Path
-    """Folder of the run."""
     network: Literal["e2vid", "firenet", "evflownet"] = "e2vid"
     preset: Literal["small", "debug", "published", "original"] = "small"
     steps: int | None = None
     """Number of steps, over which the rate falls (default: the preset's)."""
     rate: float | None = None
     """Highest learning rate (default: the preset's)."""
-    seed: int = 0
     normalised: bool = False
     """Event tensors of deviation 1, which hides the scale of the camera's thresholds; those of the
     small EV-FlowNet always are."""
@@ -74,12 +72,6 @@ class Options:
     """Weights to go on from (a released name or a file), of the same network."""
     recordings: tuple[Path, ...] = ()
     """Recordings of one sensor, with frames, to train on in place of simulated sequences."""
-    max_seconds: float = math.inf
-    """Stop after this long, with a checkpoint; the schedule still spans all steps."""
-    resume: Literal["auto", "never", "must"] = "auto"
-    """Go on with the run in --out: if there is one, never, or always."""
-    save_every: int = 200
-    """Steps between checkpoints."""
     batches: int = 16
     """Held-out batches to measure on."""
 
@@ -112,8 +104,9 @@ def main(options: Options) -> dict[str, Any]:
     bank, sample = source(options.recordings, learning)
     tx = optimiser(learning)
     step = jax.jit(make_step(network, learning, tx, sample))
-    state = train(lambda state: step(state, bank, camera, loss_weights),
-                  init_state(network, learning, tx, begun(options.start, config)), config, options)
+    fresh = init_state(network, learning, tx, begun(options.start, config))
+    state = train(lambda: (lambda state: step(state, bank, camera, loss_weights), fresh),
+                  config, options).completed()
     figures = measure(network, state.params, learning, camera, options.batches)
     conventions = ENDPOINTS if isinstance(network, EVFlowNet) else scored_by(
         "video", "lpips" in figures)

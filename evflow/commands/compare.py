@@ -53,7 +53,7 @@ class Compare(Reading):
 
     def run(self) -> None:
         from evflow.metrics.streams import compare
-        from evflow.process.provenance import sha256, versions
+        from evflow.process.provenance import sha256, told
         from evflow.report import plots
         from evflow.report.streams import write_comparison
         from evflow.report.verdict import describe_streams, judge_streams, worst
@@ -78,7 +78,7 @@ class Compare(Reading):
             shown = {f"{name} stream": f"{path}, sha256 {sha256(path)}" for name, path in (
                 ("Real", self.real), ("Synthetic", self.synthetic))}
             shown["Command"] = shlex.join(["evflow", *sys.argv[1:]])
-            shown["Versions"] = ", ".join(f"{k} {v}" for k, v in versions().items())
+            shown["Versions"] = told()
             write_comparison(self.out / "compare.html", real, synthetic, numbers, facts=shown,
                              labels=(self.real.name, self.synthetic.name),
                              overwrite=self.overwrite)

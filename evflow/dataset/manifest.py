@@ -9,7 +9,6 @@ of one sequence may differ (made on different machines); the one that fits the f
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,6 +19,7 @@ from evflow.dataset.sequence import EventSequence, sequence_names
 from evflow.dataset.store import SUFFIXES, Format
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
+from evflow.process.provenance import sha256
 
 Record = dict[str, Any]
 Identity = dict[str, Any]
@@ -48,11 +48,6 @@ def record(draft: Path, name: str, sequence: EventSequence) -> Record:
         "events_on": on, "events_off": len(sequence.events) - on,
         "duration_s": float(sequence.frame_times[-1]) * 1e-6, "frames": len(sequence.frames),
         "nominal": sequence.nominal}
-
-
-def sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class Part:

@@ -83,6 +83,29 @@ def agree(vote: bool) -> bool:
     return bool(np.any(multihost_utils.process_allgather(np.asarray(vote))))
 
 
+class Votes:
+    """`agree` for a loop that keeps the devices busy: it waits for none of their work.
+
+    Of several processes, a vote is counted one call later (the first at once): the answer is the
+    same on all in the same call.
+    """
+
+    def __init__(self) -> None:
+        mesh = make_mesh()
+        self._by_device = NamedSharding(mesh, P(AXIS))
+        self._any = jax.jit(jnp.any, out_shardings=NamedSharding(mesh, P()))
+        self._asked: jax.Array | None = None
+
+    def agree(self, vote: bool) -> bool:
+        """Whether any process voted yes in its call before; alone, the vote itself."""
+        if jax.process_count() == 1:
+            return vote
+        votes = jax.make_array_from_callback(
+            self._by_device.mesh.devices.shape, self._by_device, lambda _: np.array([vote]))
+        before, self._asked = self._asked, self._any(votes)
+        return bool(self._asked if before is None else before)
+
+
 def make_mesh() -> Mesh:
     """All devices of all processes on the axis "data". Auto: XLA chooses the inner shardings."""
     return jax.make_mesh((jax.device_count(),), (AXIS,), axis_types=(AxisType.Auto,))

@@ -1,29 +1,69 @@
-"""Where a result comes from: versions, machine, and hashes of files."""
+"""Where a result comes from: versions, source, machine, and hashes of files."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.metadata
 import os
 import platform
+import subprocess
 from pathlib import Path
+from typing import Any
 
-PACKAGES = ("jax", "jaxlib", "flax", "numpy", "opencv-python-headless", "matplotlib")
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scikit-image", "opencv-python-headless",
+            "h5py", "matplotlib")
 
 
-def versions() -> dict[str, str]:
-    """Of evflow, of what it runs on, and of the machine."""
+def provenance() -> dict[str, Any]:
+    """Saved with every result: evflow's version, its source (`source`), the versions of Python and
+    of what is installed of PACKAGES, and the machine."""
     import jax
 
     import evflow
 
-    found = {"evflow": evflow.__version__, "python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = importlib.metadata.version(name)
+            installed[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return {**found, "device": jax.devices()[0].device_kind, "platform": platform.platform()}
+    machine = {"platform": platform.platform(), "cpus": os.cpu_count(),
+               "device": jax.devices()[0].device_kind}
+    return {"evflow": evflow.__version__, "source": source(), "versions": installed,
+            "machine": machine}
+
+
+def told() -> str:
+    """The provenance in a line, for people."""
+    known = provenance()
+    parts = {"evflow": known["evflow"], "source": known["source"], **known["versions"],
+             "device": known["machine"]["device"], "platform": known["machine"]["platform"]}
+    return ", ".join(f"{name} {value}" for name, value in parts.items())
+
+
+@functools.cache
+def source() -> str:
+    """The git commit of the source tree that evflow runs from, "+dirty" where a file that git
+    knows differs from it; the version where there is no such tree."""
+    import evflow
+
+    return commit(Path(evflow.__file__).resolve().parents[1]) or evflow.__version__
+
+
+def commit(tree: Path) -> str:
+    """The git commit of `tree`, marked "+dirty" where files differ; "" where the folder is not the
+    top of a git tree (an installed package may lie amid somebody else's)."""
+    if not (tree / ".git").exists() or not (tree / "pyproject.toml").is_file():
+        return ""
+    try:
+        asked = [subprocess.run(["git", *arguments], cwd=tree, text=True, capture_output=True,
+                                check=True, timeout=60).stdout.strip()
+                 for arguments in (("rev-parse", "HEAD"),
+                                   ("status", "--porcelain", "--untracked-files=no"))]
+    except (OSError, subprocess.SubprocessError):  # no git, or none that may look here
+        return ""
+    return asked[0] + ("+dirty" if asked[1] else "")
 
 
 def sha256(path: str | os.PathLike) -> str:
@@ -36,4 +76,3 @@ def sha256(path: str | os.PathLike) -> str:
     for part in sorted(p for p in path.rglob("*") if p.is_file()):
         whole.update(f"{part.relative_to(path).as_posix()}\0{sha256(part)}\n".encode())
     return whole.hexdigest()
-

@@ -1,4 +1,4 @@
-"""Steps that no signal may break off: it waits until they are over."""
+"""Signals that wait: for the end of a step that nothing may break off, or for a loop to look."""
 
 from __future__ import annotations
 
@@ -42,3 +42,20 @@ def uninterrupted() -> Iterator[None]:
             signal.signal(number, handler)
         if came:
             signal.raise_signal(came[0])
+
+
+@contextlib.contextmanager
+def stop_requests() -> Iterator[list[int]]:
+    """A list that SIGINT and SIGTERM add themselves to; a second signal acts as usual."""
+    requests: list[int] = []
+
+    def ask(number: int, _: FrameType | None) -> None:
+        requests.append(number)
+        signal.signal(number, before[signal.Signals(number)])
+
+    before = {n: signal.signal(n, ask) for n in STOPPING}
+    try:
+        yield requests
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

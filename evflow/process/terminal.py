@@ -9,9 +9,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -26,14 +26,25 @@ def print_anything() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
+class Report(Protocol):
+    """progress(done, total): how far the work is; with a title, which then replaces the bar's."""
+
+    def __call__(self, done: int, total: int, title: str | None = None) -> None: ...
+
+
 @contextlib.contextmanager
-def bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield progress(done, total)."""
+def bar(title: str, shown: bool = True) -> Iterator[Report]:
+    """Yield progress(done, total). shown: False where another process shows the bar."""
     console = Console(stderr=True)
-    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as shown:
-        task = shown.add_task(title, total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+               TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as live:
+        task = live.add_task(title, total=None)
+
+        def report(done: int, total: int, title: str | None = None) -> None:
+            live.update(task, completed=done, total=total, description=title)
+
+        yield report
 
 
 @contextlib.contextmanager

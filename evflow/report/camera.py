@@ -20,7 +20,7 @@ from evflow.estimation.pipeline import Progress
 from evflow.estimation.result import CameraEstimate
 from evflow.network.weights import load_weights, weights_hash
 from evflow.notes import texts
-from evflow.process.provenance import sha256, versions
+from evflow.process.provenance import sha256, told
 from evflow.recordings.check import check
 from evflow.recordings.check.agreement import frame_steps
 from evflow.report import page
@@ -271,7 +271,7 @@ def _assumptions(
         "Weights": f"{weights}, sha256 {weights_hash(weights)}",
         "Recording": f"{source}, sha256 {sha256(source)}" if source else "given from Python",
         "Command": command or "–",
-        "Versions": ", ".join(f"{k} {v}" for k, v in versions().items())}
+        "Versions": told()}
     if not recording.has_frames:
         facts["Alignment"] = facts["Response"] = "No frames."
     coded = {"Weights", "Recording", "Command"}

@@ -1,14 +1,11 @@
-"""What every experiment shares: provenance of a result, where results go, names of files, how a
+"""What every experiment shares: how a result is saved, where results go, names of files, how a
 script runs and ends."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import json
-import os
-import platform
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -22,20 +19,10 @@ from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
 from evflow.network.architecture import config_of
 from evflow.network.weights import load_weights, weights_hash
+from evflow.process.provenance import provenance
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
 HOW = ("out", "workers", "max_seconds")  # options that change nothing in a result
-PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
-
-
-def provenance() -> dict[str, Any]:
-    """Versions and machine, saved with every result."""
-    import evflow
-
-    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
-    machine = {"platform": platform.platform(), "cpus": os.cpu_count(),
-               "device": jax.devices()[0].device_kind}
-    return {"evflow": evflow.__version__, "versions": versions, "machine": machine}
 
 
 def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> None:

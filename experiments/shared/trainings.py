@@ -27,10 +27,11 @@ from evflow.downstream.train import LearningConfig, LearningState, init_state, m
 from evflow.errors import EvflowDataError
 from evflow.metrics import load_lpips
 from evflow.network.weights import model_card
+from evflow.process.provenance import provenance
 from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
 from experiments.shared import eventgan_sequences, gains, held_out, targets
-from experiments.shared.common import provenance, slug, write_result
+from experiments.shared.common import slug, write_result
 from experiments.shared.conditions import NONE, RAW, Condition, Files, Workshop, conditions, told
 
 Params = dict[str, Any]

@@ -16,6 +16,8 @@ import pytest
 import evflow as ef
 from evflow.errors import EvflowDataError
 from evflow.network.weights import load_weights, model_card
+from evflow.training.options import TrainOptions
+from evflow.training.run import train_network
 from experiments import (
     ablate,
     calibrate,
@@ -27,7 +29,6 @@ from experiments import (
     limits,
     one_polarity,
     quickstart,
-    train,
 )
 from experiments.shared.common import slug
 
@@ -56,12 +57,12 @@ def test_quickstart_draws_truth_beside_estimate(
 @pytest.mark.slow
 def test_train_stops_resumes_and_calibrates(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    train.main(train.Options(out=out, preset="debug", steps=4))
+    train_network(TrainOptions(out=out, preset="debug", steps=4))
     weights = out / "weights.safetensors"
     assert model_card(weights)["steps"] == 4
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 4
     with pytest.raises(EvflowDataError, match="EV013"):
-        train.main(train.Options(out=out, preset="debug", steps=4, resume="never"))
+        train_network(TrainOptions(out=out, preset="debug", steps=4, resume="never"))
     calibrate.main(calibrate.Options(weights=weights, out=tmp_path / "final.safetensors", steps=2))
     before, after = load_weights(weights), load_weights(tmp_path / "final.safetensors")
     same = {part: all(np.array_equal(a, b) for a, b in zip(
@@ -73,9 +74,9 @@ def test_train_stops_resumes_and_calibrates(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_interrupted_training_equals_straight_training(tmp_path: Path) -> None:
     straight, halves = tmp_path / "straight", tmp_path / "halves"
-    train.main(train.Options(out=straight, preset="debug", steps=3))
-    train.main(train.Options(out=halves, preset="debug", steps=3, max_seconds=0.0))
-    train.main(train.Options(out=halves, preset="debug", steps=3, resume="must"))
+    train_network(TrainOptions(out=straight, preset="debug", steps=3))
+    train_network(TrainOptions(out=halves, preset="debug", steps=3, max_seconds=0.0))
+    train_network(TrainOptions(out=halves, preset="debug", steps=3, resume="must"))
     a, b = (load_weights(p / "weights.safetensors") for p in (straight, halves))
     jax.tree.map(np.testing.assert_array_equal, a, b)
 

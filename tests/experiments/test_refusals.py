@@ -12,6 +12,7 @@ import pytest
 
 from evflow.errors import EvflowDataError
 from evflow.training.checkpoint import Checkpoints
+from evflow.training.run import started_from
 from experiments import (
     ablate,
     calibrate,
@@ -30,7 +31,6 @@ from experiments import (
     quickstart,
     see_better,
     tell_apart,
-    train,
 )
 from experiments.shared.common import begin, estimator, write_result
 
@@ -97,7 +97,7 @@ def test_a_run_starts_from_something() -> None:
     fresh: Any = SimpleNamespace(params={"default": {"flow": {"kernel": np.zeros(3)}}})
     for weights in ("e2vid-small", "default"):  # another network, and one of other sizes
         with pytest.raises(EvflowDataError, match=r"EV018.*no part of the network"):
-            train.started_from(fresh, weights)
+            started_from(fresh, weights)
 
 
 def test_a_file_is_no_folder_of_a_run(tmp_path: Path) -> None:

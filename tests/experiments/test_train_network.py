@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-import json
 import math
-import os
-import signal
 from pathlib import Path
-from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -23,87 +17,8 @@ from evflow.errors import EvflowDataError
 from evflow.network.weights import model_card
 from experiments import ablate, train_eventgan
 from experiments import train_network as command
-from experiments.shared import loop
 
 MOST_BYTES = 2_000_000  # of released weights
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Walk:
-    step: jax.Array
-    at: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    steps: int = 7
-    seed: int = 0
-
-
-@dataclasses.dataclass(frozen=True)
-class Given:
-    out: Path
-    max_seconds: float = math.inf
-    resume: Literal["auto", "never", "must"] = "auto"
-    save_every: int = 3
-
-
-def advance(state: Walk) -> tuple[Walk, dict[str, jax.Array]]:
-    key = jax.random.fold_in(jax.random.key(0), state.step)
-    at = state.at + jax.random.normal(key)
-    return Walk(state.step + 1, at), {"at": at}
-
-
-def start() -> Walk:
-    return Walk(jnp.zeros((), jnp.int32), jnp.zeros(()))
-
-
-def test_the_loop_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    straight = loop.train(advance, start(), Plan(), Given(tmp_path / "a"))
-    assert int(straight.step) == 7
-
-    def told_to_stop(state: Walk) -> tuple[Walk, dict[str, jax.Array]]:
-        if int(state.step) == 4:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return advance(state)
-
-    with pytest.raises(KeyboardInterrupt, match=r"stopped after step 5 of 7.*goes on"):
-        loop.train(told_to_stop, start(), Plan(), Given(tmp_path / "b"))
-    assert [p.name for p in (tmp_path / "b/steps").iterdir()] == ["3", "5"]
-    with (tmp_path / "b" / "metrics.jsonl").open("a") as log:  # a crash after the checkpoint
-        log.write('{"step": 6, "time": 1.0, "at": 0.0}\n{"step": 7, "ti')
-    again = loop.train(advance, start(), Plan(), Given(tmp_path / "b", resume="must"))
-    np.testing.assert_array_equal(again.at, straight.at)
-    logs = [[json.loads(line) for line in text.splitlines()] for text in (
-        (tmp_path / name / "metrics.jsonl").read_text() for name in "ab")]
-    for row in itertools.chain(*logs):
-        del row["time"]
-    assert logs[0] == logs[1]
-    assert [row["step"] for row in logs[0]] == list(range(1, 8))
-
-
-def test_the_loop_stops_in_time_and_keeps_runs_apart(tmp_path: Path) -> None:
-    given = Given(tmp_path / "a", max_seconds=0.0)
-    assert int(loop.train(advance, start(), Plan(), given).step) == 0
-    with pytest.raises(EvflowDataError, match=r"EV013.*seed"):
-        loop.train(advance, start(), Plan(seed=1), given)
-    with pytest.raises(EvflowDataError, match="EV013"):
-        loop.train(advance, start(), Plan(), dataclasses.replace(given, resume="never"))
-    with pytest.raises(EvflowDataError, match="EV016"):
-        loop.train(advance, start(), Plan(), Given(tmp_path / "none", resume="must"))
-    assert not (tmp_path / "none").exists()
-
-
-def test_the_loop_ends_where_it_diverges(tmp_path: Path) -> None:
-    def diverges(state: Walk) -> tuple[Walk, dict[str, jax.Array]]:
-        state, metrics = advance(state)
-        return (Walk(state.step, state.at * jnp.nan), {"at": state.at * jnp.nan}
-                ) if int(state.step) == 5 else (state, metrics)
-
-    with pytest.raises(EvflowDataError, match=r"EV007.*at = nan after step 5"):
-        loop.train(diverges, start(), Plan(), Given(tmp_path))
-    assert [p.name for p in (tmp_path / "steps").iterdir()] == ["3"]
 
 
 def test_numbers_that_leave_nothing_to_do_are_refused_at_once(tmp_path: Path) -> None:

@@ -24,7 +24,9 @@ from evflow.errors import EvflowDataError
 from evflow.network.weights import load_weights
 from evflow.process import devices
 from evflow.training.checkpoint import Checkpoints
-from experiments import train
+from evflow.training.log import Log
+from evflow.training.options import TrainOptions
+from evflow.training.run import configuration
 
 pytestmark = pytest.mark.timeout(1500)
 Arrays = dict[str, np.ndarray]
@@ -83,10 +85,10 @@ def test_replicated_arrays_and_keys_are_themselves() -> None:
 
 
 def test_scenes_must_divide_among_devices(tmp_path: Path) -> None:
-    options = train.Options(out=tmp_path, preset="debug", scenes=3)
-    assert train.configuration(options, 3).scenes == 3
+    options = TrainOptions(out=tmp_path, preset="debug", scenes=3)
+    assert configuration(options, 3).scenes == 3
     with pytest.raises(EvflowDataError, match=r"EV020.*--scenes 4"):
-        train.configuration(options, 2)
+        configuration(options, 2)
 
 
 def test_another_configuration_is_named(tmp_path: Path) -> None:
@@ -106,9 +108,10 @@ def test_another_configuration_is_named(tmp_path: Path) -> None:
 def test_the_log_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     for steps, cut in ((range(1, 5), '{"step": 5, "lo'), (range(3, 5), "")):
-        with train.Log(path, steps=4, step=steps[0] - 1) as log:
+        with Log(path, 4, steps[0] - 1, lambda _: "training") as log:
             for step in steps:
-                log.add(step, 0.1, {"loss": float(step)})
+                assert log.add(step, {"loss": jnp.float32(step)}) == ""
+            log.flush()
         with path.open("a") as file:
             file.write(cut)
     lines = [json.loads(line) for line in path.read_text().splitlines()]

@@ -1,0 +1,93 @@
+"""metrics.jsonl and the progress bar of a training, one line a step.
+
+Metrics come from the device one step late: `add` writes those of the step before, so that the
+device already works on the next one while the host waits for them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+
+from evflow.files.atomic import atomic_write
+from evflow.process import devices
+from evflow.process.terminal import bar
+
+RECENT = 100  # steps whose mean metrics are a run's figures
+Metrics = dict[str, float]
+Headline = Callable[[Metrics], str]
+
+
+class Log:
+    """metrics.jsonl and the bar; only the main process has them. A context manager.
+
+    path: of metrics.jsonl. Lines beyond `step`, where the run goes on from, are dropped: no step is
+    logged twice. headline: what the bar says of a run's figures; "compiling" before the first.
+    """
+
+    def __init__(self, path: Path, steps: int, step: int, headline: Headline) -> None:
+        self._main, self._steps, self._headline = devices.is_main(), steps, headline
+        self._recent: list[Metrics] = []
+        self._waiting: tuple[int, dict[str, jax.Array]] | None = None
+        self._open = contextlib.ExitStack()
+        self._progress = self._open.enter_context(bar("compiling", shown=self._main))
+        self._progress(step, steps)
+        if self._main:
+            kept = list(lines_until(path, step))
+            with atomic_write(path, overwrite=True) as temporary:
+                temporary.write_text("".join(f"{line}\n" for line in kept))
+            # By lines: a step is logged before its checkpoint is written.
+            self._file = self._open.enter_context(path.open("a", buffering=1))
+        self._started = time.monotonic()
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    @property
+    def seconds(self) -> float:
+        """Since the run (or its last resumption) started."""
+        return time.monotonic() - self._started
+
+    def add(self, step: int, metrics: dict[str, jax.Array]) -> str:
+        """Keep one step's metrics, still being computed, and write those of the step before;
+        returns what of these is not finite, "" where all is."""
+        lost = self.flush()
+        self._waiting = step, metrics
+        return lost
+
+    def flush(self) -> str:
+        """Wait for the metrics that are kept, if any, and write them; returns as `add` does."""
+        if self._waiting is None:
+            return ""
+        (step, metrics), self._waiting = self._waiting, None
+        values = {k: float(v) for k, v in jax.device_get(metrics).items()}
+        self._recent = [*self._recent[1 - RECENT:], values]
+        if self._main:
+            self._file.write(json.dumps({"step": step, "time": self.seconds, **values}) + "\n")
+        self._progress(step, self._steps, self._headline(self.figures))
+        lost = ", ".join(f"{k} = {v}" for k, v in values.items() if not math.isfinite(v))
+        return lost and f"{lost} after step {step}"
+
+    @property
+    def figures(self) -> Metrics:
+        """Mean metrics of the recent steps of this process."""
+        names = self._recent[-1] if self._recent else {}
+        return {k: sum(r[k] for r in self._recent) / len(self._recent) for k in names}
+
+
+def lines_until(path: Path, step: int) -> Iterator[str]:
+    """The lines of a log up to `step`; none where there is no log. A line that a crash cut short
+    lies beyond the last checkpoint."""
+    for line in path.read_text().splitlines() if path.exists() else ():
+        with contextlib.suppress(json.JSONDecodeError):
+            if json.loads(line)["step"] <= step:
+                yield line

@@ -1,0 +1,118 @@
+"""The loop of every training: steps, metrics.jsonl and checkpoints, until the last step, the time
+limit or a signal, on any number of devices and processes.
+
+A step is dispatched before the metrics of the one before are fetched: the device never waits for
+the host, but where a checkpoint is due (the next step takes the state's buffers).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import jax
+
+from evflow.errors import EvflowDataError
+from evflow.process.devices import Votes, is_main
+from evflow.process.signals import stop_requests
+from evflow.training.checkpoint import Checkpoints
+from evflow.training.config import as_dict
+from evflow.training.log import Headline, Log, Metrics
+from evflow.training.options import RunOptions
+
+
+class Counted(Protocol):
+    """A state knows how many steps it is."""
+
+    @property
+    def step(self) -> jax.Array: ...
+
+
+State = TypeVar("State", bound=Counted)
+Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
+
+
+@dataclass(frozen=True)
+class Ended(Generic[State]):
+    """A run that ended: its last state, the mean metrics of its last hundred steps, and, if a
+    signal stopped this process, what there is to say of it."""
+
+    state: State
+    figures: Metrics
+    stopped: str = ""
+
+    def completed(self) -> State:
+        """The state; KeyboardInterrupt where a signal ended the run."""
+        if self.stopped:
+            raise KeyboardInterrupt(self.stopped)
+        return self.state
+
+
+def train(
+    begin: Callable[[], tuple[Advance[State], State]], config: Any, options: RunOptions,
+    headline: Headline = lambda _: "training",
+) -> Ended[State]:
+    """The state after config.steps steps, from a fresh one or the run in options.out.
+
+    begin: makes the step and the fresh state, once the folder is known to be this run's. config: a
+    dataclass that says what the run is; one in the folder must be the same. Every step is logged,
+    and the last one saved, also where time or a signal ends the run. Raises EV007 where a metric is
+    no longer finite: that state is not saved.
+    """
+    if options.save_every < 1:
+        raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
+    if options.resume == "must" and not options.out.is_dir():  # before a folder is made
+        raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
+                              "Check --out, or pass --resume auto.")
+    with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
+        resumed = goes_on(checkpoints, as_dict(config), options)
+        advance, state = begin()
+        if resumed:
+            state = checkpoints.restore(state)
+        path = options.out / "metrics.jsonl"
+        with Log(path, config.steps, int(state.step), headline) as log:
+            state, lost = _steps(advance, state, config.steps, options, checkpoints, log, requests)
+    # Raised out here, where checkpoints are written.
+    if lost:
+        raise EvflowDataError("EV007", f"{lost}.", f"Checkpoints before it are in {options.out}; "
+                              "train at a lower rate.")
+    stopped = (f"stopped after step {int(state.step)} of {config.steps}; a checkpoint is saved, "
+               "and the same command goes on." if requests else "")
+    return Ended(state, log.figures, stopped)
+
+
+def goes_on(checkpoints: Checkpoints, config: dict[str, Any], options: RunOptions) -> bool:
+    """Whether the run in the folder is continued; else the folder is made this run's."""
+    if options.resume == "never" and checkpoints.latest is not None:
+        raise EvflowDataError("EV013", f"{options.out} already holds a run.",
+                              "Pass --resume auto to go on with it, or another --out.")
+    if options.resume == "must" or checkpoints.latest is not None:
+        checkpoints.check_config(config)
+        return True
+    if is_main():
+        checkpoints.write_config(config)
+    return False
+
+
+def _steps(
+    advance: Advance[State], state: State, steps: int, options: RunOptions,
+    checkpoints: Checkpoints, log: Log, requests: list[int],
+) -> tuple[State, str]:
+    """The last state, and what of its metrics is not finite, if anything."""
+    step, votes = int(state.step), Votes()
+    # All processes must stop after the same step, but neither signals nor clocks are the same.
+    while step < steps and not votes.agree(bool(requests) or log.seconds >= options.max_seconds):
+        state, metrics = advance(state)
+        step += 1
+        lost = log.add(step, metrics)
+        if not lost and step % options.save_every == 0:
+            lost = log.flush()
+            if not lost:
+                checkpoints.save(step, state)
+        if lost:
+            return state, lost
+    lost = log.flush()
+    if not lost:
+        checkpoints.save(step, state)
+    return state, lost

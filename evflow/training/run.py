@@ -1,0 +1,90 @@
+"""A training run of the network, on every device of every process: what `evflow train` does."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from evflow.errors import EvflowDataError
+from evflow.network.weights import load_weights, save_weights
+from evflow.process import devices
+from evflow.process.provenance import provenance
+from evflow.scenes import make_bank
+from evflow.training.config import TrainConfig, as_dict, preset
+from evflow.training.log import Metrics
+from evflow.training.loop import Advance, train
+from evflow.training.options import TrainOptions
+from evflow.training.step import TrainState, init_state, make_run_step, optimiser
+
+
+def train_network(options: TrainOptions) -> Metrics:
+    """One run, from joining the other processes to weights.safetensors; returns the mean metrics
+    of its last hundred steps. A signal ends it with the weights of the last step."""
+    devices.initialise(options.coordinator, options.processes, options.process_id)
+    mesh = devices.make_mesh()
+    config = configuration(options, mesh.size)
+
+    def begin() -> tuple[Advance[TrainState], TrainState]:
+        tx = optimiser(config)
+        bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures)
+        state = init_state(config, tx, bank, "paper" if options.preset == "paper" else "default")
+        if options.start is not None:
+            state = started_from(state, options.start)
+        state, bank = devices.replicate((state, bank), mesh)
+        step = devices.parallel(make_run_step(config, tx), mesh)
+        return lambda state: step(state, bank), state
+
+    ended = train(begin, config, options, _headline)
+    steps = int(ended.state.step)
+    card = {"preset": options.preset, "steps": steps, "seed": config.seed,
+            "devices": mesh.size, "training_figures": ended.figures, "config": as_dict(config),
+            **provenance()}
+    if devices.is_main():
+        save_weights(options.out / "weights.safetensors", ended.state.average, card, overwrite=True)
+    devices.agree(True)  # leave together: a process that ends alone is a dead one to the others
+    return ended.figures
+
+
+def _headline(figures: Metrics) -> str:
+    """The error of both thresholds; before there is any, 0."""
+    theta = [figures.get(f"summary/theta_{p}", 0.0) for p in ("on", "off")]
+    return f"theta {sum(theta) / 2:.4f}"
+
+
+def configuration(options: TrainOptions, devices: int) -> TrainConfig:
+    """The preset with the options' changes; EV020 where its scenes cannot be shared out."""
+    changes = {k: getattr(options, k) for k in ("seed", "steps", "scenes", "parts")}
+    config = dataclasses.replace(
+        preset(options.preset), **{k: v for k, v in changes.items() if v is not None})
+    if config.scenes < 1:
+        raise EvflowDataError("EV020", f"scenes={config.scenes}.", "A step takes one or more.")
+    if config.scenes % devices:
+        raise EvflowDataError(
+            "EV020", f"{config.scenes} scenes a step do not divide among {devices} devices.",
+            f"Pass --scenes {math.ceil(config.scenes / devices) * devices}, or use fewer devices.")
+    return config
+
+
+def started_from(state: TrainState, weights: str) -> TrainState:
+    """The fresh state with every part of the network whose shapes agree taken from `weights`;
+    EV018 where none is."""
+    (name, fresh), = state.params.items()
+    known = load_weights(weights).get(name, {})
+    taken = {k: known[k] for k, v in fresh.items() if k in known and shapes(known[k]) == shapes(v)}
+    if not taken:
+        raise EvflowDataError(
+            "EV018", f"{weights} has no part of the network {name!r} of this run, in its sizes.",
+            "Start from weights of the same network, or leave --start out.")
+    if devices.is_main():
+        print(f"from {weights}: {', '.join(taken)}")
+    begun = {name: fresh | taken}
+    return dataclasses.replace(state, params=begun, average=jax.tree.map(jnp.copy, begun))
+
+
+def shapes(tree: Any) -> Any:
+    """The shape of every leaf."""
+    return jax.tree.map(jnp.shape, tree)

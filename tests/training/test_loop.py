@@ -1,0 +1,152 @@
+"""The loop of every training: it goes on where it stopped, keeps the device busy, and saves nothing
+that diverged."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from evflow.errors import EvflowDataError
+from evflow.process.devices import Votes
+from evflow.training.loop import train
+from evflow.training.options import RunOptions
+
+Stepped = tuple["Walk", dict[str, Any]]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    step: jax.Array
+    at: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    steps: int = 7
+    seed: int = 0
+
+
+def given(out: Path, **changes: Any) -> RunOptions:
+    return RunOptions(out=out, **{"save_every": 3, **changes})
+
+
+def advance(state: Walk) -> Stepped:
+    key = jax.random.fold_in(jax.random.key(0), state.step)
+    at = state.at + jax.random.normal(key)
+    return Walk(state.step + 1, at), {"at": at}
+
+
+def start() -> Walk:
+    return Walk(jnp.zeros((), jnp.int32), jnp.zeros(()))
+
+
+def saved(out: Path) -> set[str]:
+    return {p.name for p in (out / "steps").iterdir()}
+
+
+def test_it_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    straight = train(lambda: (advance, start()), Plan(), given(tmp_path / "a"))
+    assert int(straight.completed().step) == 7
+
+    def told_to_stop(state: Walk) -> Stepped:
+        if int(state.step) == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return advance(state)
+
+    ended = train(lambda: (told_to_stop, start()), Plan(), given(tmp_path / "b"))
+    with pytest.raises(KeyboardInterrupt, match=r"stopped after step 5 of 7.*goes on"):
+        ended.completed()
+    assert int(ended.state.step) == 5
+    assert saved(tmp_path / "b") == {"3", "5"}
+    with (tmp_path / "b" / "metrics.jsonl").open("a") as log:  # a crash after the checkpoint
+        log.write('{"step": 6, "time": 1.0, "at": 0.0}\n{"step": 7, "ti')
+    again = train(lambda: (advance, start()), Plan(), given(tmp_path / "b", resume="must"))
+    np.testing.assert_array_equal(again.state.at, straight.state.at)
+    logs = [[json.loads(line) for line in text.splitlines()] for text in (
+        (tmp_path / name / "metrics.jsonl").read_text() for name in "ab")]
+    for row in itertools.chain(*logs):
+        del row["time"]
+    assert logs[0] == logs[1]
+    assert [row["step"] for row in logs[0]] == list(range(1, 8))
+    assert straight.figures["at"] == pytest.approx(np.mean([row["at"] for row in logs[0]]))
+
+
+def test_it_stops_in_time_and_keeps_runs_apart(tmp_path: Path) -> None:
+    none = given(tmp_path / "a", max_seconds=0.0)
+    assert int(train(lambda: (advance, start()), Plan(), none).completed().step) == 0
+    with pytest.raises(EvflowDataError, match=r"EV013.*seed"):
+        train(lambda: (advance, start()), Plan(seed=1), none)
+    with pytest.raises(EvflowDataError, match="EV013"):
+        train(lambda: (advance, start()), Plan(), dataclasses.replace(none, resume="never"))
+    with pytest.raises(EvflowDataError, match="EV016"):
+        train(lambda: (advance, start()), Plan(), given(tmp_path / "none", resume="must"))
+    with pytest.raises(EvflowDataError, match=r"EV020.*--save-every 0"):
+        train(lambda: (advance, start()), Plan(), given(tmp_path / "none", save_every=0))
+    assert not (tmp_path / "none").exists()
+
+
+def test_nothing_is_begun_in_the_folder_of_another_run(tmp_path: Path) -> None:
+    train(lambda: (advance, start()), Plan(), given(tmp_path))
+
+    def begin() -> Any:
+        raise AssertionError("begun")
+
+    for plan, options in ((Plan(seed=1), given(tmp_path)),
+                          (Plan(), given(tmp_path, resume="never"))):
+        with pytest.raises(EvflowDataError, match="EV013"):
+            train(begin, plan, options)
+
+
+@pytest.mark.parametrize(("bad", "kept"), [
+    (2, set()), (3, set()), (4, {"3"}), (5, {"3"}), (6, {"3"}), (7, {"3", "6"})])
+def test_what_diverges_is_not_saved(bad: int, kept: set[str], tmp_path: Path) -> None:
+    def diverges(state: Walk) -> Stepped:
+        state, metrics = advance(state)
+        if int(state.step) != bad:
+            return state, metrics
+        return Walk(state.step, state.at * jnp.nan), {"at": state.at * jnp.nan}
+
+    with pytest.raises(EvflowDataError, match=rf"EV007.*at = nan after step {bad}\."):
+        train(lambda: (diverges, start()), Plan(), given(tmp_path))
+    assert saved(tmp_path) == kept
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["step"] == bad
+
+
+def test_the_next_step_is_on_its_way_before_metrics_are_fetched(tmp_path: Path) -> None:
+    order: list[str] = []
+
+    class Metric:
+        def __init__(self, step: int) -> None:
+            self.step = step
+
+        def __float__(self) -> float:
+            order.append(f"fetch {self.step}")
+            return 0.0
+
+    def told(state: Walk) -> Stepped:
+        state, _ = advance(state)
+        order.append(f"step {state.step}")
+        return state, {"loss": Metric(int(state.step))}
+
+    train(lambda: (told, start()), Plan(steps=5), given(tmp_path))
+    # A checkpoint waits for its metrics: what diverged is not saved.
+    assert order == ["step 1", "step 2", "fetch 1", "step 3", "fetch 2", "fetch 3", "step 4",
+                     "step 5", "fetch 4", "fetch 5"]
+
+
+@pytest.mark.parametrize("vote", [True, False])
+def test_alone_a_vote_counts_at_once(vote: bool) -> None:
+    votes = Votes()
+    assert [votes.agree(v) for v in (False, vote)] == [False, vote]
