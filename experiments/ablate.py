@@ -29,6 +29,7 @@ import tyro
 from evflow.network import architecture, flow
 from evflow.network.coordinates import squash, unsquash_summary
 from evflow.network.weights import load_weights, save_weights
+from evflow.process.devices import compiled_quickly
 from evflow.process.provenance import provenance
 from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
@@ -37,7 +38,6 @@ from evflow.training.config import PRESETS, TrainConfig, as_dict
 from evflow.training.step import cut_block, init_state, make_run_step, optimiser
 from experiments.shared.common import (
     begin,
-    compiled_quickly,
     run_script,
     slug,
     write_result,

@@ -9,8 +9,9 @@ none is set, everything runs as written. `initialise` comes before any other use
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -132,6 +133,18 @@ def parallel(step: Callable[..., Any], mesh: Mesh) -> jax.stages.Wrapped:
             return step(*args)
 
     return jax.jit(meshed, donate_argnums=0, out_shardings=NamedSharding(mesh, P()))
+
+
+@contextlib.contextmanager
+def compiled_quickly(wanted: bool) -> Iterator[None]:
+    """Programs of this block are compiled without optimisation, in half of the time, if `wanted`:
+    where they run a few times only."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", wanted or before)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
 
 
 def by_shard(

@@ -26,11 +26,12 @@ def train_network(options: TrainOptions) -> Metrics:
     of its last hundred steps. A signal ends it with the weights of the last step."""
     devices.initialise(options.coordinator, options.processes, options.process_id)
     mesh = devices.make_mesh()
-    config = configuration(options, mesh.size)
+    config, small = configuration(options, mesh.size), options.preset == "debug"
 
     def begin() -> tuple[Advance[TrainState], TrainState]:
         tx = optimiser(config)
-        bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures)
+        bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures,
+                         photos=not small)
         state = init_state(config, tx, bank, "paper" if options.preset == "paper" else "default")
         if options.start is not None:
             state = started_from(state, options.start)
@@ -38,7 +39,8 @@ def train_network(options: TrainOptions) -> Metrics:
         step = devices.parallel(make_run_step(config, tx), mesh)
         return lambda state: step(state, bank), state
 
-    ended = train(begin, config, options, _headline)
+    with devices.compiled_quickly(small):
+        ended = train(begin, config, options, _headline)
     steps = int(ended.state.step)
     card = {"preset": options.preset, "steps": steps, "seed": config.seed,
             "devices": mesh.size, "training_figures": ended.figures, "config": as_dict(config),

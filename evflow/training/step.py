@@ -93,9 +93,10 @@ def init_state(
                                           block.context, y)
     u = architecture.condition(config.model, changes, block.context, y)
     net["flow"] = flow.data_init(net["flow"], block.voxels, u, config.model.flow)
-    # A copy: the train step donates its state, and a buffer can be donated only once.
-    average = jax.tree.map(jnp.copy, params)
-    return TrainState(jnp.zeros((), jnp.int32), params, average, tx.init(params), k_run)
+    # A copy: the train step donates its state, and a buffer can be donated only once. One program
+    # each, not one a shape of the leaves.
+    average = jax.jit(lambda tree: jax.tree.map(jnp.copy, tree))(params)
+    return TrainState(jnp.zeros((), jnp.int32), params, average, jax.jit(tx.init)(params), k_run)
 
 
 def cut_block(key: Array, batch: Batch, config: TrainConfig) -> Block:

@@ -8,11 +8,10 @@ import dataclasses
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-import jax
 import tyro
 
 from evflow.errors import EvflowDataError
@@ -53,17 +52,6 @@ def hashes(config: dict[str, Any]) -> dict[str, str]:
 def slug(name: str) -> str:
     """A name that is a file name everywhere."""
     return re.sub(r"[^A-Za-z0-9.+-]+", "_", name)
-
-
-@contextlib.contextmanager
-def compiled_quickly(wanted: bool) -> Iterator[None]:
-    """Programs of this block are compiled without optimisation, in half of the time, if `wanted`:
-    where they run a few times only."""
-    jax.config.update("jax_disable_most_optimizations", wanted)
-    try:
-        yield
-    finally:
-        jax.config.update("jax_disable_most_optimizations", False)
 
 
 def begin(options: Any, name: str) -> None:
