@@ -36,10 +36,10 @@ from evflow.baselines.base import intervals, usable
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
 from evflow.report import plots
-from experiments.evaluate import ENOUGH, protocols
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.many import Setup, scores
+from experiments.shared.protocols import ENOUGH, protocols
 
 OURS, CONSTANT, KNOWN = "ours", "constant .3", "match, true video"
 POLARITIES = ("on", "off")

@@ -20,10 +20,10 @@ from evflow import estimate_camera, finish
 from evflow.camera import CameraPrior
 from evflow.estimation.pipeline import pool_recording
 from evflow.report import plots
-from experiments.evaluate import ENOUGH
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.many import Setup, scores
+from experiments.shared.protocols import ENOUGH
 
 BASE = Protocol(prior=CameraPrior(mismatch=(0.03, 0.03)))
 # 200 ms at other frame rates, other durations at 25 ms, other speeds; (frame_ms, intervals).

@@ -21,18 +21,15 @@ from typing import Any, Literal
 import numpy as np
 
 from evflow import estimate_camera, finish
-from evflow.camera import CameraPrior
-from evflow.camera.sensors import SensorModel
 from evflow.estimation.pipeline import pool_recording
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.many import Setup, scores
+from experiments.shared.protocols import ENOUGH, protocols
 
 NAMES = ("theta_on", "theta_off", "eta_on", "eta_off")
 PAPER = {"theta_on": 0.023, "theta_off": 0.022, "eta_on": 0.045, "eta_off": 0.027}
 CONSTANT = {"theta_on": 0.3, "theta_off": 0.3, "eta_on": 0.114, "eta_off": 0.114}
-ENOUGH = 200  # signal events of a polarity: all but the noise expected
-V2E = SensorModel(timestamps="v2e", noise_resets_memory=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,16 +45,6 @@ class Options:
     """Recordings per row (default: the preset's)."""
     workers: int = 1
     """Processes side by side."""
-
-
-def protocols() -> dict[str, Protocol]:
-    """Rows of the table: both mismatches on a running camera; v2e's own slots and memory from
-    the first frame on; noise that does not follow the threshold."""
-    rows = {f"{m:.2f}": Protocol(prior=CameraPrior(mismatch=(m, m))) for m in (0.03, 0.15)}
-    rows["0.03 v2e"] = Protocol(prior=CameraPrior(mismatch=(0.03, 0.03)), model=V2E, fresh=True)
-    rows["0.03 free noise"] = Protocol(
-        prior=CameraPrior(mismatch=(0.03, 0.03), noise="independent"), model=SensorModel())
-    return rows
 
 
 def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] | None:

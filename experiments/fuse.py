@@ -22,27 +22,23 @@ import numpy as np
 import optax
 import tyro
 
-from evflow import Recording, finish
-from evflow.camera import Summary
 from evflow.commands.writing import need_absent, need_suffix
 from evflow.errors import EvflowDataError
-from evflow.estimation.pipeline import pool_recording
-from evflow.estimation.refine import Chunk, fused, refine_summary, refinement_chunks
+from evflow.estimation.refine import fused, refine_summary
 from evflow.estimation.refine.fit import FusionNet
 from evflow.files.atomic import atomic_write
 from evflow.network.coordinates import squash, unsquash_summary
 from evflow.network.weights import model_card, save_weights, weights_hash
-from evflow.recordings.windows import plan_windows
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, estimator, run_script
 from experiments.shared.many import Setup, scores
+from experiments.shared.refinement import COVERED, before_refinement
 
 Array = jax.Array
 Rows = dict[str, np.ndarray]
 
 FOLDS = 5
 JITTER, DEGREES = 0.5, 30.0  # in standard deviations; of Student's t
-COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier than a Gaussian's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,20 +56,6 @@ class Options:
     rows: Path | None = None
     """Where to keep the features, to resume an interrupted run from."""
     overwrite: bool = False
-
-
-def before_refinement(
-    params: Any, recording: Recording
-) -> tuple[list[Chunk], Summary, Summary] | None:
-    """What the refinement starts from: chunks, the network's summary and its std; None where
-    nothing fired."""
-    if len(recording.events) < 10:
-        return None
-    plan = plan_windows(recording)
-    if not plan.pairs:
-        return None
-    stats, _ = pool_recording(params, recording)
-    return refinement_chunks(recording, plan.pairs), *finish(params, stats)
 
 
 def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:

@@ -19,7 +19,6 @@ second, a test of typicality (Nalisnick et al. 2019), can tell doubled threshold
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,27 +28,20 @@ import numpy as np
 
 from evflow import Camera, code_from_video, generate, load_weights, log_prob
 from evflow.camera import THETA_MIN, CameraPrior
-from evflow.camera.sensors import SensorModel
-from evflow.light.log_maps import lin_log
 from evflow.network.api import Params
 from evflow.process.terminal import bar
-from evflow.scenes import TextureBank, make_bank, render, sample_scene, watch
-from evflow.scenes.config import SceneConfig
+from evflow.scenes import TextureBank, make_bank
 from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.generated import Row, Windows, compare, figures, scene_of, simulated
 
 Array = jax.Array
-Row = dict[str, np.ndarray]
 
-MODEL = SensorModel(eta_intensity=True)
-SCENE = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
-BINS = 16
 SCALES = {  # of theta_on, theta_off
     "as it is": (1.0, 1.0), "halved": (0.5, 0.5), "doubled": (2.0, 2.0),
     "ON halved": (0.5, 1.0), "ON doubled": (2.0, 1.0),
     "OFF halved": (1.0, 0.5), "OFF doubled": (1.0, 2.0)}
 CHANGED = ("halved", "doubled")  # which log_prob is to tell from the camera as it is
 REFERENCES = 4  # simulations whose mean log_prob is what is typical
-ENOUGH = 20  # events of a scene below which its correlation says nothing
 SINGLE_PIXELS = 0.1  # share of pixels whose thresholds change at an unchanged summary
 
 
@@ -69,31 +61,6 @@ class Options:
     shape: tuple[int, int] = (64, 64)
 
 
-@partial(jax.jit, static_argnames="options")
-def scene_of(key: Array, bank: TextureBank, options: Options) -> tuple[Array, Camera]:
-    """log frames (4 * BINS + 1, H, W) of a window, and a camera."""
-    k_scene, k_nominal, k_pixels = jax.random.split(key, 3)
-    scene = sample_scene(k_scene, bank, SCENE, options.shape)
-    steps = 4 * BINS
-    times = (jnp.arange(steps + 1) / steps - 0.5) * options.window_s
-    frames = render(scene, times, options.shape)
-    light = watch.light(frames[0])
-    _, camera = watch.draw_camera(k_nominal, k_pixels, options.prior, options.shape, light)
-    return lin_log(frames), camera
-
-
-@partial(jax.jit, static_argnames="window_s")
-def simulated(
-    key: Array, frames: Array, camera: Camera, window_s: float, running: float = 1.0
-) -> Array:
-    """voxels (H, W, 2 BINS) of a camera that has been running: its memory is anywhere between
-    the thresholds. running 0: it is at the first frame."""
-    k_phase, k_sim = jax.random.split(key)
-    dt = jnp.float32(window_s / (len(frames) - 1))
-    phase = running * watch.memory(k_phase, camera)
-    return watch.voxels(k_sim, frames, camera, MODEL, 1, dt, BINS, phase)[0]
-
-
 def scaled(camera: Camera, on: Array | float, off: Array | float) -> Camera:
     return dataclasses.replace(camera, theta_on=jnp.maximum(camera.theta_on * on, THETA_MIN),
                                theta_off=jnp.maximum(camera.theta_off * off, THETA_MIN))
@@ -108,37 +75,6 @@ def variants(key: Array, camera: Camera) -> dict[str, tuple[Camera, Array]]:
         factor = jnp.where(some, scale, 1.0)
         found[name] = scaled(camera, factor, factor), some
     return found
-
-
-def compare(made: Array, one: Array, two: Array, where: Array) -> Row:
-    """Sums that add over scenes: generated voxels against two simulations of the same camera.
-    Correlations are those of a scene with at least ENOUGH events."""
-    def counts(voxels: Array) -> Array:
-        on, off = jnp.split(voxels, 2, -1)
-        return jnp.stack([on.sum(-1), off.sum(-1)])
-
-    def correlation(a: Array, b: Array) -> Array:
-        return jnp.corrcoef(jnp.stack([a[:, where].ravel(), b[:, where].ravel()]))[0, 1]
-
-    made_n, one_n, two_n = counts(made), counts(one), counts(two)
-    empty = where & (one.sum(-1) + two.sum(-1) == 0)
-    used = float(one_n[:, where].sum()) >= ENOUGH
-    pair = [correlation(made_n, one_n), correlation(one_n, two_n), 1.0] if used else [0.0] * 3
-    return {"made": np.asarray((made_n * where[None]).sum((1, 2))),
-            "simulated": np.asarray(0.5 * ((one_n + two_n) * where[None]).sum((1, 2))),
-            "empty": np.array([(jnp.abs(made) * empty[..., None]).sum(),
-                               empty.sum() * made.shape[-1]]),
-            "correlations": np.array(pair)}
-
-
-def figures(total: Row) -> dict[str, float]:
-    """Ratios of the added sums."""
-    with_one, between, scenes = total["correlations"]
-    ratio = total["made"] / total["simulated"]
-    return {"on": float(ratio[0]), "off": float(ratio[1]),
-            "empty": float(total["empty"][0] / total["empty"][1]),
-            "correlation": float(with_one / scenes), "two simulations": float(between / scenes),
-            "relative": float(with_one / between)}
 
 
 def auroc(inside: np.ndarray, outside: np.ndarray) -> float:
@@ -161,7 +97,8 @@ def compared(
 ) -> tuple[dict[str, Row], dict[str, list[float]]]:
     """Of one scene: the sums of every variant, and log_prob of simulations at the true code."""
     k_scene, k_pixels, k_made, k_one, k_two, k_typical = jax.random.split(key, 6)
-    frames, camera = scene_of(k_scene, bank, options)
+    frames, camera = scene_of(
+        k_scene, bank, Windows(options.prior, options.window_s, options.shape))
     changes = jnp.moveaxis(jnp.diff(frames[::4], axis=0), 0, -1)
     code = code_from_video(params, changes, camera, window_s=options.window_s,
                            intensity=0.5 * (frames[0] + frames[-1]))

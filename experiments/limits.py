@@ -33,10 +33,10 @@ from evflow.estimation.refine.sightings import sight
 from evflow.estimation.refine.signal import told_apart
 from evflow.light.log_maps import lin_log
 from evflow.recordings.windows import plan_windows
-from experiments.evaluate import ENOUGH, protocols
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.many import Setup, scores
+from experiments.shared.protocols import ENOUGH, protocols
 
 EDGES = {"signal": (200, 1000, 5000, np.inf), "speed": (0, 2, 6, np.inf)}
 NAMES = ("theta_on", "theta_off")

@@ -27,19 +27,9 @@ from evflow.report import plots
 from experiments.shared import laws, pages
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.sources import figure_four, sources
+from experiments.shared.table_two import LEVELS, LUX, MIDDLE, SCP, TABLE_TWO
 
 MODELS = ("noisy", "v2e", "paper", "dvs346", "dvs240")
-SCP = (101, 121, 141, 161, 181, 201)
-# Table II: threshold, its spread, events. The count of SCP 141, OFF is printed as 8,564,635; its
-# neighbours times their thresholds say that one digit is too many.
-PAPER = {
-    "on": np.array([(0.119, 0.082, 2850599), (0.159, 0.089, 1675849), (0.210, 0.096, 1172399),
-                    (0.269, 0.103, 890028), (0.342, 0.113, 729427), (0.433, 0.140, 558242)]),
-    "off": np.array([(0.203, 0.121, 1751785), (0.249, 0.107, 1110802), (0.302, 0.103, 856463.5),
-                     (0.358, 0.105, 713966), (0.420, 0.105, 637139), (0.479, 0.109, 545253)])}
-MIDDLE = 3  # SCP 161, the row that ratios refer to
-LUX = np.arange(500, 4001, 500)
-LEVELS = LUX * (255 / 4000)
 DARK, BRIGHT = 25.0, 225.0  # DN of the changing screen
 SCREEN_DT_S, RAMP_S, HOLD_S = 0.002, 0.1, 0.3
 JUDGED, BOUND = 10_000, 0.02
@@ -72,8 +62,8 @@ def camera_of(key: jax.Array, name: str, row: int, size: int, spread: bool) -> C
     """A camera with the thresholds of a row of Table II, and their spread or the sensor's own.
     The noise of "paper" is Eq. 12 at the mean luminance of LEVELS."""
     own = SENSORS[name].mismatch
-    theta = [PAPER[p][row, 0] for p in ("on", "off")]
-    sigma = [PAPER[p][row, 1] if spread else own for p in ("on", "off")]
+    theta = [TABLE_TWO[p][row, 0] for p in ("on", "off")]
+    sigma = [TABLE_TWO[p][row, 1] if spread else own for p in ("on", "off")]
     eta = [0.0, 0.0]
     if name == "paper":
         factor = float(laws.dimmed(LEVELS.mean()))
@@ -221,15 +211,15 @@ def table(result: dict[str, Any]) -> str:
         lines += [f"| θ {p.upper()} | paper, events | paper | 1/θ | "
                   + " | ".join(f"{n} (law, deviation)" for n in MODELS) + " |",
                   "|" + "---|" * (4 + len(MODELS))]
-        events = PAPER[p][:, 2] / PAPER[p][MIDDLE, 2]
-        for row, (theta, sigma, count) in enumerate(PAPER[p]):
+        events = TABLE_TWO[p][:, 2] / TABLE_TWO[p][MIDDLE, 2]
+        for row, (theta, sigma, count) in enumerate(TABLE_TWO[p]):
             cells = []
             for rows in (result["table II"][n] for n in MODELS):
                 one, base = rows[row][f"{p} ramp"], rows[MIDDLE][f"{p} ramp"]
                 cells.append(f"{one['events'] / base['events']:.3f} ("
                              f"{one['law'] / base['law']:.3f}, {one['deviation']:+.2%})")
             lines.append(f"| {theta} ± {sigma} | {count:,.0f} | {events[row]:.3f} | "
-                         f"{PAPER[p][MIDDLE, 0] / theta:.3f} | " + " | ".join(cells) + " |")
+                         f"{TABLE_TWO[p][MIDDLE, 0] / theta:.3f} | " + " | ".join(cells) + " |")
         lines.append("")
     lines += ["The paper prints 8,564,635 OFF events at θ .302; its neighbours times their "
               "thresholds say that a digit is too many.", ""]
@@ -239,7 +229,7 @@ def table(result: dict[str, Any]) -> str:
         for row in (0, MIDDLE, 5):
             rates = [[c["events"] / (rows[row]["pixels"] * rows[row]["seconds"])
                       for c in rows[row][p]] for p in ("on", "off")]
-            theta = ", ".join(f"{PAPER[p][row, 0]}" for p in ("on", "off"))
+            theta = ", ".join(f"{TABLE_TWO[p][row, 0]}" for p in ("on", "off"))
             lines.append(f"| {name} | {theta} | "
                          + " | ".join(f"{a:.3f}, {b:.3f}" for a, b in zip(*rates, strict=True))
                          + " |")
@@ -282,7 +272,7 @@ def main(options: Options) -> dict[str, Any]:
                           for s in scenes}
     result["sources"] = {s["title"]: {k: np.asarray(s[k]).tolist() for k in (
         "x", "measured", "law")} for s in alone}
-    pages.noise_laws(options.out / "noise.png", result, PAPER, LUX)
+    pages.noise_laws(options.out / "noise.png", result, TABLE_TWO, LUX)
     pages.event_rates(options.out / "events.png", scenes)
     pages.noise_sources(options.out / "sources.png", alone)
     write_result(options.out / "noise.json", result, dataclasses.asdict(options))

@@ -29,11 +29,10 @@ from evflow.camera.sensors import SENSORS, SensorModel
 from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.process.terminal import bar
 from evflow.report import plots
-from experiments.noise import LUX, MIDDLE, SCP
-from experiments.noise import PAPER as TABLE_TWO
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.images import mean_ci
 from experiments.shared.measured_noise import SIDES, Rates, measured, measured_page, ours
+from experiments.shared.table_two import LUX, MIDDLE, SCP, TABLE_TWO
 
 MODELS = {"eq12": SensorModel(eta_intensity=True), "dvs346": SENSORS["dvs346"].model}
 SCENES = ("flat", "still", "moving")

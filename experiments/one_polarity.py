@@ -24,12 +24,12 @@ from evflow.estimation.pipeline import pool_recording
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.many import Setup, scores
+from experiments.shared.protocols import ENOUGH
 
 CASES: dict[str, dict[str, Any]] = {
     "brighter": {}, "darker": {}, "OFF unreached": {"off": "unreached"},
     "OFF left out": {"off": "dropped"}}
 FADES = (1.5, 5.0)
-ENOUGH = 200  # signal events of the other polarity
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,10 +30,10 @@ from evflow.estimation.refine.points import Points, chunk_points
 from evflow.estimation.refine.signal import joined, log_intensity, rate_at
 from evflow.network.coordinates import squash_summary, summary_std, unsquash_summary
 from evflow.network.weights import model_card, save_weights
-from experiments.fuse import COVERED, before_refinement
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, estimator, run_script
 from experiments.shared.many import Setup, scores
+from experiments.shared.refinement import COVERED, before_refinement
 
 Array = jax.Array
 Row = dict[str, Any]

@@ -33,8 +33,8 @@ from evflow.scenes import make_bank
 from evflow.training.config import as_dict
 from evflow.training.loop import train
 from evflow.training.options import RunOptions
-from experiments import generate as inverse
 from experiments.shared.common import at_least, run_script, write_result, write_text
+from experiments.shared.generated import Row, Windows, compare, figures, scene_of, simulated
 
 Array = jax.Array
 
@@ -91,14 +91,14 @@ class Scene:
 def held_out(params: dict[str, Any], config: GanConfig) -> Iterator[Scene]:
     """Scenes, textures and cameras never trained on, without end."""
     low, high = config.data.window_s
-    options = inverse.Options(prior=config.data.prior, window_s=math.sqrt(low * high))
+    windows = Windows(config.data.prior, math.sqrt(low * high))
     k_bank, k_data = jax.random.split(jax.random.key(HELD_OUT))
     bank = make_bank(k_bank, 48, photos=False)
     run_generator = jax.jit(generate)
     for i in itertools.count():
         k_scene, k_one, k_two = jax.random.split(jax.random.fold_in(k_data, i), 3)
-        video, camera = inverse.scene_of(k_scene, bank, options)
-        one, two = (inverse.simulated(k, video, camera, options.window_s) for k in (k_one, k_two))
+        video, camera = scene_of(k_scene, bank, windows)
+        one, two = (simulated(k, video, camera, windows.window_s) for k in (k_one, k_two))
         frames = lin_log_inverse(video[jnp.array([0, -1])])
         yield Scene(frames, run_generator(params, *frames), one, two)
 
@@ -106,14 +106,14 @@ def held_out(params: dict[str, Any], config: GanConfig) -> Iterator[Scene]:
 def measure(params: dict[str, Any], config: GanConfig, scenes: int) -> dict[str, Any]:
     """Generated voxels of held-out windows against two simulations of the camera that made them,
     and the mean of all generated counts against that of all simulated."""
-    total: inverse.Row = {}
+    total: Row = {}
     with bar("scenes") as progress:
         for i, seen in enumerate(itertools.islice(held_out(params, config), scenes)):
             everywhere = jnp.ones(seen.frames.shape[1:], bool)
-            row = inverse.compare(seen.made, seen.one, seen.two, everywhere)
+            row = compare(seen.made, seen.one, seen.two, everywhere)
             total = jax.tree.map(np.add, total, row) if total else row
             progress(i + 1, scenes)
-    return inverse.figures(total)
+    return figures(total)
 
 
 def picture(scenes: list[Scene], path: Path) -> None:
