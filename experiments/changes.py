@@ -34,7 +34,7 @@ from evflow.training.batch import Batch, sample_batch
 from evflow.training.config import preset
 from experiments.shared import change_systems as systems
 from experiments.shared.cameras import Protocol, hidden_recording
-from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.images import mean_ci
 
 Array = jax.Array
@@ -208,10 +208,7 @@ def main(options: Options) -> dict[str, Any]:
         m: mean_ci(np.array([s[task][system][i] for s in every]))
         for i, m in enumerate(MEASURES)} for system in every[0][task]} for task in every[0]}
         for name, every in found.items()}
-    text = table(result)
-    print(text)
-    write_result(options.out / "changes.json", result, dataclasses.asdict(options))
-    write_text(options.out / "changes.md", text)
+    conclude(options, "changes", result, table(result))
     if shown:
         picture(options.out / "changes.png", list(shown.items()))
     return result

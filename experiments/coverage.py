@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jax.scipy.stats import norm
@@ -25,8 +25,8 @@ from evflow.camera import PARAMETERS
 from evflow.report import plots
 from evflow.report.plots import TITLES
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
-from experiments.shared.common import begin, run_script, write_result, write_text
-from experiments.shared.many import Setup, scores
+from experiments.shared.common import StudyOptions, begin, conclude, run_script
+from experiments.shared.many import Setup, study
 
 LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
 EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf),
@@ -34,12 +34,10 @@ EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf),
 Rows = list[dict[str, Any]]
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options(StudyOptions):
     """Measure the coverage of the estimate's intervals."""
 
-    weights: str = "default"
-    preset: Literal["debug", "full"] = "debug"
     out: Path = Path("out/coverage")
     seed: int = 5_000_077
     recordings: int | None = None
@@ -50,7 +48,6 @@ class Options:
     """Frame intervals of every recording (default: 8 to 24, of 10 to 40 ms)."""
     eta_spread: float | None = None
     """Standard deviation of log noise rates over pixels (default: 0 or .1, as in training)."""
-    workers: int = 1
 
 
 def drawn(rng: np.random.Generator, options: Options) -> Protocol:
@@ -137,11 +134,10 @@ def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "coverage")
-    count = options.recordings or {"debug": 12, "full": 1000}[options.preset]
-    jobs = [(i, drawn(np.random.default_rng((options.seed, i)), options)) for i in range(count)]
+    count = options.count(options.recordings, debug=12, full=1000)
+    protocols = [drawn(np.random.default_rng((options.seed, i)), options) for i in range(count)]
     setup = Setup(options.weights, options.seed, options.photos)
-    made = scores(score, setup, jobs, options.workers, "cameras")
-    rows = [row for row in made if row is not None]
+    rows = study(score, setup, protocols, options.workers, "cameras")
     found = curves(rows)
     result = {"levels": LEVELS.tolist(), "cameras": len(rows), "curves": found,
               "strata": strata(rows)}
@@ -152,9 +148,7 @@ def main(options: Options) -> dict[str, Any]:
     lines += [f"| {name} | {s['recordings']} | {s['inside 68']:.0%} | {s['inside 95']:.0%} |"
               for name, s in result["strata"].items()]
     text = "\n".join(lines)
-    print(text)
-    write_result(options.out / "coverage.json", result, dataclasses.asdict(options))
-    write_text(options.out / "coverage.md", text)
+    conclude(options, "coverage", result, text)
     draw(found, options.out / "coverage.png")
     return result
 

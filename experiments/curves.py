@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from evflow.camera import CameraPrior
 from evflow.estimation.pipeline import pool_recording
 from evflow.report import plots
 from experiments.shared.cameras import Hidden, Protocol
-from experiments.shared.common import begin, run_script, write_result, write_text
-from experiments.shared.many import Setup, scores
+from experiments.shared.common import StudyOptions, begin, conclude, run_script
+from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH
 
 BASE = Protocol(prior=CameraPrior(mismatch=(0.03, 0.03)))
@@ -34,17 +34,14 @@ WINDOWS_US = (25_000, 50_000, 100_000)
 EVENTS = (0, 50, 200, 1000, 3000, 10_000, 1_000_000)
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options(StudyOptions):
     """Measure the error against the amount and kind of data."""
 
-    weights: str = "default"
-    preset: Literal["debug", "full"] = "debug"
     out: Path = Path("out/curves")
     seed: int = 6_000_011
     recordings: int | None = None
     """Recordings per point (default: the preset's)."""
-    workers: int = 1
 
 
 def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
@@ -79,7 +76,7 @@ def point(rows: list[dict[str, np.ndarray]], key: str, low: float = ENOUGH,
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "curves")
-    count = options.recordings or {"debug": 2, "full": 60}[options.preset]
+    count = options.count(options.recordings, debug=2, full=60)
     settings: dict[str, dict[Any, Protocol]] = {
         "frame interval [ms]": {ms: dataclasses.replace(BASE, frame_ms=ms, intervals=n)
                                 for ms, n in RATES},
@@ -94,10 +91,8 @@ def main(options: Options) -> dict[str, Any]:
     for name, points in settings.items():
         result[name] = {}
         for value, protocol in points.items():
-            jobs = [(i, protocol) for i in range(count)]
-            setup = Setup(options.weights, options.seed)
-            made = scores(score, setup, jobs, options.workers, f"{name} {value}")
-            rows = [row for row in made if row is not None]
+            rows = study(score, Setup(options.weights, options.seed), [protocol] * count,
+                         options.workers, f"{name} {value}")
             result[name][value] = {"refined": point(rows, "refined"),
                                    "network": point(rows, "network 50")}
             base += rows
@@ -107,10 +102,7 @@ def main(options: Options) -> dict[str, Any]:
         for low, high in itertools.pairwise(EVENTS)}
     result["window [ms]"] = {us // 1000: {"network": point(base, f"network {us // 1000}")}
                              for us in WINDOWS_US}
-    text = table(result)
-    print(text)
-    write_result(options.out / "curves.json", result, dataclasses.asdict(options))
-    write_text(options.out / "curves.md", text)
+    conclude(options, "curves", result, table(result))
     draw(result, options.out / "curves.png")
     return result
 

@@ -16,35 +16,33 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from evflow import estimate_camera, finish
 from evflow.estimation.pipeline import pool_recording
 from experiments.shared.cameras import Hidden, Protocol
-from experiments.shared.common import begin, run_script, write_result, write_text
-from experiments.shared.many import Setup, scores
+from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
+from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH, protocols
 
-NAMES = ("theta_on", "theta_off", "eta_on", "eta_off")
 PAPER = {"theta_on": 0.023, "theta_off": 0.022, "eta_on": 0.045, "eta_off": 0.027}
+HEADS = ("mismatch", "parameter", "recordings", "network", r"refined \|summary - true\|", "median",
+         "constant prior", "paper", "mae_sequence", "mae_pixel", "fired pixels", "constant truth",
+         "map beats summary by", "within 68 %", "within 95 %")
 CONSTANT = {"theta_on": 0.3, "theta_off": 0.3, "eta_on": 0.114, "eta_off": 0.114}
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options(StudyOptions):
     """Evaluate weights on held-out simulated cameras."""
 
-    weights: str = "default"
-    preset: Literal["debug", "full"] = "debug"
     out: Path = Path("out/evaluate")
     seed: int = 1_000_003
     """Far from any training seed: other textures, scenes and cameras."""
     sequences: int | None = None
     """Recordings per row (default: the preset's)."""
-    workers: int = 1
-    """Processes side by side."""
 
 
 def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] | None:
@@ -52,12 +50,11 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     recording, nominal = hidden.recording, hidden.nominal
     if len(recording.events) <= ENOUGH:
         return None
-    stats, _ = pool_recording(params, recording)
-    network, _ = finish(params, stats)
+    network, _ = finish(params, pool_recording(params, recording)[0])
     found = estimate_camera(recording, params)
     counts, signal = recording.events.count_map(), hidden.signal_events()
     errors: dict[str, float] = {}
-    for i, name in enumerate(NAMES):
+    for i, name in enumerate(PAPER):
         true, pixels = float(getattr(nominal, name)), np.asarray(getattr(hidden.camera, name))
         guess, std = (float(getattr(s, name)) for s in (found.summary, found.summary_std))
         seen = np.asarray(getattr(found.camera, name))
@@ -82,7 +79,7 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
 def averages(rows: list[dict[str, float]]) -> dict[str, Any]:
     """Mean errors over the recordings with enough events, per parameter."""
     result: dict[str, Any] = {}
-    for parameter in NAMES:
+    for parameter in PAPER:
         def column(key: str, parameter: str = parameter) -> np.ndarray:
             return np.array([r[f"{key}/{parameter}"] for r in rows])
 
@@ -92,41 +89,30 @@ def averages(rows: list[dict[str, float]]) -> dict[str, Any]:
         result[parameter] |= {
             "sequences": int(used.sum()), "median": float(np.median(column("summary")[used]))}
         for name in ("summary", "map_gain"):
-            error = 1.96 * column(name)[used].std() / np.sqrt(used.sum())
-            result[parameter][f"{name}_ci95"] = float(error)
+            result[parameter][f"{name}_ci95"] = float(
+                1.96 * column(name)[used].std() / np.sqrt(used.sum()))
     return result
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
     """Markdown: ours beside the constant prior and the paper."""
-    lines = ["| mismatch | parameter | recordings | network | refined \\|summary - true\\| | "
-             "median | constant prior | paper | mae_sequence | mae_pixel | fired pixels | constant "
-             "truth | map beats summary by | within 68 % | within 95 % |", "|" + "---|" * 15]
-    for preset, rows in results.items():
-        for name, r in rows.items():
-            lines.append(
-                f"| {preset} | {name} | {r['sequences']} | {r['network']:.4f} | "
-                f"{r['summary']:.4f} ± {r['summary_ci95']:.4f} | {r['median']:.4f} | "
-                f"{r['constant']:.4f} | {PAPER[name]:.3f} | {r['mae_sequence']:.4f} | "
-                f"{r['mae_pixel']:.4f} | {r['mae_fired']:.4f} | {r['constant_truth']:.4f} | "
-                f"{r['map_gain']:.4f} ± {r['map_gain_ci95']:.4f} | {r['inside_68']:.0%} | "
-                f"{r['inside_95']:.0%} |")
-    return "\n".join(lines)
+    return markdown(HEADS, (
+        (preset, name, f"{r['sequences']}", f"{r['network']:.4f}",
+         f"{r['summary']:.4f} ± {r['summary_ci95']:.4f}", f"{r['median']:.4f}",
+         f"{r['constant']:.4f}", f"{PAPER[name]:.3f}", f"{r['mae_sequence']:.4f}",
+         f"{r['mae_pixel']:.4f}", f"{r['mae_fired']:.4f}", f"{r['constant_truth']:.4f}",
+         f"{r['map_gain']:.4f} ± {r['map_gain_ci95']:.4f}", f"{r['inside_68']:.0%}",
+         f"{r['inside_95']:.0%}") for preset, rows in results.items() for name, r in rows.items()))
 
 
 def main(options: Options) -> dict[str, dict[str, Any]]:
     begin(options, "evaluate")
-    sequences = options.sequences or {"debug": 6, "full": 320}[options.preset]
     setup = Setup(options.weights, options.seed)
-    results = {}
-    for name, protocol in protocols().items():
-        jobs = [(i, protocol) for i in range(sequences)]
-        found = scores(score, setup, jobs, options.workers, f"mismatch {name}")
-        results[name] = averages([row for row in found if row is not None])
-    text = table(results)
-    print(text)
-    write_result(options.out / "evaluate.json", results, dataclasses.asdict(options))
-    write_text(options.out / "evaluate.md", text)
+    count = options.count(options.sequences, debug=6, full=320)
+    results = {name: averages(study(
+        score, setup, [protocol] * count, options.workers, f"mismatch {name}"))
+        for name, protocol in protocols().items()}
+    conclude(options, "evaluate", results, table(results))
     return results
 
 

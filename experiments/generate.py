@@ -31,7 +31,7 @@ from evflow.camera import THETA_MIN, CameraPrior
 from evflow.network.api import Params
 from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
-from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.generated import Row, Windows, compare, figures, scene_of, simulated
 
 Array = jax.Array
@@ -138,10 +138,7 @@ def main(options: Options) -> dict[str, Any]:
     result: dict[str, Any] = {name: figures(jax.tree.map(
         lambda *sums: np.sum(sums, 0), *(row[name] for row in rows))) for name in names}
     result["auroc"] = separation({name: np.array([s[name] for s in scores]) for name in scores[0]})
-    text = table(result)
-    print(text)
-    write_result(options.out / "generate.json", result, dataclasses.asdict(options))
-    write_text(options.out / "generate.md", text)
+    conclude(options, "generate", result, table(result))
     return result
 
 

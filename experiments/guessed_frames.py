@@ -24,7 +24,7 @@ from evflow.process.terminal import bar
 from evflow.scenes import make_bank
 from evflow.scenes.config import SceneConfig
 from experiments.shared.cameras import Protocol, hidden_recording
-from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.common import begin, conclude, run_script
 
 THETAS = ("theta_on", "theta_off")
 PROTOCOL = Protocol(
@@ -62,10 +62,7 @@ def main(options: Options) -> dict[str, Any]:
     for path in options.recordings:
         rows.append({"camera": path.stem, **compared(read_recording(path), trained, None)})
     result = {"cameras": rows, **figures([r for r in rows if r["camera"].startswith("hidden")])}
-    write_result(options.out / "guessed_frames.json", result, dataclasses.asdict(options))
-    text = table(result)
-    write_text(options.out / "guessed_frames.md", text)
-    print(text)
+    conclude(options, "guessed_frames", result, table(result))
     return result
 
 

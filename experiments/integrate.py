@@ -35,7 +35,7 @@ from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
 from experiments.shared.cameras import Protocol, hidden_recording
 from experiments.shared.change_systems import cut
-from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.images import SCORES, mean_ci, score
 
 HORIZONS = {"1 frame": 1, "5 frames": 5, "10 frames": 10, "1e5 events": 100_000,
@@ -264,10 +264,7 @@ def main(options: Options) -> dict[str, Any]:
         "images": sum(r[-2] for r in found), "seconds": float(np.mean([r[-1] for r in found]))}
         for name, found in row.items()} for horizon, row in horizons.items()}
         for group, horizons in collected.items()}
-    text = table(result)
-    print(text)
-    write_result(options.out / "integrate.json", result, dataclasses.asdict(options))
-    write_text(options.out / "integrate.md", text)
+    conclude(options, "integrate", result, table(result))
     picture(options.out / "integrate.png", list(shown.values()))
     return result
 

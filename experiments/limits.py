@@ -18,59 +18,36 @@ import functools
 import itertools
 import operator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
 
 from evflow import estimate_camera, finish
-from evflow.camera import Summary
 from evflow.estimation.pipeline import pool_recording
-from evflow.estimation.refine import Chunk, pixel_posterior, refine_summary, refinement_chunks
-from evflow.estimation.refine.path import STEPS
-from evflow.estimation.refine.pixels import evidence_of
-from evflow.estimation.refine.sightings import sight
-from evflow.estimation.refine.signal import told_apart
-from evflow.light.log_maps import lin_log
+from evflow.estimation.refine import pixel_posterior, refine_summary, refinement_chunks
 from evflow.recordings.windows import plan_windows
 from experiments.shared.cameras import Hidden, Protocol
-from experiments.shared.common import begin, run_script, write_result, write_text
-from experiments.shared.many import Setup, scores
+from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
+from experiments.shared.known_video import known_path, noise_told
+from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH, protocols
 
 EDGES = {"signal": (200, 1000, 5000, np.inf), "speed": (0, 2, 6, np.inf)}
 NAMES = ("theta_on", "theta_off")
+HEADS = ("protocol", "figure, stratum", "recordings", "ours", "limit", "ratio")
 FAR = 20.0  # times the network's std
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options(StudyOptions):
     """Compare the estimate with what a known video allows."""
 
-    weights: str = "default"
-    preset: Literal["debug", "full"] = "debug"
     out: Path = Path("out/limits")
     seed: int = 1_000_003
     """The recordings of `experiments.evaluate`."""
     sequences: int | None = None
     """Recordings per row (default: the preset's)."""
-    workers: int = 1
-
-
-def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
-    """The chunk whose first frame is frame `first` of the recording, with the true video between
-    its frames (linear between its milliseconds)."""
-    kept = hidden.kept[first:first + len(chunk.dt_s) + 1]
-    at = np.concatenate([np.linspace(a, b, STEPS, endpoint=False)
-                         for a, b in itertools.pairwise(kept)] + [kept[-1:]])
-    low = np.minimum(at.astype(int), len(hidden.video) - 2)
-    log_video = np.asarray(lin_log(hidden.video[low[0]:low[-1] + 2]))
-    step, part = low - low[0], (at - low)[:, None, None].astype(np.float32)
-    path = log_video[step] * (1 - part) + log_video[step + 1] * part
-    times = hidden.recording.frame_times[first:first + len(kept)]
-    sightings = sight(hidden.recording.events, times, path, STEPS)
-    return dataclasses.replace(chunk, path=path.astype(np.float32), sightings=sightings,
-                               evidence=evidence_of(sightings, first=first == 0))
 
 
 def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] | None:
@@ -88,7 +65,7 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     maps, _ = pixel_posterior(
         functools.reduce(operator.add, (c.evidence for c in known)), best)
     found = estimate_camera(recording, params)
-    told = _noise_told(params, known, best, start)
+    told = noise_told(params, known, best, start)
     signal, counts = hidden.signal_events(), recording.events.count_map()
     exposure = 1e-6 * recording.events.duration_us * counts[0].size
     result = {"speed": float(np.mean(np.concatenate([c.motion_px for c in chunks])))}
@@ -109,16 +86,6 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
             f"ours/{eta} beside the known video": abs(float(getattr(found.summary, eta)) - noise),
             f"limit/{eta} beside the known video": abs(float(told[i]) - noise)}
     return result
-
-
-def _noise_told(
-    params: Any, known: list[Chunk], best: Summary, start: Summary
-) -> np.ndarray:
-    """Noise rates (2,) in Hz of events told apart on the true video, next to nothing known."""
-    theta = np.array([float(best.theta_on), float(best.theta_off)])
-    before = np.log([float(start.eta_on), float(start.eta_off)])
-    log_eta, _ = told_apart(known, theta, before, np.ones(2), next(iter(params.values()))["signal"])
-    return np.exp(log_eta)
 
 
 def _mean(values: Any) -> float:
@@ -149,20 +116,15 @@ def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "limits")
-    sequences = options.sequences or {"debug": 4, "full": 100}[options.preset]
+    sequences = options.count(options.sequences, debug=4, full=100)
     setup = Setup(options.weights, options.seed)
     result: dict[str, Any] = {}
-    lines = ["| protocol | figure, stratum | recordings | ours | limit | ratio |", "|" + "---|" * 6]
     for name, protocol in protocols().items():
-        jobs = [(i, protocol) for i in range(sequences)]
-        rows = [r for r in scores(score, setup, jobs, options.workers, name) if r is not None]
-        result[name] = strata(rows)
-        lines += [f"| {name} | {k} | {v['recordings']} | {v['ours']:.4f} | {v['limit']:.4f} | "
-                  f"{v['ratio']:.2f} |" for k, v in result[name].items()]
-    text = "\n".join(lines)
-    print(text)
-    write_result(options.out / "limits.json", result, dataclasses.asdict(options))
-    write_text(options.out / "limits.md", text)
+        result[name] = strata(study(
+            score, setup, [protocol] * sequences, options.workers, name))
+    conclude(options, "limits", result, markdown(HEADS, (
+        (name, k, f"{v['recordings']}", f"{v['ours']:.4f}", f"{v['limit']:.4f}",
+         f"{v['ratio']:.2f}") for name, found in result.items() for k, v in found.items())))
     return result
 
 

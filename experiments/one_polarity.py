@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -22,27 +22,26 @@ from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import pool_recording
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
-from experiments.shared.common import begin, run_script, write_result, write_text
-from experiments.shared.many import Setup, scores
+from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
+from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH
 
 CASES: dict[str, dict[str, Any]] = {
     "brighter": {}, "darker": {}, "OFF unreached": {"off": "unreached"},
     "OFF left out": {"off": "dropped"}}
 FADES = (1.5, 5.0)
+HEADS = ("case", "recordings", "said to be undetermined", "θ of the other: error", "std",
+         "in 68 / 95 %", "η: in 68 / 95 %", "network alone: error of θ", "in 68 / 95 %")
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options(StudyOptions):
     """Measure thresholds and intervals where one polarity tells nothing."""
 
-    weights: str = "default"
-    preset: Literal["debug", "full"] = "debug"
     out: Path = Path("out/one_polarity")
     seed: int = 7_000_003
     recordings: int | None = None
     """Recordings per case (default: the preset's)."""
-    workers: int = 1
 
 
 def drawn(rng: np.random.Generator, case: str) -> Protocol:
@@ -66,8 +65,7 @@ def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, float] |
         found = estimate_camera(hidden.recording, params)
     except EvflowDataError:
         return None
-    stats, _ = pool_recording(params, hidden.recording)
-    network, network_std = finish(params, stats)
+    network, network_std = finish(params, pool_recording(params, hidden.recording)[0])
 
     def away(guess: Summary, std: Summary, kind: str) -> float:
         true = float(getattr(hidden.nominal, f"{kind}_{name}"))
@@ -97,32 +95,24 @@ def averages(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def table(results: dict[str, dict[str, float]]) -> str:
-    lines = ["| case | recordings | said to be undetermined | θ of the other: error | std | "
-             "in 68 / 95 % | η: in 68 / 95 % | network alone: error of θ | in 68 / 95 % |",
-             "|" + "---|" * 9]
-    for case, r in results.items():
-        lines.append(
-            f"| {case} | {r['recordings']} | {r['said']:.0%} | {r['error']:.1%} | {r['std']:.1%} | "
-            f"{r['theta in 68']:.0%} / {r['theta in 95']:.0%} | "
-            f"{r['eta in 68']:.0%} / {r['eta in 95']:.0%} | {r['network error']:.1%} | "
-            f"{r['network theta in 68']:.0%} / {r['network theta in 95']:.0%} |")
-    return "\n".join(lines)
+    def inside(r: dict[str, float], kind: str) -> str:
+        return f"{r[f'{kind} in 68']:.0%} / {r[f'{kind} in 95']:.0%}"
+
+    return markdown(HEADS, (
+        (case, f"{r['recordings']}", f"{r['said']:.0%}", f"{r['error']:.1%}", f"{r['std']:.1%}",
+         inside(r, "theta"), inside(r, "eta"), f"{r['network error']:.1%}",
+         inside(r, "network theta")) for case, r in results.items()))
 
 
 def main(options: Options) -> dict[str, dict[str, float]]:
     begin(options, "one_polarity")
-    count = options.recordings or {"debug": 3, "full": 100}[options.preset]
-    setup = Setup(options.weights, options.seed)
-    results = {}
+    count = options.count(options.recordings, debug=3, full=100)
+    setup, results = Setup(options.weights, options.seed), {}
     for case in CASES:
-        jobs = [(i, drawn(np.random.default_rng((options.seed, i)), case)) for i in range(count)]
-        rows = [r for r in scores(score, setup, jobs, options.workers, case) if r is not None]
-        if rows:
+        cases = [drawn(np.random.default_rng((options.seed, i)), case) for i in range(count)]
+        if rows := study(score, setup, cases, options.workers, case):
             results[case] = averages(rows)
-    text = table(results)
-    print(text)
-    write_result(options.out / "one_polarity.json", results, dataclasses.asdict(options))
-    write_text(options.out / "one_polarity.md", text)
+    conclude(options, "one_polarity", results, table(results))
     return results
 
 

@@ -32,7 +32,7 @@ from evflow.network.coordinates import squash_summary, summary_std, unsquash_sum
 from evflow.network.weights import model_card, save_weights
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, estimator, run_script
-from experiments.shared.many import Setup, scores
+from experiments.shared.many import Setup, study
 from experiments.shared.refinement import COVERED, before_refinement
 
 Array = jax.Array
@@ -145,9 +145,9 @@ def main(options: Options) -> dict[str, float]:
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights)
     setup = Setup(str(options.weights), options.seed, photos=True)
-    jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i))))
-            for i in range(options.recordings)]
-    made = [r for r in scores(row, setup, jobs, options.workers, "recordings") if r is not None]
+    protocols = [draw_protocol(np.random.default_rng((options.seed, i)))
+                 for i in range(options.recordings)]
+    made = study(row, setup, protocols, options.workers, "recordings")
     part = partial(_some, made)
     widen, figures = judged(part(True), train(part(False), options))
     signal = {**train(part(True) + part(False), options), "widen": jnp.float32(widen)}

@@ -8,9 +8,9 @@ import dataclasses
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import tyro
 
@@ -22,6 +22,22 @@ from evflow.process.provenance import provenance
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
 HOW = ("out", "workers", "max_seconds")  # options that change nothing in a result
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """Options of a study over hidden recordings."""
+
+    weights: str = "default"
+    preset: Literal["debug", "full"] = "debug"
+    out: Path
+    seed: int
+    workers: int = 1
+    """Processes side by side."""
+
+    def count(self, given: int | None, debug: int, full: int) -> int:
+        """How many recordings: as many as were asked for, else the preset's."""
+        return given or {"debug": debug, "full": full}[self.preset]
 
 
 def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> None:
@@ -37,6 +53,19 @@ def write_text(path: Path, text: str) -> None:
     """Save a table, whole or not at all."""
     with atomic_write(path, overwrite=True) as temporary:
         temporary.write_text(text + "\n")
+
+
+def conclude(options: Any, name: str, result: dict[str, Any], text: str) -> None:
+    """Print a script's table, and write NAME.json and NAME.md into options.out."""
+    print(text)
+    write_result(options.out / f"{name}.json", result, dataclasses.asdict(options))
+    write_text(options.out / f"{name}.md", text)
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table of cells under `heads`."""
+    lines = (f"| {' | '.join(cells)} |" for cells in rows)
+    return "\n".join((f"| {' | '.join(heads)} |", "|" + "---|" * len(heads), *lines))
 
 
 def hashes(config: dict[str, Any]) -> dict[str, str]:

@@ -59,6 +59,16 @@ def scores(
             yield result
 
 
+def study(
+    score: Score[Result | None], setup: Setup, protocols: Sequence[Protocol], workers: int,
+    title: str,
+) -> list[Result]:
+    """`scores` of one recording of each protocol, numbered from 0; without those that are None,
+    of recordings that tell nothing."""
+    made = scores(score, setup, list(enumerate(protocols)), workers, title)
+    return [row for row in made if row is not None]
+
+
 def _scores(
     score: Score[Result], setup: Setup, jobs: Sequence[tuple[int, Protocol]], workers: int
 ) -> Iterator[Result]:

@@ -1,0 +1,42 @@
+"""The refinement where the video between the frames is known: what remains is the counts' noise."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import Any
+
+import numpy as np
+
+from evflow.camera import Summary
+from evflow.estimation.refine import Chunk
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.pixels import evidence_of
+from evflow.estimation.refine.sightings import sight
+from evflow.estimation.refine.signal import told_apart
+from evflow.light.log_maps import lin_log
+from experiments.shared.cameras import Hidden
+
+
+def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
+    """The chunk whose first frame is frame `first` of the recording, with the true video between
+    its frames (linear between its milliseconds)."""
+    kept = hidden.kept[first:first + len(chunk.dt_s) + 1]
+    at = np.concatenate([np.linspace(a, b, STEPS, endpoint=False)
+                         for a, b in itertools.pairwise(kept)] + [kept[-1:]])
+    low = np.minimum(at.astype(int), len(hidden.video) - 2)
+    log_video = np.asarray(lin_log(hidden.video[low[0]:low[-1] + 2]))
+    step, part = low - low[0], (at - low)[:, None, None].astype(np.float32)
+    path = log_video[step] * (1 - part) + log_video[step + 1] * part
+    times = hidden.recording.frame_times[first:first + len(kept)]
+    sightings = sight(hidden.recording.events, times, path, STEPS)
+    return dataclasses.replace(chunk, path=path.astype(np.float32), sightings=sightings,
+                               evidence=evidence_of(sightings, first=first == 0))
+
+
+def noise_told(params: Any, known: list[Chunk], best: Summary, start: Summary) -> np.ndarray:
+    """Noise rates (2,) in Hz of events told apart on the true video, next to nothing known."""
+    theta = np.array([float(best.theta_on), float(best.theta_off)])
+    before = np.log([float(start.eta_on), float(start.eta_off)])
+    log_eta, _ = told_apart(known, theta, before, np.ones(2), next(iter(params.values()))["signal"])
+    return np.exp(log_eta)

@@ -1,0 +1,108 @@
+"""The scripts as a set: each stands alone, is short or known to be long, and has a small preset."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import typing
+from pathlib import Path
+
+import pytest
+
+import experiments
+from experiments import evaluate, template
+from experiments.shared.cameras import Protocol
+from experiments.shared.common import StudyOptions, markdown
+from experiments.shared.many import Setup, study
+
+FOLDER = Path(next(iter(experiments.__path__)))
+SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem != "__init__")
+LINES = 120
+# Whose measure, drawing or fit is their own, and reads best beside its use.
+LONG = {"ablate", "changes", "compare_systems", "coverage", "curves", "evaluate_network", "fuse",
+        "generate", "integrate", "limits", "models", "noise", "noise_rates", "quickstart",
+        "see_better", "tell_apart", "train_eventgan", "train_network"}
+NO_DEBUG = {
+    "quickstart": "one small recording, whose size is asked for",
+    "evaluate_network": "as long as the recordings it is given",
+    "guessed_frames": "as many cameras as are asked for",
+    "combine": "computes next to nothing",
+    "calibrate": "as many steps as are asked for",
+    "fuse": "as many recordings as are asked for",
+    "tell_apart": "as many recordings as are asked for"}
+
+
+def tree(name: str) -> ast.Module:
+    return ast.parse((FOLDER / f"{name}.py").read_text())
+
+
+def modules(path: Path) -> set[str]:
+    """What a file imports of experiments, in full."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return {name for name in found if name.split(".")[0] == "experiments"}
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")),
+                         ids=lambda p: str(p.relative_to(FOLDER)))
+def test_nothing_imports_a_script(path: Path) -> None:
+    for name in modules(path):
+        assert name.startswith("experiments.shared."), f"{path} imports {name}"
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_has_options_a_main_and_few_lines(name: str) -> None:
+    script = importlib.import_module(f"experiments.{name}")
+    assert dataclasses.is_dataclass(script.Options)
+    assert callable(script.main)
+    assert ast.get_docstring(tree(name))
+    assert f"python -m experiments.{name}" in script.__doc__
+    lines = len((FOLDER / f"{name}.py").read_text().splitlines())
+    assert (lines > LINES) == (name in LONG)
+    assert lines <= 300
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_has_a_debug_preset_or_a_reason(name: str) -> None:
+    hints = typing.get_type_hints(importlib.import_module(f"experiments.{name}").Options)
+    assert ("debug" in typing.get_args(hints.get("preset"))) == (name not in NO_DEBUG)
+
+
+def test_reasons_are_of_scripts() -> None:
+    assert set(NO_DEBUG) | LONG <= set(SCRIPTS)
+
+
+def test_a_table_has_a_line_a_row() -> None:
+    assert markdown(("a", "b"), [("1", "2"), ("3", "4")]) == (
+        "| a | b |\n|---|---|\n| 1 | 2 |\n| 3 | 4 |")
+
+
+def test_a_study_counts_as_the_preset_does() -> None:
+    options = StudyOptions(out=Path(), seed=0)
+    assert options.count(None, debug=3, full=9) == 3
+    assert dataclasses.replace(options, preset="full").count(None, debug=3, full=9) == 9
+    assert options.count(5, debug=3, full=9) == 5
+
+
+def nothing(_params: object, _hidden: object, protocol: Protocol) -> int | None:
+    return protocol.intervals if protocol.intervals > 2 else None
+
+
+def test_a_study_leaves_out_what_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("experiments.shared.many.hidden_recording", lambda *_: None)
+    protocols = [Protocol(intervals=n) for n in (2, 4, 3)]
+    assert study(nothing, Setup("default", 0), protocols, 1, "recordings") == [4, 3]
+
+
+@pytest.mark.slow
+def test_the_template_runs(tmp_path: Path) -> None:
+    result = template.main(template.Options(out=tmp_path))
+    assert result.keys() == {"theta_on", "theta_off"}
+    assert all(0 < v < 0.2 for v in result.values())
+    assert {p.name for p in tmp_path.iterdir()} == {"template.json", "template.md"}
+    assert evaluate.Options().weights == template.Options().weights
