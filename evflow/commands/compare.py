@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from evflow.commands.options import Reading, note_idle, own_first, value, write_json
+from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_absent, need_folder
 
 if TYPE_CHECKING:
@@ -54,7 +55,6 @@ class Compare(Reading):
     def run(self) -> None:
         from evflow.metrics.streams import compare
         from evflow.process.provenance import sha256, told
-        from evflow.report import plots
         from evflow.report.streams import write_comparison
         from evflow.report.verdict import describe_streams, judge_streams, worst
 
@@ -64,8 +64,7 @@ class Compare(Reading):
             [self.out / "compare.html"] if self.plots else [])
         for target in targets:
             need_absent(target, self.overwrite)
-        if self.out and self.plots:
-            plots.require()
+        need_packages(self.real, self.synthetic, pictures=bool(self.out) and self.plots)
         note_idle(self, "streams are compared by their events alone")
         real, synthetic = self._streams()
         numbers = compare(real, synthetic)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from evflow.commands.options import Reading, check_finite, own_first, refuse, write_json
+from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
 from evflow.notes import Note, as_dicts
@@ -76,8 +77,7 @@ class Estimate(Reading):
                    "of use with --protocol motion only")
         if not self.reconstruct:
             refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
-        if self.plots or (self.report and moving):
-            plots.require()
+        need_packages(self.recording, pictures=self.plots or (self.report and moving))
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording = self.read(self.recording)
             doubts = self._checked(recording)

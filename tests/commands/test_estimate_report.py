@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,25 @@ def test_without_matplotlib_it_says_so_at_once(
     said = capsys.readouterr().err
     assert "EV010" in said
     assert "--no-plots" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_all_that_is_missing_is_named_once_the_path_is_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    for name in ("h5py", "matplotlib"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["estimate", str(tmp_path / "absent.h5"), "-o", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err.startswith("EV016")
+    for command in (["estimate", "a.h5"], ["compare", "a.h5", "a.h5"]):
+        inputs = [str(tmp_path / name) for name in command[1:]]
+        assert main([command[0], *inputs, "-o", str(tmp_path / "out")]) == 1
+        said = capsys.readouterr().err
+        assert said.startswith("EV010")
+        assert "h5py" in said
+        assert "matplotlib" in said
+        assert "evflow-jax[io,viz]" in said
     assert not (tmp_path / "out").exists()
 
 

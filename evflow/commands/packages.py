@@ -1,0 +1,39 @@
+"""Optional packages that a command needs: all that are missing are named at once, before any long
+work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from evflow.errors import EvflowDataError
+
+# What a format is read by.
+READERS = {"dsec": "h5py", "v2e": "h5py", "mvsec": "h5py", "event_utils": "h5py",
+           "aedat4": "aedat", "rosbag": "rosbags", "rosbag2": "rosbags"}
+EXTRAS = {"h5py": "io", "aedat": "io", "rosbags": "ros", "matplotlib": "viz"}
+
+
+def need_packages(*recordings: Path, pictures: bool) -> None:
+    """Raise EV010, naming all packages that are missing for these recordings and, if wanted, for
+    pictures; before it EV008, EV009, EV016 where a recording is none."""
+    from evflow.io.registry import find_format
+
+    uses = {READERS[name]: f"to read {path}" for path in recordings
+            if (name := find_format(path).NAME) in READERS}
+    if pictures:
+        uses["matplotlib"] = "for pictures"
+    missing = [name for name in uses if not _installed(name)]
+    if missing:
+        extras = ",".join(sorted({EXTRAS[name] for name in missing}))
+        without = ", or pass --no-plots --no-report" if missing == ["matplotlib"] else ""
+        raise EvflowDataError(
+            "EV010", f"needed: {'; '.join(f'{name} {uses[name]}' for name in missing)}.",
+            f'pip install "evflow-jax[{extras}]"{without}.')
+
+
+def _installed(name: str) -> bool:
+    try:
+        __import__(name)
+    except ImportError:
+        return False
+    return True
