@@ -139,7 +139,8 @@ def check_frames(frames: np.ndarray, size: Size) -> None:
     if frames.ndim == 4 and frames.shape[-1] in (3, 4):
         raise EvflowDataError(
             "EV002", f"frames are colour, {frames.shape}.",
-            "Convert them: frames = evflow.types.luma(frames[..., :3]) (RGB, Rec. 709).")
+            "Convert them: frames = evflow.light.colour.luma(frames[..., 2::-1]) of R, G, B(, A); "
+            "frames[..., :3] of OpenCV's B, G, R(, A).")
     if frames.ndim != 3:
         raise EvflowDataError("EV002", f"frames have shape {frames.shape}.", "Expected (T, H, W).")
     if frames.dtype not in (np.uint8, np.uint16, np.float32):
