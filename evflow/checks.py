@@ -27,6 +27,13 @@ def need(value: Any, kind: Any, name: str, fix: str) -> None:
             "EV020", f"{name} is of type {type(value).__name__}; expected {expected}.", fix)
 
 
+def require(config: Any, name: str, good: bool, rule: str) -> None:
+    """EV020 unless `good`: the field `name` of a configuration must follow `rule`."""
+    if not good:
+        kind, value = type(config).__name__, getattr(config, name)
+        raise EvflowDataError("EV020", f"{kind}({name}={value!r}).", f"It must be {rule}.")
+
+
 def check_size(size: Any) -> Size:
     """(width, height) as ints, 1..65536, or EV020."""
     try:
