@@ -16,7 +16,8 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
-from evflow.io.hints import UNITS_US, Hints, check_choices, known
+from evflow.io.decode.units import UNITS_US
+from evflow.io.hints import Hints, check_choices, known
 from evflow.light import response
 from evflow.light.colour import (
     COLOURS,
