@@ -27,6 +27,13 @@ def need(value: Any, kind: Any, name: str, fix: str) -> None:
             "EV020", f"{name} is of type {type(value).__name__}; expected {expected}.", fix)
 
 
+def require(config: Any, name: str, good: bool, rule: str) -> None:
+    """EV020 unless `good`: the field `name` of a configuration must follow `rule`."""
+    if not good:
+        kind, value = type(config).__name__, getattr(config, name)
+        raise EvflowDataError("EV020", f"{kind}({name}={value!r}).", f"It must be {rule}.")
+
+
 def check_size(size: Any) -> Size:
     """(width, height) as ints, 1..65536, or EV020."""
     try:
@@ -139,7 +146,8 @@ def check_frames(frames: np.ndarray, size: Size) -> None:
     if frames.ndim == 4 and frames.shape[-1] in (3, 4):
         raise EvflowDataError(
             "EV002", f"frames are colour, {frames.shape}.",
-            "Convert them: frames = evflow.types.luma(frames[..., :3]) (RGB, Rec. 709).")
+            "Convert them: frames = evflow.light.colour.luma(frames[..., 2::-1]) of R, G, B(, A); "
+            "frames[..., :3] of OpenCV's B, G, R(, A).")
     if frames.ndim != 3:
         raise EvflowDataError("EV002", f"frames have shape {frames.shape}.", "Expected (T, H, W).")
     if frames.dtype not in (np.uint8, np.uint16, np.float32):

@@ -31,7 +31,6 @@ from evflow.errors import EvflowDataError
 from evflow.notes import Note
 
 BIT_DEPTHS = (8, 10, 12, 14, 16)  # of the converters in image sensors; 16-bit files hold any
-LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709 weights of R, G, B
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -276,16 +275,6 @@ class Window:
     def window_s(self) -> float:
         """Length in seconds, the `window_s` of `estimate`."""
         return (self.t1_us - self.t0_us) / 1e6
-
-
-def luma(frames: np.ndarray) -> np.ndarray:
-    """Grey frames of colour ones, (..., 3) RGB -> (...), by the Rec. 709 weights.
-
-    uint16 stays uint16 (rounded) and so keeps its full scale; uint8 and float32 become float32
-    in 0..255, unrounded, so that no contrast step is added.
-    """
-    grey = frames.astype(np.float32) @ LUMA
-    return np.rint(grey).astype(np.uint16) if frames.dtype == np.uint16 else grey
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evflow.errors import EvflowDataError
-from evflow.types import Events, Recording, luma
+from evflow.types import Events, Recording
 
 SIZE = (6, 4)
 COLUMNS = {"x": [0, 5, 2], "y": [0, 3, 1], "t": [10, 10, 12], "p": [0, 1, 1]}
@@ -177,11 +177,3 @@ def test_recording_without_frames() -> None:
     assert not recording.has_frames
     assert recording.frames.shape == (0, 4, 6)
     assert recording.full_scale == 255
-
-
-def test_luma_keeps_grey_and_scale() -> None:
-    grey = np.repeat(frames()[..., None], 3, axis=-1)
-    np.testing.assert_allclose(luma(grey), frames(), rtol=1e-6)
-    assert luma(grey).dtype == np.float32
-    assert luma(grey.astype(np.uint16) * 1000).dtype == np.uint16
-    assert luma(np.array([255, 0, 0], np.uint8)) == pytest.approx(54.213)

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from evflow.checks import require
 from evflow.errors import EvflowDataError
 
 LogMap = Literal["auto", "linlog", "log_eps"]
@@ -46,9 +47,8 @@ class Voltmeter:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():  # the leak, k4 + k5 L, may have either sign
             low = {"k1": 1e-30, "k2": 1e-30, "k4": -np.inf, "k5": -np.inf}.get(name, 0.0)
-            if not (np.isfinite(value) and value >= low):
-                raise EvflowDataError("EV020", f"Voltmeter({name}={value}).",
-                                      f"It must be finite, and at least {low:g}.")
+            good = bool(np.isfinite(value)) and value >= low
+            require(self, name, good, f"finite, and at least {low:g}")
 
 
 DVS346 = Voltmeter(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
@@ -116,9 +116,8 @@ class SensorModel:
                     "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
         for name in ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades",
                      "shot_hz"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise EvflowDataError(
-                    "EV020", f"SensorModel({name}={getattr(self, name)}).", "It must be >= 0.")
+            value = getattr(self, name)
+            require(self, name, bool(np.isfinite(value)) and value >= 0, ">= 0")
         for name in WITHOUT[self.kind]:
             if getattr(self, name):
                 raise EvflowDataError(

@@ -111,15 +111,14 @@ class Reading:
         from evflow.recordings import adjust
 
         offset = 0 if self.frames_offset_ms == "auto" else round(self.frames_offset_ms * 1000)
-        pattern = parse_bayer(self.bayer)
         if self.frames is None:
             recording = adjust.shifted(recording, offset)
-            recording = adjust.demosaiced(recording, pattern) if pattern else recording
+            recording = adjust.demosaiced(recording, self.bayer) if self.bayer else recording
         else:
             recording = adjust.with_frames(
                 recording, self.frames, offset_us=offset, fps=self.frames_fps,
                 timestamps=self.timestamps, time_unit=self.timestamps_unit,
-                full_scale=self.full_scale, partial=self.partial, bayer=pattern)
+                full_scale=self.full_scale, partial=self.partial, bayer=self.bayer)
         if self.flip_frames != "none":
             recording = adjust.flipped(recording, self.flip_frames)
         recording = adjust.linearised(recording, self.response)
@@ -178,16 +177,6 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if not (width.isdecimal() and height.isdecimal()):
         raise EvflowDataError("EV020", f"size {text!r}.", "Give it as WxH: --size 346x260.")
     return int(width), int(height)
-
-
-def parse_bayer(text: str | None) -> str | None:
-    """A pattern of `colour.PATTERNS`, of any case; EV020 on anything else."""
-    from evflow.light.colour import PATTERNS
-
-    if text is None or text.lower() in PATTERNS:
-        return text and text.lower()
-    raise EvflowDataError("EV020", f"--bayer {text}.",
-                          f"Choose from {', '.join(p.upper() for p in PATTERNS)}.")
 
 
 def write_json(path: Path, facts: dict[str, Any]) -> None:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from evflow.commands.options import check_finite, parse_bayer, refuse, value
+from evflow.commands.options import check_finite, refuse, value
 from evflow.commands.writing import Format, named, need_absent
 from evflow.errors import EvflowDataError
+from evflow.light.colour import Colour
 from evflow.notes import as_dicts
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ class Simulate:
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of those times, or of a recording's; auto takes the one that gives a plausible frame
     rate, of a recording its format's own."""
-    colour: Literal["luma", "rggb", "bggr", "grbg", "gbrg"] = "luma"
+    colour: Colour = "luma"
     """What a pixel sees of colour: luma, or its channel under this Bayer mosaic. Frames with one
     channel are taken as the mosaic itself."""
     bayer: Annotated[str | None, value("RGGB|BGGR|GRBG|GBRG")] = None
@@ -150,7 +151,7 @@ class Simulate:
         return open_frames(
             self.video, fps=self.fps, timestamps=self.timestamps, colour=self.colour,
             time_unit=self.time_unit, full_scale=self.full_scale, partial=self.partial,
-            bayer=parse_bayer(self.bayer), response=self.response, flip=self.flip_frames,
+            bayer=self.bayer, response=self.response, flip=self.flip_frames,
             start_s=self.start, stop_s=self.stop)
 
     def _model(self) -> SensorModel:

@@ -12,8 +12,8 @@ from typing import Any
 
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SensorModel
+from evflow.checks import require
 from evflow.dataset.sequence import sequence_names
-from evflow.errors import EvflowDataError
 from evflow.scenes.config import SceneConfig
 
 
@@ -56,21 +56,16 @@ class DatasetConfig:
     def __post_init__(self) -> None:
         for name, least in (("train", 0), ("test", 0), ("width", 8), ("height", 8),
                             ("textures", 0), ("photos", 0), ("texture_px", 16), ("cutout_px", 16)):
-            self._require(name, getattr(self, name) >= least, f">= {least}")
-        self._require("train", self.train + self.test > 0, "> 0 where test is 0")
-        self._require("textures", self.textures + self.photos > 0, "> 0 where photos is 0")
+            require(self, name, getattr(self, name) >= least, f">= {least}")
+        require(self, "train", self.train + self.test > 0, "> 0 where test is 0")
+        require(self, "textures", self.textures + self.photos > 0, "> 0 where photos is 0")
         for name in ("lead_s", "frame_noise_dn"):
-            self._require(name, 0 <= getattr(self, name) < math.inf, ">= 0")
+            require(self, name, 0 <= getattr(self, name) < math.inf, ">= 0")
         for name, whole in (("render_hz", 1_000_000), ("frame_hz", self.render_hz)):
             rate = getattr(self, name)
-            self._require(name, rate > 0 and whole % rate == 0, f"a divisor of {whole}")
-        self._require("seconds", 1 <= self.seconds * self.frame_hz < math.inf,
-                      f"at least one frame interval, {1 / self.frame_hz:g} s")
-
-    def _require(self, name: str, good: bool, rule: str) -> None:
-        if not good:
-            raise EvflowDataError(
-                "EV020", f"DatasetConfig({name}={getattr(self, name)!r}).", f"It must be {rule}.")
+            require(self, name, rate > 0 and whole % rate == 0, f"a divisor of {whole}")
+        require(self, "seconds", 1 <= self.seconds * self.frame_hz < math.inf,
+                f"at least one frame interval, {1 / self.frame_hz:g} s")
 
     @property
     def shape(self) -> tuple[int, int]:

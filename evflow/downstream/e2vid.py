@@ -13,8 +13,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from evflow.checks import require
 from evflow.downstream.layers import ConvLayer, ConvLSTM, ResidualBlock, decoder
-from evflow.downstream.network import Network, State, require
+from evflow.downstream.network import Network, State
 
 Array = jax.Array
 

@@ -17,8 +17,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from evflow.checks import require
 from evflow.downstream.layers import ConvLayer, ResidualBlock, upsample2
-from evflow.downstream.network import Network, Params, State, require
+from evflow.downstream.network import Network, Params, State
 
 Array = jax.Array
 

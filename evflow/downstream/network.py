@@ -13,6 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from evflow.checks import require
 from evflow.errors import EvflowDataError
 
 Array = jax.Array
@@ -115,13 +116,6 @@ class Network:
 def as_floats(voxels: Any, params: Params) -> Array:
     """On the device, of the dtype that the network's numbers will have."""
     return jnp.asarray(voxels, jnp.result_type(voxels, *jax.tree.leaves(params)))
-
-
-def require(network: Any, name: str, good: bool, rule: str) -> None:
-    """EV020 unless `good`: network.name must follow `rule`."""
-    if not good:
-        kind, value = type(network).__name__, getattr(network, name)
-        raise EvflowDataError("EV020", f"{kind}({name}={value!r}).", f"It must be {rule}.")
 
 
 def run(

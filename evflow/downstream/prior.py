@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.camera import THETA_MIN, Camera
+from evflow.checks import require
 from evflow.errors import EvflowDataError
 
 Array = jax.Array
@@ -34,8 +35,7 @@ class WidePrior:
             if not least <= low <= high < math.inf:
                 raise EvflowDataError("EV020", f"WidePrior({name}={(low, high)}).",
                                       f"Give (low, high), {least} <= low <= high.")
-        if not 1 <= self.ratio < math.inf:
-            raise EvflowDataError("EV020", f"WidePrior(ratio={self.ratio}).", "It must be >= 1.")
+        require(self, "ratio", 1 <= self.ratio < math.inf, ">= 1")
 
     def sample(self, key: Array, shape: tuple[int, int]) -> Camera:
         """One camera of (H, W) pixels."""

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from evflow.camera import Camera, CameraPrior
 from evflow.camera.sensors import SensorModel
+from evflow.checks import require
 from evflow.downstream.prior import WidePrior
 from evflow.downstream.tensor import BINS, normalise, signed
 from evflow.errors import EvflowDataError
@@ -58,16 +59,11 @@ class SequenceConfig:
     def __post_init__(self) -> None:
         least = {"sequences": 1, "windows": 2, "steps_per_window": 1, "crop": 16, "bins": 2}
         for name, bound in least.items():
-            self._require(name, getattr(self, name) >= bound, f">= {bound}")
+            require(self, name, getattr(self, name) >= bound, f">= {bound}")
         for name in ("pause", "resume", "hot_pixels"):
-            self._require(name, 0 <= getattr(self, name) <= 1, "in [0, 1]")
-        self._require("window_s", self.window_s > 0, "> 0")
-        self._require("noise", self.noise >= 0, ">= 0")
-
-    def _require(self, name: str, good: bool, rule: str) -> None:
-        if not good:
-            raise EvflowDataError("EV020", f"SequenceConfig({name}={getattr(self, name)!r}).",
-                                  f"It must be {rule}.")
+            require(self, name, 0 <= getattr(self, name) <= 1, "in [0, 1]")
+        require(self, "window_s", self.window_s > 0, "> 0")
+        require(self, "noise", self.noise >= 0, ">= 0")
 
 
 @jax.tree_util.register_dataclass

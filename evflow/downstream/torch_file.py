@@ -14,13 +14,14 @@ import math
 import os
 import struct
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files import pickles
 from evflow.files.archives import is_zip, unzipped
+from evflow.files.bounded import BoundedPath
 
 ZIP_BEGIN = b"PK\x03\x04"
 MAGIC = 0x1950A86A20F9469CFC6C  # of the chain of pickles
@@ -51,21 +52,15 @@ DROPPED = (
 
 @dataclasses.dataclass(frozen=True)
 class _Storage:
-    """A flat buffer elsewhere in the file: its key, type and number of elements."""
+    """A flat buffer elsewhere in the file, `fill`ed once the pickle is read: tensors are views."""
 
-    key: str
     kind: str
-    count: int
+    data: np.ndarray
 
-
-@dataclasses.dataclass(frozen=True)
-class _Tensor:
-    """A view of a storage that is yet to be read; offset, shape and strides in elements."""
-
-    storage: _Storage
-    offset: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
+    def fill(self, raw: bytes) -> None:
+        if len(raw) != self.data.nbytes:
+            raise ValueError(f"a storage of {self.data.nbytes} bytes has {len(raw)}")
+        self.data.view(np.uint8)[:] = np.frombuffer(raw, np.uint8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +86,7 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
         raise EvflowDataError("EV020", f"{path} has {path.stat().st_size} bytes.",
                               f"The largest that is read has {MOST_BYTES}.")
     try:
-        read = _read_zip if is_zip(path) else _read_chain
-        content, storages = read(path)
-        return _checkpoint(path, content, storages)
+        return _checkpoint(path, _read_zip(path) if is_zip(path) else _read_chain(path))
     except pickles.Refused as e:
         raise EvflowDataError(
             "EV009", f"{path}: {e}.", "Nothing but weights is read. Where the file does load, save "
@@ -104,9 +97,9 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
             "Copy it again; only files of torch.save with a state dict are read.") from e
 
 
-def _read_chain(path: Path) -> tuple[Any, dict[str, bytes]]:
+def _read_chain(path: Path) -> Any:
     """Magic, protocol, system, object, keys; then each storage, its length before it."""
-    with open(path, "rb") as f:
+    with BoundedPath(path).open("rb") as f:
         try:
             known = pickles.load(f, {}) == MAGIC
         except ValueError:
@@ -123,59 +116,42 @@ def _read_chain(path: Path) -> tuple[Any, dict[str, bytes]]:
         system = pickles.load(f, {})
         if not isinstance(system, dict) or not system.get("little_endian"):
             raise ValueError("it was written on a big-endian machine")
-        needed: dict[str, _Storage] = {}
-        content = pickles.load(f, _names(), functools.partial(_refer, needed))
-        found = _read_storages(f, pickles.load(f, {}), needed)
-    return content, found
+        found: dict[str, _Storage] = {}
+        refer = functools.partial(_refer, found, path.stat().st_size)
+        content, keys = pickles.load(f, _NAMES, refer), pickles.load(f, {})
+        strings = isinstance(keys, list) and all(isinstance(key, str) for key in keys)
+        if not strings or sorted(keys) != sorted(found):
+            raise ValueError("its list of storages is not that of its tensors")
+        for storage in map(found.__getitem__, keys):
+            (count,) = struct.unpack("<q", f.read(8))
+            if count != len(storage.data):
+                raise ValueError(f"a storage has {count} elements, not {len(storage.data)}")
+            storage.fill(f.read(storage.data.nbytes))
+    return content
 
 
-def _read_storages(f: IO[bytes], keys: Any, needed: dict[str, _Storage]) -> dict[str, bytes]:
-    strings = isinstance(keys, list) and all(isinstance(key, str) for key in keys)
-    if not strings or set(keys) != set(needed):
-        raise ValueError("its list of storages is not that of its tensors")
-    found = {}
-    for key in keys:
-        storage = needed[key]
-        (count,) = struct.unpack("<q", f.read(8))
-        if count != storage.count:
-            raise ValueError(f"storage {key[:40]} has {count} elements, not {storage.count}")
-        found[key] = f.read(_bytes_of(storage))
-    return found
-
-
-def _read_zip(path: Path) -> tuple[Any, dict[str, bytes]]:
+def _read_zip(path: Path) -> Any:
     """The members data.pkl and data/<key> of the archive's one folder. What the pickle asks for is
     judged outside of `unzipped`, to which all that is wrong is damage."""
     with unzipped(path) as archive:
-        members = set(archive.namelist())
-        roots = [n.removesuffix("data.pkl") for n in members if n.endswith("/data.pkl")]
+        sizes = {info.filename: info.file_size for info in archive.infolist()}
+        roots = [n.removesuffix("data.pkl") for n in sizes if n.endswith("/data.pkl")]
         if len(roots) != 1:
             raise EvflowDataError("EV008", f"{path} is a zip, but not one of torch.save.")
         root = roots[0]
         pickle = io.BytesIO(archive.read(root + "data.pkl"))
-        order = archive.read(root + "byteorder") if root + "byteorder" in members else b"little"
+        order = archive.read(root + "byteorder") if root + "byteorder" in sizes else b"little"
     if order != b"little":
         raise ValueError("it was written on a big-endian machine")
-    needed: dict[str, _Storage] = {}
-    content = pickles.load(pickle, _names(), functools.partial(_refer, needed))
-    names = {key: f"{root}data/{key}" for key in needed}
-    missing = [name for name in names.values() if name not in members]
-    if missing:
-        raise ValueError(f"it lacks {missing[0][:80]}")
+    found: dict[str, _Storage] = {}
+    content = pickles.load(pickle, _NAMES, functools.partial(_refer, found, sum(sizes.values())))
+    members = {f"{root}data/{key}": storage for key, storage in found.items()}
+    if missing := members.keys() - sizes.keys():
+        raise ValueError(f"it lacks {min(missing)[:80]}")
     with unzipped(path) as archive:
-        return content, {key: archive.read(name) for key, name in names.items()}
-
-
-def _names() -> dict[str, pickles.Builder]:
-    return {
-        "collections.OrderedDict": _ordered,
-        "torch._utils._rebuild_tensor_v2": _tensor,
-        "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
-        "copyreg._reconstructor": pickles.Inert,
-        "copy_reg._reconstructor": pickles.Inert,
-        **{f"torch.{kind}Storage": pickles.Inert for kind in STORAGES},
-        **dict.fromkeys(DROPPED, pickles.Inert),
-    }
+        for name, storage in members.items():
+            storage.fill(archive.read(name))
+    return content
 
 
 def _ordered(*items: Any) -> dict[Any, Any]:
@@ -184,49 +160,69 @@ def _ordered(*items: Any) -> dict[Any, Any]:
     return {}
 
 
-def _refer(needed: dict[str, _Storage], identity: Any) -> _Storage:
-    """("storage", type, key, location, elements, None): a storage, noted in `needed`."""
+def _refer(found: dict[str, _Storage], there: int, identity: Any) -> _Storage:
+    """("storage", type, key, location, elements, None): a storage, noted in `found`. there: the
+    bytes that all of them may take."""
     if not (isinstance(identity, tuple) and len(identity) in (5, 6) and identity[0] == "storage"):
         raise ValueError("a storage is referred to in an unknown way")
-    _, kind, key, _, count, *view = identity
-    if not (isinstance(kind, pickles.Named) and isinstance(key, str) and _whole(count)
+    _, named, key, _, count, *view = identity
+    if not (isinstance(named, pickles.Named) and isinstance(key, str) and _whole(count)
             and view in ([], [None])):
         raise ValueError("a storage is described in an unknown way")
-    name = kind.name.removeprefix("torch.").removesuffix("Storage")
-    if name not in STORAGES:
-        raise ValueError(f"a storage is of the type {kind.name}")
-    storage = _Storage(key, name, count)
-    if needed.setdefault(key, storage) != storage:
+    kind = named.name.removeprefix("torch.").removesuffix("Storage")
+    if kind not in STORAGES:
+        raise ValueError(f"a storage is of the type {named.name}")
+    if key not in found:
+        taken = sum(storage.data.nbytes for storage in found.values())
+        if taken + count * np.dtype(STORAGES[kind]).itemsize > there:
+            raise ValueError(f"its storages take more than the {there} bytes that are there")
+        found[key] = _Storage(kind, np.empty(count, STORAGES[kind]))
+    if (found[key].kind, len(found[key].data)) != (kind, count):
         raise ValueError(f"storage {key[:40]} is described twice")
-    if sum(_bytes_of(s) for s in needed.values()) > MOST_BYTES:
-        raise ValueError(f"its storages take more than {MOST_BYTES} bytes")
-    return storage
+    return found[key]
 
 
-def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
+def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> np.ndarray:
+    """The view of a storage; offset, shape and strides are in elements."""
     good = isinstance(storage, _Storage) and _whole(offset) and all(
         isinstance(v, tuple) and len(v) <= MOST_AXES and all(map(_whole, v))
         for v in (shape, strides))
     if not good or len(shape) != len(strides):
         raise ValueError("a tensor is described in an unknown way")
-    last = offset + sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
-    size = math.prod(shape)
-    if size and last >= storage.count:
-        raise ValueError(f"a tensor {shape} lies outside of its storage of {storage.count}")
-    if size > max(storage.count, MOST_EXPANDED):  # a few bytes would fill the memory
-        raise ValueError(f"a tensor {shape} repeats a storage of {storage.count}")
-    return _Tensor(storage, offset, shape, strides)
+    flat, size = storage.data, math.prod(shape)
+    if not size:
+        return np.zeros(shape, flat.dtype)
+    if offset + sum((n - 1) * s for n, s in zip(shape, strides, strict=True)) >= len(flat):
+        raise ValueError(f"a tensor {shape} lies outside of its storage of {len(flat)}")
+    if size > max(len(flat), MOST_EXPANDED):  # a few bytes would fill the memory
+        raise ValueError(f"a tensor {shape} repeats a storage of {len(flat)}")
+    steps = tuple(s * flat.itemsize for s in strides)
+    return np.lib.stride_tricks.as_strided(flat[offset:], shape, steps)
 
 
 def _whole(value: Any) -> bool:
     return type(value) is int and 0 <= value <= MOST_BYTES
 
 
-def _bytes_of(storage: _Storage) -> int:
-    return storage.count * np.dtype(STORAGES[storage.kind]).itemsize
+def _array(tensor: np.ndarray) -> np.ndarray:
+    """A copy of its own; bfloat16, the upper half of a float32, came as the only uint16."""
+    if tensor.dtype == np.uint16:
+        return (tensor.astype(np.uint32) << 16).view(np.float32)
+    return tensor.copy()
 
 
-def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpoint:
+_NAMES: dict[str, pickles.Builder] = {
+    "collections.OrderedDict": _ordered,
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
+    "copyreg._reconstructor": pickles.Inert,
+    "copy_reg._reconstructor": pickles.Inert,
+    **{f"torch.{kind}Storage": pickles.Inert for kind in STORAGES},
+    **dict.fromkeys(DROPPED, pickles.Inert),
+}
+
+
+def _checkpoint(path: Path, content: Any) -> Checkpoint:
     content = content if isinstance(content, dict) else {}
     nested = [key for key, value in content.items() if _tensors(value)]
     key = "state_dict" if "state_dict" in content or len(nested) != 1 else nested[0]
@@ -237,18 +233,17 @@ def _checkpoint(path: Path, content: Any, storages: dict[str, bytes]) -> Checkpo
         raise EvflowDataError(
             "EV018", f"{path} holds no weights, but {sorted(map(str, content))[:8]}.",
             "Expected a state dict, or a dict with one under 'state_dict'; or with only one.")
-    if sum(8 * math.prod(t.shape) for t in tensors.values()) > 2 * MOST_BYTES:
+    if sum(8 * tensor.size for tensor in tensors.values()) > 2 * MOST_BYTES:
         raise ValueError("its tensors are more than its storages")
-    arrays = {name: _array(tensor, storages[tensor.storage.key])
-              for name, tensor in tensors.items()}
+    arrays = {name: _array(tensor) for name, tensor in tensors.items()}
     settings = {k: _plain(value) for k, value in content.items() if k != key}
     return Checkpoint(arrays, {str(k): v for k, v in settings.items() if v is not None})
 
 
-def _tensors(value: Any) -> dict[str, _Tensor]:
+def _tensors(value: Any) -> dict[str, np.ndarray]:
     """The named tensors of a dict."""
     return {_bare(name): tensor for name, tensor in value.items()
-            if isinstance(name, str) and isinstance(tensor, _Tensor)
+            if isinstance(name, str) and isinstance(tensor, np.ndarray)
             } if isinstance(value, dict) else {}
 
 
@@ -266,16 +261,3 @@ def _plain(value: Any, depth: int = 0) -> Any:
     if isinstance(value, dict) and depth < 2:
         return {str(k): _plain(v, depth + 1) for k, v in value.items()}
     return None
-
-
-def _array(tensor: _Tensor, data: bytes) -> np.ndarray:
-    if len(data) != _bytes_of(tensor.storage):
-        raise ValueError(f"storage {tensor.storage.key[:40]} is cut off: {len(data)} bytes of "
-                         f"{_bytes_of(tensor.storage)}")
-    flat: np.ndarray = np.frombuffer(data, STORAGES[tensor.storage.kind])
-    if tensor.storage.kind == "BFloat16":  # the upper half of a float32
-        flat = (flat.astype(np.uint32) << 16).view(np.float32)
-    if not math.prod(tensor.shape):
-        return np.zeros(tensor.shape, flat.dtype)
-    strides = tuple(s * flat.itemsize for s in tensor.strides)
-    return np.lib.stride_tricks.as_strided(flat[tensor.offset:], tensor.shape, strides).copy()

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import optax
 
 from evflow.camera import Camera
+from evflow.checks import require
 from evflow.downstream import losses
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, run
@@ -53,9 +54,8 @@ class LearningConfig:
         least = {"steps": 1, "warmup": 0, "rate": 0.0, "clip": 0.0, "temporal": 0.0, "skip": 0,
                  "elsewhere": 0.0}
         for name, bound in least.items():
-            if not bound <= getattr(self, name) < math.inf:  # NaN is below nothing
-                raise EvflowDataError("EV020", f"LearningConfig({name}={getattr(self, name)!r}).",
-                                      f"It must be >= {bound}, and finite.")
+            fit = bound <= getattr(self, name) < math.inf  # NaN is below nothing
+            require(self, name, fit, f">= {bound}, and finite")
         if self.skip + 2 > self.data.windows:
             raise EvflowDataError("EV020", f"skip={self.skip} of {self.data.windows} windows.",
                                   "Temporal consistency needs two images after those skipped.")

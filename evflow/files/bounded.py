@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+LITTLE = 1 << 16  # bytes for which nothing is asked, as that takes longer than reading them
+
 
 class BoundedPath(type(Path())):  # type: ignore[misc]
     """A path whose file, opened for its bytes, never takes memory for more than it has left."""
@@ -19,5 +21,7 @@ class BoundedPath(type(Path())):  # type: ignore[misc]
 
 class _BoundedFile(io.BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and 0 <= size <= LITTLE:
+            return super().read(size)
         left = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
         return super().read(left if size is None or size < 0 else min(size, left))

@@ -14,9 +14,9 @@ import numpy as np
 
 from evflow.checks import Size, check_polarity, check_size
 from evflow.errors import EvflowDataError
+from evflow.io.decode.units import UNITS_US, since_1970
 from evflow.notes import Note
 
-UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 POLARITIES = ("auto", "01", "pm1", "invert")
 
 
@@ -198,9 +198,9 @@ def dropped(count: int, total: int, size: Size) -> Note:
 
 
 def _too_late(t: np.ndarray, unit: str) -> EvflowDataError:
-    """The unit that makes them times since 1970 is named, if there is one: 2001 to 2099."""
+    """The unit that makes them times since 1970 is named, if there is one."""
     last = float(t.max())
-    since = [u for u, us in UNITS_US.items() if 1e9 < 1e-6 * us * last < 4.1e9]
+    since = since_1970(last)
     return EvflowDataError(
         "EV003", f"times span {t.min():.0f}..{last:.0f} {unit}, more than int64 microseconds hold"
         f"{f'; in {since[0]} they are times since 1970' if since else ''}.",

@@ -2,26 +2,33 @@
 mosaic -> luma.
 
 Frames are (H, W, 3) in OpenCV's order B, G, R, of dtype uint8, uint16 or float32, and keep that
-dtype. A pattern names the four corners of the mosaic's cell from the top left, row by row: under
-"rggb" pixel (0, 0) sees red and pixel (1, 1) blue. A mosaic is a grey frame to everything after.
+dtype. Luma has the weights of Rec. 601, which OpenCV's grey and so v2e, ESIM and OpenEB have: one
+colour video gives the same events there and here, from whatever it is read.
+A pattern names the four corners of the mosaic's cell from the top left, row by row: under "rggb"
+pixel (0, 0) sees red and pixel (1, 1) blue. A mosaic is a grey frame to everything after.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import Literal, get_args
 
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.notes import Note
 
 Frames = Iterator[tuple[np.ndarray, int]]
 
-PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
-COLOURS = ("luma", *PATTERNS)
+Colour = Literal["luma", "rggb", "bggr", "grbg", "gbrg"]
+COLOURS: tuple[str, ...] = get_args(Colour)
+PATTERNS = COLOURS[1:]
+CONVERTED = Note("frames.luma", "colour frames were converted to luma")
+LUMA = ("frames.luma", "frames.mosaic")  # codes of notes on frames that are luma of colours
 
 CELLS = tuple(np.s_[row::2, column::2] for row in (0, 1) for column in (0, 1))
-WEIGHTS = {"r": 0.299, "g": 0.587, "b": 0.114}  # of Rec. 601
+WEIGHTS = {"r": 0.299, "g": 0.587, "b": 0.114}  # of `luma`
 BETWEEN = {  # bilinear interpolation of a colour known at one pixel of a cell, or at two
     "r": np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], np.float32) / 4,
     "g": np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], np.float32) / 4}
@@ -30,13 +37,16 @@ PLANE_MARGIN = 32  # rows of repeated edge around a plane: more than frames to i
 
 
 def luma(bgr: np.ndarray) -> np.ndarray:
-    """Rec. 601 luma .299 R + .587 G + .114 B (H, W): OpenCV's BGR2GRAY, to the bit.
+    """Luma .299 R + .587 G + .114 B (..., H, W) of frames (..., H, W, 3), B, G, R: OpenCV's
+    BGR2GRAY, to the bit. Integers are rounded. RGB frames are passed as frames[..., ::-1].
 
-    Raises EV002 (not (H, W, 3)), EV003 (dtype).
+    Raises EV002 (not (..., H, W, 3)), EV003 (dtype).
     """
     import cv2
 
-    return cv2.cvtColor(_checked(bgr), cv2.COLOR_BGR2GRAY)
+    lead, width = bgr.shape[:-2], bgr.shape[-2:-1]
+    rows = bgr.reshape(-1, *bgr.shape[-2:]) if bgr.ndim > 3 else bgr
+    return cv2.cvtColor(_checked(rows), cv2.COLOR_BGR2GRAY).reshape(*lead, *width)
 
 
 def mosaic(bgr: np.ndarray, pattern: str) -> np.ndarray:
@@ -44,29 +54,36 @@ def mosaic(bgr: np.ndarray, pattern: str) -> np.ndarray:
 
     Raises EV002 (not (H, W, 3)), EV003 (dtype), EV020 (pattern).
     """
-    _check_pattern(pattern)
-    bgr = _checked(bgr)
+    pattern, bgr = parse_pattern(pattern), _checked(bgr)
     seen = np.empty(bgr.shape[:2], bgr.dtype)
     for cell, letter in zip(CELLS, pattern, strict=True):
         seen[cell] = bgr[..., "bgr".index(letter)][cell]
     return seen
 
 
-def mosaic_luma(seen: np.ndarray, pattern: str) -> np.ndarray:
-    """Rec. 601 luma (H, W) of a mosaic (H, W) at its own resolution, of the same dtype.
+def mosaic_luma(seen: np.ndarray, pattern: str, where: str = "a mosaic") -> np.ndarray:
+    """Luma (H, W) of a mosaic (H, W) at its own resolution, of the same dtype.
 
     Each colour is interpolated bilinearly: a missing one is the mean of its 2 or 4 nearest pixels;
-    beyond the edges the mosaic is mirrored, which keeps its cells whole.
-    Raises EV002 (not (H, W), or less than a cell), EV003 (dtype), EV020 (pattern).
+    beyond the edges the mosaic is mirrored, which keeps its cells whole. Of three equal channels,
+    as videos store grey, one is taken. where: names the frame in messages.
+    Raises EV002 (not (H, W), or less than a cell), EV003 (dtype), EV020 (pattern, or the frame has
+    colours already).
     """
     import cv2
 
-    _check_pattern(pattern)
+    pattern = parse_pattern(pattern)
+    if seen.ndim == 3:
+        if (seen[..., 1:] != seen[..., :1]).any():
+            raise EvflowDataError(
+                "EV020", f"{where} has colours already, and is no {pattern.upper()} mosaic.",
+                "Leave out --bayer.")
+        seen = np.ascontiguousarray(seen[..., 0])
     if seen.ndim != 2 or min(seen.shape) < 2:
-        raise EvflowDataError("EV002", f"a mosaic has shape {seen.shape}.", "Expected (H, W).")
+        raise EvflowDataError("EV002", f"{where} has shape {seen.shape}.", "Expected (H, W).")
     if seen.dtype not in (np.uint8, np.uint16, np.float32):
         raise EvflowDataError(
-            "EV003", f"a mosaic is {seen.dtype}.", "Expected uint8, uint16 or float32.")
+            "EV003", f"{where} is {seen.dtype}.", "Expected uint8, uint16 or float32.")
     total = np.zeros(seen.shape, np.float32)
     for letter, weight in WEIGHTS.items():
         alone = np.zeros(seen.shape, np.float32)
@@ -130,9 +147,23 @@ def unstack_planes(stacked: np.ndarray, count: int) -> np.ndarray:
     return frame
 
 
-def _check_pattern(pattern: str) -> None:
-    if pattern not in PATTERNS:
-        raise EvflowDataError("EV020", f"pattern={pattern!r}.", f"Choose from {PATTERNS}.")
+def parse_pattern(text: str) -> str:
+    """One of `PATTERNS`, written in any case; EV020."""
+    if text.lower() not in PATTERNS:
+        raise EvflowDataError(
+            "EV020", f"{text!r} is no Bayer pattern.", f"Choose from {', '.join(PATTERNS)}.")
+    return text.lower()
+
+
+def mosaic_note(pattern: str) -> Note:
+    """What is said of frames that were a mosaic."""
+    return Note(
+        "frames.mosaic", f"frames were a colour mosaic ({pattern.upper()}) and are its luma")
+
+
+def are_luma(notes: Iterable[Note]) -> bool:
+    """Whether the notes on a recording say that its frames were colour, and are luma."""
+    return any(note.code in LUMA for note in notes)
 
 
 def _checked(bgr: np.ndarray) -> np.ndarray:

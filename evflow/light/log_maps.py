@@ -157,7 +157,7 @@ def _check_frame(name: str, frame: Any) -> None:
         raise EvflowDataError("EV002", f"{name} has shape {shape}.", "Expected (..., H, W).")
     if len(shape) > 2 and shape[-1] in (3, 4) and shape[-2] > 16:
         raise EvflowDataError("EV002", f"{name} has shape {shape}: colour?",
-                              "Expected gray frames (..., H, W): evflow.types.luma(frame).")
+                              "Expected gray frames (..., H, W): evflow.light.colour.luma(frame).")
     if frame.dtype in DEPTHS or isinstance(frame, jax.core.Tracer):
         return
     if not jnp.issubdtype(frame.dtype, jnp.integer) and not jnp.issubdtype(

@@ -1,5 +1,5 @@
-"""Frames as they came -> the light that fell on the sensor: a raw colour mosaic as luma, a response
-undone, a mirrored image turned. Single frames (H, W), or (H, W, 3) where no mosaic is concerned.
+"""Frames as they came -> the light that fell on the sensor: a response undone, a mirrored image
+turned. Single frames (H, W) or (H, W, 3).
 """
 
 from __future__ import annotations
@@ -7,13 +7,11 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.light.colour import mosaic_luma
 from evflow.notes import Note
 
 FLIPS: dict[str, tuple[int, ...]] = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}  # axes
 RESPONSES = ("linear", "gamma", "srgb")
 GAMMA = 2.2
-LUMA = ("frames.luma", "frames.mosaic")  # codes of notes on frames that are luma of colours
 
 
 def linear_light(frame: np.ndarray, response: str) -> np.ndarray:
@@ -36,24 +34,6 @@ def linear_light(frame: np.ndarray, response: str) -> np.ndarray:
 def _srgb(code: np.ndarray) -> np.ndarray:
     curved = ((code + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
     return np.where(code <= 0.04045, code / np.float32(12.92), curved)
-
-
-def luma_of_mosaic(frame: np.ndarray, pattern: str, where: str) -> np.ndarray:
-    """The luma (H, W) of a raw mosaic: of one channel, or of three that are equal, as videos store
-    grey. EV020 where the frame has colours already; errors of `colour.mosaic_luma`."""
-    if frame.ndim == 3:
-        if (frame[..., 1:] != frame[..., :1]).any():
-            raise EvflowDataError(
-                "EV020", f"{where} has colours already, and is no {pattern.upper()} mosaic.",
-                "Leave out --bayer.")
-        frame = np.ascontiguousarray(frame[..., 0])
-    return mosaic_luma(frame, pattern)
-
-
-def of_mosaic(pattern: str) -> Note:
-    """What is said of frames that were a mosaic."""
-    return Note(
-        "frames.mosaic", f"frames were a colour mosaic ({pattern.upper()}) and are its luma")
 
 
 def linearised(response: str) -> Note:

@@ -17,6 +17,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files import pickles
+from evflow.files.bounded import BoundedPath
 from evflow.metrics.image import check_images
 
 Array = jax.Array
@@ -51,7 +52,7 @@ def load_lpips(net: str = "alex", path: str | os.PathLike | None = None) -> Para
         raise EvflowDataError("EV009", f"{path} has {path.stat().st_size} bytes; these weights "
                               f"have less than {MOST_BYTES}.")
     try:
-        with open(path, "rb") as f:
+        with BoundedPath(path).open("rb") as f:
             found = _arrays(pickles.load(f, _NAMES), DEEP)
         if sum(a.nbytes for a in jax.tree.leaves(found)) > MOST_BYTES:  # one of them many times
             raise ValueError("its arrays are larger than the file")

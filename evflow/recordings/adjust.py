@@ -14,7 +14,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io.source import open_frames
 from evflow.light import response as light
-from evflow.light.colour import mosaic_luma
+from evflow.light.colour import are_luma, mosaic_luma, mosaic_note
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -49,14 +49,14 @@ def linearised(recording: Recording, response: str) -> Recording:
 def demosaiced(recording: Recording, pattern: str) -> Recording:
     """The recording whose frames are a raw mosaic, with their luma in its place, of the same size
     and dtype. EV020 where they were colour images already; errors of `colour.mosaic_luma`."""
-    if any(note.code in light.LUMA for note in recording.notes):
+    if are_luma(recording.notes):
         raise EvflowDataError(
             "EV020", "the frames are luma of colour images already, and no "
             f"{pattern.upper()} mosaic.", "Leave out --bayer.")
     frames = np.empty(recording.frames.shape, recording.frames.dtype)
     for i, frame in enumerate(recording.frames):
         frames[i] = mosaic_luma(frame, pattern)
-    return _changed(recording, light.of_mosaic(pattern), frames=frames)
+    return _changed(recording, mosaic_note(pattern), frames=frames)
 
 
 def shifted(recording: Recording, offset_us: int) -> Recording:

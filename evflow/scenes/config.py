@@ -10,6 +10,7 @@ import dataclasses
 import math
 from typing import Literal
 
+from evflow.checks import require
 from evflow.errors import EvflowDataError
 
 Range = tuple[float, float]
@@ -58,14 +59,14 @@ class SceneConfig:
             name, value = field.name, getattr(self, field.name)
             if isinstance(value, tuple):
                 low = 0.0 if name in ("shake_px", "brightness") else -math.inf
-                _require(self, name, len(value) == 2 and all(map(math.isfinite, value))
-                         and low <= value[0] <= value[1], "two finite numbers, low <= high")
+                require(self, name, len(value) == 2 and all(map(math.isfinite, value))
+                        and low <= value[0] <= value[1], "two finite numbers, low <= high")
         for name in _POSITIVE:
-            _require(self, name, getattr(self, name)[0] > 0, "a range above 0")
+            require(self, name, getattr(self, name)[0] > 0, "a range above 0")
         for name in _PROBABILITIES:
-            _require(self, name, 0 <= getattr(self, name) <= 1, "a number in [0, 1]")
-        _require(self, "brightness", self.brightness[1] <= 1, "a range within [0, 1]")
-        _require(self, "foregrounds", self.foregrounds >= 0, "an integer >= 0")
+            require(self, name, 0 <= getattr(self, name) <= 1, "a number in [0, 1]")
+        require(self, "brightness", self.brightness[1] <= 1, "a range within [0, 1]")
+        require(self, "foregrounds", self.foregrounds >= 0, "an integer >= 0")
 
     @staticmethod
     def preset(name: Literal["default", "paper"]) -> SceneConfig:
@@ -77,9 +78,3 @@ class SceneConfig:
             return SceneConfig(
                 foreground_probability=1.0, static_fraction=0.0, shake_probability=0.0)
         raise EvflowDataError("EV020", f"scene preset {name!r}.", "Choose 'default' or 'paper'.")
-
-
-def _require(config: SceneConfig, name: str, good: bool, rule: str) -> None:
-    if not good:
-        raise EvflowDataError(
-            "EV020", f"SceneConfig({name}={getattr(config, name)!r}).", f"It must be {rule}.")

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.light.colour import luma
 
 FILES = (
     "astronaut.png", "brick.png", "camera.png", "cell.png", "chelsea.png", "clock_motion.png",
     "coffee.png", "coins.png", "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png",
     "microaneurysms.png", "retina.jpg", "rocket.jpg", "text.png",
 )
-_LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)  # ITU-R BT.601, as v2e's cv2 conversion
 
 
 def photo_paths() -> tuple[Path, ...]:
@@ -50,7 +50,7 @@ def read_luma(path: Path) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise EvflowDataError("EV009", f"{path} is not a readable image.", "Replace it.")
-    return (image.astype(np.float32) @ _LUMA_BGR) / np.float32(255)
+    return luma(image.astype(np.float32)) / np.float32(255)
 
 
 def crop(

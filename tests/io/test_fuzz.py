@@ -180,6 +180,14 @@ def test_the_size_of_a_picture_is_read_from_its_header(tmp_path: Path, name: str
     assert claimed_size(target.read_bytes()[:7]) is None
 
 
+@pytest.mark.parametrize(("data", "size"), [
+    (b"P5 64 48 255\n", (64, 48)),
+    (b"P6\n# a comment\n64 # another\n# and one\n48\n255\n", (64, 48)),
+    (b"P5 30000#30000 255\n 1 255 ", None)])  # OpenCV reads 30000x30000
+def test_comments_in_a_pgm_hide_no_size(data: bytes, size: tuple[int, int] | None) -> None:
+    assert claimed_size(data) == size
+
+
 def test_an_npy_header_is_read_no_further_than_numpy_would(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     path.write_bytes(b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(64))

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import typing
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers.recordings import make, write_ijrr
+from helpers.tables import write_evreal
 from helpers.videos import code_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evflow.commands.simulate import Simulate
+from evflow.errors import EvflowDataError
+from evflow.io.images.frames import FrameHints, Image, converted
+from evflow.io.registry import read_recording
+from evflow.io.source import open_frames
 from evflow.light.colour import (
     COLOURS,
     PATTERNS,
@@ -23,6 +30,7 @@ from evflow.light.colour import (
     unstack_planes,
 )
 from evflow.simulator.interpolate import upsample
+from evflow.types import Recording
 
 
 def colours(shape: tuple[int, int] = (8, 10), seed: int = 0) -> np.ndarray:
@@ -47,6 +55,16 @@ def test_luma_keeps_deeper_dtypes(dtype: type) -> None:
     grey = luma(bgr)
     assert grey.dtype == dtype
     np.testing.assert_allclose(grey, bgr @ [0.114, 0.587, 0.299], atol=1.0)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_grey_stays_what_it_is_and_stacks_are_as_single_frames(dtype: type) -> None:
+    grey = colours().astype(dtype)
+    np.testing.assert_allclose(luma(np.repeat(grey[..., None], 3, -1)), grey, rtol=1e-6)
+    stack = np.stack([colours(seed=i) for i in range(3)]).astype(dtype)
+    np.testing.assert_array_equal(luma(stack), np.stack([luma(frame) for frame in stack]))
+    white = np.iinfo(dtype).max if dtype != np.float32 else 255
+    assert (luma(np.full((2, 2, 3), white, dtype)) == white).all()  # full scale stays
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -149,6 +167,45 @@ def test_a_mosaic_of_any_size_but_not_of_any_kind() -> None:
     grey = np.full((5, 7), 90, np.uint8)
     np.testing.assert_array_equal(mosaic_luma(grey, "gbrg"), grey)
     assert code_of(lambda: mosaic_luma(grey, "rgbg")) == "EV020"
-    assert code_of(lambda: mosaic_luma(colours(), "rggb")) == "EV002"
+    assert code_of(lambda: mosaic_luma(colours(), "rggb")) == "EV020"  # colours already
+    np.testing.assert_array_equal(mosaic_luma(np.stack([grey] * 3, -1), "GBRG"), grey)
     assert code_of(lambda: mosaic_luma(grey[:1], "rggb")) == "EV002"
     assert code_of(lambda: mosaic_luma(grey.astype(np.int64), "rggb")) == "EV003"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_one_colour_video_has_one_grey_by_every_path(tmp_path: Path, dtype: type) -> None:
+    """An RGB stack, PNG files, frames as a video decodes them, recordings that bring them along."""
+    deep = dtype == np.uint16
+    rgb = np.random.default_rng(5).integers(0, 65536 if deep else 256, (6, 48, 64, 3), dtype)
+    bgr, us = rgb[..., ::-1], 10_000 * np.arange(6)
+    np.savez(tmp_path / "stack.npz", frames=rgb, frame_times=us)
+    made = make(200, count=6)
+    folder = write_ijrr(tmp_path / "ijrr", made)
+    for file, frame in zip(sorted((folder / "images").glob("*.png")), bgr, strict=True):
+        cv2.imwrite(str(file), frame)
+    evreal = write_evreal(tmp_path, made)
+    np.save(evreal / "images.npy", bgr)
+    video = (Image(frame, 10_000 * i, "a video") for i, frame in enumerate(bgr))
+    by_path = {
+        "stack": [frame for frame, _ in open_frames(tmp_path / "stack.npz").open()],
+        "folder": [frame for frame, _ in open_frames(folder / "images", fps=100).open()],
+        "video": [frame for frame, _ in converted(video, FrameHints(), [])],
+        "ijrr": read_recording(folder).frames, "evreal": read_recording(evreal).frames,
+        "array": Recording(made.events, luma(bgr), us).frames}
+    red, green, blue = (rgb[..., i].astype(np.int64) for i in range(3))
+    exact = (299 * red + 587 * green + 114 * blue) / 1000  # Rec. 601, in whole numbers
+    for name, frames in by_path.items():
+        scaled = deep and name in ("stack", "folder", "video")  # to 0..255, white at 65535
+        dn = np.asarray(frames) * (257.0 if scaled else 1.0)
+        np.testing.assert_allclose(dn, by_path["array"], rtol=1e-6, err_msg=name)
+        assert np.abs(dn - exact).max() <= (3.0 if deep else 0.51), name  # weights of 14 bits
+
+
+def test_colour_frames_are_refused_with_what_makes_them_grey() -> None:
+    made = make(200, count=2)
+    rgba = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 4), np.uint8)
+    with pytest.raises(EvflowDataError, match=r"EV002.*luma\(frames\[\.\.\., 2::-1\]\)"):
+        Recording(made.events, rgba, made.frame_times)
+    grey = Recording(made.events, luma(rgba[..., 2::-1]), made.frame_times).frames
+    assert abs(grey[1, 2, 3] - rgba[1, 2, 3, :3] @ [0.299, 0.587, 0.114]) <= 0.51

@@ -15,15 +15,13 @@ from typing import IO
 
 import numpy as np
 
-from evflow.errors import EvflowDataError
 from evflow.io.decode.stream import Chunk, Damage
+from evflow.io.decode.units import check_text_seconds
 
 BLANKS = bytes.maketrans(b",;", b"  ")  # what else stands between numbers
 HEAD = 1 << 14  # bytes by which a file is recognised, and the order of its columns told
 BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
 MAX_LINE = 1000  # a longer one is not text
-FEW, LATE_S = 10, 1000  # whole times: so many, or so late, are no seconds
-YEAR_2099_S = 4.1e9  # since 1970
 
 
 def events(
@@ -42,28 +40,13 @@ def events(
 
 
 def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    """The chunks; EV003 where the times of the first are whole numbers, which seconds are not, or
-    later than any seconds since 1970."""
+    """The chunks; EV003 where the times of the first are no seconds, by `check_text_seconds`."""
     seen = False
     for chunk in chunks:
         if not seen and len(chunk.t):
-            _check_seconds(path, chunk.t)
+            check_text_seconds(chunk.t, path)
         seen = seen or len(chunk.t) > 0
         yield chunk
-
-
-def _check_seconds(path: Path, t: np.ndarray) -> None:
-    last = float(np.nanmax(t, initial=0.0))
-    if last >= 2.0**63:  # no times at all, as `stream.gather` tells
-        return
-    if bool((t % 1 == 0).all()) and (len(t) >= FEW or last >= LATE_S):
-        raise EvflowDataError(
-            "EV003", f"{path}: all times are whole numbers ({t[0]:.0f}, ...), not seconds.",
-            "Microseconds? Pass time_unit='us' (--time-unit us).")
-    if last > YEAR_2099_S:
-        raise EvflowDataError(
-            "EV003", f"{path}: {last:.6f} s are no time since 1970.",
-            "Milliseconds, or microseconds? Pass time_unit='ms' or 'us' (--time-unit).")
 
 
 def plain(block: bytes, byte: int) -> bytes:

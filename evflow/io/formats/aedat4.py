@@ -51,7 +51,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Events (N,) and frames (T, H, W) uint8; colour frames become Rec. 709 luma (float32).
+    """Events (N,) and frames (T, H, W) uint8; colour frames become their luma.
 
     Raises EV008 (no event stream, or several), EV009 (damaged), EV010 (no `aedat`), and what
     `stream.gather` and `Recording` raise.
@@ -121,7 +121,8 @@ class _Reading:
                         self._at(found[-1]["t"])
                     elif "frame" in packet:
                         self.times.append(_mid_exposure(packet["frame"]))
-                        self.stack.append(packet["frame"]["pixels"])
+                        pixels = packet["frame"]["pixels"]  # colours come as R, G, B(, A)
+                        self.stack.append(pixels if pixels.ndim == 2 else pixels[..., 2::-1])
             self.warned |= {str(w.message) for w in said}
         except (KeyboardInterrupt, SystemExit, EvflowDataError):
             raise

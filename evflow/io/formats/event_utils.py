@@ -54,7 +54,7 @@ def read(path: Path, hints: Hints) -> Recording:
         stamps = np.array([_time(path, image) for image in images])
         times, told = beside_events(stamps, path, native, hints, events)
         return tables.with_frames(path, events, span, times,
-                                  lambda keep: (_rgb(image[:]) for image in images[keep]),
+                                  lambda keep: (_pixels(image[:]) for image in images[keep]),
                                   notes + told)
 
 
@@ -71,11 +71,9 @@ def _time(path: Path, image: Any) -> Any:
     return np.asarray(image.attrs["timestamp"]).reshape(-1)[0]
 
 
-def _rgb(pixels: np.ndarray) -> np.ndarray:
-    """OpenCV, which the writers use, orders colours B, G, R; one channel becomes none."""
-    if pixels.ndim == 2:
-        return pixels
-    return pixels[..., 0] if pixels.shape[-1] == 1 else pixels[..., 2::-1]
+def _pixels(image: np.ndarray) -> np.ndarray:
+    """One channel becomes none; the writers' OpenCV orders three B, G, R."""
+    return image[..., 0] if image.ndim == 3 and image.shape[-1] == 1 else image
 
 
 def _size(

@@ -47,7 +47,7 @@ def read(path: Path, hints: Hints) -> Recording:
     stamps = mapped(path / "images_ts.npy", (len(images),))
     times, told = beside_events(np.asarray(stamps), path, _unit(stamps), hints, events)
     return tables.with_frames(path, events, span, times,
-                              lambda keep: map(_rgb, images[keep]), notes + told)
+                              lambda keep: map(np.array, images[keep]), notes + told)
 
 
 def _unit(times: np.ndarray) -> str:
@@ -61,11 +61,6 @@ def _images(path: Path) -> np.ndarray | None:
         return mapped(path / "images.npy", (None, None, None))
     except EvflowDataError:
         return mapped(path / "images.npy", (None, None, None, 3))
-
-
-def _rgb(image: np.ndarray) -> np.ndarray:
-    """A copy of its own; the writers' OpenCV orders colours B, G, R."""
-    return np.array(image if image.ndim == 2 else image[..., ::-1])
 
 
 def _told_size(path: Path) -> Size | None:

@@ -138,7 +138,7 @@ def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
 
 
 def _image(root: Root, name: str) -> np.ndarray:
-    """One image file at its full bit depth, grey or RGB; EV008, EV009, EV016."""
+    """One image file at its full bit depth, grey or B, G, R; EV008, EV009, EV016."""
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts:
         raise EvflowDataError("EV008", f"images.txt names {name}, which leaves the recording.")
@@ -147,5 +147,4 @@ def _image(root: Root, name: str) -> np.ndarray:
         raise EvflowDataError(
             "EV016", f"images.txt names {name}, which is not in {root}.",
             "Restore the image, or remove its line.")
-    image = decode(file)
-    return image if image.ndim == 2 else image[..., 2::-1]  # OpenCV's order is B, G, R(, A)
+    return decode(file)

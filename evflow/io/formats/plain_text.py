@@ -21,8 +21,8 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io.decode import text
 from evflow.io.decode.stream import Chunk, collect
+from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
-from evflow.io.images.times import written_unit
 from evflow.types import Recording
 
 NAME = "text"

@@ -16,12 +16,19 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
-from evflow.io.hints import UNITS_US, Hints, check_choices, known
+from evflow.io.decode.units import UNITS_US
+from evflow.io.hints import Hints, check_choices, known
 from evflow.light import response
-from evflow.light.colour import COLOURS, luma
+from evflow.light.colour import (
+    COLOURS,
+    CONVERTED,
+    luma,
+    mosaic_luma,
+    mosaic_note,
+    parse_pattern,
+)
 from evflow.notes import Note
 from evflow.types import Events, Recording
-from evflow.types import luma as rec709
 
 Frames = Iterator[tuple[np.ndarray, int]]
 
@@ -67,7 +74,7 @@ class FrameHints:
         check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS,
                       flip=("none", *response.FLIPS), response=response.RESPONSES)
         Hints(start_s=self.start_s, stop_s=self.stop_s)  # EV020 where they are no range
-        if self.bayer is not None and self.colour != "luma":
+        if self.bayer is not None and parse_pattern(self.bayer) and self.colour != "luma":
             raise EvflowDataError(
                 "EV020", f"bayer={self.bayer} makes luma of a mosaic, colour={self.colour} wants "
                 "the mosaic itself.", "Give one of them.")
@@ -148,8 +155,7 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
 def _seen(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, bool]:
     """The frame as light, and `bright` as `_frame` has it."""
     if hints.bayer is not None:
-        seen = response.luma_of_mosaic(image.pixels, hints.bayer, image.where)
-        image = image._replace(pixels=seen)
+        image = image._replace(pixels=mosaic_luma(image.pixels, hints.bayer, image.where))
     frame, bright = _frame(image, hints, bright)
     frame = response.linear_light(frame, hints.response)
     return frame if hints.flip == "none" else np.flip(frame, response.FLIPS[hints.flip]), bright
@@ -191,7 +197,7 @@ def _frame(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, b
 
 def _seen_first(image: Image, frame: np.ndarray, hints: FrameHints) -> list[Note]:
     """What the user should know about the first frame."""
-    notes = [] if hints.bayer is None else [response.of_mosaic(hints.bayer)]
+    notes = [] if hints.bayer is None else [mosaic_note(hints.bayer)]
     if hints.response != "linear":
         notes.append(response.linearised(hints.response))
     if hints.flip != "none":
@@ -219,8 +225,8 @@ def existing(path: str | os.PathLike) -> Path:
 
 
 class FrameStack:
-    """Images (H, W) or (H, W, 3) RGB that come one by one, as the frames of a recording: colour
-    becomes luma. Kept as `Spool` does it. where: names their file in messages."""
+    """Images (H, W) or (H, W, 3) in B, G, R that come one by one, as the frames of a recording:
+    colour becomes luma. Kept as `Spool` does it. where: names their file in messages."""
 
     def __init__(self, where: object) -> None:
         self.where, self.count = where, 0
@@ -243,7 +249,7 @@ class FrameStack:
             raise EvflowDataError(
                 "EV003", f"{self.where} has frames of {self._first.dtype} and {image.dtype}.",
                 "Use those of one bit depth.")
-        grey = image if image.ndim == 2 else rec709(image[..., :3])
+        grey = image if image.ndim == 2 else luma(image[..., :3])
         self._spool = self._spool or Spool(grey.dtype)
         self._spool.append(grey.ravel())
         self.count += 1
@@ -254,7 +260,7 @@ class FrameStack:
             return Recording.of_events(events, notes)
         frames = self._spool.array().reshape(self.count, *self._first.shape[:2])
         if self._first.ndim == 3:
-            notes += (Note("frames.luma", "colour frames were converted to Rec. 709 luma"),)
+            notes = (*notes, CONVERTED)
         return Recording(events, frames, times, notes)
 
 

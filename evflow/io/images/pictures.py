@@ -13,7 +13,8 @@ from collections.abc import Callable
 Size = tuple[int, int]
 
 PIXEL = 8  # bytes at most: four channels of 16 bits
-NETPBM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
+# A comment right behind a number begins another one to some decoders: blanks come first.
+NETPBM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})\s(?:\s+|#[^\n]*\n)*(\d{1,9})\s")
 TIFF_SIZE = (256, 257)  # tags ImageWidth, ImageLength
 TIFF_KINDS = {3: "H", 4: "I", 16: "Q"}
 JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})

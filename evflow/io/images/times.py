@@ -9,7 +9,6 @@ Lines that begin with # are comments. A unit written in a comment or header coun
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Collection
 from pathlib import Path, PurePosixPath
@@ -20,20 +19,21 @@ from evflow.checks import check_times
 from evflow.errors import EvflowDataError
 from evflow.files.arrays import mapped
 from evflow.io.decode.text import is_float
-from evflow.io.hints import UNITS_US, Hints
+from evflow.io.decode.units import (
+    UNITS_US,
+    shared_unit,
+    usual_step,
+    usual_unit,
+    video_unit,
+    written_unit,
+)
+from evflow.io.hints import Hints
 from evflow.io.images.frames import existing
 from evflow.notes import Note
 from evflow.types import Events
 
 MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
-EPOCH_S = (1e9, 4.1e9)  # 2001 to 2099 as seconds since 1970
-POSSIBLE_S = (2e-5, 2.0)  # between frames: 50,000 frames/s to one in two seconds
-USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s, where only one unit of 1000 can fall
-USUAL_US = 2e4  # of two units the one nearer to 50 frames/s
 TELL = "pass --timestamps-unit beside --frames (simulate: --time-unit)"
-UNIT_WORDS = re.compile(
-    r"(?:[\[(_]|in )(n(?:s|sec|anoseconds?)|[uµμ]s(?:ec)?|microseconds?|m(?:s|sec|illiseconds?)|"
-    r"s(?:ec(?:onds?)?)?)\b", re.IGNORECASE)
 
 Notes = tuple[Note, ...]
 Times = tuple[np.ndarray, list[str], Notes]  # int64 us (T,); names (T,) or none
@@ -77,7 +77,7 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
             f"({len(back):,} such).", "Frame times must increase: lines out of order, or repeated?")
     notes: Notes = ()
     if unit == "auto":
-        unit, notes = _plausible_unit(times, where)
+        unit, notes = _video_unit(times, where)
     us = Hints(time_unit=unit).microseconds(times, unit)
     return check_times(us, f"{where}, read in {unit}", strict=True), notes
 
@@ -98,56 +98,25 @@ def beside_events(
     if usual or times.ndim != 1 or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
         return hints.microseconds(times, native), ()
     units = [native, *UNITS_US] if told == "auto" else [told, native]
-    unit = _lasting(times, events.t, units)
+    unit = shared_unit(times, events.t, units)
     if unit is None and told == "auto":
         return to_us(times, where)
-    unit = unit or _nearest(times, units)
+    unit = unit or usual_unit(times, units)
     notes = () if unit == told else (
         Note("frames.unit", f"frame times of {where} were read in {unit}."),)
     return Hints(time_unit=unit).microseconds(times, unit), notes
 
 
-def _lasting(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | None:
-    """The unit in which times (T,) share most of the span of events at t (N,) us, the first of
-    several; None where none shares any."""
-    if not (len(times) and len(t)):
-        return None
-
-    def shared(unit: str) -> float:
-        first, last = (float(v) * UNITS_US[unit] for v in (times.min(), times.max()))
-        common = min(last, float(t[-1])) - max(first, float(t[0])) + 1.0
-        return max(common, 0.0) / (max(last, float(t[-1])) - min(first, float(t[0])) + 1.0)
-
-    best = max(units, key=shared)
-    return best if shared(best) > 0 else None
-
-
-def _nearest(times: np.ndarray, units: list[str]) -> str:
-    """The unit that makes times (T,) the more usual video, the first of several."""
-    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
-    if not step > 0:
-        return units[0]
-    return min(units, key=lambda unit: abs(math.log(step * UNITS_US[unit] / USUAL_US)))
-
-
-def _plausible_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
-    """The unit in which the times are those of a video, and the note that says so."""
-    step = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 0.0
-    seconds = {unit: 1e-6 * scale for unit, scale in UNITS_US.items()}
-    whole = times.dtype.kind in "iu" or bool((times % 1 == 0).all())
-    epoch = [u for u, s in seconds.items() if EPOCH_S[0] < abs(float(times[0])) * s < EPOCH_S[1]]
-    possible = [u for u, s in seconds.items() if POSSIBLE_S[0] <= step * s <= POSSIBLE_S[1]
-                and (whole or u in ("s", "ms"))]
-    usual = [u for u in possible if USUAL_S[0] <= step * seconds[u] <= USUAL_S[1]]
-    for found in (set(epoch) & set(possible), possible, usual):
-        if len(found) == 1:
-            (unit,) = found
-            rate = f"{1 / (step * seconds[unit]):.4g} frames/s"
-            return unit, (Note("frames.unit", f"times of {where} were read in {unit} ({rate}); "
-                               f"else {TELL}."),)
-    would = ", ".join(f"{1 / (step * seconds[u]):.4g} frames/s in {u}" for u in possible)
+def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
+    """The unit in which the times are those of a video, and the note that says so; EV003."""
+    unit, rates = video_unit(times)
+    if unit is not None:
+        rate = f"{rates[unit]:.4g} frames/s"
+        return unit, (Note("frames.unit", f"times of {where} were read in {unit} ({rate}); "
+                           f"else {TELL}."),)
+    would = ", ".join(f"{rate:.4g} frames/s in {u}" for u, rate in rates.items())
     raise EvflowDataError(
-        "EV003", f"{where}: steps of {step:g} (from {times[0]}) have no clear unit"
+        "EV003", f"{where}: steps of {usual_step(times):g} (from {times[0]}) have no clear unit"
         + (f": {would}." if would else "."),
         f"Is it {', '.join(UNITS_US)}? {TELL.capitalize()}.")
 
@@ -175,18 +144,6 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
                 f"{len(rows[0])} columns.", "Cut off or damaged? Copy it again.")
         rows.append(fields)
     return rows, written_unit(words)
-
-
-def written_unit(words: str) -> str:
-    """The unit of times that a header or comment tells, or "auto"."""
-    units = {_unit(word.lower()) for word in UNIT_WORDS.findall(words)}
-    return units.pop() if len(units) == 1 else "auto"
-
-
-def _unit(word: str) -> str:
-    if word[0] in "uµμ" or word.startswith("mic"):
-        return "us"
-    return {"n": "ns", "m": "ms", "s": "s"}[word[0]]
 
 
 def _columns(

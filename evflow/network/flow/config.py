@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 import jax
 
+from evflow.checks import require
 from evflow.errors import EvflowDataError
 
 Array: TypeAlias = jax.Array
@@ -39,9 +40,7 @@ class FlowConfig:
 
     def __post_init__(self) -> None:
         for name in ("levels", "steps", "hidden", "condition"):
-            if getattr(self, name) < 1:
-                raise EvflowDataError(
-                    "EV020", f"FlowConfig({name}={getattr(self, name)}).", "It must be >= 1.")
+            require(self, name, getattr(self, name) >= 1, ">= 1")
         if self.channels < 1 or self.channels % 2**self.levels:
             raise EvflowDataError(
                 "EV020", f"FlowConfig(channels={self.channels}, levels={self.levels}).",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evflow.light.response import LUMA
+from evflow.light.colour import LUMA
 from evflow.recordings.check.findings import Finding
 from evflow.types import Recording
 

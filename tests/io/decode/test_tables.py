@@ -171,4 +171,4 @@ def test_event_utils_sizes_and_colour(tmp_path: Path) -> None:
         f["images/image000000000"] = blue
         f["images/image000000000"].attrs["timestamp"] = time
 
-    assert read_recording(edited(path, colour)).frames[0, 0, 0] == pytest.approx(200 * 0.0722)
+    assert read_recording(edited(path, colour)).frames[0, 0, 0] == round(200 * 0.114)

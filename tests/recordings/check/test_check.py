@@ -16,6 +16,7 @@ from helpers.networks import hidden
 
 from evflow import Events, Recording, Report, check, read_recording, write_events
 from evflow.errors import CODES, EvflowDataError
+from evflow.light.colour import CONVERTED
 from evflow.notes import Note
 from evflow.recordings.adjust import flipped, shifted
 from evflow.recordings.check import frames_offset
@@ -131,8 +132,7 @@ def test_mistake_8_colour_frames(sound: Recording) -> None:
     elsewhere = Note("frames.replaced", "frames are those of colour.mp4")
     noted = dataclasses.replace(sound, notes=(elsewhere,))
     assert not check(noted).notes
-    noted = dataclasses.replace(
-        sound, notes=(Note("frames.luma", "colour frames were converted to Rec. 709 luma"),))
+    noted = dataclasses.replace(sound, notes=(CONVERTED,))
     (note,) = check(noted).notes
     assert note.code == "EV032"
 

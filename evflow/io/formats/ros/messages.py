@@ -130,7 +130,7 @@ class Message:
         return packed.tobytes()
 
     def image(self) -> np.ndarray:
-        """The pixels, (H, W) or (H, W, 3) RGB, of an image whose header was read."""
+        """The pixels, (H, W) or (H, W, 3) in B, G, R, of an image whose header was read."""
         height, width = self.fields("II")
         encoding = self.text()
         big_endian, step = self.fields("BI")
@@ -148,4 +148,4 @@ class Message:
         if channels == 1:
             return pixels
         colour = pixels.reshape(height, width, channels)
-        return colour if encoding == "rgb8" else colour[..., ::-1]
+        return colour if encoding == "bgr8" else colour[..., ::-1]
