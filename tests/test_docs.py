@@ -1,9 +1,10 @@
 """The documents keep their word: README.md and docs/*.md run as they are printed.
 
 Every fenced block of bash or python runs, in order, in a folder with a small recording, a video and
-a folder of frames. On the line above a block may stand `<!-- not run: reason -->`, `<!-- slow -->`
-or `<!-- needs PACKAGE -->`; installation is not run. The quick test leaves out what `SLOW` names
-and lays a camera ready in its place; the slow one runs it all, with a small preset for a large one.
+a folder of frames; the README's Python also runs in an empty one. On the line above a block may
+stand `<!-- not run: reason -->`, `<!-- slow -->` or `<!-- needs PACKAGE -->`; installation is not
+run. The quick test leaves out what `SLOW` names and lays a camera ready in its place; the slow one
+runs it all, with a small preset for a large one.
 """
 
 from __future__ import annotations
@@ -31,10 +32,22 @@ from evflow.errors import CODES
 from evflow.io import write_recording
 from evflow.io.registry import FORMATS, WRITERS
 from evflow.notes import NOTES
-from experiments import make_dataset, see_better, train_network
+from experiments import (
+    coverage,
+    curves,
+    evaluate,
+    integrate,
+    limits,
+    make_dataset,
+    see_better,
+    train,
+    train_eventgan,
+    train_network,
+)
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*DOCUMENTS, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
 BLOCK = re.compile(r"(?:<!-- (?P<mark>[^>]+) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)^```$",
                    re.DOTALL | re.MULTILINE)
 MARK = re.compile(r"slow|needs \w+|not run: .+")
@@ -92,19 +105,10 @@ def texture(seconds: float) -> np.ndarray:
     return cv2.warpAffine(image, shift, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
-def given() -> dict[str, Any]:
-    """What the Python of a document takes for granted: a video as DN, as log light, as changes."""
-    video = np.stack([texture(t / 1e3) for t in range(9)])
-    wide = np.random.default_rng(1).uniform(3.0, 5.0, (260, 346)).astype(np.float32)
-    changes = np.random.default_rng(2).normal(0, 0.02, (260, 346, 16)).astype(np.float32)
-    log_frames = wide + np.cumsum(np.moveaxis(changes, -1, 0), 0)
-    return {"frames": video, "times_us": 1000 * np.arange(9), "dL": changes,
-            "log_frames": log_frames}
-
-
 def run_document(document: Path, *, quick: bool) -> int:
     """Run the blocks in the present folder; returns how many commands and Python blocks ran."""
-    names, ran = given(), 0
+    names: dict[str, Any] = {}
+    ran = 0
     for block in blocks(document):
         needed = block.mark.removeprefix("needs ") if block.mark.startswith("needs ") else ""
         if (block.mark.startswith("not run") or (quick and block.mark == "slow")
@@ -166,17 +170,50 @@ def test_blocks_are_marked_as_agreed(document: Path) -> None:
         assert not block.mark or MARK.fullmatch(block.mark)
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: d.name)
+@pytest.mark.parametrize("document", PAGES, ids=lambda d: d.name)
 def test_links_lead_somewhere(document: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)", document.read_text("utf-8")):
-        assert target.startswith("https://") or (document.parent / target).exists(), target
+    links = re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", document.read_text("utf-8"))
+    for target, heading in links:
+        page = document.parent / target if target else document
+        assert target.startswith("https://") or page.exists(), target
+        assert not heading or heading in anchors(page), f"{target}#{heading}"
+
+
+def anchors(page: Path) -> set[str]:
+    """What GitHub calls the headings of a page in links."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+def test_the_readme_is_one_page() -> None:
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert len(text.splitlines()) <= 120
+    assert len(text.split()) <= 750
+
+
+@pytest.mark.slow
+def test_the_readmes_python_runs_from_a_fresh_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)  # no recording, no video, no camera
+    names: dict[str, Any] = {}
+    for block in blocks(ROOT / "README.md"):
+        if block.kind == "python":
+            exec(compile(block.text, "README.md", "exec"), names)
+    assert "estimated" in capsys.readouterr().out
+    for name in ("theta_on", "theta_off"):
+        true = float(np.median(getattr(names["hidden"], name)))
+        assert abs(float(getattr(names["found"].summary, name)) - true) < 0.1 * true
+    assert names["camera"].theta_on.shape == SHAPE
 
 
 @pytest.mark.parametrize("document", DOCUMENTS[1:], ids=lambda d: d.name)
 def test_options_exist(document: Path) -> None:
-    known = {"--help"}
+    known = {"--help", "--xla_force_host_platform_device_count"}  # the second is XLA's
     commands = [typing.get_args(c)[0] for c in typing.get_args(Command)]
-    for options in (*commands, make_dataset.Options, see_better.Options, train_network.Options):
+    scripts = (coverage, curves, evaluate, integrate, limits, make_dataset, see_better, train,
+               train_eventgan, train_network)
+    for options in (*commands, *(script.Options for script in scripts)):
         for field in dataclasses.fields(options):
             flag = field.name.replace("_", "-")
             known |= {f"--{flag}", f"--no-{flag}"}

@@ -1,4 +1,4 @@
-"""The compared systems: other ways to tell a camera's thresholds and noise, one file each.
+"""The compared systems: other methods for a camera's thresholds and noise, one file each.
 
     SYSTEMS["ecc median"].fit(recording) -> Fitted
 

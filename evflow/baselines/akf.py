@@ -1,4 +1,4 @@
-"""The asynchronous Kalman filter: every pixel follows its log intensity x and its variance P.
+"""The asynchronous Kalman filter: log intensity x and its variance P, tracked per pixel.
 
 Wang, Ng, Scheerlinck, Mahony, "An Asynchronous Kalman Filter for Hybrid Event Cameras" (ICCV
 2021). Between updates, dt apart, with reference brightness y and its precision 1/R, exactly:

@@ -1,4 +1,4 @@
-"""What the compared systems share: the protocol, its result, and the data they all start from.
+"""Shared by the compared systems: the protocol, its result, and the input data.
 
 A `System` is a frozen dataclass of its options; `fit` takes a recording and never fails for lack
 of data: what cannot be measured is marked invalid and holds a stated value, never NaN. Thresholds

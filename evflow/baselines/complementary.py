@@ -1,4 +1,4 @@
-"""The complementary filter: events high-passed, frames low-passed, added up.
+"""The complementary filter: high-passed events plus low-passed frames.
 
 Scheerlinck, Barnes, Mahony, "Continuous-time Intensity Estimation Using Event Cameras" (ACCV
 2018): dx/dt = sum of p theta delta(t - t_i) - alpha (x - L_frame), the latest frame held. Between

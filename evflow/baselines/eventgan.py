@@ -1,4 +1,4 @@
-"""EventGAN: event volumes straight from two frames, by a network trained against a critic.
+"""EventGAN: event volumes from two frames, by a network trained against a critic.
 
 Zhu, Wang, Khant, Daniilidis, "EventGAN: Leveraging Large Scale Image Datasets for Event Cameras"
 (ICCP 2021). A U-Net turns two frames into a volume of counts; a patch critic (hinge loss) sees

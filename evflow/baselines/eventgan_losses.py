@@ -1,4 +1,4 @@
-"""EventGAN's losses: the critic's, and what a volume of events must tell of motion and image.
+"""EventGAN's losses: the critic's, and cycle losses on the motion and image that events imply.
 
 Frames are in -1..1, predictions lists of maps from coarse to full resolution, each scale weighing
 half of the next finer one.

@@ -1,4 +1,4 @@
-"""JAER: thresholds as gains that learn, frame by frame, to end where the next frame is.
+"""JAER: thresholds as gains, updated online so that integrated events match the next frame.
 
 Brandli, Muller, Delbruck, "Real-time, high-speed video decompression using a frame- and
 event-based DAVIS sensor" (ISCAS 2014). Each event adds its gain to a log display buffer; at a new

@@ -1,4 +1,4 @@
-"""LGAN: maps of mean thresholds and of their spread, learnt against critics of event patches.
+"""LGAN: maps of the mean and spread of thresholds, trained against critics of event patches.
 
 Gu, Li, Zhang, Tian, "How to Learn a Domain-Adaptive Event Simulator?" (ACM MM 2021). A network sees
 a frame and says mean and spread of each pixel's thresholds; a simulator draws thresholds and makes

@@ -1,5 +1,5 @@
-"""What LGAN learns through: runs of a recording's own scene, and a simulator of them whose counts
-pass gradients straight through to the thresholds.
+"""LGAN's simulator: stretches of a recording's own scene, simulated with straight-through
+gradients of the event counts in the thresholds.
 
 The forward pass is `evflow.simulator`, exactly; nothing is smoothed. A run is cut into clips, each
 with its own counts. The memory at a run's start is unknown: a fair comparison plays the first clip

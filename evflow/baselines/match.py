@@ -1,4 +1,4 @@
-"""MATCH: the thresholds at which a simulation of the same scene sends as many events.
+"""MATCH: the thresholds at which a simulation of the same scene has the recorded event counts.
 
 Nothing is learned. Per polarity, the mean over pixels of the square root of the count is matched:
 the root keeps the few pixels at the threshold's clamp, which send most events where the mismatch

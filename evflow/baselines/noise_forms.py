@@ -1,4 +1,4 @@
-"""Noise rates in closed form: what two simulators say of a scene at rest (paper, Table IV).
+"""Closed-form noise rates of two simulators for a static scene (paper, Table IV).
 
 v2e's shot noise falls linearly with light and inversely with a pixel's threshold; the leak of
 DVS-Voltmeter is a Brownian motion with drift between two levels, whose exits are known. Arrays

@@ -1,4 +1,4 @@
-"""Intensity from events and frames: what the reconstructing systems share.
+"""Intensity from events and frames: the protocol shared by the reconstructing systems.
 
     Integration().reconstruct(events, frames, frame_times, camera, times) -> DN (T, H, W)
 

@@ -1,4 +1,4 @@
-"""A recording's own scene, simulated with any thresholds: what MATCH and S2R compare with.
+"""A recording's own scene, simulated with given thresholds, for MATCH and S2R.
 
 The path between the frames is motion-compensated, or given where the frames are a fast video. A
 camera is one row (theta_ON, theta_OFF, eta_ON, eta_OFF, sigma_ON, sigma_OFF); all rows see the

@@ -1,4 +1,4 @@
-"""S2R: the contrast threshold at which simulated sequences have the recording's event rate.
+"""S2R: the contrast threshold at which simulated sequences have the recorded event rate.
 
 Stoffregen, Scheerlinck et al., "Reducing the Sim-to-Real Gap for Event Cameras" (ECCV 2020): the
 events per pixel and second of a recording are compared with those of simulated sequences at a grid

@@ -1,4 +1,4 @@
-"""The U-Net that the adversarial systems share: images (..., H, W, C) of any size -> maps.
+"""The U-Net of the adversarial systems: images (..., H, W, C) of any size -> maps.
 
 A head at full resolution, encoders that halve, residual blocks, decoders that double (nearest) and
 take in what the encoder of their size saw, and a linear 1x1 prediction at every scale. The channels

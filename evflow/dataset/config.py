@@ -1,4 +1,4 @@
-"""What a data set is: a frozen description that, with a seed, fixes every byte of every sequence.
+"""The configuration of a data set; with a seed it determines every byte of every sequence.
 
 `DatasetConfig` is hashable and goes into the manifest as JSON; presets are `full` (the size of
 the source paper's set: 300 sequences to train on, 30 to test on) and `debug` (seconds).

@@ -1,4 +1,4 @@
-"""What a data set holds, and whether it still does: manifests, hashes, verification.
+"""Manifests of data sets: contents, hashes, verification.
 
 Every shard keeps a manifest of its own, manifests/00002-of-00004.json, and writes no other's, so
 that no lock is needed. A sequence is recorded there before it is renamed into place: what is in

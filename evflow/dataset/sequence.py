@@ -1,4 +1,4 @@
-"""A sequence of a data set as its users see it: events, frames and the truth. NumPy only.
+"""A sequence of a data set for its users: events, frames and ground truth. NumPy only.
 
 Units: times in us from the sequence's first frame, flow in pixels per frame interval, intensity
 changes and thresholds in natural-log units, noise rates in Hz per pixel and polarity.

@@ -1,4 +1,4 @@
-"""Making a data set: shards, workers, and going on after anything that stopped it.
+"""Making a data set: shards, workers, and resuming after any interruption.
 
 A sequence is drafted in a hidden folder, recorded in the shard's manifest, then renamed into place:
 a killed process leaves nothing that looks finished. Processes share nothing but the folder, and

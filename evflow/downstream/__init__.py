@@ -1,5 +1,5 @@
-"""What events are used for: networks that turn them into video (E2VID, FireNet) and optical flow
-(EV-FlowNet), usable alone, with the weights that others have published.
+"""Networks that turn events into video (E2VID, FireNet) and optical flow (EV-FlowNet), usable
+on their own, with the weights that others have published.
 
     network, params = load_published("E2VID_plus.pth.tar")
     images = reconstruct(network, params, events, frame_times_us)

@@ -1,4 +1,4 @@
-"""What a recurrent layer does between its convolutions, such that XLA:CPU fuses it well.
+"""The element-wise part of recurrent layers, written so that XLA:CPU fuses it well.
 
 Left alone, XLA fuses two things to their harm. A chain of cheap operations goes into each of its
 users: where a state is carried by such a chain and the sequence is unrolled, the gradient of a

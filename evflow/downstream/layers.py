@@ -1,4 +1,4 @@
-"""The layers that the published event networks are made of, with PyTorch's semantics.
+"""Layers of the published event networks, with PyTorch's semantics.
 
 Images are (..., H, W, channels), kernels HWIO. Padding is explicit: SAME puts the border of a
 strided convolution one pixel off. A recurrent layer maps (x, state) to (new state); the state

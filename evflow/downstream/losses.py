@@ -1,4 +1,4 @@
-"""What the event networks are trained by: looking right, and not flickering; true flow.
+"""Losses of the event networks: image similarity, temporal consistency, optical flow.
 
 Every loss is a scalar of sequences with time first; pure and differentiable.
 """

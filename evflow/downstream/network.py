@@ -1,4 +1,4 @@
-"""What the event networks share: pure init and apply, padding, and running over a sequence.
+"""Shared by the event networks: pure init and apply, padding, running over a sequence.
 
 A network is a frozen dataclass of its static structure; its params are a nested dict of arrays,
 its state a pytree. `apply` takes one event tensor, `run` a sequence of them.

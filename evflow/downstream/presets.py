@@ -1,4 +1,4 @@
-"""What the event networks are and learn from, by name: `small` trains on two cores and fits into
+"""Named configurations of networks and trainings: `small` trains on two cores and fits into
 2 MB, `published` is after the papers for one GPU, `original` EV-FlowNet's first form, which needs
 no true flow, `debug` takes seconds. Stoffregen et al. (ECCV 2020) train E2VID on 2 sequences of
 112 px at a rate of 1e-4, with temporal consistency 2 and LPIPS by VGG; here are 4 of 128 px, 3e-4,

@@ -1,5 +1,5 @@
-"""Cameras to train event networks for, where the camera that will be used is not known: wider
-than any estimate's prior, so that one network serves them all."""
+"""A wide prior of cameras, for networks whose camera is not known at training: wider than the
+estimate's prior, so that one network serves all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Published weights in our params: by the names and shapes of the PyTorch modules they come from.
+"""Published weights as params, matched by the names and shapes of their PyTorch modules.
 
 E2VID, E2VID+, FireNet (2020 and S2R's), EV-FlowNet (S2R's). The structure (sizes, decoder, norm,
 skips) is read off the arrays, so that networks of other sizes trained by the same code load too.

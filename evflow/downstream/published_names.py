@@ -1,4 +1,4 @@
-"""What published PyTorch checkpoints call the layers of our networks."""
+"""Layer names in published PyTorch checkpoints."""
 
 from __future__ import annotations
 

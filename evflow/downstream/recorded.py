@@ -1,4 +1,4 @@
-"""Training sequences from recordings: real events and frames, in place of simulated ones.
+"""Training sequences from real recordings instead of simulation.
 
 What a recording does not tell stays out of the loss: there is no true flow (EV-FlowNet learns from
 the frames at the ends of its windows, see `losses.photometric`) and no temporal consistency.

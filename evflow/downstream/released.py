@@ -1,4 +1,4 @@
-"""Event networks in files of our own: parameters, and in the model card what they belong to.
+"""Released event networks: parameters, with architecture and training in the model card.
 
     trained = load_network("e2vid-small")          # released; or a .safetensors file of a training,
     trained = load_network("E2VID_plus.pth.tar")   # or a published checkpoint

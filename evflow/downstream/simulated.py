@@ -1,5 +1,5 @@
-"""Training sequences for the event networks, simulated where they are used: scene, camera, event
-tensors, the frames and the flow they should give. One pure function of (key, bank, config).
+"""Training sequences for the event networks, simulated on the device: scene, camera, event
+tensors, target frames and flow. One pure function of (key, bank, config).
 
 The camera is drawn from a prior, or is a measured one, of which every sequence sees a random
 crop: training data as that very camera would have recorded them.

@@ -1,5 +1,5 @@
-"""When a network looks at a stream of events: at the frames, after every so many events, or at
-equal intervals."""
+"""The instants at which a network runs on a stream of events: at the frames, after a fixed
+number of events, or at equal intervals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training of the event networks: one step, simulation included; no loop lives here.
+"""One training step of the event networks, including simulation.
 
     step = jax.jit(make_step(network, config, tx))
     state, metrics = step(state, bank)

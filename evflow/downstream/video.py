@@ -1,5 +1,5 @@
-"""Recordings through a trained network: frames for those that have none, and scores of images
-against the frames of those that have."""
+"""Recordings through a trained network: frames for recordings without any, and scores of images
+against recorded frames."""
 
 from __future__ import annotations
 

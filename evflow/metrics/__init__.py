@@ -1,4 +1,4 @@
-"""How alike things are: numbers alone, no drawing. Event streams, images, optical flow.
+"""Scores of event streams, images and optical flow, as numbers without drawing.
 
 The names load on first use: comparing streams needs no JAX.
 """

@@ -1,4 +1,4 @@
-"""How good optical flow is: by the events it sharpens (FWL, RSAT), or by the true flow (AEE).
+"""Quality of optical flow: sharpness of warped events (FWL, RSAT), or error (AEE).
 
 Events are arrays of a fixed length N, weight 0 for padding; flow (2, H, W) = (x, y) in pixels per
 unit of the events' time. Pure, jit-able, batched by vmap. FWL of the same flow differs by window,

@@ -1,4 +1,4 @@
-"""Scores of optical flow over a recording: FWL and RSAT by its events, AEE by the true flow.
+"""Scores of optical flow over a recording: FWL and RSAT from its events, AEE from the true flow.
 
 A result holds the conventions that made it, the number of events a window, and, where the true
 flow is known, the FWL of that: the ceiling.

@@ -1,4 +1,4 @@
-"""How alike images are: MSE, RMSE, PSNR, SSIM, and the change of intensity.
+"""Similarity of images: MSE, RMSE, PSNR, SSIM, and the error of intensity changes.
 
 Images are (..., H, W) on [0, 1], results (...): one number an image. Pure, jit-able; leading
 axes batch. SSIM is one name for several numbers (the same pair: .61 by `evreal`, .75 by `etnet`,

@@ -1,4 +1,4 @@
-"""Scores of reconstructed video by a stated protocol: numbers that can be compared.
+"""Scores of reconstructed video under a stated protocol, so that they can be compared.
 
 A result holds the protocol that made it: which SSIM, which LPIPS, clipped or not, linear or log
 domain, and whether frames or sequences weigh the same.

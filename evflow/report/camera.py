@@ -1,4 +1,4 @@
-"""The report on an estimated camera: ten panels in one HTML file, for whoever has to believe it.
+"""The report on an estimated camera: ten panels in one HTML file, as evidence for the estimate.
 
 The recording's own frames are simulated again with the estimate and laid beside what was
 recorded; an estimate from the first half is tried on the second. What cannot be shown says why.

@@ -1,4 +1,4 @@
-"""The report's drawings as SVG: rates, counts, intervals, histograms, scatters.
+"""The report's charts as SVG: rates, counts, intervals, histograms, scatter plots.
 
 Text stays text, in the reader's own sans-serif. ON is red and OFF is blue; what was recorded is
 solid, what was simulated dashed. A figure's size is in inches of 96 CSS pixels.

@@ -1,4 +1,4 @@
-"""Optical flow as colour: the hue says where to, the saturation how fast; no arrows."""
+"""Optical flow as colour: hue is the direction, saturation the speed."""
 
 from __future__ import annotations
 

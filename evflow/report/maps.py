@@ -1,4 +1,4 @@
-"""Panels of the camera itself: its maps, ON against OFF, its hot and dead pixels."""
+"""Panels of the camera: its maps, ON against OFF, its hot and dead pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events as a film or a sheet: red ON, blue OFF, over white or over the recording's frames.
+"""Events as a film or an image: ON red, OFF blue, on white or over the recording's frames.
 
 Needs OpenCV and Pillow alone.
 """

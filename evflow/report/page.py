@@ -1,4 +1,4 @@
-"""An HTML page that needs nothing but itself: panels of text, tables and pictures inside one file.
+"""Self-contained HTML pages: panels of text, tables and pictures in one file.
 
 Pictures of pixels are PNGs with a palette, drawings are SVG, both inlined; there is no script and
 no network. Made for a screen, a phone and paper alike.

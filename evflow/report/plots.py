@@ -1,4 +1,4 @@
-"""Pictures: maps, histograms, event images, and the quickstart's one-page comparison.
+"""Plots: maps, histograms, event images, and the quickstart's one-page comparison.
 
 matplotlib is imported on first use (extra `viz`) and always draws off-screen.
 """

@@ -1,4 +1,4 @@
-"""The proof of an estimate: the recording's own frames, seen again by the estimated camera.
+"""Validation of an estimate: the recording's own frames, simulated with the estimated camera.
 
 A stretch of the recording is simulated twice, with two keys: what the two have in common is the
 most that the recording and one of them could. Bounded work: the busiest seconds, and for the

@@ -1,4 +1,4 @@
-"""An estimate in words."""
+"""A text summary of an estimate."""
 
 from __future__ import annotations
 

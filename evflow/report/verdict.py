@@ -1,4 +1,4 @@
-"""Numbers into words: is an estimate good enough, are two streams alike, and what to do.
+"""Verdicts from numbers: whether an estimate is good, whether two streams agree, what to do.
 
 The bounds are judgements, and are printed with the verdict: a stream is good within a quarter of
 the rate, with at least .8 of the correlation that is possible; poor beyond twice the rate or below

@@ -1,4 +1,4 @@
-"""Pictures -> a film: .mp4 and .avi by OpenCV, .gif by Pillow; or a folder of images with times.
+"""Writing pictures as .mp4 or .avi (OpenCV), .gif (Pillow), or a folder of images with times.
 
 A film is written beside its place, opened again, and only moved there if all its pictures can be
 read.

@@ -1,4 +1,4 @@
-"""Synthetic moving scenes, rendered on the device: what training cameras look at.
+"""Synthetic moving scenes for training, rendered on the device.
 
 `make_bank` draws textures once, `folder_bank` and `coco_bank` take them from your own pictures;
 `sample_scene` and `render` are pure and batch by vmap.

@@ -1,4 +1,4 @@
-"""The texture bank: all that scenes are made of, drawn once, then resident on the device.
+"""The texture bank: textures and cut-outs of scenes, drawn once and kept on the device.
 
 `make_bank` is host code and pure given its key; the bank it returns is a pytree that passes
 through jit. Backgrounds are squares that the renderer continues by mirroring; cut-outs carry

@@ -1,4 +1,4 @@
-"""What scenes are drawn from: the ranges of speeds, sizes, contrasts and trajectories.
+"""Distributions of scenes: ranges of speeds, sizes, contrasts and trajectories.
 
 Units are those of the sensor: pixels, seconds, degrees. Every range is (low, high), inclusive;
 those marked "log" are drawn log-uniformly, so that each octave is equally likely.

@@ -1,4 +1,4 @@
-"""The exact optical flow of a scene: where each pixel's surface point goes, and if it stays seen.
+"""The exact optical flow of a scene, and whether each point stays visible.
 
 Layers move by similarity transforms that are known in closed form, so the flow between two
 instants is too, whatever the distance. Pure functions on the device; batch by `vmap`.

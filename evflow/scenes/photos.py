@@ -1,4 +1,4 @@
-"""Photographs for scenes: those that ship inside the installed scikit-image wheel.
+"""Photographs for scenes, from the installed scikit-image package.
 
 Host code. Nothing is ever downloaded: only files already on the disk are read. The list holds
 the pictures that scikit-image documents as CC0, public domain or free of known restrictions,

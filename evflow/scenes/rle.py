@@ -1,4 +1,4 @@
-"""COCO's run-length masks: runs of 0 and 1 in turn, down the columns, beginning with 0.
+"""COCO's run-length masks: alternating runs of 0 and 1 down the columns, 0 first.
 
 Runs come as a list, or packed into a string: 5 bits to a character (code 48 + value, 32 = more
 follow), lowest first, in two's complement, and from the fourth on as the difference to the run

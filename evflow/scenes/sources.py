@@ -1,4 +1,4 @@
-"""Your own pictures as scenes: a folder of images as textures, objects of a COCO json cut out.
+"""Scenes from your own images: a folder as textures, or objects cut out by a COCO json.
 
 Host code. `folder_bank` and `coco_bank` give a `TextureBank` as `make_bank` does, each a pure
 function of its key and the files; `join_banks` puts banks together.

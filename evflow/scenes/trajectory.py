@@ -1,4 +1,4 @@
-"""How a layer moves: a similarity transform as a closed-form function of time.
+"""Trajectories of layers: similarity transforms as closed-form functions of time.
 
 A trajectory is constant velocity, spin and scale rate plus an optional sinusoidal shake, so a
 pose at any instant is exact and needs no earlier one: frames can be rendered in any order, at

@@ -1,4 +1,4 @@
-"""Frames and a camera in, events or voxels out.
+"""The simulator: frames and a camera in; events, voxels or counts out.
 
 pixel.py one interval of one pixel · noise.py Poisson noise and leak · sensor.py all pixels,
 vmapped · to events: frames.py what comes in, active.py the pixels that may fire, pack.py sorted

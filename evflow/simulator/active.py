@@ -1,4 +1,4 @@
-"""A block of frames on the device: which pixels may send events, and what those send.
+"""One block of frames on the device: find the pixels that may fire, and step only those.
 
 Few pixels fire in a few milliseconds. Those that may are gathered, taken through the block interval
 by interval, and their memory is put back, so that cost follows the active pixels. Where the memory

@@ -1,4 +1,4 @@
-"""Events of one interval -> weights on the voxel bins it touches (Eq. 2), without the events.
+"""Weights of one interval's events on the voxel bins (Eq. 2), without making the events.
 
 Within an interval a pixel's events sit on an arithmetic progression, so the sum of their
 triangular weights has a closed form (`hat_sums`). An interval touches few bins, mostly two; only

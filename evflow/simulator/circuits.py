@@ -1,4 +1,4 @@
-"""The host's view of a sensor: frames go in block by block, events come out.
+"""Pixel circuits on the host: frames in, block by block; events out.
 
 `Still` and `Drifting` (v2e, ESIM, the paper) and `Brownian` (DVS-Voltmeter) keep the pixels'
 state from block to block. `run` sends blocks to the device and yields what will fetch their events;

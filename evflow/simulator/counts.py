@@ -1,4 +1,4 @@
-"""Event counts per pixel and polarity: exact ones, and a smooth mode that has gradients.
+"""Event counts per pixel and polarity: exact, or smooth with gradients.
 
 Counts are steps in theta. The smooth mode replaces each step by a ramp of some width around it:
 as wide as a threshold, the count is what one expects of a pixel whose memory may lie anywhere; as

@@ -1,4 +1,4 @@
-"""Frames -> events, a sorted list: the device finds what is sent, the host packs it.
+"""Frames -> a sorted list of events: computed on the device, packed on the host.
 
 Frames go to the device in blocks that begin at multiples of BLOCK (the last one padded with
 empty intervals), so the same compiled programs see every frame and the bytes do not depend on

@@ -1,4 +1,4 @@
-"""The border: video that comes in, checked, frame by frame and in blocks."""
+"""Validation of incoming video, frame by frame and in blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frame intervals -> what they add to a voxel grid, without ever making an event.
+"""Contributions of frame intervals to a voxel grid, without making events.
 
 The frames are scanned, `sensor.advance` says when events fall, `bins` what they weigh, and each
 interval's few touched bins are added to the grid in place.

@@ -1,4 +1,4 @@
-"""Slow video -> fast video: frames in between, by optical flow (OpenCV DIS).
+"""Frame interpolation by optical flow (OpenCV DIS).
 
 The simulator takes log intensity as linear between frames, which is right only while nothing
 moves by more than about a pixel. Blending 40 ms apart mis-simulates everything fast, so slower

@@ -1,4 +1,4 @@
-"""What a block of frames has sent -> a sorted list of events (host, NumPy).
+"""The events of a block of frames, as a sorted list (host, NumPy).
 
 Event times are integer microseconds in (t_prev, t_now] of their frame interval, so intervals
 never overlap. The order is total: time, OFF before ON, noise after signal, pixel.

@@ -1,4 +1,4 @@
-"""One pixel, one frame interval: pure functions of scalars, to be vmapped over pixels.
+"""One pixel over one frame interval: pure functions of scalars, vmapped over pixels.
 
 The low-passed log intensity `lp` moves linearly from its old to its new value during the
 interval; the memory `base` holds the value at the last event. An event fires each time

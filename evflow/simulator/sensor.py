@@ -1,4 +1,4 @@
-"""All pixels of a sensor, one frame interval: what both exits, events and voxels, step.
+"""All pixels of a sensor over one frame interval: the step shared by events and voxels.
 
 `start` makes a sensor and its state from the first frame, `advance` moves the state by one
 interval. Both are pure; jit, vmap and scan them. Pixels are one flat axis (N,).

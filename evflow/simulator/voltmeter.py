@@ -1,4 +1,4 @@
-"""DVS-Voltmeter: a pixel whose voltage is a Brownian motion with drift between two frames.
+"""DVS-Voltmeter: the pixel's voltage as a Brownian motion with drift.
 
 Lin et al., "DVS-Voltmeter: Stochastic Process-based Event Simulator for Dynamic Vision
 Sensors", ECCV 2022. An event is the first passage of the voltage through +level_on or

@@ -1,4 +1,4 @@
-"""Frames -> voxel grid without ever making an event.
+"""Frames -> voxel grid, without making events.
 
 `simulate_window` is pure; jit, vmap and scan it. Large frames are taken in tiles of pixels, whose
 state, light and grid stay in the cache from the first frame to the last. Where `simulate_voxels`
