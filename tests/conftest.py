@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.compilation import compile_quickly, remember
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
-# What one worker, or one process that a test starts, has compiled the others need not.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR",
-                      str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+compile_quickly(os.environ)
+remember(os.environ)
 MOST_MB = 2500  # of memory, that compiled programs may fill before they are forgotten
 
 
@@ -37,18 +36,6 @@ def _bounded_memory() -> Iterator[None]:
     if "jax" in sys.modules and int(resident) > MOST_MB * 1024:
         sys.modules["jax"].clear_caches()
         gc.collect()
-
-
-@pytest.fixture(scope="module")
-def quick_compilation() -> Iterator[None]:
-    """For tests of what programs do rather than how they round, and which run once: compiled
-    without optimisation, in half of the time. Other modules never meet these programs."""
-    import jax
-
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,9 @@ set make. Rounding differs between processors and versions of XLA, so hashes are
 on another machine the test skips and says how to add it:
 
     python tests/test_same_bytes.py
+
+Once of programs that are compiled quickly, as those of the other tests; and, slow, of programs
+compiled as users compile them.
 """
 
 from __future__ import annotations
@@ -10,8 +13,11 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import os
 import platform
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -19,6 +25,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from helpers.compilation import as_in_use, compile_quickly, quickly
 from helpers.networks import hidden, small_config
 
 import evflow as ef
@@ -29,6 +36,7 @@ from evflow.training.step import init_state, make_run_step, optimiser
 
 STORED = Path(__file__).parent / "data" / "same_bytes.json"
 PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
+QUICKLY = ", compiled quickly"
 FLAGS = ("avx2", "fma", "avx512f", "avx512_bf16", "amx_tile")  # what XLA's code depends on
 
 
@@ -69,11 +77,12 @@ def trained() -> str:
     tx = optimiser(config)
     bank = make_bank(jax.random.key(0), 4, photos=False, size=64, cutout_size=32)
     state = init_state(config, tx, bank, "default")
+    before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)  # a minute less of compilation
     try:
         state, metrics = jax.jit(make_run_step(config, tx))(state, bank)
     finally:
-        jax.config.update("jax_disable_most_optimizations", False)
+        jax.config.update("jax_disable_most_optimizations", before)
     return digest(jax.tree.leaves((state.params, state.average, metrics)))
 
 
@@ -89,15 +98,40 @@ MADE: dict[str, Callable[[], str]] = {
     "make_sequence": made}
 
 
+def hashes(environment: dict[str, str], *names: str) -> dict[str, str]:
+    """What a process of that environment makes."""
+    done = subprocess.run([sys.executable, __file__, "--print", *names], env=environment,
+                          check=True, capture_output=True, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def stored(kind: str) -> dict[str, str]:
+    """Hashes of this machine, or the test is skipped. kind: "" or QUICKLY."""
+    known = json.loads(STORED.read_text()).get(machine() + kind)
+    if known is None:
+        pytest.skip(f"no hashes for {machine()}{kind}: python {Path(__file__).name} adds them")
+    return known
+
+
+@pytest.mark.skipif(not quickly(os.environ), reason="the whole run compiles as in use")
 @pytest.mark.parametrize("name", MADE)
 def test_the_same_keys_give_the_same_bytes(name: str) -> None:
-    stored = json.loads(STORED.read_text()).get(machine())
-    if stored is None:
-        pytest.skip(f"no hashes for {machine()}: python {Path(__file__).name} adds them")
-    assert MADE[name]() == stored[name]
+    assert MADE[name]() == stored(QUICKLY)[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MADE)
+def test_programs_compiled_as_in_use_give_the_same_bytes(name: str) -> None:
+    expected = stored("")[name]
+    assert hashes(as_in_use(), name) == {name: expected}
 
 
 if __name__ == "__main__":
-    known = json.loads(STORED.read_text()) if STORED.exists() else {}
-    known[machine()] = {name: make() for name, make in MADE.items()}
-    STORED.write_text(json.dumps(known, indent=1) + "\n")
+    if sys.argv[1:2] == ["--print"]:
+        print(json.dumps({name: MADE[name]() for name in sys.argv[2:]}))
+    else:
+        quick = as_in_use()
+        compile_quickly(quick)
+        known = json.loads(STORED.read_text()) if STORED.exists() else {}
+        known |= {machine(): hashes(as_in_use(), *MADE), machine() + QUICKLY: hashes(quick, *MADE)}
+        STORED.write_text(json.dumps(known, indent=1) + "\n")

@@ -17,8 +17,6 @@ from evflow.camera import THETA_MIN, Camera
 from evflow.simulator import simulate_counts, simulate_voxels
 from evflow.types import Events
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SHAPE = (32, 40)
 SMALL = Lgan(iterations=3, hidden=(8,), groups=2, draws=2, critic_steps=2, patch=12,
              classes=(1, 1, 2))

@@ -32,8 +32,6 @@ from evflow.network.coordinates import unsquash_summary
 from evflow.simulator import simulate, simulate_voxels
 from evflow.voxel import voxelize
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 QUICK = Setting(quick=True)
 RUN_FACTS = {"time", "platform", "python", "cpu", "cpus", "memory_gb", "load_before", "versions",
              "quick"}

@@ -15,8 +15,6 @@ from evflow import Recording, read_recording, write_events
 from evflow.cli import main
 from evflow.recordings.adjust import shifted
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -16,8 +16,6 @@ from helpers.networks import hidden
 from evflow import Camera, Recording, cli, read_events, write_events
 from evflow.cli import main
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:

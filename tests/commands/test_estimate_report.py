@@ -14,8 +14,6 @@ from helpers.networks import hidden
 from evflow import write_events
 from evflow.cli import main
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -20,8 +20,6 @@ from evflow.report.flow import flow_colours, flow_image, wheel
 from evflow.report.video import enlarged, write_video
 from evflow.types import Events
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -34,8 +34,6 @@ from evflow.recordings import iter_windows
 from evflow.types import Events
 from experiments import make_dataset
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 FORMATS = ("dsec", "npy")
 
 

@@ -27,8 +27,6 @@ from evflow.errors import EvflowDataError
 from evflow.types import Events
 from evflow.voxel import voxelize
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 TINY = [E2VID(base=4, encoders=1, blocks=1), FireNet(base=4), EVFlowNet(base=4, scales=4),
         E2VID(base=4, encoders=1, blocks=0, skip="concat", norm="batch", decoder="transposed",
               output="sigmoid")]

@@ -28,8 +28,6 @@ from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank, make_bank
 from evflow.types import Events, Recording
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 DATA = SequenceConfig(sequences=4, windows=4, steps_per_window=4, crop=16, noise=0.0,
                       hot_pixels=0.0, model=SensorModel())
 SMALL = E2VID(base=4, encoders=1, blocks=0)

@@ -25,8 +25,6 @@ from experiments import evaluate_network
 from experiments.evaluate_network import Options
 from experiments.shared import recorded
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SIZE = (32, 24)
 
 

@@ -32,8 +32,6 @@ from experiments import (
 )
 from experiments.shared.common import slug
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def test_quickstart_draws_truth_beside_estimate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

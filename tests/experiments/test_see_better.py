@@ -28,8 +28,6 @@ from experiments.shared.common import slug
 from experiments.shared.conditions import Files, Workshop, conditions, network_maps, told
 from experiments.shared.trainings import SIMULATED, Trainings
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SHAPE = (24, 32)
 
 
@@ -316,7 +314,6 @@ def test_runs_are_kept_and_gone_on_with(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick_compilation")
 def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> None:
     setting = see_better.preset_of("flow", "debug")
     setting = dataclasses.replace(setting, names=("raw",), seeds=1, drawn=3, learning=(

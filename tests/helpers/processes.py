@@ -26,7 +26,8 @@ class Processes:
 
     def start(self, *args: object, devices: int = 1, **environment: str) -> subprocess.Popen[str]:
         """python ARGS, its output in the folder."""
-        flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+        flags = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} "
+                              f"--xla_force_host_platform_device_count={devices}"}
         with (self.folder / f"output{len(self._all)}.txt").open("w") as output:
             process = subprocess.Popen(
                 [sys.executable, *map(str, args)], env=self._environment | flags | environment,

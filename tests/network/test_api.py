@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers.compilation import precise
 from helpers.networks import seen, small_params
 
 from evflow import squash, unsquash
@@ -18,8 +19,6 @@ from evflow.network import api, inference
 from evflow.network.config import MODELS
 from evflow.network.coordinates import camera_std, squash_summary, unsquash_summary
 from evflow.network.weights import load_weights
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +52,13 @@ def test_inverse_undoes_forward_in_double_precision(shipped: dict[str, Any]) -> 
     rng = np.random.default_rng(0)
     voxels, dlogI = rng.poisson(0.3, (4, 5, 32)).astype(float), rng.normal(0, 0.3, (4, 5))
     dL = rng.normal(0, 0.1, (4, 5, 16))
+    forward, inverse = (jax.jit(f, compiler_options=precise()) for f in (api.forward, api.inverse))
     with jax.enable_x64(True):
         for code in (api.encode(shipped, voxels, dlogI),
                      api.encode(shipped, voxels.astype(np.float32), dlogI.astype(np.float32)),
                      api.code_from_video(shipped, dL, Camera.constant((4, 5)))):
-            y, z, _ = api.forward(shipped, voxels, code)
-            again = api.inverse(shipped, y, z, code)
+            y, z, _ = forward(shipped, voxels, code)
+            again = inverse(shipped, y, z, code)
             assert {a.dtype for a in (y, z, again)} == {jnp.dtype("float64")}
             np.testing.assert_allclose(again, voxels, rtol=0, atol=1e-9)
 

@@ -17,7 +17,6 @@ from evflow.network import api, architecture, inference
 from evflow.network.config import MODELS
 from evflow.process import chunks
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 close = {"rtol": 0, "atol": 2e-5}
 
 

@@ -26,8 +26,6 @@ from evflow.report import camera, page
 from evflow.report.resimulate import busiest, usable_runs
 from evflow.report.verdict import judge_estimate, judge_stream, known, poorer, worst
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 PANELS = ("verdict", "maps", "on-off", "rates", "images", "counts", "intervals", "faults",
           "held-out", "assumptions")
 

@@ -14,8 +14,6 @@ import pytest
 from evflow.scenes import Layer, Scene, SceneConfig, Trajectory, make_bank, render, sample_scene
 from evflow.scenes.motion import optical_flow
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @functools.cache
 def scenes(count: int = 8) -> list[tuple[Scene, tuple[int, int]]]:

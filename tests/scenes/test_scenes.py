@@ -20,8 +20,6 @@ from evflow.scenes.photos import crop
 from evflow.scenes.textures import cutout_mask, finish
 from evflow.scenes.trajectory import SCALE_LIMIT, Pose, mirror, pose, recycle
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 finish_texture = jax.jit(finish)
 
 # ---------------------------------------------------------------- textures, photographs, bank

@@ -17,8 +17,6 @@ from evflow.training.batch import Batch
 from evflow.training.batch import sample_batch as sample_batch_eagerly
 from evflow.training.config import PRESETS, NuisanceConfig
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
 
 

@@ -9,8 +9,6 @@ import pytest
 
 from evflow.training import losses
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def test_condition_loss_is_least_at_the_target() -> None:
     target = jnp.float32(0.02)

@@ -18,8 +18,6 @@ from evflow.training.batch import sample_batch
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.step import TrainState, init_state, loss_fn, make_run_step, optimiser
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 CONFIG = small_config(steps=40, warmup=2)
 TX = optimiser(CONFIG)
 

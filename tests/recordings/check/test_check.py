@@ -22,8 +22,6 @@ from evflow.recordings.adjust import flipped, shifted
 from evflow.recordings.check import frames_offset
 from evflow.recordings.faulty_pixels import hot_among_neighbours
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def sound() -> Recording:

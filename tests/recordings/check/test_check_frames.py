@@ -19,8 +19,6 @@ from evflow.notes import Note
 from evflow.recordings.adjust import flipped, shifted, with_frames
 from evflow.recordings.glitches import exposed
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def watched() -> tuple[Recording, Camera]:

@@ -14,8 +14,6 @@ from evflow import Events, Recording, check, estimate_camera, read_recording
 from evflow.errors import EvflowDataError
 from evflow.recordings.stillness import company, gathered, stands_still
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SIZE = (64, 48)
 SECONDS = 20.0
 

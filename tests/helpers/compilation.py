@@ -1,0 +1,66 @@
+"""How the tests compile: quickly and remembered, or as in use.
+
+Compilation is most of the suite's time, and most programs run once on few pixels. They are
+compiled in a third of the time: without optimisation, by XLA's older emitters.
+EVFLOW_TESTS_OPTIMISED=1 lets the whole suite run as users compile; `as_in_use` and `precise` are
+for the tests that always do.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+from collections.abc import Mapping, MutableMapping
+from pathlib import Path
+
+TESTS = Path(__file__).parents[1]
+OPTIMISED = "EVFLOW_TESTS_OPTIMISED"
+UNOPTIMISED = "JAX_DISABLE_MOST_OPTIMIZATIONS"
+# Other versions of XLA may not know these flags, and end a process that is given an unknown one.
+FLAGS_OF = "0.10."
+FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+
+
+def compile_quickly(environment: MutableMapping[str, str]) -> None:
+    """To be called before JAX is imported."""
+    if environment.get(OPTIMISED):
+        return
+    environment[UNOPTIMISED] = "1"
+    flags = environment.get("XLA_FLAGS", "")
+    if importlib.metadata.version("jaxlib").startswith(FLAGS_OF) and FLAGS not in flags:
+        environment["XLA_FLAGS"] = f"{flags} {FLAGS}".strip()
+
+
+def quickly(environment: Mapping[str, str]) -> bool:
+    """Whether `compile_quickly` has set all that it can."""
+    return UNOPTIMISED in environment and FLAGS in environment.get("XLA_FLAGS", "")
+
+
+def as_in_use() -> dict[str, str]:
+    """The environment for a process that compiles as users do."""
+    environment = {k: v for k, v in os.environ.items() if k != UNOPTIMISED}
+    environment["XLA_FLAGS"] = environment.get("XLA_FLAGS", "").replace(FLAGS, "").strip()
+    environment["PYTHONPATH"] = os.pathsep.join(map(str, (TESTS.parent, TESTS)))
+    return environment
+
+
+def precise() -> dict[str, bool]:
+    """Compiler options for programs whose rounding is what is tested: the older emitters round
+    double precision to some 4e-7."""
+    return {"xla_cpu_use_fusion_emitters": True} if quickly(os.environ) else {}
+
+
+def remember(environment: MutableMapping[str, str]) -> None:
+    """What one worker, process or run has compiled no other need compile: kept in the user's cache
+    folder, unless the environment names another or that one cannot be written."""
+    folder = Path(environment.get("XDG_CACHE_HOME") or "~/.cache") / "evflow" / "jax-tests"
+    try:
+        folder = folder.expanduser()
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # nobody's home
+        return
+    if os.access(folder, os.W_OK):
+        for name, value in (("COMPILATION_CACHE_DIR", str(folder)),
+                            ("PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0"),
+                            ("PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")):
+            environment.setdefault(f"JAX_{name}", value)
