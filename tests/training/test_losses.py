@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from evflow.training import losses
+from evflow.training.config import LossConfig
+from evflow.training.step import total_loss
 
 
 def test_condition_loss_is_least_at_the_target() -> None:
@@ -93,6 +95,22 @@ def test_adaptive_weight(loss: float, weight: float) -> None:
 def test_adaptive_weight_has_no_gradient() -> None:
     scaled = jax.grad(lambda x: losses.adaptive_weight(x) * x)(jnp.float32(50.0))
     assert float(scaled) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("adaptive", [True, False])
+def test_the_total_is_the_weighted_sum_of_all_parts(adaptive: bool) -> None:
+    """Eq. 11, and the gradient of each part in it is its weight."""
+    names = ("condition", "change_l1", "parameter", "flow", "event", "inverse_flow", "summary",
+             "spread")
+    weights = {name: 0.5 + i for i, name in enumerate(names)}
+    values = dict(zip(names, (0.3, 2.0, 47.0, -310.0, 2300.0, -5.0, 0.7, 12.0), strict=True))
+    scales = dict(zip(names, (1.0, 1.0, 0.1, 0.01, 1e-3, 1.0, 1.0, 0.1), strict=True))
+    config = LossConfig(**weights, adaptive=adaptive)
+    total, grads = jax.value_and_grad(total_loss)(
+        {name: jnp.float32(value) for name, value in values.items()}, config)
+    factors = {n: weights[n] * (scales[n] if adaptive else 1.0) for n in names}
+    assert float(total) == pytest.approx(sum(factors[n] * values[n] for n in names), rel=1e-5)
+    assert {n: float(g) for n, g in grads.items()} == pytest.approx(factors, rel=1e-5)
 
 
 def test_summary_loss_pulls_the_std_to_the_error() -> None:

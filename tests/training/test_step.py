@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,24 @@ from helpers.networks import small_config
 from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank, make_bank
 from evflow.training import config as configs
+from evflow.training import step as training_step
 from evflow.training.batch import sample_batch
 from evflow.training.checkpoint import Checkpoints
-from evflow.training.step import TrainState, init_state, loss_fn, make_run_step, optimiser
+from evflow.training.losses import adaptive_weight
+from evflow.training.step import (
+    TrainState,
+    init_state,
+    loss_fn,
+    make_run_step,
+    optimiser,
+    step_key,
+)
 
 CONFIG = small_config(steps=40, warmup=2)
 TX = optimiser(CONFIG)
+WEIGHTS = configs.LossConfig(inverse_flow=0.5)
+PARTS = ("summary", "condition", "change_l1", "parameter", "flow", "event", "inverse_flow",
+         "spread")
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +56,67 @@ def leaves(state: TrainState) -> list[np.ndarray]:
     return [np.asarray(a) for a in jax.tree.leaves(plain)]
 
 
-def test_every_trainable_leaf_gets_a_gradient(bank: TextureBank, fresh: TrainState) -> None:
-    """After one step (couplings start at zero) only actnorm's buffers have none."""
+@pytest.fixture(scope="module")
+def gradients(bank: TextureBank, fresh: TrainState) -> tuple[dict[str, Any], Any]:
+    """The losses by name, the total under "loss", and for each parameter the gradients of all of
+    them on a leading axis. After one step, as couplings start at zero."""
     batch = jax.jit(sample_batch, static_argnames="config")(jax.random.key(1), bank, CONFIG)
-    params = jax.tree.map(lambda p: p + 0.01, fresh.params)
-    grads = jax.jit(jax.grad(lambda p: loss_fn(p, batch, jax.random.key(2), CONFIG)[0]))(params)
+    config = dataclasses.replace(CONFIG, loss=WEIGHTS)
+
+    @jax.jit
+    def program(params: Any) -> tuple[dict[str, Any], Any]:
+        def of(params: Any) -> dict[str, Any]:
+            metrics = loss_fn(params, batch, jax.random.key(2), config)[1]
+            return {k: v for k, v in metrics.items() if k.startswith("loss")}
+
+        found, pullback = jax.vjp(of, params)
+        rows = dict(zip(found, jnp.eye(len(found)), strict=True))
+        return found, jax.vmap(lambda row: pullback(row)[0])(rows)
+
+    return program(jax.tree.map(lambda p: p + 0.01, fresh.params))
+
+
+def test_every_trainable_leaf_gets_a_gradient(gradients: tuple[dict[str, Any], Any]) -> None:
+    """Only actnorm's buffers have none."""
+    found, grads = gradients
+    total = list(found).index("loss")
     for path, leaf in jax.tree_util.tree_leaves_with_path(grads):
         assert np.isfinite(leaf).all(), path
         is_buffer = path[-1].key == "base"
-        assert bool(jnp.any(leaf != 0)) is not is_buffer, path
+        assert bool(np.any(leaf[total] != 0)) is not is_buffer, path
+
+
+def test_every_loss_teaches_with_its_weight(gradients: tuple[dict[str, Any], Any]) -> None:
+    """Eq. 11: the total and its gradient are the sums of all parts, weighted and scaled."""
+    found, grads = gradients
+    names = list(found)
+    assert set(names) == {"loss", *(f"loss/{part}" for part in PARTS)}
+    factors = {f"loss/{part}": getattr(WEIGHTS, part) * float(adaptive_weight(
+        found[f"loss/{part}"])) for part in PARTS}
+    row = np.array([factors.get(name, 0.0) for name in names])
+    values = np.array([float(found[name]) for name in names])
+    assert float(found["loss"]) == pytest.approx(row @ values, rel=1e-4)
+    flat = np.concatenate([np.asarray(leaf, float).reshape(len(names), -1)
+                           for leaf in jax.tree.leaves(grads)], 1)
+    for name, gradient in zip(names, flat, strict=True):
+        assert gradient.any(), name
+    total = flat[names.index("loss")]
+    np.testing.assert_allclose(row @ flat, total, rtol=1e-3, atol=1e-5 * np.abs(total).max())
+
+
+def test_every_step_and_use_has_random_numbers_of_its_own(
+    fresh: TrainState, bank: TextureBank, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = [dataclasses.replace(fresh, step=jnp.int32(i)) for i in range(3)]
+    keys = [step_key(state, use) for state in states for use in ("losses", "data")]
+    assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 6
+    drawn: list[Any] = []
+    monkeypatch.setattr(training_step, "sample_batch", lambda key, *_: drawn.append(key))
+    monkeypatch.setattr(training_step, "make_train_step", lambda *_: lambda state, batch: state)
+    for state in states:
+        make_run_step(CONFIG, TX)(state, bank)
+    for key, expected in zip(drawn, keys[1::2], strict=True):
+        np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(expected))
 
 
 @pytest.mark.slow
@@ -93,8 +158,6 @@ def test_missing_checkpoint_is_named(tmp_path: Path, fresh: TrainState) -> None:
 @pytest.mark.slow
 def test_the_paper_preset_steps(bank: TextureBank) -> None:
     """64 steps per level set, tanh output, condition from the events: one finite update."""
-    import dataclasses
-
     paper = dataclasses.replace(
         configs.preset("paper"), crop=16, scenes=2, cameras=1, block=(8, 8), warmup=1, steps=3,
         sensors=configs.preset("paper").sensors)
