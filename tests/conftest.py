@@ -38,6 +38,19 @@ def _bounded_memory() -> Iterator[None]:
         gc.collect()
 
 
+@pytest.fixture(scope="module")
+def optimised() -> Iterator[None]:
+    """For tests that run longer than they compile, or that depend on the last bit."""
+    import jax
+
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder EVFLOW_DATA, which holds data/ (recordings, formats, images) and goldens/."""

@@ -25,6 +25,8 @@ from evflow.camera.perturb import (
 from evflow.errors import EvflowDataError
 from evflow.simulator import simulate
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 KEY = jax.random.key(11)
 SHAPE = (200, 250)
 PIXELS = 50_000

@@ -21,6 +21,8 @@ from evflow.simulator import simulate, simulate_voxels
 from evflow.types import Events
 from evflow.voxel import voxelize
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 KEY = jax.random.key(0)
 QUIET = Camera.constant(SHAPE, 0.15, 0.2)
 NOISY = Camera.constant(SHAPE, 0.15, 0.2, 30.0, 15.0)

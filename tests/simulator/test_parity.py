@@ -15,6 +15,8 @@ from evflow.camera.sensors import SensorModel
 from evflow.simulator import simulate
 from evflow.types import Events
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 SMALL = Path(__file__).parents[1] / "data" / "small_v2e.npz"
 TOLERANCE = 0.005  # of the total: what exact threshold ties of 8-bit video may move
 CASES: dict[str, tuple[float, float, dict[str, Any]]] = {

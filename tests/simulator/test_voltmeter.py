@@ -26,6 +26,8 @@ from evflow.simulator.voltmeter import (
     weights,
 )
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 KEY = jax.random.key(0)
 PRESETS = {"dvs346": DVS346, "dvs240": DVS240}
 NOISY = Voltmeter(5.0, 20.0, 5e-3, 1e-6, 1e-8, 2e-3)  # sigma such that every draw matters
