@@ -277,14 +277,15 @@ def test_low_pass_follows_its_difference_equation() -> None:
     dt, count = 1e-3, 40
     frames = np.full((count, *SHAPE), 255.0, np.float32)
     frames[0] = 20.0
-    camera = Camera.constant(SHAPE, 0.05, 0.05)
+    theta = 0.01  # a coarse one would hide a corner that is off by a twentieth
+    camera = Camera.constant(SHAPE, theta, theta)
     events = simulate(KEY, frames, milliseconds(count), camera, model=SensorModel(cutoff_hz=40.0))
     lp = np.log(20.0) + np.log(255 / 20) * (1 - (1 - 2 * np.pi * 40 * dt) ** np.arange(count))
-    level = np.floor((lp - lp[0]) / 0.05)
+    level = np.floor((lp - lp[0]) / theta)
     seen = np.histogram(events.t, milliseconds(count) + 1)[0] / np.prod(SHAPE)
     assert np.abs(np.cumsum(seen) - level[1:]).max() <= 1
-    assert seen.sum() == pytest.approx(np.log(255 / 20) / 0.05, abs=1.01)
-    assert seen[0] == pytest.approx(2 * np.pi * 0.04 * np.log(255 / 20) / 0.05, abs=1.01)
+    assert seen.sum() == pytest.approx(np.log(255 / 20) / theta, abs=1.01)
+    assert seen[0] == pytest.approx(2 * np.pi * 0.04 * np.log(255 / 20) / theta, abs=1.01)
 
 
 def test_floor_division_is_exact_but_for_ties() -> None:
