@@ -26,8 +26,12 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.one_polarity import untold, without
 from evflow.estimation.pixel_noise import pixel_rates, quiet_time
 from evflow.estimation.refine import (
+    IDEAL,
     Chunk,
+    Found,
+    Photoreceptor,
     PixelEvidence,
+    find_photoreceptor,
     pixel_posterior,
     plan_runs,
     refine_summary,
@@ -105,18 +109,24 @@ def estimate_camera(
             yield window
             advance()
 
-    stats, n_events, n_shown = _pool(params, windows())
+    found = find_photoreceptor(recording, runs) if runs else None
+    seen_by = found.seen if found is not None and found.needed else IDEAL
+    stats, n_events, n_shown = _pool(params, windows(), seen_by)
     summary, summary_std = api.finish(params, stats)
-    surveyed = survey(recording, runs, advance)
+    surveyed = survey(recording, runs, advance, seen_by)
     hot, chunks = np.zeros(n_events.shape, bool), surveyed.chunks
     if runs:
         hot = hot_pixels(surveyed.quiet, float(summary.eta_on + summary.eta_off))
         chunks = [dataclasses.replace(c, bright=c.bright & ~hot) for c in chunks]
+        if found is not None and not seen_by.ideal:
+            summary, summary_std = _regressed(summary, summary_std, found)
         summary, summary_std = _refined(params, chunks, summary, summary_std)
+        if found is not None and not seen_by.ideal:
+            summary_std = _widened(summary, summary_std, found)
     unknown = untold(stats, summary)
     if unknown:
         summary, summary_std = without(unknown, chunks, summary, summary_std)
-    quiet = _quiet_time(windows(), summary, hot)
+    quiet = _quiet_time(windows(), summary, hot, seen_by)
     if runs:
         camera, std = _by_regression(surveyed.evidence, summary, summary_std)
     else:
@@ -130,12 +140,21 @@ def estimate_camera(
         tuple(f"theta_{name}" for name in unknown))
 
 
-def window_inputs(window: Window) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
+def window_inputs(
+    window: Window, seen_by: Photoreceptor = IDEAL
+) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
     """voxels (H, W, 32), dlogI (H, W) and conditions of one window of a recording."""
     voxels = voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
-    before, after = lin_log(window.frame0), lin_log(window.frame1)
+    before, after = (_log_light(f, seen_by) for f in (window.frame0, window.frame1))
     intensity, dlogI = 0.5 * (before + after), after - before
     return voxels, dlogI, {"window_s": window.window_s, "intensity": intensity}
+
+
+def _log_light(frame: np.ndarray, seen_by: Photoreceptor) -> Array:
+    """A frame (H, W) in log units, with the light that its pixels see beside it."""
+    if not seen_by.offset_dn:
+        return lin_log(frame)
+    return lin_log(np.maximum(frame.astype(np.float32) + seen_by.offset_dn, 0.0))
 
 
 def pool_recording(
@@ -146,14 +165,14 @@ def pool_recording(
 
 
 def _pool(
-    params: api.Params, windows: Iterator[Window]
+    params: api.Params, windows: Iterator[Window], seen_by: Photoreceptor = IDEAL
 ) -> tuple[api.Stats, np.ndarray, np.ndarray]:
     """Summed Stats of what the frames show, all events (H, W), and those that the frames show."""
     total: api.Stats | None = None
     n_events = n_shown = np.zeros(())
     for window in windows:
         shown = exposed(window.frame0, window.frame1)
-        stats = _shown_stats(params, window, shown)
+        stats = _shown_stats(params, window, shown, seen_by)
         counts = window.events.count_map().sum(0).astype(np.uint32)
         total = stats if total is None else total + stats
         n_events, n_shown = n_events + counts, n_shown + counts * shown
@@ -165,10 +184,12 @@ def _pool(
     return total, n_events.astype(np.uint32), n_shown
 
 
-def _shown_stats(params: api.Params, window: Window, shown: np.ndarray) -> api.Stats:
+def _shown_stats(
+    params: api.Params, window: Window, shown: np.ndarray, seen_by: Photoreceptor
+) -> api.Stats:
     """Stats of the pixels that are shown (H, W). The others are replaced by random ones of them
     and the sums scaled down to their number: arrays of one shape are compiled once."""
-    voxels, dlogI, given = window_inputs(window)
+    voxels, dlogI, given = window_inputs(window, seen_by)
     share = float(shown.mean())
     if 0 < share < 1:
         rng = np.random.default_rng(window.index)
@@ -185,14 +206,17 @@ def _shown_stats(params: api.Params, window: Window, shown: np.ndarray) -> api.S
     return stats if share == 1 else jax.tree.map(lambda leaf: leaf * share, stats)
 
 
-def _quiet_time(windows: Iterator[Window], summary: Summary, hot: np.ndarray) -> np.ndarray:
+def _quiet_time(
+    windows: Iterator[Window], summary: Summary, hot: np.ndarray, seen_by: Photoreceptor
+) -> np.ndarray:
     """The `quiet_time` of all windows: (2, 2, H, W), ON and OFF, events and seconds."""
     noise = np.array([summary.eta_on, summary.eta_off])
     total = np.zeros((2, 2, *hot.shape))
     for window in windows:
-        before, after = window.frame0, window.frame1
-        total += quiet_time(window.events.count_map(), np.asarray(lin_log(after) - lin_log(before)),
-                            exposed(before, after), hot, window.window_s, noise)
+        frames = window.frame0, window.frame1
+        before, after = (_log_light(f, seen_by) for f in frames)
+        total += quiet_time(window.events.count_map(), np.asarray(after - before),
+                            exposed(*frames), hot, window.window_s, noise)
     return total
 
 
@@ -244,6 +268,22 @@ def _refined(
     parts = next(iter(params.values()))
     refined = refine_summary(chunks, summary, std, parts.get("fusion"), parts.get("signal"))
     return refined.summary, refined.std
+
+
+def _regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Summary]:
+    """The summary with the pooled regression's thresholds: the network knows few slow pixels."""
+    (on, off), error = found.thresholds()
+    on, off, error = jnp.float32(on), jnp.float32(off), jnp.float32(error)
+    return (dataclasses.replace(summary, theta_on=on, theta_off=off),
+            dataclasses.replace(std, theta_on=error * on, theta_off=error * off))
+
+
+def _widened(summary: Summary, std: Summary, found: Found) -> Summary:
+    """The std with what not knowing the photoreceptor leaves open of the thresholds."""
+    on, off = found.theta_error
+    return dataclasses.replace(
+        std, theta_on=jnp.hypot(std.theta_on, jnp.float32(on) * summary.theta_on),
+        theta_off=jnp.hypot(std.theta_off, jnp.float32(off) * summary.theta_off))
 
 
 def _by_regression(

@@ -19,15 +19,31 @@ from evflow.estimation.refine.fit import Refined, fused, refine_summary
 from evflow.estimation.refine.path import (
     Chunk,
     Survey,
+    find_photoreceptor,
     make_chunk,
     plan_runs,
     refinement_chunks,
     survey,
 )
+from evflow.estimation.refine.photoreceptor import IDEAL, Found, Photoreceptor
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
 
 __all__ = [
-    "Chunk", "PixelEvidence", "Refined", "Survey", "foreseen", "fused", "make_chunk",
-    "pixel_posterior", "plan_runs", "refine_alone", "refine_summary", "refinement_chunks",
+    "IDEAL",
+    "Chunk",
+    "Found",
+    "Photoreceptor",
+    "PixelEvidence",
+    "Refined",
+    "Survey",
+    "find_photoreceptor",
+    "foreseen",
+    "fused",
+    "make_chunk",
+    "pixel_posterior",
+    "plan_runs",
+    "refine_alone",
+    "refine_summary",
+    "refinement_chunks",
     "survey",
 ]

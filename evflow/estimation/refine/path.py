@@ -11,8 +11,18 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterable
 
+import jax
 import numpy as np
 
+from evflow.estimation.refine.photoreceptor import (
+    FAST,
+    IDEAL,
+    Found,
+    Photoreceptor,
+    find,
+    sample,
+    seen_path,
+)
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
 from evflow.estimation.refine.sightings import Sightings, sight
 from evflow.estimation.refine.trace import Trace, trace_of_events
@@ -24,6 +34,7 @@ from evflow.types import Recording
 INTERVALS = 8  # frame intervals per chunk: 200 ms at 40 Hz
 STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 px a step
 CHUNK_PIXELS = 8 * 346 * 260  # pixels of all chunks simulated, of a long recording
+STRETCHES = 3  # that tell the photoreceptor
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,7 +74,8 @@ class Survey:
 
 
 def survey(
-    recording: Recording, runs: list[list[int]], advance: Callable[[], None] = lambda: None
+    recording: Recording, runs: list[list[int]], advance: Callable[[], None] = lambda: None,
+    seen_by: Photoreceptor = IDEAL,
 ) -> Survey:
     """A recording's stretches, one after the other in the memory of one and of those kept.
     runs: of `plan_runs`; advance() is called after each."""
@@ -72,7 +84,7 @@ def survey(
     chunks, evidence = [], PixelEvidence.nothing((height, width))
     quiet = np.zeros((4, height, width))
     for run in runs:
-        chunk = make_chunk(recording, run)
+        chunk = make_chunk(recording, run, seen_by=seen_by)
         evidence, quiet = evidence + chunk.evidence, quiet + chunk.quiet
         if run in simulated:
             chunks.append(chunk)
@@ -117,26 +129,78 @@ def plan_chunks(recording: Recording, runs: list[list[int]]) -> list[list[int]]:
     return runs
 
 
-def make_chunk(recording: Recording, run: list[int], steps: int = STEPS) -> Chunk:
-    """Interpolate the frames of a run of intervals and count its events."""
+def make_chunk(
+    recording: Recording, run: list[int], steps: int = STEPS, seen_by: Photoreceptor = IDEAL
+) -> Chunk:
+    """Interpolate the frames of a run of intervals, put them through what its pixels see them by,
+    and count its events."""
+    film = interpolated(recording, run, steps)
+    times = film.times_us + round(seen_by.delay_s * 1e6)
+    fine = as_seen(film, seen_by)
+    dark, light = film.frames.min(0) + seen_by.offset_dn, film.frames.max(0)
+    bright = (dark >= DARK_DN) & (light <= SATURATED_DN)
+    trace = trace_of_events(recording.events, times, steps)
+    sightings = sight(recording.events, times, fine, steps, film.shown)
+    return Chunk(
+        fine, bright, film.dt_s, film.motion_px, trace,
+        evidence_of(sightings, first=run[0] == 0),
+        _quiet(fine, trace, film.dt_s, film.shown[1:] & film.shown[:-1]), sightings)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Film:
+    """The frames of a run and what lies between them. frames: (K + 1, H, W) DN; dn: (K * steps +
+    1, H, W) DN; times_us: (K + 1,); dt_s: (K,) interval lengths; motion_px: (K,) fast motion;
+    shown: (K + 1, H, W) bool, frames that are neither saturated nor black."""
+
+    frames: np.ndarray
+    dn: np.ndarray
+    times_us: np.ndarray
+    dt_s: np.ndarray
+    motion_px: np.ndarray
+    shown: np.ndarray
+
+
+def interpolated(recording: Recording, run: list[int], steps: int = STEPS) -> Film:
+    """The frames of a run of intervals, filled up by optical flow."""
     frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
     times = recording.frame_times[run[0]:run[-1] + 2]
     interpolator = Interpolator()
-    path, motion = [frames[0]], []
+    dn, motion = [frames[0]], []
     for a, b in itertools.pairwise(frames):
         between, moved = interpolator.between(a, b, steps)
-        path += [*between, b]
+        dn += [*between, b]
         motion.append(moved)
-    stack, fine = np.stack(frames), np.asarray(lin_log(np.stack(path)))
-    bright = (stack.min(0) >= DARK_DN) & (stack.max(0) <= SATURATED_DN)
-    seen = np.stack([exposed(frame) for frame in frames])
-    dt_s = np.diff(times).astype(np.float32) * 1e-6
-    trace = trace_of_events(recording.events, times, steps)
-    sightings = sight(recording.events, times, fine, steps, seen)
-    return Chunk(
-        fine, bright, dt_s, np.array(motion, np.float32), trace,
-        evidence_of(sightings, first=run[0] == 0),
-        _quiet(fine, trace, dt_s, seen[1:] & seen[:-1]), sightings)
+    return Film(
+        np.stack(frames), np.stack(dn), times, np.diff(times).astype(np.float32) * 1e-6,
+        np.array(motion, np.float32), np.stack([exposed(frame) for frame in frames]))
+
+
+def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
+    """The path (K * steps + 1, H, W) in log units that a photoreceptor makes of a film."""
+    if not seen_by.offset_dn and not seen_by.tau_s:
+        return np.asarray(lin_log(film.dn))
+    steps = (len(film.dn) - 1) // len(film.dt_s)
+    dt_s = np.repeat(film.dt_s / steps, steps).astype(np.float32)
+    values = (np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST)))
+    return np.asarray(_seen(film.dn, dt_s, *values))
+
+
+_seen = jax.jit(seen_path)
+
+
+def find_photoreceptor(recording: Recording, runs: list[list[int]]) -> Found | None:
+    """What the pixels of a recording see its frames by, from a few of its runs of intervals; None
+    where too little happens."""
+    runs = plan_chunks(recording, runs)
+    chosen = np.unique(np.linspace(0, len(runs) - 1, min(STRETCHES, len(runs))).round())
+    parts = []
+    for k in chosen.astype(int):
+        film = interpolated(recording, runs[k])
+        s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
+        parts.append((film.dn, np.repeat(film.dt_s / STEPS, STEPS), s))
+    data = sample(parts)
+    return find(data) if data is not None else None
 
 
 def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, shown: np.ndarray) -> np.ndarray:

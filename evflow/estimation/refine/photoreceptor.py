@@ -1,0 +1,329 @@
+"""What a pixel sees of what frames show: added light, a low-pass, and another clock.
+
+A pixel sees log(light + its dark current) through a photoreceptor that follows with a delay; a
+frame subtracts its black level, and its time stamp is off by a little. With light L in DN of the
+frames, what the pixel sees is s in
+
+    ds/dt = r(t) (u(t) - s),    u = lin-log(L + offset),    r = 2 pi cutoff (L + offset + 20) / 275
+
+(first order, its rate proportional to light as in v2e), `delay` after the frame's clock. At an
+event the memory equals s, so that s at a pixel's events is theta_on a - theta_off b plus a
+constant, a and b counting its events. The pooled regression of all pixels explains the more of s
+the truer (offset, tau, delay) are; tau = 1 / (2 pi cutoff) is linear where the pixel is fast.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from evflow.estimation.refine.sightings import Sightings, counted, trusted
+
+Array = jax.Array
+
+FAST = 1e-5  # s: a photoreceptor too fast to be seen between two fine frames
+LEAST_DN = 0.1  # of light, before the log
+LEAST_LIGHT = 0.02  # of v2e's full rate
+PIXELS, EVENTS = 4096, 1 << 15  # of a stretch that are looked at
+SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
+TILES = (6, 8)  # blocks of the image whose errors are independent
+OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, where the search begins
+TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
+PRIOR = np.array([25.0, 5e-3, 1.5e-3])  # std of offset (DN), tau and delay (s) before any data
+SCALE = np.array([2.0, 2e-4, 2e-4])  # of finite differences
+STEP = np.array([12.0, 3e-3, 1e-3])  # most that one step changes
+LOW, HIGH = np.array([-25.0, FAST, -6e-3]), np.array([90.0, 3e-2, 6e-3])
+PATTERN = (4.0, 1.0, 0.25)  # SCALEs that are tried, one coordinate at a time
+MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
+ENOUGH = 500  # events to look at
+MOST_SIZE = 4000.0  # events' worth of a recording, as errors of the path are alike everywhere
+PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
+# The path is wrong in its own way everywhere. What it explains better by less than a few per cent
+# of what is left says nothing of the pixel, and so much is left open of what is found:
+BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
+FLOOR = np.array([0.5, 1e-4, 5e-4])
+DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
+
+
+@dataclasses.dataclass(frozen=True)
+class Photoreceptor:
+    """offset_dn: light added to the frames' DN before the log; tau_s: time constant of the
+    low-pass at 255 DN, 0 where it is too fast to be seen; delay_s: of the events after the
+    frames."""
+
+    offset_dn: float = 0.0
+    tau_s: float = 0.0
+    delay_s: float = 0.0
+
+    @property
+    def ideal(self) -> bool:
+        return self == Photoreceptor()
+
+    @property
+    def cutoff_hz(self) -> float:
+        """Corner of the low-pass at 255 DN; 0 where there is none."""
+        return 1.0 / (2.0 * np.pi * self.tau_s) if self.tau_s > FAST else 0.0
+
+
+IDEAL = Photoreceptor()
+
+
+# The less of the contrast a path keeps, the less of the events it explains. On simulated recordings
+# with .8 to .98 explained, the regression's thresholds over the true ones are 1 - LACKING times the
+# rest, but for a few per cent and a part of what is lacking.
+LACKING, LEAST_KEPT = 1.5, 0.5
+KEPT_ERROR = (0.04, 0.4)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Found:
+    """seen: the most probable photoreceptor; theta (2,): of the pooled regression; covariance (3, 3) of (offset, tau, delay); slope
+    (2, 3): how log theta_on, log theta_off of the pooled regression change with the three;
+    explained: shares of the variance that the regression explains, ideal and as found; chance:
+    probability that the ideal pixel is not enough. size: events' worth of the sample."""
+
+    seen: Photoreceptor
+    theta: np.ndarray
+    covariance: np.ndarray
+    slope: np.ndarray
+    explained: tuple[float, float]
+    chance: float
+    size: float
+
+    @property
+    def needed(self) -> bool:
+        """Whether an ideal pixel is the less probable."""
+        return self.chance > 0.5
+
+    def thresholds(self) -> tuple[np.ndarray, float]:
+        """theta (2,) of the pooled regression, less what the path lacks of the contrast, and its
+        relative error."""
+        kept = float(np.clip(1 - LACKING * (1 - self.explained[1]), LEAST_KEPT, 1.0))
+        return self.theta / kept, float(np.hypot(KEPT_ERROR[0], KEPT_ERROR[1] * (1 - kept)))
+
+    @property
+    def theta_error(self) -> np.ndarray:
+        """Relative error (2,) of theta that not knowing the three leaves."""
+        return np.sqrt(np.einsum("ij,jk,ik->i", self.slope, self.covariance, self.slope))
+
+
+class Sample(NamedTuple):
+    """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N):
+    pixel (0..P-1), at (in fine steps), on, off (counts so far), weight; block (C, P)."""
+
+    dn: Array
+    dt_s: Array
+    pixel: Array
+    at: Array
+    on: Array
+    off: Array
+    weight: Array
+    block: Array
+
+
+def lin_log_dn(dn: Array) -> Array:
+    """v2e's lin-log of DN >= 0, without its rounding."""
+    return jnp.where(dn <= 20.0, dn * (np.log(20.0) / 20.0), jnp.log(jnp.maximum(dn, 1.0)))
+
+
+def seen_path(dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> Array:
+    """s (T + 1, ...) of light (T + 1, ...) in DN that is linear in the log between fine steps of
+    dt_s (T,): exact, begun at rest."""
+    light = jnp.maximum(jnp.asarray(dn) + offset, LEAST_DN)
+    u = lin_log_dn(light)
+    rate = jnp.maximum((light + 20.0) / 275.0, LEAST_LIGHT) / jnp.maximum(tau_s, FAST)
+
+    def step(s: Array, x: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        before, now, r, h = x
+        lag = (now - before) / (r * h)
+        s = now - lag + (s - before + lag) * jnp.exp(-r * h)
+        return s, s
+
+    rest = 0.5 * (rate[1:] + rate[:-1])
+    _, s = jax.lax.scan(step, u[0], (u[:-1], u[1:], rest, jnp.asarray(dt_s)))
+    return jnp.concatenate([u[:1], s])
+
+
+def sample(
+    parts: list[tuple[np.ndarray, np.ndarray, Sightings]], seed: int = 0
+) -> Sample | None:
+    """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
+    its fine steps, and its sightings; None where too little happens."""
+    rng, rows = np.random.default_rng(seed), []
+    length = max((len(dn) for dn, *_ in parts), default=0)
+    for dn, dt_s, s in parts:
+        if len(dn) == length and len(s.pixel):
+            rows.append(_row(dn, dt_s, s, rng, len(rows)))
+    if sum(int((r.weight > 0).sum()) for r in rows) < ENOUGH:
+        return None
+    return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
+
+
+def _row(
+    dn: np.ndarray, dt_s: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
+) -> Sample:
+    steps = len(dt_s) // (len(s.frames) - 1)
+    at = (s.interval + s.fraction) * steps
+    group, on, off = counted(s)
+    weight = trusted(s) * (at > SETTLE_S / dt_s.mean())
+    pixels = s.pixel[s.first]
+    chosen = np.flatnonzero(np.bincount(group, weight > 0, len(pixels)) >= 2)
+    if len(chosen) > PIXELS:
+        chosen = np.sort(rng.choice(chosen, PIXELS, replace=False))
+    place = np.full(len(pixels), -1)
+    place[chosen] = np.arange(len(chosen))
+    kept = np.flatnonzero((place[group] >= 0) & (weight > 1e-6))[:EVENTS]
+    (height, width), where = s.shape, pixels[chosen]
+    block = (where // width * TILES[0] // height) * TILES[1] + where % width * TILES[1] // width
+
+    def filled(values: np.ndarray, n: int) -> np.ndarray:
+        pad = [(0, 0)] * (values.ndim - 1) + [(0, n - values.shape[-1])]
+        return np.pad(values.astype(np.float32), pad)
+
+    light = filled(dn.reshape(len(dn), -1)[:, where], PIXELS)
+    events = [filled(v[kept], EVENTS) for v in (at, on, off, weight)]
+    return Sample(light, dt_s.astype(np.float32),
+                  filled(place[group][kept], EVENTS).astype(np.int32), *events,
+                  filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32))
+
+
+@jax.jit
+def _sums(phi: Array, data: Sample) -> Array:
+    """(blocks, 6): weighted sums of aa, ab, bb, as, bs, ss about each pixel's means."""
+    blocks = data.dn.shape[0] * TILES[0] * TILES[1]
+
+    def one(d: Sample) -> Array:
+        s = seen_path(d.dn, d.dt_s, phi[0], phi[1])
+        at = jnp.clip(d.at - phi[2] / d.dt_s.mean(), 0.0, len(d.dt_s) - 1e-3)
+        step = jnp.floor(at).astype(jnp.int32)
+        y = s[step, d.pixel] + (at - step) * (s[step + 1, d.pixel] - s[step, d.pixel])
+
+        def total(v: Array) -> Array:
+            return jax.ops.segment_sum(v, d.pixel, PIXELS)
+
+        mass = jnp.maximum(total(d.weight), 1e-9)
+        a, b, y = (v - (total(d.weight * v) / mass)[d.pixel] for v in (d.on, d.off, y))
+        sums = jnp.stack([total(d.weight * u * v)
+                          for u, v in ((a, a), (a, b), (b, b), (a, y), (b, y), (y, y))], -1)
+        return jax.ops.segment_sum(sums, d.block, blocks)
+
+    return jax.lax.map(one, data).sum(0)
+
+
+_slopes = jax.jit(jax.jacfwd(_sums))
+
+
+def _solved(sums: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """theta_on, -theta_off of the pooled regression, what it leaves and what there is."""
+    aa, ab, bb, ay, by, yy = sums
+    theta = np.linalg.solve(np.array([[aa, ab], [ab, bb]]), np.array([ay, by]))
+    return theta, float(yy - theta @ np.array([ay, by])), float(yy)
+
+
+def _totals(phi: np.ndarray, data: Sample) -> np.ndarray:
+    return np.asarray(_sums(jnp.asarray(phi, jnp.float32), data), np.float64).sum(0)
+
+
+def _unexplained(phi: np.ndarray, data: Sample) -> float:
+    """Log of the share of variance that the regression leaves."""
+    _, left, all_ = _solved(_totals(phi, data))
+    return float(np.log(max(left, 1e-12) / all_))
+
+
+def _by_block(phi: np.ndarray, data: Sample) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative (blocks, 3) of `_unexplained`, block by block, and of log theta (2, 3)."""
+    at = jnp.asarray(phi, jnp.float32)
+    total = _totals(phi, data)
+    change = np.asarray(_slopes(at, data), np.float64)
+    theta, left, all_ = _solved(total)
+    on, off = theta
+    of_left = np.array([on * on, 2 * on * off, off * off, -2 * on, -2 * off, 1.0])
+    slope = np.einsum("bkp,k->bp", change, of_left) / left - change[:, 5] / all_
+    of_theta = np.linalg.solve(np.array([[total[0], total[1]], [total[1], total[2]]]),
+                               change.sum(0)[3:5])
+    return slope, of_theta / theta[:, None]
+
+
+def find(data: Sample) -> Found:
+    """The photoreceptor that is most probable, and how well it is known: the curvature, and the
+    scatter of the gradient from block to block."""
+    plain, phi = _unexplained(PLAIN, data), _start(data)
+    for _ in range(2):
+        size = _size(phi, data)
+        phi = _descend(phi, data, size)
+    value = _unexplained(phi, data)
+    slope, of_theta = _by_block(phi, data)
+    curvature = _curvature(phi, slope.sum(0), data)
+    away = slope - slope.mean(0)
+    units = np.outer(SCALE, SCALE)
+    scatter = away.T @ away * units
+    bent = curvature * units
+    information = bent @ np.linalg.inv(scatter + 1e-12 * np.eye(3)) @ bent
+    information += np.diag((SCALE / PRIOR) ** 2)
+    covariance = np.linalg.inv(information) * units + np.diag(FLOOR**2)
+    odds = 0.5 * min(size, BELIEVED) * (plain - value) - DOUBT - 0.5 * float(
+        (((phi - PLAIN) / PRIOR) ** 2).sum())
+    seen = Photoreceptor(float(phi[0]), float(phi[1]) if phi[1] > 2 * FAST else 0.0, float(phi[2]))
+    theta = np.abs(_solved(_totals(phi, data))[0])
+    return Found(seen, theta, covariance, of_theta, (1 - np.exp(plain), 1 - np.exp(value)),
+                 float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), size)
+
+
+def _size(phi: np.ndarray, data: Sample) -> float:
+    """How many independent events the sample is worth: with L the log of the unexplained share,
+    the likelihood is exp(-size L / 2), whose gradient scatters as much as it is curved."""
+    slope, _ = _by_block(phi, data)
+    bent = np.diag(_curvature(phi, slope.sum(0), data))
+    scatter = ((slope - slope.mean(0)) ** 2).sum(0)
+    return float(np.clip(2.0 * np.median(bent / np.maximum(scatter, 1e-30)), 10.0, MOST_SIZE))
+
+
+def _start(data: Sample) -> np.ndarray:
+    """The best of a coarse grid, coordinate by coordinate."""
+    phi = PLAIN.copy()
+    for k, values in ((1, TAUS), (0, OFFSETS), (1, TAUS), (0, OFFSETS)):
+        tried = [np.where(np.arange(3) == k, v, phi) for v in values]
+        phi = min(tried, key=partial(_unexplained, data=data))
+    return phi
+
+
+def _descend(phi: np.ndarray, data: Sample, size: float) -> np.ndarray:
+    """Newton's steps, damped until they lead down, and single coordinates where none does: the
+    lin-log's bend at 20 DN bends the likelihood too."""
+    def value(at: np.ndarray) -> float:
+        away = (at - PLAIN) / PRIOR
+        return 0.5 * size * _unexplained(at, data) + 0.5 * float(away @ away)
+
+    best = value(phi)
+    for _ in range(MOST_STEPS):
+        slope = _by_block(phi, data)[0].sum(0)
+        gradient = 0.5 * size * slope + (phi - PLAIN) / PRIOR**2
+        bent = 0.5 * size * _curvature(phi, slope, data) + np.diag(PRIOR**-2.0)
+        steps = [-np.linalg.solve(bent + np.diag(np.diag(bent)) * damping, gradient)
+                 for damping in (0.02, 0.5, 5.0)]
+        steps += [sign * much * SCALE * (np.arange(3) == k)
+                  for much in PATTERN for k in range(3) for sign in (1, -1)]
+        before = best
+        for step in steps:
+            new = np.clip(phi + np.clip(step, -STEP, STEP), LOW, HIGH)
+            if (tried := value(new)) < best - 0.5 * CONVERGED:
+                phi, best = new, tried
+                break
+        if before - best < CONVERGED:
+            break
+    return phi
+
+
+def _curvature(phi: np.ndarray, gradient: np.ndarray, data: Sample) -> np.ndarray:
+    """Of `_unexplained` (3, 3), positive definite."""
+    rows = [(_by_block(phi + SCALE * (np.arange(3) == k), data)[0].sum(0) - gradient) / SCALE[k]
+            for k in range(3)]
+    units = np.outer(SCALE, SCALE)
+    values, vectors = np.linalg.eigh(0.5 * (np.array(rows) + np.array(rows).T) * units)
+    return vectors @ np.diag(np.maximum(values, 1e-9)) @ vectors.T / units
