@@ -83,10 +83,11 @@ KEPT_ERROR = (0.04, 0.4)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Found:
-    """seen: the most probable photoreceptor; theta (2,): of the pooled regression; covariance (3, 3) of (offset, tau, delay); slope
-    (2, 3): how log theta_on, log theta_off of the pooled regression change with the three;
-    explained: shares of the variance that the regression explains, ideal and as found; chance:
-    probability that the ideal pixel is not enough. size: events' worth of the sample."""
+    """seen: the most probable photoreceptor; theta (2,): of the pooled regression; covariance
+    (3, 3) of (offset, tau, delay); slope (2, 3): how log theta_on, log theta_off of the pooled
+    regression change with the three; explained: shares of the variance that the regression
+    explains, with an ideal pixel and as found; chance: probability that the ideal pixel is not
+    enough; size: how many independent events the sample is worth."""
 
     seen: Photoreceptor
     theta: np.ndarray
@@ -160,14 +161,15 @@ def sample(
     for dn, dt_s, s in parts:
         if len(dn) == length and len(s.pixel):
             rows.append(_row(dn, dt_s, s, rng, len(rows)))
-    if sum(int((r.weight > 0).sum()) for r in rows) < ENOUGH:
+    if sum(int((weight > 0).sum()) for *_, weight, _ in rows) < ENOUGH:
         return None
     return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
 
 
 def _row(
     dn: np.ndarray, dt_s: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
-) -> Sample:
+) -> tuple[np.ndarray, ...]:
+    """The fields of a Sample, of one stretch."""
     steps = len(dt_s) // (len(s.frames) - 1)
     at = (s.interval + s.fraction) * steps
     group, on, off = counted(s)
@@ -188,9 +190,8 @@ def _row(
 
     light = filled(dn.reshape(len(dn), -1)[:, where], PIXELS)
     events = [filled(v[kept], EVENTS) for v in (at, on, off, weight)]
-    return Sample(light, dt_s.astype(np.float32),
-                  filled(place[group][kept], EVENTS).astype(np.int32), *events,
-                  filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32))
+    return (light, dt_s.astype(np.float32), filled(place[group][kept], EVENTS).astype(np.int32),
+            *events, filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32))
 
 
 @jax.jit

@@ -1,0 +1,108 @@
+"""What pixels see frames by: the low-pass against a plain integration, and all three constants
+found again in events that an independent pixel makes of a known film."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.photoreceptor import FAST, find, sample, seen_path
+from evflow.estimation.refine.sightings import sight
+from evflow.types import Events
+
+INTERVALS, SHAPE, FRAME_S = 16, (20, 26), 0.02
+SUB = 8  # instants of the independent pixel in a fine step
+
+
+def lin_log(dn: np.ndarray) -> np.ndarray:
+    return np.where(dn <= 20, dn * np.log(20) / 20, np.log(np.maximum(dn, 1)))
+
+
+def film(seed: int = 0) -> np.ndarray:
+    """(T + 1, H, W) DN: stripes and blobs that drift, change pace and breathe."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, INTERVALS * FRAME_S, INTERVALS * STEPS + 1)[:, None, None]
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    total = np.zeros((len(t), *SHAPE))
+    for _ in range(6):
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        length, pace = rng.uniform(5, 14), rng.uniform(3, 11)
+        along = (np.cos(angle) * x + np.sin(angle) * y)[None] / length
+        total += np.sin(2 * np.pi * (along + pace * t + 0.4 * np.sin(9 * t)) + phase)
+    return 20 + 190 / (1 + np.exp(-1.5 * total))
+
+
+def integrated(dn: np.ndarray, dt_s: float, offset: float, tau_s: float, sub: int) -> np.ndarray:
+    """The photoreceptor at `sub` instants of each step, by short explicit steps."""
+    light = np.maximum(dn + offset, 0.1)
+    u = lin_log(light)
+    s, out = u[0].copy(), [u[0]]
+    for i in range(len(dn) - 1):
+        rate = ((light[i] + light[i + 1]) / 2 + 20) / 275 / max(tau_s, 1e-12)
+        for k in range(1, sub + 1):
+            now = u[i] + (u[i + 1] - u[i]) * k / sub
+            s = now + (s - now) * np.exp(-rate * dt_s / sub) if tau_s else now
+            out.append(s)
+    return np.stack(out)
+
+
+def events_of(path: np.ndarray, dt_s: float, delay_s: float, on: float, off: float) -> Events:
+    """Events of pixels that see path (T, H, W), instants dt_s apart: loops, one pixel at a time."""
+    rows = []
+    rng = np.random.default_rng(1)
+    for y, x in np.ndindex(path.shape[1:]):
+        a, b = rng.normal(on, 0.03 * on), rng.normal(off, 0.03 * off)
+        memory = path[0, y, x] + rng.uniform(-a, b)
+        for i in range(1, len(path)):
+            before, now = path[i - 1, y, x], path[i, y, x]
+            while now - memory > a or memory - now > b:
+                up = now > memory
+                memory += a if up else -b
+                part = (memory - before) / (now - before)
+                rows.append((x, y, round(((i - 1 + part) * dt_s + delay_s) * 1e6), up))
+    rows.sort(key=lambda row: row[2])
+    x, y, t, p = (np.array(column) for column in zip(*rows, strict=True))
+    return Events(x, y, t + 10_000, p, SHAPE[::-1])
+
+
+@pytest.mark.parametrize(("offset", "tau_s"), [(0.0, 0.0), (24.0, 2e-3), (-12.0, 5e-3)])
+def test_the_path_is_that_of_a_plain_integration(offset: float, tau_s: float) -> None:
+    dn = film()[:40].astype(np.float32)
+    dt_s = FRAME_S / STEPS
+    want = integrated(dn, dt_s, offset, tau_s, 400)[::400]
+    got = seen_path(dn, np.full(39, dt_s, np.float32), np.float32(offset),
+                    np.float32(max(tau_s, FAST)))
+    assert np.abs(np.asarray(got) - want).max() < (5e-3 if tau_s else 0.02)
+
+
+@pytest.mark.parametrize(("offset", "cutoff_hz", "delay_s"), [
+    (0.0, 0.0, 0.0), (0.0, 100.0, 0.0), (24.0, 200.0, 1e-3), (-12.0, 30.0, -1e-3)])
+def test_the_constants_are_found_again(offset: float, cutoff_hz: float, delay_s: float) -> None:
+    dn, dt_s = film(), FRAME_S / STEPS
+    tau_s = 1 / (2 * np.pi * cutoff_hz) if cutoff_hz else 0.0
+    seen = integrated(dn, dt_s, offset, tau_s, SUB)
+    events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2)
+    times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
+    s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
+    data = sample([(dn.astype(np.float32), np.full(INTERVALS * STEPS, dt_s), s)])
+    assert data is not None
+    found = find(data)
+    std = np.sqrt(np.diag(found.covariance))
+    assert found.needed == bool(offset or cutoff_hz)
+    assert abs(found.seen.offset_dn - offset) < 3 * std[0] + 0.5
+    assert abs(found.seen.tau_s - tau_s) < 3 * std[1] + 0.05 * tau_s
+    assert abs(found.seen.delay_s - delay_s) < 3 * std[2]
+    assert np.abs(found.theta / [0.25, 0.2] - 1).max() < 0.04 + 3 * found.theta_error.max()
+    assert found.explained[1] > 0.98
+    if cutoff_hz:
+        assert found.seen.cutoff_hz == pytest.approx(cutoff_hz, rel=0.15)
+
+
+def test_where_little_happens_nothing_is_looked_for() -> None:
+    dn = np.full((INTERVALS * STEPS + 1, *SHAPE), 100.0, np.float32)
+    events = Events(np.array([1]), np.array([1]), np.array([30_000]), np.array([True]), SHAPE[::-1])
+    times = 10_000 + 20_000 * np.arange(INTERVALS + 1)
+    s = sight(events, times, lin_log(dn), STEPS)
+    assert sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s)]) is None
+    assert sample([]) is None
