@@ -156,7 +156,8 @@ def sample(
 ) -> Sample | None:
     """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
     its fine steps, and its sightings; None where too little happens."""
-    rng, rows = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    rows: list[tuple[np.ndarray, ...]] = []
     length = max((len(dn) for dn, *_ in parts), default=0)
     for dn, dt_s, s in parts:
         if len(dn) == length and len(s.pixel):
