@@ -26,10 +26,8 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.one_polarity import untold, without
 from evflow.estimation.pixel_noise import pixel_rates, quiet_time
 from evflow.estimation.refine import (
-    IDEAL,
     Chunk,
     Found,
-    Photoreceptor,
     PixelEvidence,
     find_photoreceptor,
     pixel_posterior,
@@ -49,6 +47,7 @@ from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels
 from evflow.recordings.glitches import exposed
 from evflow.recordings.stillness import stands_still
 from evflow.recordings.windows import condensed, iter_windows, plan_windows
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 from evflow.training.config import PRESETS
 from evflow.types import Recording, Window
 from evflow.voxel import voxelize

@@ -6,6 +6,7 @@
     recorded against simulated Moments --> the summary   fit.py
     the same of one polarity alone --> its threshold     alone.py
     recorded events on the path --> each pixel's theta   pixels.py
+    recorded events on the path --> what pixels see the frames by   receptor_search.py
     recorded events of quiet pixels --> noise rates      noise.py
     events, random points --> noise told from signal     points.py, signal.py
 
@@ -25,8 +26,8 @@ from evflow.estimation.refine.path import (
     refinement_chunks,
     survey,
 )
-from evflow.estimation.refine.photoreceptor import IDEAL, Found, Photoreceptor
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
+from evflow.estimation.refine.receptor_search import Found
 
 __all__ = [
     "IDEAL",

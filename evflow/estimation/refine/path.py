@@ -14,21 +14,14 @@ from collections.abc import Callable, Iterable
 import jax
 import numpy as np
 
-from evflow.estimation.refine.photoreceptor import (
-    FAST,
-    IDEAL,
-    Found,
-    Photoreceptor,
-    find,
-    sample,
-    seen_path,
-)
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
+from evflow.estimation.refine.receptor_search import Found, find, sample
 from evflow.estimation.refine.sightings import Sightings, sight
 from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.light.log_maps import lin_log
 from evflow.recordings.glitches import SATURATED_DN, exposed
 from evflow.simulator.interpolate import MIN_SIDE, Interpolator
+from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
 from evflow.types import Recording
 
 INTERVALS = 8  # frame intervals per chunk: 200 ms at 40 Hz

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine.path import STEPS
-from evflow.estimation.refine.photoreceptor import FAST, find, sample, seen_path
+from evflow.estimation.refine.receptor_search import find, sample
 from evflow.estimation.refine.sightings import sight
+from evflow.simulator.photoreceptor import FAST, seen_path
 from evflow.types import Events
 
 INTERVALS, SHAPE, FRAME_S = 16, (20, 26), 0.02

@@ -1,15 +1,10 @@
-"""What a pixel sees of what frames show: added light, a low-pass, and another clock.
+"""The photoreceptor of a camera, from its recording: which one explains the events best.
 
-A pixel sees log(light + its dark current) through a photoreceptor that follows with a delay; a
-frame subtracts its black level, and its time stamp is off by a little. With light L in DN of the
-frames, what the pixel sees is s in
-
-    ds/dt = r(t) (u(t) - s),    u = lin-log(L + offset),    r = 2 pi cutoff (L + offset + 20) / 275
-
-(first order, its rate proportional to light as in v2e), `delay` after the frame's clock. At an
-event the memory equals s, so that s at a pixel's events is theta_on a - theta_off b plus a
-constant, a and b counting its events. The pooled regression of all pixels explains the more of s
-the truer (offset, tau, delay) are; tau = 1 / (2 pi cutoff) is linear where the pixel is fast.
+At an event the memory equals what the pixel sees, s of simulator/photoreceptor.py, so that s at a
+pixel's events is theta_on a - theta_off b plus a constant, a and b counting its events. The pooled
+regression of all pixels explains the more of s the truer (offset, tau, delay) are; tau is linear
+where the pixel is fast. What cannot be told apart, as an offset from a threshold, is in the
+covariance.
 """
 
 from __future__ import annotations
@@ -21,15 +16,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
+from evflow.camera.optics import Optics
+from evflow.camera.sensors import SensorModel
 from evflow.estimation.refine.sightings import Sightings, counted, trusted
+from evflow.simulator.photoreceptor import FAST, Photoreceptor, seen_path
 
 Array = jax.Array
 
-FAST = 1e-5  # s: a photoreceptor too fast to be seen between two fine frames
-LEAST_DN = 0.1  # of light, before the log
-LEAST_LIGHT = 0.02  # of v2e's full rate
 PIXELS, EVENTS = 4096, 1 << 15  # of a stretch that are looked at
 SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
 TILES = (6, 8)  # blocks of the image whose errors are independent
@@ -49,29 +43,6 @@ PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
 FLOOR = np.array([0.5, 1e-4, 5e-4])
 DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
-
-
-@dataclasses.dataclass(frozen=True)
-class Photoreceptor:
-    """offset_dn: light added to the frames' DN before the log; tau_s: time constant of the
-    low-pass at 255 DN, 0 where it is too fast to be seen; delay_s: of the events after the
-    frames."""
-
-    offset_dn: float = 0.0
-    tau_s: float = 0.0
-    delay_s: float = 0.0
-
-    @property
-    def ideal(self) -> bool:
-        return self == Photoreceptor()
-
-    @property
-    def cutoff_hz(self) -> float:
-        """Corner of the low-pass at 255 DN; 0 where there is none."""
-        return 1.0 / (2.0 * np.pi * self.tau_s) if self.tau_s > FAST else 0.0
-
-
-IDEAL = Photoreceptor()
 
 
 # The less of the contrast a path keeps, the less of the events it explains. On simulated recordings
@@ -96,6 +67,33 @@ class Found:
     explained: tuple[float, float]
     chance: float
     size: float
+
+    @property
+    def std(self) -> np.ndarray:
+        """Of offset (DN), tau (s) and delay (s)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def sensor(self) -> tuple[SensorModel, dict[str, float]]:
+        """The pixel circuit that was measured, and its standard deviations; a cutoff that lies
+        within two of them of none is none."""
+        tau, error = self.seen.tau_s, float(self.std[1])
+        seen = self.needed and tau > 2.0 * error
+        cutoff = self.seen.cutoff_hz if seen else 0.0
+        return (SensorModel(cutoff_hz=cutoff, noise_resets_memory=True),
+                {"cutoff_hz": cutoff * error / tau if seen else float("nan")})
+
+    @property
+    def least_cutoff_hz(self) -> float:
+        """What the cutoff is above, by two standard deviations of tau."""
+        slow = (self.seen.tau_s if self.needed else 0.0) + 2.0 * float(self.std[1])
+        return float(1.0 / (2.0 * np.pi * slow))
+
+    @property
+    def optics(self) -> Optics:
+        """What the frames show beside what the pixels saw."""
+        offset, delay = (self.seen.offset_dn, self.seen.delay_s) if self.needed else (0.0, 0.0)
+        return Optics(offset, delay, float(self.std[0]), float(self.std[2]))
 
     @property
     def needed(self) -> bool:
@@ -126,29 +124,6 @@ class Sample(NamedTuple):
     off: Array
     weight: Array
     block: Array
-
-
-def lin_log_dn(dn: Array) -> Array:
-    """v2e's lin-log of DN >= 0, without its rounding."""
-    return jnp.where(dn <= 20.0, dn * (np.log(20.0) / 20.0), jnp.log(jnp.maximum(dn, 1.0)))
-
-
-def seen_path(dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> Array:
-    """s (T + 1, ...) of light (T + 1, ...) in DN that is linear in the log between fine steps of
-    dt_s (T,): exact, begun at rest."""
-    light = jnp.maximum(jnp.asarray(dn) + offset, LEAST_DN)
-    u = lin_log_dn(light)
-    rate = jnp.maximum((light + 20.0) / 275.0, LEAST_LIGHT) / jnp.maximum(tau_s, FAST)
-
-    def step(s: Array, x: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
-        before, now, r, h = x
-        lag = (now - before) / (r * h)
-        s = now - lag + (s - before + lag) * jnp.exp(-r * h)
-        return s, s
-
-    rest = 0.5 * (rate[1:] + rate[:-1])
-    _, s = jax.lax.scan(step, u[0], (u[:-1], u[1:], rest, jnp.asarray(dt_s)))
-    return jnp.concatenate([u[:1], s])
 
 
 def sample(

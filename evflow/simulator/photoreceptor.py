@@ -1,0 +1,117 @@
+"""What a pixel sees of what frames show: added light, a low-pass, and another clock.
+
+A pixel sees log(light + its dark current) through a photoreceptor that follows with a delay; a
+frame subtracts its black level, and its time stamp is off by a little. With light L in DN of the
+frames, what the pixel sees is s in
+
+    ds/dt = r(t) (u(t) - s),    u = lin-log(L + offset),    r = (L + offset + 20) / 275 / tau
+
+(first order, its rate proportional to light as in v2e), `delay` after the frames' clock. Between
+instants u moves linearly, which is solved exactly, however long the step: `SensorModel.cutoff_hz`
+is v2e's own form of it, true for steps far below tau. tau = 1 / (2 pi cutoff).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from evflow.camera.optics import Optics
+from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import lin_log_inverse
+
+Array = jax.Array
+
+FAST = 1e-5  # s: a photoreceptor too fast to be seen between two fine frames
+LEAST_DN = 0.1  # of light, before the log
+LEAST_LIGHT = 0.02  # of v2e's full rate
+
+
+@dataclasses.dataclass(frozen=True)
+class Photoreceptor:
+    """offset_dn: light added to the frames' DN before the log; tau_s: time constant of the
+    low-pass at 255 DN, 0 where it is too fast to be seen; delay_s: of the events after the
+    frames."""
+
+    offset_dn: float = 0.0
+    tau_s: float = 0.0
+    delay_s: float = 0.0
+
+    @staticmethod
+    def of(sensor: SensorModel, optics: Optics) -> Photoreceptor:
+        tau_s = 1.0 / (2.0 * np.pi * sensor.cutoff_hz) if sensor.cutoff_hz > 0 else 0.0
+        return Photoreceptor(optics.offset_dn, tau_s, optics.delay_s)
+
+    @property
+    def ideal(self) -> bool:
+        return self == Photoreceptor()
+
+    @property
+    def cutoff_hz(self) -> float:
+        """Corner of the low-pass at 255 DN; 0 where there is none."""
+        return 1.0 / (2.0 * np.pi * self.tau_s) if self.tau_s > FAST else 0.0
+
+
+IDEAL = Photoreceptor()
+
+
+def lin_log_dn(dn: ArrayLike) -> Array:
+    """v2e's lin-log of DN >= 0, beyond 255 too, without its rounding."""
+    dn = jnp.asarray(dn)
+    return jnp.where(dn <= 20.0, dn * (np.log(20.0) / 20.0), jnp.log(jnp.maximum(dn, 1.0)))
+
+
+def seen_path(dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> Array:
+    """s (T + 1, ...) of light (T + 1, ...) in DN at instants dt_s (T,) apart, begun at rest."""
+    u, rate = _light(dn, offset, tau_s)
+
+    def step(s: Array, x: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        s = _followed(s, *x)
+        return s, s
+
+    pace = 0.5 * (rate[1:] + rate[:-1])
+    _, s = jax.lax.scan(step, u[0], (u[:-1], u[1:], pace, jnp.asarray(dt_s)))
+    return jnp.concatenate([u[:1], s])
+
+
+def seen_frames(
+    pairs: Iterable[tuple[np.ndarray, int]], seen_by: Photoreceptor
+) -> Iterator[tuple[np.ndarray, int]]:
+    """Frames (H, W) in DN at their times in us -> the frames that an ideal pixel would have to be
+    shown to see the same, float32, at the times of the events."""
+    if seen_by.ideal:
+        yield from pairs
+        return
+    offset, tau_s = (np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST)))
+    s = u = rate = None
+    last_us, delay_us = 0, round(seen_by.delay_s * 1e6)
+    for frame, t_us in pairs:
+        now, pace = _light_of_frame(np.asarray(frame, np.float32), offset, tau_s)
+        if s is None or not seen_by.tau_s:
+            s = now
+        else:
+            assert u is not None and rate is not None
+            s = _step(s, u, now, 0.5 * (rate + pace), np.float32((t_us - last_us) * 1e-6))
+        u, rate, last_us = now, pace, t_us
+        yield np.asarray(_as_dn(s)), t_us + delay_us
+
+
+def _light(dn: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> tuple[Array, Array]:
+    """u and r at light in DN."""
+    light = jnp.maximum(jnp.asarray(dn) + offset, LEAST_DN)
+    rate = jnp.maximum((light + 20.0) / 275.0, LEAST_LIGHT) / jnp.maximum(tau_s, FAST)
+    return lin_log_dn(light), rate
+
+
+def _followed(s: Array, before: Array, now: Array, rate: Array, dt_s: Array) -> Array:
+    """s at the end of a step in which u moves from `before` to `now`."""
+    lag = (now - before) / (rate * dt_s)
+    return now - lag + (s - before + lag) * jnp.exp(-rate * dt_s)
+
+
+_light_of_frame, _step, _as_dn = jax.jit(_light), jax.jit(_followed), jax.jit(lin_log_inverse)
