@@ -1,17 +1,64 @@
-"""What the frames of a recording show beside what its pixels saw."""
+"""What of a measured camera is not per pixel: its circuit, and what its frames show beside it.
+
+camera.npz holds both as scalars, `sensor_cutoff_hz`, `optics_offset_dn`, ... and their standard
+deviations `..._std`, NaN where nothing was measured.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from evflow.camera.sensors import SensorModel
+from evflow.errors import EvflowDataError
+from evflow.files.archives import load_npz
+
+MEASURED = ("cutoff_hz",)  # of a SensorModel
 
 
 @dataclasses.dataclass(frozen=True)
 class Optics:
-    """offset_dn: light in DN that pixels see beside what frames show (dark light, less the frames'
-    black level); delay_s: seconds by which events come after what the frames' times say; the
-    standard deviations of both, NaN where they were not measured."""
+    """What the frames of a recording show beside what its pixels saw.
+
+    offset_dn: light in DN that pixels see beside it (dark light, less the frames' black level);
+    delay_s: seconds by which events come after what the frames' times say; the standard
+    deviations of both, NaN where they were not measured.
+    """
 
     offset_dn: float = 0.0
     delay_s: float = 0.0
     offset_dn_std: float = float("nan")
     delay_s_std: float = float("nan")
+
+
+def as_arrays(
+    sensor: SensorModel, std: Mapping[str, float], optics: Optics
+) -> dict[str, np.ndarray]:
+    """Scalars by the names that they have in camera.npz."""
+    named = {f"sensor_{name}": getattr(sensor, name) for name in MEASURED}
+    named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
+    named |= {f"optics_{name}": value for name, value in dataclasses.asdict(optics).items()}
+    return {name: np.float64(value) for name, value in named.items()}
+
+
+def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
+    """The circuit and the optics in a camera.npz; those of an ideal pixel where it holds none.
+    Raises EV009 where a value is no number, EV016 where there is no file."""
+    held = load_npz(Path(path))
+    values: dict[str, dict[str, float]] = {"sensor": {}, "optics": {}}
+    names = {"sensor": MEASURED, "optics": tuple(f.name for f in dataclasses.fields(Optics))}
+    for room, wanted in names.items():
+        for name in wanted:
+            value = held.get(f"{room}_{name}")
+            if value is None:
+                continue
+            if np.shape(value) != () or value.dtype.kind not in "fiu" or (
+                    not name.endswith("_std") and not np.isfinite(value)):
+                raise EvflowDataError("EV009", f"{path}: {room}_{name} is no finite number.",
+                                      "Make the file again: evflow estimate.")
+            values[room][name] = float(value)
+    return SensorModel(noise_resets_memory=True, **values["sensor"]), Optics(**values["optics"])

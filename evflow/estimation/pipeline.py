@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Iterator
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -135,8 +135,35 @@ def estimate_camera(
     return CameraEstimate(
         camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         len(plan.pairs),
-        (*condensed(plan.skipped), *_notes(stats, unknown, n_events, summary, hot, dead)),
-        tuple(f"theta_{name}" for name in unknown))
+        (*condensed(plan.skipped), *_notes(stats, unknown, n_events, summary, hot, dead),
+         *_receptor_notes(found)),
+        tuple(f"theta_{name}" for name in unknown), **_measured(found))
+
+
+def _measured(found: Found | None) -> dict[str, Any]:
+    """The fields of a CameraEstimate that are not per pixel."""
+    if found is None:
+        return {}
+    sensor, std = found.sensor
+    return {"sensor": sensor, "sensor_std": std, "optics": found.optics}
+
+
+def _receptor_notes(found: Found | None) -> list[Note]:
+    if found is None:
+        return []
+    notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be seen: it is "
+                  f"above {found.least_cutoff_hz:.0f} Hz at 255 DN.")]
+    if found.sensor[0].cutoff_hz:
+        notes = [Note("pixels.slow", "the thresholds are those of the light behind the "
+                      "photoreceptor's low-pass; without it they come out otherwise where things "
+                      "move fast.")]
+    optics = found.optics
+    if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
+        more = "more" if optics.offset_dn > 0 else "less"
+        notes.append(Note("frames.light", f"pixels see {abs(optics.offset_dn):.0f} DN {more} light "
+                          "than the frames show (dark current, black level): thresholds are those "
+                          "of that light. A gamma of the frames cannot be told from one recording."))
+    return notes
 
 
 def window_inputs(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.camera.optics import Optics, as_arrays
+from evflow.camera.sensors import SensorModel
 from evflow.notes import Note, as_dicts
 
 THRESHOLDS = ("theta_on", "theta_off")  # of whose measurement `undetermined` speaks
@@ -33,6 +36,10 @@ class CameraEstimate:
         notes: what to know before trusting it.
         undetermined: those of `THRESHOLDS` that the recording does not tell: their values, and
             widths, are the prior's.
+        sensor: the pixel circuit as far as it was measured: cutoff_hz, 0 where the photoreceptor
+            is too fast to be seen.
+        sensor_std: its standard deviations by field, NaN where nothing was measured.
+        optics: what the frames show beside what the pixels saw.
     """
 
     camera: Camera
@@ -46,9 +53,13 @@ class CameraEstimate:
     windows: int
     notes: tuple[Note, ...]
     undetermined: tuple[str, ...]
+    sensor: SensorModel = SensorModel(noise_resets_memory=True)
+    sensor_std: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    optics: Optics = Optics()
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
-        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead.
+        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead, and the
+        scalars of `camera.optics`.
 
         Args:
             path: of the file; `Camera.load` reads it.
@@ -61,6 +72,7 @@ class CameraEstimate:
             EvflowDataError: EV013 (exists), EV014 (maps out of range), EV019 (cannot be written).
         """
         extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
+        extra |= as_arrays(self.sensor, self.sensor_std, self.optics)
         return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
                                 n_events=self.n_events, hot=self.hot, dead=self.dead)
 
@@ -72,7 +84,10 @@ class CameraEstimate:
         def places(mask: np.ndarray) -> list[list[int]]:
             return [[int(x), int(y)] for y, x in np.argwhere(mask)]
 
+        scalars = as_arrays(self.sensor, self.sensor_std, self.optics)
+        measured = {k: float(v) if np.isfinite(v) else None for k, v in scalars.items()}
         return {"summary": floats(self.summary), "summary_std": floats(self.summary_std),
+                **measured,
                 "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
                 "hot_pixels": places(self.hot), "dead_pixels": places(self.dead),
                 "windows": self.windows, "undetermined": list(self.undetermined),

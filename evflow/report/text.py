@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from evflow.estimation.result import CameraEstimate
 
@@ -17,9 +18,20 @@ def describe(found: CameraEstimate) -> str:
     std = dataclasses.asdict(found.summary_std)
     lines = [f"{LABELS[name]:22} {float(value):7.3f} ± {float(std[name]):.3f}"
              for name, value in dataclasses.asdict(found.summary).items()]
+    lines += measured(found)
     events = f"from {int(found.n_events.sum()):,} events"
     windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
     lines.append(f"{events} in {windows}; {found.valid.mean():.0%} of the pixels have events of "
                  "their own" if found.windows else f"{events} of a static scene")
     lines += [f"note: {note}" for note in found.notes]
     return "\n".join(lines)
+
+
+def measured(found: CameraEstimate) -> list[str]:
+    """Of the circuit and the frames, a line for what was measured."""
+    optics, cutoff = found.optics, found.sensor.cutoff_hz
+    rows = [("cutoff (Hz at 255 DN)", cutoff, found.sensor_std.get("cutoff_hz", math.nan), 0),
+            ("light added (DN)", optics.offset_dn, optics.offset_dn_std, 1),
+            ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std, 2)]
+    return [f"{name:24} {value:5.{digits}f} ± {std:.{digits}f}"
+            for name, value, std, digits in rows if value and math.isfinite(std)]

@@ -88,17 +88,15 @@ def seen_frames(
         yield from pairs
         return
     offset, tau_s = (np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST)))
-    s = u = rate = None
-    last_us, delay_us = 0, round(seen_by.delay_s * 1e6)
+    before: tuple[Array, Array, Array, int] | None = None
     for frame, t_us in pairs:
-        now, pace = _light_of_frame(np.asarray(frame, np.float32), offset, tau_s)
-        if s is None or not seen_by.tau_s:
-            s = now
-        else:
-            assert u is not None and rate is not None
-            s = _step(s, u, now, 0.5 * (rate + pace), np.float32((t_us - last_us) * 1e-6))
-        u, rate, last_us = now, pace, t_us
-        yield np.asarray(_as_dn(s)), t_us + delay_us
+        now, rate = _light_of_frame(np.asarray(frame, np.float32), offset, tau_s)
+        s = now
+        if before is not None and seen_by.tau_s:
+            old, u, pace, last_us = before
+            s = _step(old, u, now, 0.5 * (pace + rate), np.float32((t_us - last_us) * 1e-6))
+        before = s, now, rate, t_us
+        yield np.asarray(_as_dn(s)), t_us + round(seen_by.delay_s * 1e6)
 
 
 def _light(dn: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> tuple[Array, Array]:

@@ -49,7 +49,7 @@ DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera
 # with .8 to .98 explained, the regression's thresholds over the true ones are 1 - LACKING times the
 # rest, but for a few per cent and a part of what is lacking.
 LACKING, LEAST_KEPT = 1.5, 0.5
-KEPT_ERROR = (0.04, 0.4)
+KEPT_ERROR = (0.04, 0.8)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
