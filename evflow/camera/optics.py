@@ -42,7 +42,7 @@ def as_arrays(
     named = {f"sensor_{name}": getattr(sensor, name) for name in MEASURED}
     named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
     named |= {f"optics_{name}": value for name, value in dataclasses.asdict(optics).items()}
-    return {name: np.float64(value) for name, value in named.items()}
+    return {name: np.asarray(value, np.float64) for name, value in named.items()}
 
 
 def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
@@ -61,4 +61,6 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
                 raise EvflowDataError("EV009", f"{path}: {room}_{name} is no finite number.",
                                       "Make the file again: evflow estimate.")
             values[room][name] = float(value)
-    return SensorModel(noise_resets_memory=True, **values["sensor"]), Optics(**values["optics"])
+    sensor = SensorModel(
+        cutoff_hz=values["sensor"].get("cutoff_hz", 0.0), noise_resets_memory=True)
+    return sensor, Optics(**values["optics"])

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from evflow.camera.sensors import SensorModel
     from evflow.io.images.frames import Frames, FrameSource
     from evflow.io.writer import EventWriter
+    from evflow.simulator.photoreceptor import Photoreceptor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +46,9 @@ class Simulate:
     frames_too: bool = False
     """Write the video's frames beside the events: grey, at their own times."""
     camera: Annotated[Path | None, value("FILE")] = None
-    """camera.npz from evflow estimate; without it the thresholds below, or the sensor's own."""
+    """camera.npz from evflow estimate, its photoreceptor's cutoff included, and, where VIDEO is a
+    recording, the light that its frames lack; without it the thresholds below, or the sensor's
+    own."""
     draw: bool = False
     """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
     the most likely values are too even."""
@@ -108,6 +111,7 @@ class Simulate:
         from evflow.process.terminal import bar
         from evflow.simulator import simulate_stream
         from evflow.simulator.interpolate import unzip, upsample
+        from evflow.simulator.photoreceptor import seen_frames
 
         format = named(self.format, self.out)
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
@@ -130,6 +134,7 @@ class Simulate:
             pairs = as_seen(
                 video, self.colour, None if limit == 0 else lambda slow, pixel:
                 upsample(slow, max_motion_px=pixel * limit, warn=source.notes.append))
+            pairs = seen_frames(pairs, self._seen_by(source))
             for events in simulate_stream(jax.random.key(self.seed), *unzip(pairs), camera,
                                           model=sensor):
                 writer.append(events)
@@ -153,6 +158,17 @@ class Simulate:
             time_unit=self.time_unit, full_scale=self.full_scale, partial=self.partial,
             bayer=self.bayer, response=self.response, flip=self.flip_frames,
             start_s=self.start, stop_s=self.stop)
+
+    def _seen_by(self, source: FrameSource) -> Photoreceptor:
+        """The measured camera's photoreceptor; of its light and clock only in front of frames that
+        a camera recorded beside its events."""
+        from evflow.camera.optics import Optics, read_sensor
+        from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
+
+        if self.camera is None or self.sensor != "clean":
+            return IDEAL
+        sensor, optics = read_sensor(self.camera)
+        return Photoreceptor.of(sensor, optics if source.recorded else Optics())
 
     def _model(self) -> SensorModel:
         """The pixels' circuit; EV020 where it has no such choice."""

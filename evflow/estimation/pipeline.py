@@ -160,9 +160,10 @@ def _receptor_notes(found: Found | None) -> list[Note]:
     optics = found.optics
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
-        notes.append(Note("frames.light", f"pixels see {abs(optics.offset_dn):.0f} DN {more} light "
-                          "than the frames show (dark current, black level): thresholds are those "
-                          "of that light. A gamma of the frames cannot be told from one recording."))
+        notes.append(Note(
+            "frames.light", f"pixels see {abs(optics.offset_dn):.0f} DN {more} light than the "
+            "frames show (dark current, black level): thresholds are those of that light. A gamma "
+            "of the frames cannot be told from one recording."))
     return notes
 
 

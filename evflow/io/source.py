@@ -81,8 +81,9 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
         for i, t in enumerate(recording.frame_times.tolist()):
             yield Image(recording.frames[i], t, f"frame {i} of {path}")
 
-    return _source(recording.events.size, len(recording.frames), images, told,
-                   list(recording.notes))
+    return dataclasses.replace(
+        _source(recording.events.size, len(recording.frames), images, told,
+                list(recording.notes)), recorded=True)
 
 
 def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:

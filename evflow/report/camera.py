@@ -56,6 +56,7 @@ from evflow.report.verdict import (
     poorer,
     worst,
 )
+from evflow.simulator.photoreceptor import Photoreceptor
 from evflow.types import Recording
 
 NAMES: Names = ("recorded", "re-simulated")
@@ -142,7 +143,8 @@ def gather(
         if not (known(found, "on") and known(found, "off")):
             raise EvflowDataError("EV017", "the thresholds are undetermined.")
         runs = usable_runs(recording)
-        trial = resimulate(recording, found.camera, busiest(recording, runs), seed)
+        trial = resimulate(recording, found.camera, busiest(recording, runs), seed,
+                           Photoreceptor.of(found.sensor, found.optics))
     except EvflowDataError as error:
         why = why_held = error.seen
     step()

@@ -23,6 +23,7 @@ from evflow.notes import Note
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, seen_frames
 from evflow.types import Events, Recording
 
 SECONDS = 3.0  # of recording at most that are simulated
@@ -88,15 +89,18 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
     return found
 
 
-def resimulate(recording: Recording, camera: Camera, run: Run, seed: int) -> Trial:
-    """Simulate the frames of `run` twice, interpolated to 1 px of motion, and compare."""
+def resimulate(
+    recording: Recording, camera: Camera, run: Run, seed: int, seen_by: Photoreceptor = IDEAL
+) -> Trial:
+    """Simulate the frames of `run` twice, interpolated to 1 px of motion and put through what its
+    pixels see them by, and compare."""
     notes: list[Note] = []
     model = SensorModel(noise_resets_memory=True)
 
     def seen(key: jax.Array) -> Events:
         pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
                  for i in range(run[0], run[1] + 1))
-        frames, times = unzip(upsample(pairs, warn=notes.append))
+        frames, times = unzip(seen_frames(upsample(pairs, warn=notes.append), seen_by))
         return Events.concatenate(list(simulate_stream(key, frames, times, camera, model=model)))
 
     begin = run[0] + 1 if run[1] - run[0] >= SETTLING else run[0]
@@ -131,4 +135,6 @@ def held_out(
     half = Recording(recording.events.slice(int(times[begin]), int(times[middle])),
                      recording.frames[begin:middle + 1], times[begin:middle + 1])
     found = estimate_camera(half, params, min_window_us=min_window_us)
-    return found, resimulate(recording, found.camera, busiest(recording, [(middle, last)]), seed)
+    seen_by = Photoreceptor.of(found.sensor, found.optics)
+    return found, resimulate(
+        recording, found.camera, busiest(recording, [(middle, last)]), seed, seen_by)

@@ -105,13 +105,14 @@ class FrameHints:
 class FrameSource:
     """size (width, height); count: frames expected (0 = unknown); open(): a fresh iterator of
     (frame, time in us), one decoded at a time. notes: what was assumed; it may grow while
-    frames are read. Frames are (H, W), or (H, W, 3) where a mosaic was asked for of
-    colour input, uint8 or float32 DN on 0..255."""
+    frames are read. recorded: by a camera that recorded events too. Frames are (H, W), or (H, W,
+    3) where a mosaic was asked for of colour input, uint8 or float32 DN on 0..255."""
 
     size: tuple[int, int]
     count: int
     open: Callable[[], Frames]
     notes: list[Note] = dataclasses.field(default_factory=list)
+    recorded: bool = False
 
     def watched(self, progress: Callable[[int, int], None]) -> Frames:
         """The frames, with progress(done, total) called after each."""
