@@ -29,14 +29,14 @@ SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
 TILES = (6, 8)  # blocks of the image whose errors are independent
 OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, where the search begins
 TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
-PRIOR = np.array([25.0, 5e-3, 1.5e-3])  # std of offset (DN), tau and delay (s) before any data
+PRIOR = np.array([25.0, 5e-3, 8e-4])  # std of offset (DN), tau and delay (s) before any data
 SCALE = np.array([2.0, 2e-4, 2e-4])  # of finite differences
 STEP = np.array([12.0, 3e-3, 1e-3])  # most that one step changes
-LOW, HIGH = np.array([-25.0, FAST, -6e-3]), np.array([90.0, 3e-2, 6e-3])
+LOW, HIGH = np.array([-25.0, FAST, -4e-3]), np.array([90.0, 3e-2, 4e-3])
 PATTERN = (4.0, 1.0, 0.25)  # SCALEs that are tried, one coordinate at a time
 MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
 ENOUGH = 500  # events to look at
-MOST_SIZE = 4000.0  # events' worth of a recording, as errors of the path are alike everywhere
+MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # The path is wrong in its own way everywhere. What it explains better by less than a few per cent
 # of what is left says nothing of the pixel, and so much is left open of what is found:
