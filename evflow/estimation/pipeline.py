@@ -30,6 +30,7 @@ from evflow.estimation.refine import (
     Found,
     PixelEvidence,
     find_photoreceptor,
+    frame_noise,
     pixel_posterior,
     plan_runs,
     refine_summary,
@@ -108,11 +109,12 @@ def estimate_camera(
             yield window
             advance()
 
-    found = find_photoreceptor(recording, runs) if runs else None
+    noise_dn = frame_noise(recording, [i for run in runs for i in run]) if runs else 0.0
+    found = find_photoreceptor(recording, runs, noise_dn) if runs else None
     seen_by = found.seen if found is not None and found.needed else IDEAL
     stats, n_events, n_shown = _pool(params, windows(), seen_by)
     summary, summary_std = api.finish(params, stats)
-    surveyed = survey(recording, runs, advance, seen_by)
+    surveyed = survey(recording, runs, advance, seen_by, noise_dn)
     hot, chunks = np.zeros(n_events.shape, bool), surveyed.chunks
     if runs:
         hot = hot_pixels(surveyed.quiet, float(summary.eta_on + summary.eta_off))

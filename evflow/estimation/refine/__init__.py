@@ -16,6 +16,7 @@ its memory is known: nothing depends on what happened before the recording began
 """
 
 from evflow.estimation.refine.alone import foreseen, refine_alone
+from evflow.estimation.refine.denoise import frame_noise
 from evflow.estimation.refine.fit import Refined, fused, refine_summary
 from evflow.estimation.refine.path import (
     Chunk,
@@ -39,6 +40,7 @@ __all__ = [
     "Survey",
     "find_photoreceptor",
     "foreseen",
+    "frame_noise",
     "fused",
     "make_chunk",
     "pixel_posterior",

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 import jax
 import numpy as np
 
+from evflow.estimation.refine.denoise import denoised
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
 from evflow.estimation.refine.receptor_search import Found, find, sample
 from evflow.estimation.refine.sightings import Sightings, sight
@@ -68,7 +69,7 @@ class Survey:
 
 def survey(
     recording: Recording, runs: list[list[int]], advance: Callable[[], None] = lambda: None,
-    seen_by: Photoreceptor = IDEAL,
+    seen_by: Photoreceptor = IDEAL, noise_dn: float = 0.0,
 ) -> Survey:
     """A recording's stretches, one after the other in the memory of one and of those kept.
     runs: of `plan_runs`; advance() is called after each."""
@@ -77,7 +78,7 @@ def survey(
     chunks, evidence = [], PixelEvidence.nothing((height, width))
     quiet = np.zeros((4, height, width))
     for run in runs:
-        chunk = make_chunk(recording, run, seen_by=seen_by)
+        chunk = make_chunk(recording, run, STEPS, seen_by, noise_dn)
         evidence, quiet = evidence + chunk.evidence, quiet + chunk.quiet
         if run in simulated:
             chunks.append(chunk)
@@ -123,11 +124,12 @@ def plan_chunks(recording: Recording, runs: list[list[int]]) -> list[list[int]]:
 
 
 def make_chunk(
-    recording: Recording, run: list[int], steps: int = STEPS, seen_by: Photoreceptor = IDEAL
+    recording: Recording, run: list[int], steps: int = STEPS, seen_by: Photoreceptor = IDEAL,
+    noise_dn: float = 0.0,
 ) -> Chunk:
     """Interpolate the frames of a run of intervals, put them through what its pixels see them by,
     and count its events."""
-    film = interpolated(recording, run, steps)
+    film = interpolated(recording, run, steps, noise_dn)
     times = film.times_us + round(seen_by.delay_s * 1e6)
     fine = as_seen(film, seen_by)
     dark, light = film.frames.min(0) + seen_by.offset_dn, film.frames.max(0)
@@ -154,13 +156,15 @@ class Film:
     shown: np.ndarray
 
 
-def interpolated(recording: Recording, run: list[int], steps: int = STEPS) -> Film:
-    """The frames of a run of intervals, filled up by optical flow."""
+def interpolated(
+    recording: Recording, run: list[int], steps: int = STEPS, noise_dn: float = 0.0
+) -> Film:
+    """The frames of a run of intervals, less their noise, filled up by optical flow."""
     frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
     times = recording.frame_times[run[0]:run[-1] + 2]
-    interpolator = Interpolator()
-    dn, motion = [frames[0]], []
-    for a, b in itertools.pairwise(frames):
+    interpolator, clean = Interpolator(), [denoised(frame, noise_dn) for frame in frames]
+    dn, motion = [clean[0]], []
+    for a, b in itertools.pairwise(clean):
         between, moved = interpolator.between(a, b, steps)
         dn += [*between, b]
         motion.append(moved)
@@ -182,14 +186,16 @@ def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
 _seen = jax.jit(seen_path)
 
 
-def find_photoreceptor(recording: Recording, runs: list[list[int]]) -> Found | None:
+def find_photoreceptor(
+    recording: Recording, runs: list[list[int]], noise_dn: float = 0.0
+) -> Found | None:
     """What the pixels of a recording see its frames by, from a few of its runs of intervals; None
     where too little happens."""
     runs = plan_chunks(recording, runs)
     chosen = np.unique(np.linspace(0, len(runs) - 1, min(STRETCHES, len(runs))).round())
     parts = []
     for k in chosen.astype(int):
-        film = interpolated(recording, runs[k])
+        film = interpolated(recording, runs[k], STEPS, noise_dn)
         s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
         parts.append((film.dn, np.repeat(film.dt_s / STEPS, STEPS), s))
     data = sample(parts)
