@@ -83,11 +83,13 @@ def seen_frames(
     pairs: Iterable[tuple[np.ndarray, int]], seen_by: Photoreceptor
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Frames (H, W) in DN at their times in us -> the frames that an ideal pixel would have to be
-    shown to see the same, float32, at the times of the events."""
+    shown to see the same, float32 on 0..255, at the times of the events. All are darker by one
+    factor where light is added: a pixel sees changes of the log alone."""
     if seen_by.ideal:
         yield from pairs
         return
     offset, tau_s = (np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST)))
+    darker = np.float32(np.log1p(max(seen_by.offset_dn, 0.0) / 255.0))
     before: tuple[Array, Array, Array, int] | None = None
     for frame, t_us in pairs:
         now, rate = _light_of_frame(np.asarray(frame, np.float32), offset, tau_s)
@@ -96,7 +98,7 @@ def seen_frames(
             old, u, pace, last_us = before
             s = _step(old, u, now, 0.5 * (pace + rate), np.float32((t_us - last_us) * 1e-6))
         before = s, now, rate, t_us
-        yield np.asarray(_as_dn(s)), t_us + round(seen_by.delay_s * 1e6)
+        yield np.minimum(np.asarray(_as_dn(s - darker)), 255), t_us + round(seen_by.delay_s * 1e6)
 
 
 def _light(dn: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> tuple[Array, Array]:

@@ -35,7 +35,7 @@ STEP = np.array([12.0, 3e-3, 1e-3])  # most that one step changes
 LOW, HIGH = np.array([-25.0, FAST, -4e-3]), np.array([90.0, 3e-2, 4e-3])
 PATTERN = (4.0, 1.0, 0.25)  # SCALEs that are tried, one coordinate at a time
 MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
-ENOUGH = 500  # events to look at
+ENOUGH = 200  # events of either polarity to look at
 MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # The path is wrong in its own way everywhere. What it explains better by less than a few per cent
@@ -131,14 +131,12 @@ def sample(
 ) -> Sample | None:
     """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
     its fine steps, and its sightings; None where too little happens."""
-    rng = np.random.default_rng(seed)
-    rows: list[tuple[np.ndarray, ...]] = []
     length = max((len(dn) for dn, *_ in parts), default=0)
-    for dn, dt_s, s in parts:
-        if len(dn) == length and len(s.pixel):
-            rows.append(_row(dn, dt_s, s, rng, len(rows)))
-    if sum(int((weight > 0).sum()) for *_, weight, _ in rows) < ENOUGH:
+    used = [part for part in parts if len(part[0]) == length and len(part[2].pixel)]
+    if any(sum(int((s.on == on).sum()) for *_, s in used) < ENOUGH for on in (True, False)):
         return None
+    rng = np.random.default_rng(seed)
+    rows = [_row(*part, rng, number) for number, part in enumerate(used)]
     return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
 
 

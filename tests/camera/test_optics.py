@@ -1,0 +1,35 @@
+"""What of a measured camera is not per pixel, in camera.npz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evflow.camera import Camera
+from evflow.camera.optics import Optics, as_arrays, read_sensor
+from evflow.camera.sensors import SensorModel
+from evflow.errors import EvflowDataError
+
+
+def test_it_is_read_as_it_was_written(tmp_path: Path) -> None:
+    sensor = SensorModel(cutoff_hz=150.0, noise_resets_memory=True)
+    optics = Optics(20.0, 1e-3, 4.0, 5e-4)
+    path = tmp_path / "camera.npz"
+    Camera.constant((4, 5)).save(path, **as_arrays(sensor, {"cutoff_hz": 30.0}, optics))
+    assert read_sensor(path) == (sensor, optics)
+    assert float(np.load(path)["sensor_cutoff_hz_std"]) == 30.0
+
+
+def test_a_camera_without_any_has_an_ideal_pixel(tmp_path: Path) -> None:
+    Camera.constant((4, 5)).save(tmp_path / "camera.npz")
+    sensor, optics = read_sensor(tmp_path / "camera.npz")
+    assert sensor.cutoff_hz == optics.offset_dn == optics.delay_s == 0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.zeros(2), "fast"])
+def test_what_is_no_number_is_refused(tmp_path: Path, value: object) -> None:
+    Camera.constant((4, 5)).save(tmp_path / "camera.npz", sensor_cutoff_hz=np.asarray(value))
+    with pytest.raises(EvflowDataError, match=r"EV009.*sensor_cutoff_hz"):
+        read_sensor(tmp_path / "camera.npz")

@@ -1,0 +1,49 @@
+"""Noise of frames: measured where nothing happens, and taken away where it is worth it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from evflow.estimation.refine.denoise import denoised, frame_noise
+from evflow.types import Events, Recording
+
+SHAPE = (72, 96)
+
+
+def scene(noise_dn: float, moves: int = 0) -> Recording:
+    """A smooth picture, of which `moves` px pass between two of nine frames."""
+    rng = np.random.default_rng(0)
+    wide = cv2.GaussianBlur(rng.normal(0, 1, (72, 240)), (0, 0), 5)
+    wide = 120 + 60 * wide / wide.std()
+    frames = np.stack([wide[:, k * moves:k * moves + 96] for k in range(9)])
+    frames = frames + noise_dn * rng.normal(0, 1, frames.shape)
+    one = np.array([0, 180_000])
+    events = Events(np.array([3, 4]), np.array([3, 4]), one, np.array([True, False]), SHAPE[::-1])
+    return Recording(events, np.clip(np.rint(frames), 0, 255).astype(np.uint8),
+                     1000 + 20_000 * np.arange(9))
+
+
+@pytest.mark.parametrize("noise_dn", [1.0, 3.0, 6.0])
+@pytest.mark.parametrize("moves", [0, 1])
+def test_noise_is_measured(noise_dn: float, moves: int) -> None:
+    """The quantile of the tiles lies a little below."""
+    assert frame_noise(scene(noise_dn, moves), list(range(8))) == pytest.approx(noise_dn, rel=0.25)
+
+
+def test_busy_frames_tell_nothing() -> None:
+    calm = scene(3.0)
+    rng = np.random.default_rng(1)
+    t = np.sort(rng.integers(0, 180_000, 60_000))
+    events = Events(rng.integers(0, 96, 60_000), rng.integers(0, 72, 60_000), t,
+                    rng.random(60_000) < 0.5, SHAPE[::-1])
+    assert frame_noise(Recording(events, calm.frames, calm.frame_times), list(range(8))) == 0.0
+
+
+def test_much_noise_is_taken_away_and_little_is_left() -> None:
+    clean, noisy = scene(0.0).frame_dn(0), scene(4.0).frame_dn(0)
+    before, after = (float(np.std(f - clean)) for f in (noisy, denoised(noisy, 4.0)))
+    assert after < 0.9 * before
+    assert np.std(denoised(clean, 4.0) - clean) < 1.0
+    assert denoised(noisy, 1.0) is noisy

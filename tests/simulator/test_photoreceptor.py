@@ -1,0 +1,54 @@
+"""A photoreceptor in front of a simulation: frames as an ideal pixel would see them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evflow.camera.optics import Optics
+from evflow.camera.sensors import SensorModel
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, seen_frames
+
+KNEE = np.log(20) / 20
+
+
+def lin_log(dn: np.ndarray) -> np.ndarray:
+    return np.where(dn <= 20, dn * KNEE, np.log(np.maximum(dn, 1)))
+
+
+def flash(count: int, step_us: int) -> list[tuple[np.ndarray, int]]:
+    """A dark, then a bright, field from frame 1 on."""
+    return [(np.full((2, 3), 40.0 if i == 0 else 160.0), i * step_us) for i in range(count)]
+
+
+def test_an_ideal_one_changes_nothing() -> None:
+    pairs = flash(3, 1000)
+    assert all(a is b for a, b in zip(seen_frames(pairs, IDEAL), pairs, strict=True))
+
+
+@pytest.mark.parametrize("step_us", [100, 4000])
+def test_a_step_of_light_is_followed_exponentially(step_us: int) -> None:
+    """After the step's own ramp, whatever the frames' distance: the rest decays by the rate of
+    the new light."""
+    seen_by = Photoreceptor(tau_s=5e-3)
+    made = list(seen_frames(flash(6, step_us), seen_by))
+    rest = lin_log(np.array(160.0)) - np.array([lin_log(f[0, 0]) for f, _ in made[1:]])
+    decay = np.exp(-(180 / 275) / 5e-3 * step_us * 1e-6)
+    np.testing.assert_allclose(rest[1:] / rest[:-1], decay, rtol=2e-3)
+    assert [t for _, t in made] == [step_us * i for i in range(6)]
+
+
+def test_light_that_is_added_lowers_contrast_and_stays_within_8_bits() -> None:
+    dn = np.array([[0.0, 10.0, 100.0, 255.0]])
+    (seen, t), = seen_frames([(dn, 50)], Photoreceptor(offset_dn=24.0, delay_s=1e-3))
+    assert t == 1050
+    assert seen.min() >= 0
+    assert seen.max() <= 255
+    np.testing.assert_allclose(np.diff(lin_log(seen)), np.diff(np.log(dn + 24)), atol=2e-5)
+
+
+def test_it_is_that_of_a_measured_camera() -> None:
+    measured = Photoreceptor.of(SensorModel(cutoff_hz=100.0), Optics(offset_dn=7.0, delay_s=2e-3))
+    assert measured.cutoff_hz == pytest.approx(100.0)
+    assert (measured.offset_dn, measured.delay_s) == (7.0, 2e-3)
+    assert Photoreceptor.of(SensorModel(), Optics()).ideal
