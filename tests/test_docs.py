@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 
 import evflow as ef
-from evflow.cli import Command, main
+from evflow.cli import main, offered
 from evflow.errors import CODES
 from evflow.io import write_recording
 from evflow.io.registry import FORMATS, WRITERS
@@ -210,7 +210,7 @@ def test_the_readmes_python_runs_from_a_fresh_checkout(
 @pytest.mark.parametrize("document", DOCUMENTS[1:], ids=lambda d: d.name)
 def test_options_exist(document: Path) -> None:
     known = {"--help", "--xla_force_host_platform_device_count"}  # the second is XLA's
-    commands = [typing.get_args(c)[0] for c in typing.get_args(Command)]
+    commands = [typing.get_args(c)[0] for c in typing.get_args(offered())]
     scripts = (coverage, curves, evaluate, integrate, limits, make_dataset, see_better, train,
                train_eventgan, train_network)
     for options in (*commands, *(script.Options for script in scripts)):

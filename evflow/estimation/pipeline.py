@@ -61,8 +61,8 @@ FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
 def estimate_camera(
     recording_or_path: Recording | str | os.PathLike, params: api.Params | None = None, *,
-    refine: Literal["auto", "off"] = "auto", min_window_us: int = 40_000,
-    progress: Progress | None = None,
+    refine: Literal["auto", "off"] = "auto", pixel: Literal["measured", "ideal"] = "measured",
+    min_window_us: int = 40_000, progress: Progress | None = None,
 ) -> CameraEstimate:
     """Measure a camera, pixel by pixel, from a recording with frames.
 
@@ -73,6 +73,8 @@ def estimate_camera(
         recording_or_path: events and frames on one clock, or the path of a file that holds them.
         params: of `load_weights`; None loads the released ones.
         refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .011).
+        pixel: "measured" looks for the photoreceptor and for what frames do not show; "ideal" takes
+            pixels and frames at their word.
         min_window_us: windows run from frame to frame until at least this long, microseconds.
         progress: progress(done, total) is called after every window and stretch.
 
@@ -86,8 +88,10 @@ def estimate_camera(
     Example:
         >>> ef.estimate_camera("flight.h5").save("camera.npz")
     """
-    if refine not in ("auto", "off"):
-        raise EvflowDataError("EV020", f"refine={refine!r}.", 'Choose "auto" or "off".')
+    for name, value, known in (("refine", refine, ("auto", "off")),
+                               ("pixel", pixel, ("measured", "ideal"))):
+        if value not in known:
+            raise EvflowDataError("EV020", f"{name}={value!r}.", f"Choose from {known}.")
     recording = recording_or_path
     if not isinstance(recording, Recording):
         recording = io.read_recording(recording)
@@ -110,7 +114,8 @@ def estimate_camera(
             advance()
 
     noise_dn = frame_noise(recording, [i for run in runs for i in run]) if runs else 0.0
-    found = find_photoreceptor(recording, runs, noise_dn) if runs else None
+    sought = bool(runs) and pixel == "measured"
+    found = find_photoreceptor(recording, runs, noise_dn) if sought else None
     seen_by = found.seen if found is not None and found.needed else IDEAL
     stats, n_events, n_shown = _pool(params, windows(), seen_by)
     summary, summary_std = api.finish(params, stats)

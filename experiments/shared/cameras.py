@@ -29,7 +29,9 @@ class Protocol:
     """What the recordings are like. fresh: the events begin at the first frame, with its
     brightness in the memory; else the camera has been running for 20 ms. fade: instead of moving,
     the scene's brightness is multiplied by this in all. off: whether OFF events come as they
-    should, have a threshold that nothing reaches, or are sent but left out of the recording."""
+    should, have a threshold that nothing reaches, or are sent but left out of the recording.
+    exposure_ms: over which a frame is the mean of the light; black_dn: added to the frames;
+    dark_dn: added to the light that pixels see."""
 
     prior: CameraPrior = CameraPrior()
     scene: SceneConfig = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
@@ -41,6 +43,9 @@ class Protocol:
     fresh: bool = False
     fade: float = 1.0
     off: Literal["sent", "unreached", "dropped"] = "sent"
+    exposure_ms: int = 0
+    black_dn: float = 0.0
+    dark_dn: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,6 +83,14 @@ def _faded(image: np.ndarray, factor: float, count: int) -> np.ndarray:
     return (BLACK + room * np.clip(image, 0, 255) / 255) * gains[:, None, None]
 
 
+def _exposed(frames: np.ndarray, kept: np.ndarray, exposure_ms: int) -> np.ndarray:
+    """The frames (T, H, W) at `kept`, each the mean over an exposure around its time."""
+    half = exposure_ms // 2
+    if not half:
+        return frames[kept]
+    return np.stack([frames[max(0, k - half):k + half + 1].mean(0) for k in kept])
+
+
 def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidden:
     """Draw a scene and a camera; simulate the recording."""
     k_scene, k_nominal, k_pixels, k_events, k_noise = jax.random.split(key, 5)
@@ -94,13 +107,15 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
         nominal = dataclasses.replace(nominal, theta_off=jnp.float32(UNREACHED))
         camera = sample_pixels(k_pixels, nominal, protocol.shape, prior.eta_spread)
     times = np.arange(length) * 1000
-    events, labels = simulate(k_events, frames, times, camera, model=protocol.model, labels=True)
+    lit = np.minimum(frames + np.float32(protocol.dark_dn), 255) if protocol.dark_dn else frames
+    events, labels = simulate(k_events, lit, times, camera, model=protocol.model, labels=True)
     if protocol.off == "dropped":
         on = events.p
         labels = labels[on]
         events = Events(events.x[on], events.y[on], events.t[on], events.p[on], events.size)
     kept = np.arange(lead, length, protocol.frame_ms)
-    gray = np.asarray(watch.recorded(k_noise, frames[kept], protocol.frame_noise_dn), np.uint8)
+    shown = _exposed(frames, kept, protocol.exposure_ms) + np.float32(protocol.black_dn)
+    gray = np.asarray(watch.recorded(k_noise, shown, protocol.frame_noise_dn), np.uint8)
     gain = watch.noise_gain(protocol.model, light, light[0])
     return Hidden(Recording(events, gray, times[kept]), watch.with_noise(camera, gain),
                   watch.with_noise(nominal, gain), frames, kept, labels)

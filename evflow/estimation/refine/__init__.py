@@ -24,6 +24,7 @@ from evflow.estimation.refine.path import (
     find_photoreceptor,
     make_chunk,
     plan_runs,
+    receptor_sample,
     refinement_chunks,
     survey,
 )
@@ -31,10 +32,8 @@ from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
 from evflow.estimation.refine.receptor_search import Found
 
 __all__ = [
-    "IDEAL",
     "Chunk",
     "Found",
-    "Photoreceptor",
     "PixelEvidence",
     "Refined",
     "Survey",
@@ -45,6 +44,7 @@ __all__ = [
     "make_chunk",
     "pixel_posterior",
     "plan_runs",
+    "receptor_sample",
     "refine_alone",
     "refine_summary",
     "refinement_chunks",

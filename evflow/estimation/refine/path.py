@@ -16,7 +16,8 @@ import numpy as np
 
 from evflow.estimation.refine.denoise import denoised
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
-from evflow.estimation.refine.receptor_search import Found, find, sample
+from evflow.estimation.refine.receptor_data import Sample, sample
+from evflow.estimation.refine.receptor_search import Found, find
 from evflow.estimation.refine.sightings import Sightings, sight
 from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.light.log_maps import lin_log
@@ -186,11 +187,11 @@ def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
 _seen = jax.jit(seen_path)
 
 
-def find_photoreceptor(
+def receptor_sample(
     recording: Recording, runs: list[list[int]], noise_dn: float = 0.0
-) -> Found | None:
-    """What the pixels of a recording see its frames by, from a few of its runs of intervals; None
-    where too little happens."""
+) -> Sample | None:
+    """What a few of a recording's runs of intervals say of the photoreceptor; None where too
+    little happens."""
     runs = plan_chunks(recording, runs)
     chosen = np.unique(np.linspace(0, len(runs) - 1, min(STRETCHES, len(runs))).round())
     parts = []
@@ -198,7 +199,14 @@ def find_photoreceptor(
         film = interpolated(recording, runs[k], STEPS, noise_dn)
         s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
         parts.append((film.dn, np.repeat(film.dt_s / STEPS, STEPS), s))
-    data = sample(parts)
+    return sample(parts)
+
+
+def find_photoreceptor(
+    recording: Recording, runs: list[list[int]], noise_dn: float = 0.0
+) -> Found | None:
+    """What the pixels of a recording see its frames by; None where too little happens."""
+    data = receptor_sample(recording, runs, noise_dn)
     return find(data) if data is not None else None
 
 

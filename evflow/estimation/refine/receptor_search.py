@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +18,11 @@ import numpy as np
 
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
-from evflow.estimation.refine.sightings import Sightings, counted, trusted
+from evflow.estimation.refine.receptor_data import PIXELS, TILES, Sample
 from evflow.simulator.photoreceptor import FAST, Photoreceptor, seen_path
 
 Array = jax.Array
 
-PIXELS, EVENTS = 4096, 1 << 15  # of a stretch that are looked at
-SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
-TILES = (6, 8)  # blocks of the image whose errors are independent
 OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, where the search begins
 TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
 PRIOR = np.array([25.0, 5e-3, 8e-4])  # std of offset (DN), tau and delay (s) before any data
@@ -35,7 +31,6 @@ STEP = np.array([12.0, 3e-3, 1e-3])  # most that one step changes
 LOW, HIGH = np.array([-25.0, FAST, -4e-3]), np.array([90.0, 3e-2, 4e-3])
 PATTERN = (4.0, 1.0, 0.25)  # SCALEs that are tried, one coordinate at a time
 MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
-ENOUGH = 200  # events of either polarity to look at
 MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # The path is wrong in its own way everywhere. What it explains better by less than a few per cent
@@ -54,7 +49,8 @@ KEPT_ERROR = (0.04, 0.8)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Found:
-    """seen: the most probable photoreceptor; theta (2,): of the pooled regression; covariance
+    """seen: the most probable photoreceptor; theta, ideal_theta (2,): of the pooled
+    regression, with it and with an ideal pixel; covariance
     (3, 3) of (offset, tau, delay); slope (2, 3): how log theta_on, log theta_off of the pooled
     regression change with the three; explained: shares of the variance that the regression
     explains, with an ideal pixel and as found; chance: probability that the ideal pixel is not
@@ -62,6 +58,7 @@ class Found:
 
     seen: Photoreceptor
     theta: np.ndarray
+    ideal_theta: np.ndarray
     covariance: np.ndarray
     slope: np.ndarray
     explained: tuple[float, float]
@@ -110,62 +107,6 @@ class Found:
     def theta_error(self) -> np.ndarray:
         """Relative error (2,) of theta that not knowing the three leaves."""
         return np.sqrt(np.einsum("ij,jk,ik->i", self.slope, self.covariance, self.slope))
-
-
-class Sample(NamedTuple):
-    """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N):
-    pixel (0..P-1), at (in fine steps), on, off (counts so far), weight; block (C, P)."""
-
-    dn: Array
-    dt_s: Array
-    pixel: Array
-    at: Array
-    on: Array
-    off: Array
-    weight: Array
-    block: Array
-
-
-def sample(
-    parts: list[tuple[np.ndarray, np.ndarray, Sightings]], seed: int = 0
-) -> Sample | None:
-    """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
-    its fine steps, and its sightings; None where too little happens."""
-    length = max((len(dn) for dn, *_ in parts), default=0)
-    used = [part for part in parts if len(part[0]) == length and len(part[2].pixel)]
-    if any(sum(int((s.on == on).sum()) for *_, s in used) < ENOUGH for on in (True, False)):
-        return None
-    rng = np.random.default_rng(seed)
-    rows = [_row(*part, rng, number) for number, part in enumerate(used)]
-    return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
-
-
-def _row(
-    dn: np.ndarray, dt_s: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
-) -> tuple[np.ndarray, ...]:
-    """The fields of a Sample, of one stretch."""
-    steps = len(dt_s) // (len(s.frames) - 1)
-    at = (s.interval + s.fraction) * steps
-    group, on, off = counted(s)
-    weight = trusted(s) * (at > SETTLE_S / dt_s.mean())
-    pixels = s.pixel[s.first]
-    chosen = np.flatnonzero(np.bincount(group, weight > 0, len(pixels)) >= 2)
-    if len(chosen) > PIXELS:
-        chosen = np.sort(rng.choice(chosen, PIXELS, replace=False))
-    place = np.full(len(pixels), -1)
-    place[chosen] = np.arange(len(chosen))
-    kept = np.flatnonzero((place[group] >= 0) & (weight > 1e-6))[:EVENTS]
-    (height, width), where = s.shape, pixels[chosen]
-    block = (where // width * TILES[0] // height) * TILES[1] + where % width * TILES[1] // width
-
-    def filled(values: np.ndarray, n: int) -> np.ndarray:
-        pad = [(0, 0)] * (values.ndim - 1) + [(0, n - values.shape[-1])]
-        return np.pad(values.astype(np.float32), pad)
-
-    light = filled(dn.reshape(len(dn), -1)[:, where], PIXELS)
-    events = [filled(v[kept], EVENTS) for v in (at, on, off, weight)]
-    return (light, dt_s.astype(np.float32), filled(place[group][kept], EVENTS).astype(np.int32),
-            *events, filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32))
 
 
 @jax.jit
@@ -245,8 +186,8 @@ def find(data: Sample) -> Found:
     odds = 0.5 * min(size, BELIEVED) * (plain - value) - DOUBT - 0.5 * float(
         (((phi - PLAIN) / PRIOR) ** 2).sum())
     seen = Photoreceptor(float(phi[0]), float(phi[1]) if phi[1] > 2 * FAST else 0.0, float(phi[2]))
-    theta = np.abs(_solved(_totals(phi, data))[0])
-    return Found(seen, theta, covariance, of_theta, (1 - np.exp(plain), 1 - np.exp(value)),
+    theta, ideal = (np.abs(_solved(_totals(at, data))[0]) for at in (phi, PLAIN))
+    return Found(seen, theta, ideal, covariance, of_theta, (1 - np.exp(plain), 1 - np.exp(value)),
                  float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), size)
 
 
@@ -257,6 +198,16 @@ def _size(phi: np.ndarray, data: Sample) -> float:
     bent = np.diag(_curvature(phi, slope.sum(0), data))
     scatter = ((slope - slope.mean(0)) ** 2).sum(0)
     return float(np.clip(2.0 * np.median(bent / np.maximum(scatter, 1e-30)), 10.0, MOST_SIZE))
+
+
+def explained(data: Sample, seen_by: Photoreceptor, theta: np.ndarray) -> float:
+    """Share of the variance that thresholds (2,) explain behind a photoreceptor, both of another
+    part of the recording."""
+    aa, ab, bb, ay, by, yy = _totals(
+        np.array([seen_by.offset_dn, max(seen_by.tau_s, FAST), seen_by.delay_s]), data)
+    on, off = theta
+    return 1.0 - float(yy - 2 * (on * ay + off * by) + on**2 * aa + 2 * on * off * ab
+                       + off**2 * bb) / float(yy)
 
 
 def _start(data: Sample) -> np.ndarray:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine.path import STEPS
-from evflow.estimation.refine.receptor_search import find, sample
+from evflow.estimation.refine.receptor_data import sample
+from evflow.estimation.refine.receptor_search import find
 from evflow.estimation.refine.sightings import sight
 from evflow.simulator.photoreceptor import FAST, seen_path
 from evflow.types import Events

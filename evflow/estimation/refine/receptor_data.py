@@ -1,0 +1,74 @@
+"""What the search for a photoreceptor looks at: some pixels of some stretches, and their events."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.estimation.refine.sightings import Sightings, counted, trusted
+
+Array = jax.Array
+
+PIXELS, EVENTS = 4096, 1 << 15  # of a stretch that are looked at
+SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
+TILES = (6, 8)  # blocks of the image whose errors are independent
+ENOUGH = 200  # events of either polarity to look at
+
+
+class Sample(NamedTuple):
+    """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N):
+    pixel (0..P-1), at (in fine steps), on, off (counts so far), weight; block (C, P)."""
+
+    dn: Array
+    dt_s: Array
+    pixel: Array
+    at: Array
+    on: Array
+    off: Array
+    weight: Array
+    block: Array
+
+
+def sample(
+    parts: list[tuple[np.ndarray, np.ndarray, Sightings]], seed: int = 0
+) -> Sample | None:
+    """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
+    its fine steps, and its sightings; None where too little happens."""
+    length = max((len(dn) for dn, *_ in parts), default=0)
+    used = [part for part in parts if len(part[0]) == length and len(part[2].pixel)]
+    if any(sum(int((s.on == on).sum()) for *_, s in used) < ENOUGH for on in (True, False)):
+        return None
+    rng = np.random.default_rng(seed)
+    rows = [_row(*part, rng, number) for number, part in enumerate(used)]
+    return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
+
+
+def _row(
+    dn: np.ndarray, dt_s: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
+) -> tuple[np.ndarray, ...]:
+    """The fields of a Sample, of one stretch."""
+    steps = len(dt_s) // (len(s.frames) - 1)
+    at = (s.interval + s.fraction) * steps
+    group, on, off = counted(s)
+    weight = trusted(s) * (at > SETTLE_S / dt_s.mean())
+    pixels = s.pixel[s.first]
+    chosen = np.flatnonzero(np.bincount(group, weight > 0, len(pixels)) >= 2)
+    if len(chosen) > PIXELS:
+        chosen = np.sort(rng.choice(chosen, PIXELS, replace=False))
+    place = np.full(len(pixels), -1)
+    place[chosen] = np.arange(len(chosen))
+    kept = np.flatnonzero((place[group] >= 0) & (weight > 1e-6))[:EVENTS]
+    (height, width), where = s.shape, pixels[chosen]
+    block = (where // width * TILES[0] // height) * TILES[1] + where % width * TILES[1] // width
+
+    def filled(values: np.ndarray, n: int) -> np.ndarray:
+        pad = [(0, 0)] * (values.ndim - 1) + [(0, n - values.shape[-1])]
+        return np.pad(values.astype(np.float32), pad)
+
+    light = filled(dn.reshape(len(dn), -1)[:, where], PIXELS)
+    events = [filled(v[kept], EVENTS) for v in (at, on, off, weight)]
+    return (light, dt_s.astype(np.float32), filled(place[group][kept], EVENTS).astype(np.int32),
+            *events, filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32))

@@ -1,0 +1,30 @@
+"""Cameras whose pixels are slow and whose frames are no measurement of light, by what differs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evflow.camera import CameraPrior
+from evflow.camera.sensors import SENSORS, SensorModel
+from evflow.scenes.config import SceneConfig
+from experiments.shared.cameras import Protocol
+
+BASE = Protocol(
+    prior=CameraPrior(theta=(0.12, 0.45)), shape=(120, 160), frame_ms=40, intervals=24,
+    scene=SceneConfig(speed_px_s=(20.0, 200.0), contrast=(0.4, 1.0), static_fraction=0.0))
+REAL = SensorModel(cutoff_hz=100.0, leak_hz=0.1, shot_hz=1.0, refractory_s=1e-3,
+                   noise_resets_memory=True)
+CHANGES: dict[str, dict[str, Any]] = {
+    "ideal": {},
+    **{f"cutoff {hz} Hz": {"model": SensorModel(cutoff_hz=hz, noise_resets_memory=True)}
+       for hz in (300.0, 100.0, 30.0)},
+    **{f"exposed {ms} ms": {"exposure_ms": ms} for ms in (10, 20)},
+    **{f"frame noise {dn} DN": {"frame_noise_dn": dn} for dn in (1.0, 3.0)},
+    **{f"black level {dn:+.0f} DN": {"black_dn": dn} for dn in (-8.0, 8.0, 16.0)},
+    "dark light 24 DN": {"dark_dn": 24.0},
+    **{f"dead time {ms} ms": {"model": SensorModel(refractory_s=ms * 1e-3)} for ms in (1, 5)},
+    "leak .3 Hz": {"model": SensorModel(leak_hz=0.3, leak_jitter=0.1, noise_resets_memory=True)},
+    "shot noise 5 Hz": {"model": SensorModel(shot_hz=5.0, noise_resets_memory=True)},
+    "v2e's noisy": {"model": SENSORS["noisy"].model},
+    "as a real camera": {"model": REAL, "exposure_ms": 10, "frame_noise_dn": 2.0, "black_dn": 4.0},
+}
