@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,11 @@ os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 compile_quickly(os.environ)
 remember(os.environ)
 MOST_MB = 2500  # of memory, that compiled programs may fill before they are forgotten
+
+
+# A shell lets what it starts in the background ignore Ctrl-C, and so would every child.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(optionalhook=True)
