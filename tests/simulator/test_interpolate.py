@@ -9,6 +9,7 @@ import pytest
 from helpers.videos import code_of
 
 from evflow.errors import EvflowDataError
+from evflow.notes import Note
 from evflow.simulator.interpolate import MAX_STEPS, Interpolator, unzip, upsample
 
 SIZE = 96
@@ -92,13 +93,13 @@ def test_given_frames_come_out_unchanged_and_still_scenes_stay_short() -> None:
 
 
 def test_warns_once_where_motion_is_too_fast() -> None:
-    told: list[str] = []
+    told: list[Note] = []
     pairs = [(shifted(6.0 * i), 40_000 * i) for i in range(3)]
     out = list(upsample(pairs, max_motion_px=0.05, warn=told.append))
     assert len(out) == 2 * MAX_STEPS + 1
     assert len(told) == 1
-    assert "between the frames at 0 and 40000 us" in told[0]
-    assert str(MAX_STEPS) in told[0]
+    assert "between the frames at 0 and 40000 us" in told[0].text
+    assert str(MAX_STEPS) in told[0].text
     list(upsample(pairs, max_motion_px=1.0, warn=told.append))
     assert len(told) == 1
 

@@ -143,10 +143,15 @@ def test_saturated_pixels_tell_nothing(watched: tuple[Recording, Camera]) -> Non
     clipped = np.clip(np.rint(recording.frames * 1.6), 0, 255).astype(np.uint8)
     assert 0.05 < (clipped == 255).mean() < 0.6
     saturated = dataclasses.replace(recording, frames=clipped)
-    found = estimate_camera(saturated)
+    found = estimate_camera(saturated, pixel="ideal")
     truth = np.array([np.median(watched[1].theta_on), np.median(watched[1].theta_off)])
     estimate = np.array([float(found.summary.theta_on), float(found.summary.theta_off)])
     assert estimate == pytest.approx(truth, rel=0.12)
+    # The brighter frames move the knee of the lin-log, which is taken for an offset in part.
+    measured = estimate_camera(saturated)
+    for name, value in zip(("theta_on", "theta_off"), truth, strict=True):
+        away = abs(float(getattr(measured.summary, name)) - value)
+        assert away < 2 * float(getattr(measured.summary_std, name))
     white = (clipped == 255).all(0)
     assert white.any()
     assert not found.valid[white].any()
