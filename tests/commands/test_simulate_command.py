@@ -212,7 +212,7 @@ def test_terminated_from_outside_it_leaves_no_file(tmp_path: Path) -> None:
     work = tmp_path / "out"
     work.mkdir()
     script = (
-        "import sys; sys.path[:0] = ['tests/commands', '.']\n"
+        "import sys; sys.path[:0] = ['tests/commands', 'tests', '.']\n"
         "import evflow.io.source, evflow.cli\n"
         "from evflow.io.images.frames import FrameSource\n"
         "from test_simulate_command import endless, SHAPE\n"
