@@ -25,6 +25,8 @@ Array = jax.Array
 MAX_MEAN = 70.0  # noise events per pixel and interval; beyond ~85 exp(-mean) underflows
 LEAK_THETA = 10.0  # natural log; all of an image sensor's range is 5.5
 GOLDEN = np.uint32(0x9E3779B9)  # 2^32 / golden ratio: distinct numbers far apart
+# sin(2 pi y) / y in powers of y^2, |y| <= 1/4: the fit of least relative error, 5e-9.
+SINE = (6.28318548, -41.3416786, 81.6022339, -76.5749893, 39.7109184)
 JITTER = 1 << 30  # what the leak's draws are numbered from; those of events count from 0
 
 
@@ -236,8 +238,18 @@ def leak(model: SensorModel, leaking: Array, words: Array, drawn: Array, dt: Arr
     if model.leak_jitter <= 0:
         return leaking * dt
     u, v = (further(words, drawn, jnp.uint32(JITTER + i)) for i in (0, 1))
-    normal = jnp.sqrt(-2.0 * jnp.log(u)) * jnp.cos(2 * jnp.pi * v)
+    normal = jnp.sqrt(-2.0 * jnp.log(u)) * cosine(v)
     return leaking * dt * (1.0 - model.leak_jitter * normal)
+
+
+def cosine(turns: Array) -> Array:
+    """cos(2 pi turns) of float32 turns in [0, 1], 2e-7 off. On a CPU XLA asks the C library, number
+    by number: 10 ns each, where this takes .3 ns."""
+    y = 0.25 - jnp.minimum(turns, 1.0 - turns)
+    square, sine = y * y, jnp.full_like(y, SINE[-1])
+    for coefficient in SINE[-2::-1]:
+        sine = sine * square + coefficient
+    return y * sine
 
 
 def leak_pattern(model: SensorModel, key: Array, shape: tuple[int, ...]) -> Array:

@@ -17,7 +17,16 @@ from helpers.videos import by_pixel
 from evflow.camera import Camera, CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.simulator import simulate
-from evflow.simulator.noise import draw, event, further, pixel_words, poisson, salts, uniform
+from evflow.simulator.noise import (
+    cosine,
+    draw,
+    event,
+    further,
+    pixel_words,
+    poisson,
+    salts,
+    uniform,
+)
 from evflow.types import Events
 
 SHAPE = (64, 64)
@@ -213,3 +222,9 @@ def test_host_and_device_place_events_alike() -> None:
     for theirs, ours in zip(event(ETA, words, drawn, jnp.asarray(k), share),
                             event(ETA, *map(np.asarray, (words, drawn, k, share))), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_cosine_of_a_draw_is_that_of_the_angle() -> None:
+    turns = np.append(np.linspace(0, 1, 4097), [2.0**-33, 0.25 - 2.0**-26]).astype(np.float32)
+    exact = np.cos(2 * np.pi * turns.astype(np.float64))
+    np.testing.assert_allclose(cosine(jnp.asarray(turns)), exact, rtol=0, atol=2.5e-7)
