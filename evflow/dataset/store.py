@@ -22,7 +22,8 @@ from evflow.errors import EvflowDataError
 from evflow.files.folders import atomic_folder
 from evflow.files.whole import need_size
 from evflow.io import DsecWriter, read_recording
-from evflow.io.decode.hdf5 import DAMAGE, load_h5py, plausible
+from evflow.io.decode import tables
+from evflow.io.decode.hdf5 import plausible
 from evflow.types import Events, Recording
 
 Format = Literal["dsec", "npy"]
@@ -111,14 +112,9 @@ def _read_dsec(path: Path) -> EventSequence:
     if not recording.has_frames:
         raise EvflowDataError("EV008", f"{path} has no frames: no sequence of a data set.")
     layout = truth_layout(*recording.frames.shape)
-    try:
-        with load_h5py().File(path) as f:
-            _need(path, layout, f.__contains__)
-            stored = {name: plausible(path, f[name])[()] for name in layout}
-    except DAMAGE as e:
-        raise EvflowDataError(
-            "EV009", f"{path} is cut off or damaged ({type(e).__name__}: {e}).",
-            "Make it again.") from e
+    with tables.opened(path) as f:
+        _need(path, layout, f.__contains__)
+        stored = {name: plausible(path, f[name])[()] for name in layout}
     flags = stored["flow_visible"]
     return EventSequence.of(recording, stored | {"flow_visible": flags.astype(bool)})
 

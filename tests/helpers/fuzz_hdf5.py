@@ -44,6 +44,10 @@ def instead(f: Any, name: str, what: str) -> None:
         f[name] = h5py.SoftLink("/" + name)
     elif what == "elsewhere":
         f[name] = h5py.ExternalLink("/etc/passwd", "/x")
+    elif what == "itself":
+        layout = h5py.VirtualLayout(shape, "f8")
+        layout[...] = h5py.VirtualSource(".", name, shape)
+        f.create_virtual_dataset(name, layout)
     elif what == "claims":
         f.create_dataset(name, (1 << 40, *shape[1:]), "u4", chunks=(9, *shape[1:]))
     elif what == "blocks":
@@ -58,7 +62,7 @@ def instead(f: Any, name: str, what: str) -> None:
 
 WHAT = ("strings", "scalar", "compound", "complex", "deep", "empty", "nan", "huge", "references",
         "dates", "group", "dangling", "circle", "elsewhere", "claims", "blocks",
-        "foreign-file", "vlen")
+        "foreign-file", "itself", "vlen")
 
 
 def hdf5(folder: Path, kind: str, place: str, what: str) -> Sample:
@@ -76,7 +80,8 @@ for _kind, _places in PLACES.items():
     for _place in _places:
         HOSTILE |= {f"hostile-{_kind}-{_place.replace('/', '-')}-{_what}":
                     partial(hdf5, kind=_kind, place=_place, what=_what) for _what in WHAT
-                    if (_place, _what) != ("t_offset", "foreign-file")}  # HDF5 keeps scalars
+                    if _place != "t_offset" or _what not in ("foreign-file", "itself")}
+                    # HDF5 keeps scalars
 
 
 @hostile

@@ -36,11 +36,7 @@ def load_h5py() -> Any:
 
 
 def plausible(path: Path, data: Any) -> Any:
-    """The data set, unless it claims more than the file can hold, or lies in another; EV009."""
-    if getattr(data, "external", None):
-        raise EvflowDataError(
-            "EV009", f"{path}: {data.name} lies outside of it, in {data.external[0][0]}.",
-            "Only what is in the file itself is read: repack it (h5repack).")
+    """The data set, unless it claims more than the file can hold; EV009."""
     check_expansion(data.nbytes, os.path.getsize(path), f"{path}: {data.name} {data.shape}")
     if data.nbytes > MAX_RATIO * os.path.getsize(path):
         raise EvflowDataError(

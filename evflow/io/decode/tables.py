@@ -27,27 +27,37 @@ ROWS = 1 << 15  # events read at a time: 1 MiB of four float64 columns, which a 
 
 
 def holds(head: bytes, path: Path, test: Callable[[Any], bool]) -> bool:
-    """Is it an HDF5 file that can be opened and passes the test?"""
+    """Is it an HDF5 file that can be opened and passes the test, or might if the test had not come
+    upon another file?"""
     if not head.startswith(MAGIC):
         return False
     try:
-        with load_h5py().File(path) as f:
+        with _file(path) as f:
             return bool(test(f))
-    except (EvflowDataError, *DAMAGE):
+    except EvflowDataError as e:
+        return e.code == "EV009"  # `read` says why
+    except DAMAGE:
         return False
 
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The open HDF5 file; EV009 (damaged), EV010 (no h5py)."""
-    h5py = load_h5py()
+    """The open HDF5 file; EV009 (damaged; what is asked for lies in another), EV010 (no h5py)."""
     try:
-        with h5py.File(path) as f:
+        with _file(path) as f:
             yield f
     except DAMAGE as e:
         raise EvflowDataError(
             "EV009", f"{path} is cut off or damaged ({type(e).__name__}: {e}).",
             "Copy it again; h5ls and h5dump show what is left.") from e
+
+
+def _file(path: Path) -> Any:
+    """The file, nothing outside of which is followed."""
+    load_h5py()
+    from evflow.io.decode.hdf5_contained import File
+
+    return File(path)
 
 
 def dataset(path: Path, group: Any, name: str, shape: tuple[int | None, ...]) -> Any:

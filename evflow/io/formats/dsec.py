@@ -20,7 +20,7 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
-from evflow.io.decode.hdf5 import DAMAGE, MAGIC, Hdf5Writer, load_h5py, plausible
+from evflow.io.decode.hdf5 import MAGIC, Hdf5Writer, plausible
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
 from evflow.io.images.times import beside_events
@@ -45,9 +45,9 @@ def sniff(path: Path, head: bytes) -> bool:
     if not head.startswith(MAGIC):
         return False
     try:
-        with load_h5py().File(path) as f:
+        with tables.opened(path) as f:
             return "events" in f and hasattr(f["events"], "keys")
-    except (EvflowDataError, *DAMAGE):
+    except EvflowDataError:
         return True  # `read` says why
 
 
