@@ -24,6 +24,7 @@ from evflow.notes import Note
 from evflow.types import Events, Recording
 
 CHUNK = 1 << 18  # bytes decoded at a time: the temporaries of 64k words stay in a core's cache
+MOST_RESERVED = 0.125, 16  # of the words of a chunk, and at least; of random ones a third are
 KINDS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": bool}
 
 
@@ -106,19 +107,54 @@ def cut_at(wrong: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def typed(
-    source: Iterable[tuple[int, np.ndarray]], undefined: np.ndarray, name: str,
+    source: Iterable[tuple[int, np.ndarray]], reserved: Reserved,
     decode: Callable[[np.ndarray, np.ndarray, int], Chunk], unit: str = "byte",
 ) -> Iterator[Chunk]:
-    """decode(words, their types, byte) of (byte, words) whose top four bits are a type; Damage
-    at a type of which `undefined` (16,) says that the format `name` has none."""
+    """decode(words, their types, byte) of (byte, words) whose top four bits are a type. Words of
+    reserved types stay among them, for `decode` to pass over."""
     for byte, table in source:
         size = table.dtype.itemsize
         kind = (table >> (8 * size - 4)).astype(np.uint8)
-        sound, wrong = cut_at(undefined[kind], table)
-        yield decode(sound, kind[: len(sound)], byte)
+        wrong = reserved.seen(table, kind)
+        sound = len(table) if wrong < 0 else wrong
+        yield decode(table[:sound], kind[:sound], byte)
         if wrong >= 0:
             raise Damage(byte + size * wrong, f"word {table[wrong]:#0{2 * size + 2}x} is of type "
-                         f"{kind[wrong]:#x}, which {name} does not have", unit)
+                         f"{kind[wrong]:#x}, which {reserved.format} does not have, and so are "
+                         "many behind it", unit)
+
+
+class Reserved:
+    """Words of types that a format reserves or does not define: they are passed over and counted,
+    as firmware pads with them. types: (16,) bool, which they are.
+
+    Where more than `MOST_RESERVED` of a chunk are such, of several values, this is another format,
+    or damage.
+    """
+
+    def __init__(self, types: np.ndarray, format: str) -> None:
+        self.types, self.format = types, format
+        self.count, self.example = 0, 0
+
+    def seen(self, table: np.ndarray, kind: np.ndarray) -> int:
+        """Count those of a chunk; the index of the first where there are too many, else -1."""
+        odd = self.types[kind]
+        if not odd.any():
+            return -1
+        at = np.flatnonzero(odd)
+        first = table[at[0]]
+        share, least = MOST_RESERVED
+        if len(at) > max(least, share * len(table)) and (table[at] != first).any():
+            return int(at[0])
+        self.example = self.example or int(first)
+        self.count += len(at)
+        return -1
+
+    def notes(self) -> tuple[Note, ...]:
+        if not self.count:
+            return ()
+        return (Note("events.unread", f"{self.count:,} words of types that {self.format} reserves "
+                     f"({self.example:#x}, ...) were skipped"),)
 
 
 def collect(

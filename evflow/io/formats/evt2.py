@@ -2,8 +2,9 @@
 32-bit words, their type in bits 31-28.
 
 0, 1: an event, OFF or ON: time [27:22] (the low 6 bits), x [21:11], y [10:0]. 8: the high 28 bits
-of time, in 64 us; they wrap after 4.8 hours. A: trigger; E, F: other: counted, not read. Times
-stay on the sensor's clock. Events before the first time word have no time and are left out.
+of time, in 64 us; they wrap after 4.8 hours. A: trigger; E, F: other: counted, not read. Other
+types are reserved: counted and skipped. Times stay on the sensor's clock. Events before the first
+time word have no time and are left out.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.io.decode import prophesee
-from evflow.io.decode.stream import Chunk, Clock, collect, typed, words
+from evflow.io.decode.stream import Chunk, Clock, Reserved, collect, typed, words
 from evflow.io.hints import Hints
 from evflow.notes import Note
 from evflow.types import Recording
@@ -24,7 +25,7 @@ NAME = "evt2"
 EXTENSIONS: tuple[str, ...] = (".raw",)
 
 TIME, TRIGGER = 0x8, 0xA
-UNDEFINED = np.array([kind not in (0, 1, TIME, TRIGGER, 0xE, 0xF) for kind in range(16)])
+RESERVED = np.array([kind not in (0, 1, TIME, TRIGGER, 0xE, 0xF) for kind in range(16)])
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -51,9 +52,10 @@ class Decoder:
     def __init__(self) -> None:
         self.clock = Clock(28)
         self.timeless = self.triggers = 0
+        self.reserved = Reserved(RESERVED, "EVT2")
 
     def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
-        return typed(source, UNDEFINED, "EVT2", self.decode)
+        return typed(source, self.reserved, self.decode)
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
         marks = np.flatnonzero(kind == TIME)
@@ -73,7 +75,7 @@ class Decoder:
                      t, events >= 1 << 28, lambda i: byte + 4 * int(rows[i]))
 
     def notes(self) -> tuple[Note, ...]:
-        return leftovers(self.timeless, self.triggers)
+        return (*self.reserved.notes(), *leftovers(self.timeless, self.triggers))
 
 
 def leftovers(timeless: int, triggers: int) -> tuple[Note, ...]:

@@ -4,7 +4,8 @@
 0: row y [10:0]. 2: an event at x [10:0], polarity [11]. 3: vector base, x and polarity the same.
 4, 5: events at base + i where bit i of 12 (8) is set; the base advances by 12 (8). 6, 8: low and
 high 12 bits of time in us, which wraps every 16.8 s; a new high word starts at low 0. A: trigger;
-7, E, F: other: not read. Events before the first row, time or base are left out, and counted.
+7, E, F: other: not read. 1, 9, B, C, D are reserved, and pad some recordings (0x9999): counted and
+skipped, as are events before the first row, time or base.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from evflow.io.decode import prophesee
-from evflow.io.decode.stream import Chunk, Clock, collect, hold, typed, words
+from evflow.io.decode.stream import Chunk, Clock, Reserved, collect, hold, typed, words
 from evflow.io.formats.evt2 import leftovers
 from evflow.io.hints import Hints
 from evflow.notes import Note
@@ -25,7 +26,7 @@ NAME = "evt3"
 EXTENSIONS: tuple[str, ...] = (".raw",)
 
 ROW, SINGLE, BASE, VECTOR_12, VECTOR_8, LOW, HIGH, TRIGGER = 0, 2, 3, 4, 5, 6, 8, 10
-UNDEFINED = np.array([kind in (1, 9, 11, 12, 13) for kind in range(16)])
+RESERVED = np.array([kind in (1, 9, 11, 12, 13) for kind in range(16)])
 EMITS = np.array([kind in (SINGLE, VECTOR_12, VECTOR_8) for kind in range(16)])
 ADVANCE = np.array([12 * (kind == VECTOR_12) + 8 * (kind == VECTOR_8) for kind in range(16)])
 MASK = np.array([{VECTOR_12: 0xFFF, VECTOR_8: 0xFF}.get(kind, 0) for kind in range(16)], np.uint16)
@@ -60,9 +61,10 @@ class Decoder:
         self.clock, self.unit = Clock(12), unit
         self.time, self.row, self.base, self.on = NEVER, UNKNOWN, UNKNOWN, False
         self.stateless = self.triggers = 0
+        self.reserved = Reserved(RESERVED, "EVT3")
 
     def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
-        return typed(source, UNDEFINED, "EVT3", self.decode, self.unit)
+        return typed(source, self.reserved, self.decode, self.unit)
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
         self.triggers += int(np.count_nonzero(kind == TRIGGER))
@@ -145,4 +147,4 @@ class Decoder:
                      lambda i: byte + 2 * int(rows[of[i]]), self.unit)
 
     def notes(self) -> tuple[Note, ...]:
-        return leftovers(self.stateless, self.triggers)
+        return (*self.reserved.notes(), *leftovers(self.stateless, self.triggers))

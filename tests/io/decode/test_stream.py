@@ -102,7 +102,7 @@ def test_stop_reads_no_further(
     path, first = write(tmp_path, kind, events), int(events.t[0])
     data = bytearray(path.read_bytes())
     half = len(data) // 2
-    data[half:] = b"\x11" * (len(data) - half)
+    data[half:] = (b"\x11\x11\x11\xd1" * len(data))[: len(data) - half]
     path.write_bytes(bytes(data))
     stop = (int(events.t[300]) - first) / 1e6
     equal(read_events(path, stop_s=stop), events.slice(first, int(events.t[300])))

@@ -34,15 +34,42 @@ def test_words_beside_the_events(tmp_path: Path) -> None:
     assert len(read_recording(path).events) == 0
 
 
-@pytest.mark.parametrize("kind", [2, 7, 9, 0xB, 0xD])
-def test_undefined_word_is_told_with_its_byte(tmp_path: Path, kind: int) -> None:
-    sound = evt2(clustered(50))
+@pytest.mark.parametrize(("encode", "bits", "kinds"), [
+    (evt2, 32, (2, 7, 9, 0xB, 0xD)), (evt3, 16, (1, 9, 0xB, 0xC, 0xD))])
+def test_reserved_words_are_skipped_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encode: Callable[..., bytes], bits: int,
+    kinds: tuple[int, ...]
+) -> None:
+    """Anywhere among the words, one by one or a page of padding, over chunk borders."""
+    events = clustered(400)
+    sound, rng = np.frombuffer(encode(events, b""), f"<u{bits // 8}"), np.random.default_rng(0)
+    pad = (0x9999999 << 4 | 9) >> (32 - bits)  # 0x9999, 0x99999999
+    one = [kind << (bits - 4) | int(rng.integers(256)) for kind in kinds]
     path = tmp_path / "a.raw"
-    path.write_bytes(sound + struct.pack("<I", kind << 28 | 0x123) + bytes(8))
+    for words in ([pad], one, [pad] * 5000):
+        monkeypatch.setattr("evflow.io.decode.stream.CHUNK", 1000 if len(words) < 9 else 1 << 18)
+        data = np.insert(sound, np.sort(rng.integers(0, len(sound), len(words))), words)
+        path.write_bytes(encode(clustered(0)) + data.astype(sound.dtype).tobytes())
+        got = read_recording(path)
+        equal(got.events, events)
+        assert [note.code for note in got.notes] == ["events.unread"]
+        assert got.notes[0].text.startswith(f"{len(words):,} words of types that EVT")
+    assert f"({pad:#x}, ...)" in got.notes[0].text
+
+
+@pytest.mark.parametrize(("encode", "bits"), [(evt2, 32), (evt3, 16)])
+def test_many_reserved_words_are_damage(
+    tmp_path: Path, encode: Callable[..., bytes], bits: int
+) -> None:
+    sound = encode(clustered(50))
+    junk = [(9 + 2 * (i % 2)) << (bits - 4) | i for i in range(60)]
+    path = tmp_path / "a.raw"
+    path.write_bytes(sound + np.array(junk, f"<u{bits // 8}").tobytes())
     error = refused(path)
     assert error.code == "EV009"
     assert f"at byte {len(sound):,} of" in str(error)
-    assert f"type {kind:#x}" in str(error)
+    assert "type 0x9" in str(error)
+    equal(read_recording(path, partial=True).events, clustered(50))
 
 
 @pytest.mark.parametrize(("text", "encoding", "size"), [

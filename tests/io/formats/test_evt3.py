@@ -108,16 +108,6 @@ def test_new_high_word_starts_at_low_zero(tmp_path: Path) -> None:
     assert read_events(path).t.tolist() == [0x1FFF, 0x2000, 0x2001, 0x2001]
 
 
-@pytest.mark.parametrize("kind", [1, 9, 0xB, 0xC, 0xD])
-def test_undefined_word_is_told_with_its_byte(tmp_path: Path, kind: int) -> None:
-    sound = evt3(clustered(50))
-    path = tmp_path / "a.raw"
-    path.write_bytes(sound + struct.pack("<H", kind << 12) + bytes(8))
-    error = refused(path)
-    assert error.code == "EV009"
-    assert f"at byte {len(sound):,} of" in str(error)
-
-
 def test_vectors_that_never_end_leave_the_sensor(tmp_path: Path) -> None:
     """70,000 masks after one base reach x = 840,000: refused, not wrapped into 16 bits."""
     path = tmp_path / "a.raw"

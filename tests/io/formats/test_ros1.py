@@ -55,6 +55,18 @@ def test_event_packets(
         assert got.has_frames == encoding.startswith("libcaer")
 
 
+@needs_rosbags
+def test_reserved_words_in_packets_are_skipped(tmp_path: Path) -> None:
+    want = make().events
+    first, *rest = packet_messages(want, "evt3")
+    head, data = first[3].split(b"evt3\0", 1)
+    padded = struct.pack("<I", struct.unpack("<I", data[:4])[0] + 6) + b"\x99" * 6 + data[4:]
+    messages = [(*first[:3], head + b"evt3\0" + padded), *rest]
+    got = read_recording(write(tmp_path / "a.bag", messages))
+    equal(got.events, as_sent(want, "evt3"))
+    assert got.notes[0].text.startswith("3 words of types that EVT3 reserves (0x9999")
+
+
 def test_words_of_libcaer_cmp_change_a_state() -> None:
     """Column, time and base hold from word to word, column and base from message to message."""
     words = [0x2005, 0x3803, 0x0002, 0x1007, 0x4010, 0x5003, 0x5080, 0x1009, 0x300C, 0x4820]

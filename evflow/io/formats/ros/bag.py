@@ -19,7 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
 from evflow.io.decode.stream import Damage, gather
 from evflow.io.formats.ros.messages import EVENT_TYPES, IMAGE, Message, Packet
-from evflow.io.formats.ros.packets import OTHER_CLOCK, decoder
+from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded
 from evflow.io.hints import Hints
 from evflow.io.images.frames import FrameStack
 from evflow.notes import Note
@@ -37,8 +37,9 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
     topic, kind = topics[0]
     notes = tuple(Note("events.unread", f"topic {other} was not read") for other, _ in topics[1:])
     first = bag.first(topic, kind)
-    chunks, native = decoder(bag.path, first, bag.packets(topic, kind))
-    events, span, told = gather(bag.path, chunks, hints, first.size, native)
+    found = decoded(bag.path, first, bag.packets(topic, kind))
+    events, span, told = gather(bag.path, found.chunks, hints, first.size, found.native)
+    told = (*found.notes(), *told)
     image_topic = bag.image_beside(topic)
     if image_topic is None:
         return Recording.of_events(events, notes + told)

@@ -8,8 +8,9 @@ on time_base) and `libcaer_cmp` (see `libcaer_words`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,24 +20,32 @@ from evflow.io.decode.stream import Chunk, Clock, Damage
 from evflow.io.formats import evt3
 from evflow.io.formats.ros import libcaer_words
 from evflow.io.formats.ros.messages import EVENT, Packet
+from evflow.notes import Note
 
 CAER = np.dtype([("data", "<u4"), ("t", "<u4")])
 OTHER_CLOCK = ("evt3", "mono")  # encodings whose times are not those of other topics
 
 
-def decoder(
-    path: Path, first: Packet, packets: Iterable[Packet]
-) -> tuple[Iterator[Chunk], str]:
-    """Chunks of the encoding of the first packet, and the unit of their times."""
+class Decoded(NamedTuple):
+    """chunks of events, the unit of their times, and what was left out, told at the end."""
+
+    chunks: Iterator[Chunk]
+    native: str
+    notes: Callable[[], tuple[Note, ...]] = tuple
+
+
+def decoded(path: Path, first: Packet, packets: Iterable[Packet]) -> Decoded:
+    """The packets, of the encoding of the first."""
     if first.encoding == "evt3":
-        return evt3.Decoder("payload byte").chunks(_words(packets)), "us"
+        evt = evt3.Decoder("payload byte")
+        return Decoded(evt.chunks(_words(packets)), "us", evt.notes)
     known = {"": _event_array, "mono": _mono, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp}
     if first.encoding not in known:
         raise EvflowDataError(
             "EV008", f"{path}: events are encoded as {first.encoding[:20]!r}.",
             f"Known encodings: evt3, {', '.join(filter(None, known))}; convert the bag with "
             "event_camera_tools.")
-    return _counted(known[first.encoding](packets)), "ns"
+    return Decoded(_counted(known[first.encoding](packets)), "ns")
 
 
 def _counted(parts: Iterator[tuple[np.ndarray, ...]]) -> Iterator[Chunk]:
