@@ -46,7 +46,8 @@ def simulate_counts(
             eta and light.
 
     Returns:
-        (H, W, 2) = [ON, OFF] events, float32 (float64 where log_frames are).
+        (H, W, 2) = [ON, OFF] events, float32 (float64 where log_frames are); within jit NaN at
+        pixels whose parameters are impossible (theta <= 0, eta < 0), which else raise EV014.
 
     Raises:
         EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
@@ -88,12 +89,14 @@ def _counts(
     times: Array, *, model: SensorModel, smooth: float,
 ) -> Array:
     steps, *shape = log_frames.shape
+    camera, marks = sensor.possible(camera)
     whole, state = sensor.start(key, log_frames[0], camera, model, nominal)
     frames = log_frames[1:].reshape(steps - 1, math.prod(shape))
     if smooth:  # of the thresholds themselves: rounded ones have no gradient
         whole = dataclasses.replace(whole, camera=jax.tree.map(jnp.ravel, camera))
     scan = partial(_scan_smooth, smooth) if smooth else partial(_scan, times)
-    return jnp.stack(scan(model, whole, state, frames, dt), -1).reshape(*shape, 2)
+    counts = jnp.stack(scan(model, whole, state, frames, dt), -1)
+    return counts.reshape(*shape, 2) * marks[..., None]
 
 
 def _scan(

@@ -89,6 +89,20 @@ class Disturbance:
     struck: Struck | None
 
 
+def possible(camera: Camera) -> tuple[Camera, Array]:
+    """A traced camera with parameters that a pixel can have, and (..., H, W) what its pixels'
+    output is to be multiplied by: 1, or NaN where the parameters were impossible (theta <= 0,
+    eta < 0, not finite). Within jit nothing can be refused, and a pixel of negative threshold would
+    send numbers that look like events."""
+    least = {"theta_on": 1e-30, "theta_off": 1e-30, "eta_on": 0.0, "eta_off": 0.0}
+    maps = {name: jnp.asarray(getattr(camera, name)) for name in least}
+    good = [jnp.isfinite(values) & (values >= least[name]) for name, values in maps.items()]
+    allowed = good[0] & good[1] & good[2] & good[3]
+    put = Camera(**{name: jnp.where(allowed, values, 1.0) for name, values in maps.items()})
+    unmoved = 1.0 + 0.0 * sum(maps.values())  # through it the gradients become NaN as well
+    return put, jnp.where(allowed, 1.0, jnp.nan) * unmoved
+
+
 def start(
     key: Array, log_frame: Array, camera: Camera, model: SensorModel,
     nominal: Array | None, phase: Array | float = 0.0,

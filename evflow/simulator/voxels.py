@@ -112,7 +112,8 @@ def simulate_voxels(
         bins: time bins B per polarity, >= 2.
 
     Returns:
-        float32 (..., H, W, 2*bins), channels [ON 0..B-1, OFF 0..B-1], in events.
+        float32 (..., H, W, 2*bins), channels [ON 0..B-1, OFF 0..B-1], in events; within jit NaN at
+        pixels whose parameters are impossible (theta <= 0, eta < 0), which else raise EV014.
 
     Raises:
         EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
@@ -198,6 +199,10 @@ def _voxels(
     times: Array, *, model: SensorModel, bins: int, lead: tuple[int, ...],
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
+        camera, marks = sensor.possible(camera)
+        return grid_of(key, frames, camera, nominal) * marks[..., None]
+
+    def grid_of(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
         if model.kind != "voltmeter":
             first = as_log(model, frames[0])
             whole, state = sensor.start(key, first, camera, model, nominal)

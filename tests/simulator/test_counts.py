@@ -14,7 +14,7 @@ from helpers.videos import SHAPE, code_of, drifting, milliseconds
 from evflow.camera import Camera, CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import to_log
-from evflow.simulator import simulate, simulate_counts
+from evflow.simulator import simulate, simulate_counts, simulate_voxels
 from evflow.simulator.counts import soft_floor
 
 KEY = jax.random.key(0)
@@ -109,6 +109,34 @@ def test_more_sensitive_pixels_count_more() -> None:
         KEY, LOG, Camera(t, QUIET.theta_off, QUIET.eta_on, QUIET.eta_off), frame_dt_s=1e-3,
         smooth=1.0)[..., 0].sum())(QUIET.theta_on)
     assert float((slope < 0).mean()) > 0.9
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("theta_on", -0.05), ("theta_off", 0.0), ("eta_on", -1.0), ("theta_on", np.nan)])
+def test_an_impossible_pixel_is_nan_where_nothing_can_be_refused(name: str, value: float) -> None:
+    """Within jit: its counts and gradients, and those of no other pixel. Outside: EV014."""
+    def total(values: jax.Array, smooth: float) -> tuple[jax.Array, jax.Array]:
+        camera = dataclasses.replace(NOISY, **{name: values})
+        counts = simulate_counts(KEY, LOG, camera, frame_dt_s=1e-3, smooth=smooth)
+        return counts.sum(), counts
+
+    sound = getattr(NOISY, name)
+    wrong = sound.at[3, 4].set(value)
+    assert code_of(lambda: total(wrong, 1.0)) == "EV014"
+    assert code_of(lambda: simulate_voxels(KEY, LOG, dataclasses.replace(NOISY, **{name: wrong}),
+                                           frame_dt_s=1e-3)) == "EV014"
+    taught = jax.jit(jax.grad(total, has_aux=True), static_argnums=1)
+    (gradient, counts), (_, whole) = (taught(values, 1.0) for values in (wrong, sound))
+    here = np.zeros(SHAPE, bool)
+    here[3, 4] = True
+    np.testing.assert_array_equal(np.isnan(counts).all(-1), here)
+    np.testing.assert_array_equal(np.isnan(gradient), here)
+    np.testing.assert_allclose(counts[~here], whole[~here], rtol=0.1)  # noise knows the median
+    np.testing.assert_array_equal(
+        np.isnan(jax.jit(lambda v: total(v, 0.0)[1])(wrong)).all(-1), here)
+    voxels = jax.jit(lambda v: simulate_voxels(KEY, LOG, dataclasses.replace(NOISY, **{name: v}),
+                                               frame_dt_s=1e-3))(wrong)
+    np.testing.assert_array_equal(np.isnan(voxels).all(-1), here)
 
 
 def test_vmap_over_cameras() -> None:

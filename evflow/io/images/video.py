@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io.images.folder import SUFFIXES
 from evflow.io.images.frames import FrameHints, Image, existing
+from evflow.io.images.matroska import first_stamp_s
 from evflow.io.images.stacks import cut_off
 from evflow.io.images.times import read_times
 from evflow.notes import Note
@@ -146,7 +148,10 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
                 "A cut-off mp4 has lost its index: copy it again. Other kinds: convert them to mp4 "
                 "(H.264) or avi (MJPG).")
         rate = capture.get(cv2.CAP_PROP_FPS)
-        claimed = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        claimed = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if claimed > 0 and 0 < rate < 1e6:  # counted from 0, where a film may begin later
+            claimed -= math.floor(first_stamp_s(path) * rate + 0.5)
+        claimed = max(0, claimed)
         good, first = capture.read()
         if not good:
             raise EvflowDataError("EV009", f"no frame of {path} can be decoded.", "Copy it again.")

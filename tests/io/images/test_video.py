@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from helpers.sources import message, read
 from helpers.videos import code_of, drifting
 
+from evflow.io.images.matroska import first_stamp_s
 from evflow.io.images.video import Clock
 from evflow.io.source import open_frames
 
@@ -81,6 +83,34 @@ def test_a_variable_frame_rate_is_followed(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(times), steps, atol=1)
     assert "variable frame rate (16.67 to 50 frames/s)" in notes[0].text
     assert np.diff(read(path, fps=50)[1]).tolist() == [20_000] * 11
+
+
+def begin_late(path: Path, late_ms: int) -> None:
+    """Move all stamps of a Matroska film of OpenCV's, and the end that its header tells."""
+    data = bytearray(path.read_bytes())
+    for block in re.finditer(rb"\xa3[\x40-\x7f].\x81(..)\x80\xff\xd8", bytes(data), re.DOTALL):
+        stamp = struct.unpack(">h", block[1])[0] + late_ms
+        struct.pack_into(">h", data, block.start(1), stamp)
+    at = data.index(b"\x44\x89\x88") + 3  # duration, in ms, and as text beside the track
+    (end,) = struct.unpack_from(">d", data, at)
+    struct.pack_into(">d", data, at, end + late_ms)
+    text = b"00:00:%06.3f" % (end / 1e3)
+    path.write_bytes(data.replace(text, b"00:00:%06.3f" % ((end + late_ms) / 1e3)))
+
+
+@pytest.mark.parametrize("late_ms", [1, 40, 500, 1400])
+def test_a_film_that_begins_late_is_no_damaged_one(tmp_path: Path, late_ms: int) -> None:
+    path = clip(tmp_path / "a.mkv", 40)
+    begin_late(path, late_ms)
+    assert first_stamp_s(path) == late_ms / 1e3
+    for hints in ({}, {"fps": 25.0}):
+        assert read(path, **hints)[1] == [40_000 * i for i in range(40)]
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    assert "of the 40 frames" in message(lambda: open_frames(path))
+    for end in range(4, 80, 5):  # whatever is left of a header: no error of ours
+        path.write_bytes(data[:end])
+        assert first_stamp_s(path) == 0
 
 
 def test_the_clock_of_coarse_absent_and_backward_stamps() -> None:
