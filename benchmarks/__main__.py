@@ -128,8 +128,8 @@ def table(records: list[Record], run: dict[str, Any]) -> Table:
     shown = Table(title=title, caption="x first: time against the first case of the same task, "
                   "turn by turn, above 1 = slower. % of sgemm, copy: of the best measured in this "
                   "run. others: cores busy with other processes meanwhile.")
-    for name in ("task", "implementation", "median s", "min s", "per second", "% sgemm", "% copy",
-                 "x first", "peak MB", "others"):
+    for name in ("task", "implementation", "median s", "min s", "CPU s", "per second", "% sgemm",
+                 "% copy", "x first", "peak MB", "others"):
         shown.add_column(name, justify="left" if name in ("task", "implementation") else "right")
     for r, following in zip(records, [*records[1:], None], strict=True):
         shown.add_row(*row(r), end_section=following is None or following.subject != r.subject)
@@ -144,7 +144,8 @@ def row(r: Record) -> tuple[str, ...]:
     rates = "\n".join(f"{quantity(rate)} {unit}" for unit, rate in r.rates.items()
                       if unit != "GB" or r.subject == "limits")
     shares = (f"{100 * r.of_limit[k]:.1f}" if k in r.of_limit else "" for k in ("sgemm", "copy"))
-    return (*start, f"{r.seconds:.3g}", f"{r.fastest:.3g}", rates, *shares,
+    return (*start, f"{r.seconds:.3g}", f"{r.fastest:.3g}",
+            "" if r.cpu is None else f"{r.cpu:.3g}", rates, *shares,
             "" if r.relative is None else f"{r.relative:.2f}",
             "" if r.peak_mb is None else f"{r.peak_mb:.0f}",
             "" if r.others is None else f"{r.others:.2f}")

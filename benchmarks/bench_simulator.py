@@ -1,8 +1,10 @@
 """Frames to events and to voxels: evflow against a one-thread numba loop.
 
 The video is made here: a photograph of scikit-image under a smooth similarity motion, 346x260 at
-1000 frames per second. "noise on" is v2e's noisy pixel: low-pass at 30 Hz, leak .1 Hz, shot noise
-5 Hz, each noise event resetting the memory. Events are delivered as one sorted list in memory.
+1000 frames per second. Each pixel has thresholds of its own, .2 with a mismatch of .03. "noise on"
+is v2e's noisy pixel (`--sensor noisy`): low-pass at 30 Hz, leak .1 Hz that jitters and differs from
+pixel to pixel, shot noise 5 Hz, each noise event resetting the memory. Events are delivered as one
+sorted list in memory.
 """
 
 from __future__ import annotations
@@ -15,14 +17,15 @@ import jax
 import numpy as np
 
 from benchmarks.harness import Case, Setting, Workload
-from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
+from evflow.camera import Camera, CameraPrior
+from evflow.camera.sensors import SENSORS, SensorModel
 from evflow.light.log_maps import uint8_table
 from evflow.scenes.photos import load_photos
 from evflow.simulator import simulate, simulate_voxels
 
-CUTOFF_HZ, LEAK_HZ, SHOT_HZ = 30.0, 0.1, 5.0
-THETA, DT_US, BINS = 0.2, 1000, 16
+PRIOR = CameraPrior((0.2, 0.2), (0.03, 0.03), noise="none")
+MODELS = {False: SensorModel(), True: SENSORS["noisy"].model}  # noise off, on
+DT_US, BINS = 1000, 16
 WINDOW_FRAMES = 50  # intervals per voxel grid: 50 ms
 
 
@@ -42,17 +45,14 @@ def video(setting: Setting, frames: int) -> np.ndarray:
     return out
 
 
-def _sensor(noisy: bool) -> SensorModel:
-    if not noisy:
-        return SensorModel()
-    return SensorModel(cutoff_hz=CUTOFF_HZ, leak_hz=LEAK_HZ, shot_hz=SHOT_HZ,
-                       noise_resets_memory=True)
+def _camera(frames: np.ndarray) -> Camera:
+    return Camera.sample(jax.random.key(1), frames.shape[1:], PRIOR)
 
 
 def events_evflow(setting: Setting, noisy: bool) -> Workload:
     frames = video(setting, 20 if setting.quick else 300)
     times = np.arange(len(frames)) * DT_US
-    camera, model = Camera.constant(frames.shape[1:], THETA, THETA), _sensor(noisy)
+    camera, model = _camera(frames), MODELS[noisy]
     return Workload(lambda: simulate(jax.random.key(0), frames, times, camera, model=model),
                     lambda events: _work(frames, len(events)))
 
@@ -61,8 +61,8 @@ def events_numba(setting: Setting, noisy: bool) -> Workload:
     from benchmarks import peer_numba
 
     frames, table = video(setting, 20 if setting.quick else 300), uint8_table("linlog")
-    pixel = peer_numba.Pixel(THETA, DT_US, noisy, CUTOFF_HZ, LEAK_HZ, SHOT_HZ)
-    return Workload(lambda: peer_numba.simulate(frames, table, pixel),
+    pixels = peer_numba.Pixels.of(_camera(frames), MODELS[noisy], DT_US * 1e-6)
+    return Workload(lambda: peer_numba.simulate(frames, table, pixels),
                     lambda events: _work(frames, len(events[0])))
 
 
@@ -73,7 +73,7 @@ def _work(frames: np.ndarray, events: int) -> dict[str, float]:
 
 def voxels_evflow(setting: Setting, noisy: bool) -> Workload:
     frames = video(setting, (10 if setting.quick else WINDOW_FRAMES) + 1)
-    camera, model = Camera.constant(frames.shape[1:], THETA, THETA), _sensor(noisy)
+    camera, model = _camera(frames), MODELS[noisy]
     return Workload(
         lambda: simulate_voxels(jax.random.key(0), frames, camera,
                                 frame_dt_s=DT_US * 1e-6, model=model, bins=BINS),
@@ -84,9 +84,9 @@ def voxels_numba(setting: Setting, noisy: bool) -> Workload:
     from benchmarks import peer_numba
 
     frames = video(setting, (10 if setting.quick else WINDOW_FRAMES) + 1)
-    pixel = peer_numba.Pixel(THETA, DT_US, noisy, CUTOFF_HZ, LEAK_HZ, SHOT_HZ)
+    pixels = peer_numba.Pixels.of(_camera(frames), MODELS[noisy], DT_US * 1e-6)
     table = uint8_table("linlog")
-    return Workload(lambda: peer_numba.simulate_voxels(frames, table, pixel, BINS),
+    return Workload(lambda: peer_numba.simulate_voxels(frames, table, pixels, BINS),
                     partial(_voxel_work, frames))
 
 

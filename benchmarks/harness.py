@@ -72,8 +72,9 @@ class Case:
 class Record:
     """One measured case, one line of JSON.
 
-    seconds: median of `times`, a call's in each turn; fastest: the least; first_call: the first,
-    compilation included. peak_mb: highest resident memory during the timed calls, less that before
+    seconds: median of `times`, a call's in each turn; fastest: the least; cpu: median of the CPU
+    seconds of a call, of all threads of the process; first_call: the first call, compilation
+    included. peak_mb: highest resident memory during the timed calls, less that before
     the first call (so it holds what compilation leaves behind); None where the system cannot tell.
     others: CPU cores that other processes kept busy meanwhile, on average; above ~.1 the times are
     theirs too (None where the system cannot tell).
@@ -89,6 +90,7 @@ class Record:
     implementation: str
     seconds: float | None = None
     fastest: float | None = None
+    cpu: float | None = None
     first_call: float | None = None
     times: tuple[float, ...] = ()
     peak_mb: float | None = None
@@ -123,6 +125,7 @@ class Runner:
         self.workload = case.prepare(self.setting)
         self.before = resident_mb("VmRSS")
         self.times: list[float] = []
+        self.cpu: list[float] = []
         self.clocks: list[tuple[Clocks, Clocks]] = []
         began = time.perf_counter()
         self._call()
@@ -138,7 +141,8 @@ class Runner:
         while not calls or now - start[0] < least:
             self._call()
             now, calls = time.perf_counter(), calls + 1
-        self.clocks.append((start, _clocks()))
+        self.clocks.append((start, end := _clocks()))
+        self.cpu.append((end[1] - start[1]) / calls)
         self.times.append((now - start[0]) / calls)
         return now - start[0]
 
@@ -150,8 +154,8 @@ class Runner:
         peak = resident_mb("VmHWM")
         work, seconds = self.workload.count(self.result), statistics.median(self.times)
         return Record(
-            *self.case.name, seconds=seconds, fastest=min(self.times), first_call=self.first,
-            times=tuple(self.times),
+            *self.case.name, seconds=seconds, fastest=min(self.times),
+            cpu=statistics.median(self.cpu), first_call=self.first, times=tuple(self.times),
             peak_mb=(None if self.before is None or peak is None
                      else max(peak - self.before, 0.0)),
             others=_others(self.clocks), work=work,

@@ -23,6 +23,7 @@ from benchmarks.__main__ import SUBJECTS, Options, main, select
 from benchmarks.harness import Case, Record, Setting, Workload, compare, measure
 from benchmarks.turns import by_task, in_turn
 from evflow.camera import Camera
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import uint8_table
 from evflow.network import flow
@@ -57,6 +58,7 @@ def test_subject_yields_complete_records(subject: str, tmp_path: Path) -> None:
             assert "is not installed" in r["skipped"]
             continue
         assert r["seconds"] >= r["fastest"] > 0
+        assert r["cpu"] > 0
         assert len(r["times"]) == 1
         assert r["relative"] > 0
         assert r["rates"].keys() == r["work"].keys() >= UNITS.get(r["subject"], set())
@@ -151,10 +153,11 @@ def test_numba_peer_sends_the_same_events() -> None:
     pytest.importorskip("numba")
     from benchmarks import peer_numba
 
-    frames, pixel = bench_simulator.video(QUICK, 20), peer_numba.Pixel()
-    table, camera = uint8_table("linlog"), Camera.constant(frames.shape[1:])
+    frames, table = bench_simulator.video(QUICK, 20), uint8_table("linlog")
+    camera = Camera.sample(jax.random.key(1), frames.shape[1:], bench_simulator.PRIOR)
+    pixels = peer_numba.Pixels.of(camera, SensorModel(), 1e-3)
     events = simulate(jax.random.key(0), frames, np.arange(20) * 1000, camera)
-    x, y, t, p = peer_numba.simulate(frames, table, pixel)
+    x, y, t, p = peer_numba.simulate(frames, table, pixels)
     assert len(events) > 100
     assert (np.diff(t) >= 0).all()
 
@@ -168,20 +171,24 @@ def test_numba_peer_sends_the_same_events() -> None:
     log_frames = jnp.asarray(table)[frames]
     grid = simulate_voxels(jax.random.key(0), log_frames, camera, frame_dt_s=1e-3)
     np.testing.assert_allclose(
-        peer_numba.simulate_voxels(frames, table, pixel, 16), grid, atol=2e-3)
+        peer_numba.simulate_voxels(frames, table, pixels, 16), grid, atol=2e-3)
 
 
 def test_numba_peer_is_as_noisy() -> None:
     pytest.importorskip("numba")
     from benchmarks import peer_numba
 
-    frames = np.full((401, 36, 48), 128, np.uint8)
-    pixel = peer_numba.Pixel(noisy=True, shot_hz=5.0)
-    count = len(peer_numba.simulate(frames, uint8_table("linlog"), pixel)[0])
-    expected = 5.0 * (1 - 0.75 * 148 / 275) * 0.4 * 36 * 48
-    assert abs(count - expected) < 5 * expected**0.5
-    grid = peer_numba.simulate_voxels(frames, uint8_table("linlog"), pixel, 16)
-    assert grid.sum() == pytest.approx(count, rel=1e-4)
+    frames, table = np.full((401, 36, 48), 128, np.uint8), uint8_table("linlog")
+    model = SensorModel(shot_hz=5.0, leak_hz=5.0, leak_jitter=0.1, noise_resets_memory=True)
+    pixels = peer_numba.Pixels.of(Camera.constant(frames.shape[1:]), model, 1e-3)
+    *_, p = peer_numba.simulate(frames, table, pixels)
+    ours = simulate(jax.random.key(0), frames, np.arange(401) * 1000,
+                    Camera.constant(frames.shape[1:]), model=model)
+    for theirs, mine in ((p.sum(), ours.p.sum()), ((~p).sum(), (~ours.p).sum())):
+        assert theirs > 900
+        assert abs(int(theirs) - int(mine)) < 5 * (theirs + mine) ** 0.5
+    grid = peer_numba.simulate_voxels(frames, table, pixels, 16)
+    assert grid.sum() == pytest.approx(len(p), rel=1e-4)
 
 
 def _scattered(params: Any) -> Any:
