@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from evflow.errors import CODES
 
 NOTES: dict[str, str] = {
+    "events.layout": "how the file is laid out was inferred",
     "events.outside": "events outside the sensor were left out",
     "events.partial": "only the part before the damage was read",
     "events.timeless": "events before the first time word were left out",

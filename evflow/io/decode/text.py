@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import io
+import re
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -22,6 +23,8 @@ BLANKS = bytes.maketrans(b",;", b"  ")  # what else stands between numbers
 HEAD = 1 << 14  # bytes by which a file is recognised, and the order of its columns told
 BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
 MAX_LINE = 1000  # a longer one is not text
+WORD = re.compile(rb"\b(?:true|false|on|off)\b", re.IGNORECASE)
+ON = (b"true", b"on")
 
 
 def events(
@@ -51,11 +54,13 @@ def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
 
 def plain(block: bytes, byte: int) -> bytes:
     """Lines of as many bytes with blanks between their numbers: no commas, no byte order mark at
-    byte 0, and Python's True and False as 1 and 0."""
+    byte 0, and True and False, ON and OFF in any case as 1 and 0."""
     if byte == 0 and block.startswith(codecs.BOM_UTF8):
         block = b"   " + block[len(codecs.BOM_UTF8):]
-    if b"True" in block or b"False" in block:
-        block = block.replace(b"True", b"1   ").replace(b"False", b"0    ")
+    if WORD.search(block, 0, MAX_LINE):  # where one line has one, all have
+        for word in set(WORD.findall(block)):
+            digit = b"1" if word.lower() in ON else b"0"
+            block = re.sub(rb"\b%b\b" % word, digit.ljust(len(word)), block)
     return block.translate(BLANKS)
 
 

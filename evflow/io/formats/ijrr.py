@@ -89,8 +89,10 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
     seconds, names = _read_index(root / IMAGES) if name == EVENTS else (np.zeros(0), [])
     size = _image(root, names[0]).shape[1::-1] if names else None
     with (root / name).open("rb") as f:
-        chunks, native = plain_text.events(path, f, hints)
+        chunks, native, found = plain_text.events(path, f, hints)
+        size = size or found.size
         events, span, notes = gather(path, _some(path, chunks, hints, size), hints, size, native)
+        notes = (*found.notes, *notes)
     if not names:
         return Recording.of_events(events, notes)
     times, told = beside_events(seconds, root / IMAGES, "s", hints, events)

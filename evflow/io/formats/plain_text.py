@@ -2,50 +2,49 @@
 the `x,y,p,t` of Prophesee's converter. IJRR's events.txt is read by it too.
 
 The order is that of a header (a comment or the first line: `t x y p`, `timestamp,x,y,polarity`,
-`row,col,p,t`), else that of the first lines: the polarity is the last or the third column, the time
-at the other end. Times are in the unit that the header tells ("t[us]", "timestamp_ns"); else they
-are seconds where they have fractions, and microseconds where they are whole and in Prophesee's
-order; other whole ones are refused.
+`row,col,p,t`, faery's `t,x@640,y@480,on`; columns of other names are left out), else that of the
+first lines (`decode.columns`). The size is the header's (OpenEB's `%geometry:1280,720`), where it
+has one. Times are in the unit that the header tells ("t[us]", "timestamp_ns"); else they are
+seconds where they have fractions, and microseconds where they are whole and the file is of a tool
+that writes those: Prophesee's order or geometry, faery's header. Other whole ones are refused.
 """
 
 from __future__ import annotations
 
+import codecs
 import itertools
-import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
 import numpy as np
 
+from evflow.checks import Size
 from evflow.errors import EvflowDataError
-from evflow.io.decode import text
+from evflow.io.decode import columns, text
 from evflow.io.decode.stream import Chunk, collect
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
+from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "text"
 EXTENSIONS: tuple[str, ...] = (".csv", ".txt", ".tsv", ".dat", ".log")
 
-PROPHESEE = "xypt"
-NAMES = {  # of columns, without their units
-    **dict.fromkeys(("t", "ts", "time", "times", "timestamp", "timestamps"), "t"),
-    **dict.fromkeys(("x", "xs", "col", "column", "u"), "x"),
-    **dict.fromkeys(("y", "ys", "row", "v"), "y"),
-    **dict.fromkeys(("p", "ps", "pol", "polarity", "polarities"), "p")}
-BRACKETS, SUFFIX = re.compile(r"[\[(].*?[\])]"), re.compile(r"_[a-zµμ]+$")  # units
-POLARITIES = {-1.0, 0.0, 1.0}
-TELLING = 10  # rows: by so many, fractions in the coordinates are those of undistorted events
+COMMAS = str.maketrans(",;", "  ")
+MOST = 12  # columns of a header
 
 
 class Layout(NamedTuple):
-    """order: of the columns, "txyp" or another, "itxyp" after an index; unit: of the times, "auto"
-    where no header tells it; begin: the byte at which the header ends."""
+    """order: of the columns, "txyp" or another, "-" for one that is not read; unit: of the times,
+    "auto" where no header tells it, "whole": us where they are whole; begin: the byte at which the
+    header ends; size: (width, height), where the header tells it; notes: what was assumed."""
 
     order: str
     unit: str
     begin: int
+    size: Size | None = None
+    notes: tuple[Note, ...] = ()
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -59,113 +58,116 @@ def read(path: Path, hints: Hints) -> Recording:
     """Raises EV003 (times without a unit), EV008 (a header that is not understood), EV015 (text
     does not tell the size) and what `stream.gather` raises."""
     with open(path, "rb") as f:
-        chunks, native = events(path, f, hints)
-        return collect(path, chunks, hints, None, native=native)
+        chunks, native, found = events(path, f, hints)
+        return collect(path, chunks, hints, found.size, lambda: found.notes, native)
 
 
-def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str]:
-    """Chunks of the events of a text open at its beginning, and the unit of their times. Where
-    nothing tells the order it is `t x y p`. Raises as `read`."""
-    order, unit, begin = layout(f.read(text.HEAD)) or Layout("txyp", "auto", 0)
-    f.seek(begin)
-    chunks = text.events(f, (len(order),), begin, order)
+def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str, Layout]:
+    """Chunks of the events of a text open at its beginning, the unit of their times, and the
+    layout. Where nothing tells the order it is `t x y p`. Raises as `read`."""
+    found = layout(f.read(text.HEAD)) or Layout("txyp", "auto", 0)
+    f.seek(found.begin)
+    chunks = text.events(f, (len(found.order),), found.begin, found.order)
     if hints.time_unit != "auto":
-        return chunks, hints.time_unit
-    if unit != "auto":
-        return _in_us(chunks, unit), "us"
-    if order == PROPHESEE:
+        return chunks, hints.time_unit, found
+    if found.unit not in ("auto", "whole"):
+        return _in_us(chunks, found.unit), "us", found
+    if found.unit == "whole":
         first = list(itertools.islice(chunks, 1))
         chunks = itertools.chain(first, chunks)
-        if not first or _whole(first[0].t):
-            return _in_us(_all_whole(path, chunks), "us"), "us"
-    return text.in_seconds(path, chunks), "s"
+        if not first or columns.whole(first[0].t):
+            return _in_us(_all_whole(path, chunks), "us"), "us", found
+    return text.in_seconds(path, chunks), "s", found
 
 
 def layout(head: bytes) -> Layout | None:
     """What a file that begins so holds; None where it is no text of events. EV008 where a header
     names some of the columns, but not which is which."""
     rows: list[list[float]] = []
-    names: list[str] = []
-    told, unit, byte, begin = "", "auto", 0, 0
+    headers: list[str] = []
+    told, said, byte, begin = "", "", 0, 0
     whole = head if len(head) < text.HEAD else head[: head.rfind(b"\n") + 1]
     for line in whole.splitlines(keepends=True):
-        content = text.plain(line, byte)
+        words, comment = _decoded(line), line.lstrip().startswith((b"#", b"%"))
+        fields = text.plain(line, byte).partition(b"#")[0].split()
         byte += len(line)
-        fields = content.partition(b"#")[0].split()
-        if fields and not rows and not any(map(text.is_float, fields)):
-            told = _decoded(content)  # the first line, which must name what there is
+        if not rows and (comment or not any(map(text.is_float, _fields(words)))):
+            told = words if words and not comment else told  # it must name what there is
+            headers += [words] if _order(words) else []
+            begin, said = byte, f"{said}\n{words}"
         elif fields:
             if not all(map(text.is_number, fields)) or (rows and len(fields) != len(rows[0])):
                 break  # damage, of which `text.events` tells where it is
             rows.append(list(map(float, fields)))
-            continue
-        elif rows or not content.strip():
-            continue
-        begin = byte
-        if found := _names(_decoded(content)):
-            names, unit = found, written_unit(_decoded(content))
-    if told and not names and sum(map(bool, _columns(told))) >= 2:
+    if told and not headers and sum(map(bool, map(columns.meaning, _fields(told)))) >= 2:
         raise EvflowDataError(
             "EV008", f"its header is {told[:80]!r}: which columns are t, x, y and p?",
             "Name four columns t, x, y, p (timestamp, polarity, row, col are known too).")
-    if names and rows and len(rows[0]) == 5 and _counts([row[0] for row in rows]):
-        names = ["i", *names]  # the index that pandas writes
-    if names:
-        fits = not rows or len(rows[0]) == len(names)
-        return Layout("".join(names), unit, begin) if fits else None
-    order = _order(rows) if rows and not told else ""
-    return Layout(order, "auto", begin) if order else None
+    return _laid_out(headers, rows, bool(told), begin, columns.written_size(said))
+
+
+def _laid_out(
+    headers: list[str], rows: list[list[float]], told: bool, begin: int, size: Size | None
+) -> Layout | None:
+    """The layout by the last header that fits the rows, else by the rows; told: no comment names
+    the columns, but a line of their own."""
+    for words in reversed(headers):
+        order = _order(words)
+        if rows and len(rows[0]) == len(order) + 1 and _counts([row[0] for row in rows]):
+            order = f"-{order}"  # the index that pandas writes
+        if rows and len(rows[0]) != len(order):
+            continue
+        named = columns.by_name(_fields(words)).values()
+        left = [name for name in _fields(words) if name not in named]
+        notes = (Note("events.unread", f"columns {', '.join(left)} were not read"),) if left else ()
+        unit = written_unit(words)
+        return Layout(order, unit if unit != "auto" else _whole(order, size), begin, size, notes)
+    order = columns.order_of(np.array(rows)) if rows and len(rows[0]) == 4 and not told else ""
+    if not order:
+        return None
+    notes = () if order == "txyp" or size else (columns.inferred(order),)
+    return Layout(order, _whole(order, size), begin, size, notes)
+
+
+def _whole(order: str, size: Size | None) -> str:
+    """How times without a unit are read: a tool that writes the size writes microseconds."""
+    return "whole" if order == columns.PROPHESEE or size else "auto"
 
 
 def _decoded(line: bytes) -> str:
-    """A header as text: whatever its encoding, micro is one."""
+    """A line of a header as text: whatever its encoding, micro is one."""
+    line = line.removeprefix(codecs.BOM_UTF8)
     try:
-        return line.decode("utf-8").strip().lstrip("#").strip()
+        words = line.decode("utf-8")
     except UnicodeDecodeError:
-        return line.decode("latin-1").strip().lstrip("#").strip()
+        words = line.decode("latin-1")
+    return words.strip().lstrip("#%").strip()
 
 
-def _columns(line: str) -> list[str]:
-    """For each word of a header what it stands for, "" where that is not known."""
-    fields = BRACKETS.sub(" ", line.lower()).split()
-    return [NAMES.get(SUFFIX.sub("", field.strip("\"'")), "") for field in fields]
+def _fields(words: str) -> list[str]:
+    """The words of a header, without their units in brackets."""
+    return columns.BRACKETS.sub(" ", words.translate(COMMAS)).split()
 
 
-def _names(line: str) -> list[str]:
-    """Which column is which, of a header that names all four and nothing else; else nothing."""
-    found = _columns(line)
-    return found if sorted(found) == sorted("txyp") else []
+def _order(words: str) -> str:
+    """Which column is which, of a header that names all four, "-" where another is; else "". A
+    comment is a header if it names nothing else."""
+    fields = _fields(words)
+    chosen = columns.by_name(fields)
+    if not chosen or len(fields) > MOST or len(set(fields)) < len(fields):
+        return ""
+    told = {name: column for column, name in chosen.items()}
+    return "".join(told.get(name, "-") for name in fields)
 
 
 def _counts(column: list[float]) -> bool:
     return all(b - a == 1 for a, b in itertools.pairwise(column))
 
 
-def _order(rows: list[list[float]]) -> str:
-    """Of rows without a header; empty where they cannot be events."""
-    if len(rows[0]) != 4:
-        return ""
-    columns = dict(enumerate(np.array(rows).T))
-    for order in ("txyp", PROPHESEE):
-        t, x, y, p = (columns[order.index(name)] for name in "txyp")
-        signs = set(p.tolist())
-        if not signs <= POLARITIES or min(x.min(), y.min()) < 0 or set(t.tolist()) <= {0.0, 1.0}:
-            continue
-        rising, both = bool((np.diff(t) >= 0).all()), len(signs) > 1
-        pixels = _whole(x) and _whole(y)
-        if (pixels and (rising or both)) or (rising and both and len(rows) >= TELLING):
-            return order
-    return ""
-
-
-def _whole(values: np.ndarray) -> bool:
-    return bool((values % 1 == 0).all())
-
-
 def _all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
     """Chunks of times that were taken for microseconds; EV003 at the first fraction."""
     for chunk in chunks:
-        if not _whole(chunk.t):
+        if not columns.whole(chunk.t):
             raise EvflowDataError(
                 "EV003", f"{path}: the first times are whole, later ones are not.",
                 "Microseconds or seconds? Pass time_unit='us' or 's' (--time-unit).")

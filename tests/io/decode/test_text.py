@@ -13,6 +13,7 @@ from helpers.tables import want, write
 
 from evflow.io import read_events, read_recording
 from evflow.io.registry import find_format
+from evflow.types import Events
 
 
 @pytest.mark.parametrize("kind", ["v2e-text", "e2vid"])
@@ -151,6 +152,48 @@ def test_headers_count_beside_images_too(tmp_path: Path) -> None:
     found = read_recording(tmp_path)
     equal(found.events, wanted.events)
     np.testing.assert_array_equal(found.frame_times, wanted.frame_times)
+
+
+SIZED = {  # text that tells its size, in microseconds
+    "openeb": "%geometry:64,48\n" + rows(US, order="xypt", comma=","),
+    "openeb-names": "%geometry:64,48\nx,y,polarity,timestamp\n" + rows(
+        US, order="xypt", comma=","),
+    "openeb-comment": "# geometry 64x48\n" + rows(US, order="xypt", comma=","),
+    "faery": "t,x@64,y@48,on\n" + rows(US, comma=","),
+    "sides": "# width: 64, height: 48\nt,x,y,p\n" + rows(US, comma=","),
+    "fifth": "%geometry:64,48\nt,x,y,p,label\n" + rows(US, comma=",").replace("\n", ",7\n"),
+    "true": "t,x@64,y@48,on\n" + rows(US, comma=",").replace(",0\n", ",false\n").replace(
+        ",1\n", ",true\n"),
+    "ON": "t,x@64,y@48,on\n" + rows(US, comma=",").replace(",0\n", ",OFF\n").replace(
+        ",1\n", ",ON\n"),
+    "xytp": "%geometry:64,48\n" + rows(US, order="xytp"),
+    "tpxy": "%geometry:64,48\n" + rows(US, order="tpxy"),
+    "pxyt": "%geometry:64,48\n" + rows(US, order="pxyt"),
+}
+
+
+@pytest.mark.parametrize("kind", SIZED)
+def test_text_that_tells_its_size(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(SIZED[kind])
+    found = read_recording(path)
+    equal(found.events, Events([3 + i for i in range(12)], [20 - i for i in range(12)], US[:12],
+                               [i % 2 for i in range(12)], (64, 48)))
+    assert [note.text for note in found.notes] == (
+        ["columns label were not read"] if kind == "fifth" else [])
+    assert refused(path, size=(9, 48)).code == "EV005"
+
+
+@pytest.mark.parametrize("order", ["xytp", "tpxy", "pxyt"])
+def test_the_order_is_judged_and_told(tmp_path: Path, order: str) -> None:
+    """Without a header; a sentence that happens to name four columns is none."""
+    path = tmp_path / "a.txt"
+    path.write_text("# the time t, x and y of events, and their p\n" + rows(US, order=order))
+    found = read_recording(path, size=SIZE, time_unit="us")
+    assert found.events.t.tolist() == US[:12]
+    assert found.events.x.tolist() == [3 + i for i in range(12)]
+    assert [note.code for note in found.notes] == ["events.layout"]
+    assert f"taken as {', '.join(order)}" in found.notes[0].text
 
 
 NO_EVENTS = {

@@ -1,0 +1,104 @@
+"""Which column is t, x, y and p: by its name, else by its values.
+
+Names are those of headers, of fields of arrays, of members of archives and of data sets. Values
+are judged where there are no names: the polarity has two values, the time never falls, pixels are
+whole; x is taken to stand before y. Of two orders that fit, `t x y p` comes first, then `x y p t`,
+then the one whose times span most.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Collection, Iterable
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.notes import Note
+
+NAMES = {  # of columns, without their units
+    **dict.fromkeys(("t", "ts", "time", "times", "timestamp", "timestamps"), "t"),
+    **dict.fromkeys(("x", "xs", "col", "column", "u"), "x"),
+    **dict.fromkeys(("y", "ys", "row", "v"), "y"),
+    **dict.fromkeys(("p", "ps", "pol", "polarity", "polarities", "on"), "p")}
+BRACKETS = re.compile(r"[\[(].*?[\])]")
+UNIT = re.compile(r"_(?:[mnuµμ]?s(?:ecs?)?|(?:milli|micro|nano)?seconds?|px|pixels?)$")
+SIDE = re.compile(r"@(\d{1,5})$")  # faery's x@640
+PAIR = re.compile(r"\b(?:geometry|resolution|size)\b\D{0,3}(\d{1,5})\s*[x,;\s]\s*(\d{1,5})\b", re.I)
+SIDES = re.compile(r"\b(width|height)\b\W{0,3}(\d{1,5})\b", re.I)
+POLARITIES = {-1.0, 0.0, 1.0}
+PROPHESEE = "xypt"
+KNOWN = ("txyp", PROPHESEE)
+OTHERS = tuple(
+    "".join(order) for order in itertools.permutations("txyp")
+    if order.index("x") < order.index("y") and "".join(order) not in KNOWN)
+TELLING = 10  # rows: by so many, fractions in the coordinates are those of undistorted events
+
+
+def meaning(name: str) -> str:
+    """"t", "x", "y" or "p" of a column of this name, "" where that is not known."""
+    bare = SIDE.sub("", BRACKETS.sub(" ", name.lower()).strip().strip("\"'").strip())
+    return NAMES.get(bare) or NAMES.get(UNIT.sub("", bare), "")
+
+
+def by_name(names: Iterable[str]) -> dict[str, str]:
+    """{"t": a name, "x": ...} of the names that mean all four; empty where one is missing, or two
+    mean the same: then the shorter ones, if they mean all four by themselves."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        if column := meaning(name):
+            found.setdefault(column, []).append(name)
+    if len(found) < 4:
+        return {}
+    best = {column: min(same, key=len) for column, same in found.items()}
+    clear = all(sum(len(n) == len(best[c]) for n in same) == 1 for c, same in found.items())
+    return best if clear else {}
+
+
+def written_size(words: str) -> Size | None:
+    """(width, height) that a header or comment tells: "geometry:1280,720", "x@640,y@480"."""
+    if pair := PAIR.search(words):
+        return int(pair[1]), int(pair[2])
+    sides: dict[str, str] = {name.lower(): side for name, side in SIDES.findall(words)}
+    for field in words.lower().replace(",", " ").split():
+        if (side := SIDE.search(field)) and meaning(field) in ("x", "y"):
+            sides["width" if meaning(field) == "x" else "height"] = side[1]
+    return (int(sides["width"]), int(sides["height"])) if len(sides) == 2 else None
+
+
+def order_of(rows: np.ndarray) -> str:
+    """"txyp", "xypt" or another order of the columns of rows (n, 4) of numbers without names;
+    "" where they cannot be events."""
+    with np.errstate(invalid="ignore"):
+        fits = {order: _fits(rows, order) for order in (*KNOWN, *OTHERS)}
+    sound = [order for order, rising in fits.items() if rising]
+    if len(sound) > 1:
+        span = {order: float(np.ptp(rows[:, order.index("t")])) for order in sound}
+        sound.sort(key=lambda order: (-span[order], (*KNOWN, *OTHERS).index(order)))
+    return next(iter(sound), next((o for o in KNOWN if fits[o] is not None), ""))
+
+
+def _fits(rows: np.ndarray, order: str) -> bool | None:
+    """Can these be events in that order? None: no; else whether their times never fall."""
+    t, x, y, p = (rows[:, order.index(name)] for name in "txyp")
+    signs = set(p.tolist())
+    if not signs <= POLARITIES or min(x.min(), y.min()) < 0 or set(t.tolist()) <= {0.0, 1.0}:
+        return None
+    rising, both = bool((np.diff(t) >= 0).all()), len(signs) > 1
+    pixels = whole(x) and whole(y)
+    if order in KNOWN:
+        possible = (pixels and (rising or both)) or (rising and both and len(rows) >= TELLING)
+    else:
+        possible = pixels and rising and both and len(rows) >= TELLING
+    return rising if possible else None
+
+
+def whole(values: np.ndarray) -> bool:
+    return bool((values % 1 == 0).all())
+
+
+def inferred(order: Collection[str]) -> Note:
+    """What is said of an order that nothing but the values tells."""
+    return Note("events.layout", f"nothing names the columns: they were taken as "
+                f"{', '.join(order)} after their values")
