@@ -27,6 +27,7 @@ from evflow.io.formats import (
     evreal,
     evt2,
     evt3,
+    evt21,
     ijrr,
     mvsec,
     npz,
@@ -55,8 +56,8 @@ class Format(Protocol):
 
 
 FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
-    aedat4, aedat2, evt2, evt3, dat, v2e, mvsec, event_utils, dsec, npz, evimo2, evreal, e2vid,
-    v2e_text, ijrr, plain_text, ros1, ros2)
+    aedat4, aedat2, evt2, evt21, evt3, dat, v2e, mvsec, event_utils, dsec, npz, evimo2, evreal,
+    e2vid, v2e_text, ijrr, plain_text, ros1, ros2)
 WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
     dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
     npz.NpzWriter, Aedat4Writer)}

@@ -250,7 +250,8 @@ def coco(folder: Path) -> Sample:
 
 
 SAMPLES: dict[str, Callable[[Path], Sample]] = {
-    **{kind: partial(stream, kind=kind) for kind in ("aedat2", "dat", "evt2", "evt3")},
+    **{kind: partial(stream, kind=kind) for kind in (
+        "aedat2", "dat", "evt2", "evt2.1", "evt3")},
     **{kind: partial(table, kind=kind) for kind in tables.WRITERS},
     "dsec": dsec, "npz": npz, "ijrr": ijrr, "ijrr-zip": ijrr_zip, "e2vid-text": e2vid_text,
     "images-png": partial(images, suffix="png"), "images-jpg": partial(images, suffix="jpg"),

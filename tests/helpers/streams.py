@@ -15,7 +15,7 @@ from evflow.io import read_events
 from evflow.types import Events
 
 SIZE = (240, 180)
-TURN = {"evt2": 2**34, "evt3": 2**24, "dat": 2**32, "aedat2": 2**32}
+TURN = {"evt2": 2**34, "evt2.1": 2**34, "evt3": 2**24, "dat": 2**32, "aedat2": 2**32}
 
 
 def clustered(n: int = 400, first: int = 1000, pause: int = 300, seed: int = 0) -> Events:
@@ -46,6 +46,29 @@ def evt2(events: Events, header: bytes = b"% evt 2.0\n% geometry 240x180\n") -> 
             out.append(0x80000000 | (last & 0xFFFFFFF))
         out.append(p << 28 | (t & 63) << 22 | x << 11 | y)
     return header + struct.pack(f"<{len(out)}I", *out)
+
+
+def evt21(
+    events: Events, header: bytes = b"% evt 2.1\n% format EVT21;height=180;width=240\n% end\n",
+    legacy: bool = False,
+) -> bytes:
+    """A word for events of one row, time and polarity in ascending x within 32 pixels."""
+    out: list[int] = []
+    rows, i, last = listed(events), 0, None
+    while i < len(rows):
+        x, y, t, p = rows[i]
+        if (t >> 6) != last:
+            last = t >> 6
+            out.append(8 << 60 | (last & 0xFFFFFFF) << 32)
+        mask, base, reach = 0, x & ~31, x - 1
+        while i < len(rows) and rows[i][1:] == (y, t, p) and reach < rows[i][0] < base + 32:
+            reach = rows[i][0]
+            mask |= 1 << (reach - base)
+            i += 1
+        out.append(p << 60 | (t & 63) << 54 | base << 43 | y << 32 | mask)
+    if legacy:
+        out = [word << 32 & 2**64 - 1 | word >> 32 for word in out]
+    return header + struct.pack(f"<{len(out)}Q", *out)
 
 
 def evt3(events: Events, header: bytes = b"% format EVT3;height=180;width=240\n% end\n") -> bytes:
@@ -92,7 +115,7 @@ def aedat2(events: Events, header: bytes = b"#!AER-DAT2.0\r\n# AEChip: a.b.DAVIS
         for x, y, t, p in listed(events))
 
 
-ENCODERS = {"evt2": evt2, "evt3": evt3, "dat": dat, "aedat2": aedat2}
+ENCODERS = {"evt2": evt2, "evt2.1": evt21, "evt3": evt3, "dat": dat, "aedat2": aedat2}
 each = pytest.mark.parametrize("kind", ENCODERS)
 
 

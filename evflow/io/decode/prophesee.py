@@ -37,7 +37,8 @@ class Header:
         """"EVT2", "EVT3", "EVT2.1" ... as `% format` or `% evt` has it; "" where neither is."""
         named = self.fields.get("format", "").split(";")[0].strip().upper()
         version = self.fields.get("evt", "").strip()
-        return (named or (f"EVT{version}" if version else "")).removesuffix(".0")
+        found = (named or (f"EVT{version}" if version else "")).removesuffix(".0")
+        return {"EVT21": "EVT2.1", "EVT20": "EVT2", "EVT30": "EVT3"}.get(found, found)
 
     @property
     def order(self) -> str:

@@ -30,7 +30,7 @@ RESERVED = np.array([kind not in (0, 1, TIME, TRIGGER, 0xE, 0xF) for kind in ran
 
 def sniff(path: Path, head: bytes) -> bool:
     """EVT 2.0, and the encodings that no reader knows: `read` names them."""
-    return prophesee.parse(head).encoding not in ("", "EVT3")
+    return prophesee.parse(head).encoding not in ("", "EVT2.1", "EVT3")
 
 
 def read(path: Path, hints: Hints) -> Recording:
@@ -38,8 +38,9 @@ def read(path: Path, hints: Hints) -> Recording:
     header = prophesee.read_header(path)
     if header.encoding != "EVT2":
         raise EvflowDataError(
-            "EV008", f"{path} is Prophesee RAW of encoding {header.encoding}; EVT2 and EVT3 are "
-            "read.", "Convert it with the camera's software to EVT3, DAT or HDF5 without ECF.")
+            "EV008", f"{path} is Prophesee RAW of encoding {header.encoding}; read are EVT2, "
+            "EVT2.1 and EVT3.", "Convert it with Metavision: metavision_file_to_dat or "
+            "metavision_file_to_csv.")
     size, notes = header.size()
     decoder = Decoder()
     source = words(path, header.start, f"{header.order}u4")
@@ -58,24 +59,39 @@ class Decoder:
         return typed(source, self.reserved, self.decode)
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
+        rows, t, early = self.timed(table, kind)
+        self.timeless += len(early)
+        x, y, p = fields(table[rows])
+        return Chunk(x, y, t, p, lambda i: byte + 4 * int(rows[i]))
+
+    def timed(
+        self, table: np.ndarray, kind: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Indices (n,) of the words of events, their times (n,) int64 us, and indices of those
+        that come before the first time."""
         marks = np.flatnonzero(kind == TIME)
         rows = np.flatnonzero(kind < 2)
         before = self.clock.value
         high = np.append(before or 0, self.clock.unwrap(table[marks] & 0xFFFFFFF))
         edges = np.searchsorted(rows, marks)
+        lost = 0
         if before is None:
             lost = int(edges[0]) if len(edges) else len(rows)
-            self.timeless += lost
-            rows, edges = rows[lost:], edges - lost
+            edges = edges - lost
         self.triggers += int(np.count_nonzero(kind == TRIGGER))
-        events = table[rows]
+        early, rows = rows[:lost], rows[lost:]
         t = np.repeat(high << 6, np.diff(edges, prepend=0, append=len(rows)))
-        t += (events >> 22) & 63
-        return Chunk(((events >> 11) & 0x7FF).astype(np.uint16), (events & 0x7FF).astype(np.uint16),
-                     t, events >= 1 << 28, lambda i: byte + 4 * int(rows[i]))
+        t += (table[rows] >> 22) & 63
+        return rows, t, early
 
     def notes(self) -> tuple[Note, ...]:
         return (*self.reserved.notes(), *leftovers(self.timeless, self.triggers))
+
+
+def fields(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y and polarity of words (n,) of events."""
+    return ((words >> 11) & 0x7FF).astype(np.uint16), (words & 0x7FF).astype(np.uint16), (
+        words >= 1 << 28)
 
 
 def leftovers(timeless: int, triggers: int) -> tuple[Note, ...]:

@@ -75,7 +75,7 @@ def test_many_reserved_words_are_damage(
 @pytest.mark.parametrize(("text", "encoding", "size"), [
     (b"% evt 2.0\n% geometry 640x480\n", "EVT2", (640, 480)),
     (b"% evt 3.0\n% format EVT3;height=720;width=1280\n% end\n", "EVT3", (1280, 720)),
-    (b"% format EVT21;endianness=legacy;height=320;width=320\n", "EVT21", (320, 320)),
+    (b"% format EVT21;endianness=legacy;height=320;width=320\n", "EVT2.1", (320, 320)),
     (b"% evt 2.0\r\n% plugin_name hal_plugin_gen31_fx3\r\n", "EVT2", (640, 480)),
     (b"% evt 3.0\n% sensor_name IMX636\n", "EVT3", (1280, 720)),
     (b"% evt 3.0\n% generation 4.2\n", "EVT3", (1280, 720)),
@@ -100,10 +100,10 @@ def test_data_that_begins_like_a_header_line(tmp_path: Path) -> None:
 
 def test_other_encodings_and_sizes(tmp_path: Path) -> None:
     path = tmp_path / "a.raw"
-    path.write_bytes(b"% evt 2.1\n\0\0\0\0")
+    path.write_bytes(b"% format HISTO3D;height=320;width=320\n\0\0\0\0")
     error = refused(path)
     assert error.code == "EV008"
-    assert "EVT2.1" in str(error)
+    assert "HISTO3D" in str(error)
     path.write_bytes(evt2(clustered(50), b"% evt 2.0\n"))
     error = refused(path)
     assert error.code == "EV015"

@@ -1,0 +1,98 @@
+"""Prophesee RAW, encoding EVT 2.1 (docs.prophesee.ai, data encoding formats): a `% ` header, then
+64-bit words, whose upper half is a word of EVT 2.0.
+
+Types 0 and 1 stand for up to 32 events of one row, time and polarity: at x + i where bit i of the
+lower half is set. The GenX320 sends a word as a whole, the IMX636 its upper half first
+("endianness=legacy"); where the header does not say, the order that makes sense of the first words
+is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from evflow.io.decode import prophesee
+from evflow.io.decode.stream import Chunk, collect, typed, words
+from evflow.io.formats import evt2
+from evflow.io.hints import Hints
+from evflow.notes import Note
+from evflow.types import Recording
+
+NAME = "evt2.1"
+EXTENSIONS: tuple[str, ...] = (".raw",)
+
+HALF = np.uint64(32)
+TRIED = 1 << 15  # words by which the order of halves is told
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    return prophesee.parse(head).encoding == "EVT2.1"
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises what `stream.collect` raises."""
+    header = prophesee.read_header(path)
+    size, notes = header.size()
+    swapped, told = _halves_swapped(path, header)
+    decoder = Decoder()
+    source = _whole(words(path, header.start, f"{header.order}u8"), swapped)
+    return collect(path, decoder.chunks(source), hints, size,
+                   lambda: (*notes, *told, *decoder.notes()))
+
+
+class Decoder(evt2.Decoder):
+    """That of EVT 2.0, for words that stand for several events."""
+
+    def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
+        return typed(source, evt2.UNDEFINED, "EVT2.1", self.decode)
+
+    def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
+        upper, mask = (table >> HALF).astype(np.uint32), table.astype(np.uint32)
+        rows, t, early = self.timed(upper, kind)
+        self.timeless += int(np.bitwise_count(mask[early]).sum())
+        x, y, p = evt2.fields(upper[rows])
+        bits = np.unpackbits(mask[rows].astype("<u4").view(np.uint8), bitorder="little")
+        places = np.flatnonzero(bits)
+        of = places >> 5
+        return Chunk(x[of] + (places & 31).astype(np.uint16), y[of], t[of], p[of],
+                     lambda i: byte + 8 * int(rows[of[i]]))
+
+
+def _whole(
+    source: Iterator[tuple[int, np.ndarray]], swapped: bool
+) -> Iterator[tuple[int, np.ndarray]]:
+    """The words, whose halves stand the other way round in the file."""
+    for byte, table in source:
+        yield byte, _swap(table) if swapped else table
+
+
+def _swap(table: np.ndarray) -> np.ndarray:
+    swapped: np.ndarray = table << HALF | table >> HALF
+    return swapped
+
+
+def _halves_swapped(path: Path, header: prophesee.Header) -> tuple[bool, tuple[Note, ...]]:
+    """Does the upper half of each word come first? And a note, where the words alone tell it."""
+    layout = header.fields.get("format", "").lower()
+    if "endianness=" in layout:
+        return "endianness=legacy" in layout, ()
+    with open(path, "rb") as f:
+        f.seek(header.start)
+        data = f.read(8 * TRIED)
+    table = np.frombuffer(data, f"{header.order}u8", len(data) // 8)
+    swapped = _sense(_swap(table)) > _sense(table)
+    order = "legacy (IMX636)" if swapped else "little"
+    return swapped, (Note("events.layout", "the header does not tell which half of a word comes "
+                          f"first: taken as {order} after the first words"),)
+
+
+def _sense(table: np.ndarray) -> tuple[int, int]:
+    """How steadily time advances by words of time (among the bits of masks, it does not), and how
+    many words have a type that there is."""
+    kind = (table >> np.uint64(60)).astype(np.uint8)
+    high = (table[kind == evt2.TIME] >> HALF) & np.uint64(0xFFFFFFF)
+    back = int((high[1:] < high[:-1]).sum())
+    return len(high) - 3 * back, int((~evt2.UNDEFINED[kind]).sum())
