@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from evflow.io.decode import prophesee
-from evflow.io.decode.stream import Chunk, collect, typed, words
+from evflow.io.decode.stream import Chunk, Reserved, collect, words
 from evflow.io.formats import evt2
 from evflow.io.hints import Hints
 from evflow.notes import Note
@@ -46,8 +46,9 @@ def read(path: Path, hints: Hints) -> Recording:
 class Decoder(evt2.Decoder):
     """That of EVT 2.0, for words that stand for several events."""
 
-    def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
-        return typed(source, evt2.UNDEFINED, "EVT2.1", self.decode)
+    def __init__(self) -> None:
+        super().__init__()
+        self.reserved = Reserved(evt2.RESERVED, "EVT2.1")
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
         upper, mask = (table >> HALF).astype(np.uint32), table.astype(np.uint32)
@@ -95,4 +96,4 @@ def _sense(table: np.ndarray) -> tuple[int, int]:
     kind = (table >> np.uint64(60)).astype(np.uint8)
     high = (table[kind == evt2.TIME] >> HALF) & np.uint64(0xFFFFFFF)
     back = int((high[1:] < high[:-1]).sum())
-    return len(high) - 3 * back, int((~evt2.UNDEFINED[kind]).sum())
+    return len(high) - 3 * back, int((~evt2.RESERVED[kind]).sum())
