@@ -18,6 +18,7 @@ from evflow.commands.estimate import Estimate
 from evflow.commands.export import Export
 from evflow.commands.flow import Flow
 from evflow.commands.info import Info
+from evflow.commands.options import Compiling
 from evflow.commands.reconstruct import Reconstruct
 from evflow.commands.render import Render
 from evflow.commands.simulate import Simulate
@@ -25,6 +26,7 @@ from evflow.commands.train import Train
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
+from evflow.process.compilation import remember
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
 EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
@@ -48,10 +50,13 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with stoppable():
             arguments = forwarded(sys.argv[1:] if argv is None else argv)
-            tyro.cli(
+            command = tyro.cli(
                 offered(), args=arguments, prog="evflow",
                 description="Measure an event camera from its recording; simulate any video as it "
-                "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/").run()
+                "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
+            if isinstance(command, Compiling) and command.compile_cache:
+                remember()
+            command.run()
             sys.stdout.flush()
     except EvflowDataError as e:
         print(e, file=sys.stderr)

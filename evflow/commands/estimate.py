@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from evflow.commands.options import Reading, check_finite, own_first, refuse, write_json
+from evflow.commands.options import Compiling, Reading, check_finite, own_first, refuse, write_json
 from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
@@ -27,7 +27,7 @@ SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate notes these itself
 
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Estimate(Reading):
+class Estimate(Compiling, Reading):
     """Measure a camera: per-pixel thresholds and noise rates, from events and frames.
 
     Example: evflow estimate flight.aedat4 -o cam/
@@ -128,7 +128,7 @@ class Estimate(Reading):
         from evflow.process.terminal import bar
 
         params = load_weights(self.weights)
-        with bar("estimating") as progress:
+        with bar("estimating", compiles=True) as progress:
             found = estimate_camera(
                 recording, params, min_window_us=round(self.window_ms * 1000), progress=progress)
         if recording.frames_were_made:
@@ -148,7 +148,7 @@ class Estimate(Reading):
         from evflow.process.terminal import bar
         from evflow.report.camera import write_report
 
-        with bar("reporting") as progress:
+        with bar("reporting", compiles=True) as progress:
             write_report(
                 out / "report.html", found, recording, weights=self.weights,
                 source=self.recording, command=shlex.join(["evflow", *sys.argv[1:]]),

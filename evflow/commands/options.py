@@ -47,6 +47,15 @@ def own_first(command: type[T]) -> type[T]:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Compiling:
+    """What a command that compiles programs inherits."""
+
+    compile_cache: bool = True
+    """Keep compiled programs in the user's cache folder (~/.cache/evflow), so that later runs start
+    sooner; JAX_COMPILATION_CACHE_DIR names another."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
     """How a recording is read; what a command that reads one inherits."""
 

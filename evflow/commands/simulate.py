@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from evflow.commands.options import check_finite, refuse, value
+from evflow.commands.options import Compiling, check_finite, own_first, refuse, value
 from evflow.commands.writing import Format, named, need_absent
 from evflow.errors import EvflowDataError
 from evflow.light.colour import Colour
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from evflow.simulator.photoreceptor import Photoreceptor
 
 
+@own_first
 @dataclasses.dataclass(frozen=True)
-class Simulate:
+class Simulate(Compiling):
     """Simulate a video, a folder of images, or a recording's frames, as a camera would see it.
 
     Example: evflow simulate ride.mp4 --camera cam/camera.npz -o synth.h5

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from evflow.commands.options import Reading, refuse, value
+from evflow.commands.options import Compiling, Reading, refuse, value
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Windowed(Reading):
+class Windowed(Compiling, Reading):
     """How a recording is read, cut into windows, and filmed."""
 
     sync: Literal["auto", "frames", "events", "ms"] = "auto"

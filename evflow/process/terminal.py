@@ -16,6 +16,8 @@ from typing import Any, NoReturn, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from evflow.process.compilation import told_of
+
 INTERRUPTED = 130  # the shell's exit code of Ctrl-C
 
 
@@ -33,18 +35,27 @@ class Report(Protocol):
 
 
 @contextlib.contextmanager
-def bar(title: str, shown: bool = True) -> Iterator[Report]:
-    """Yield progress(done, total). shown: False where another process shows the bar."""
+def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[Report]:
+    """Yield progress(done, total). shown: False where another process shows the bar; compiles:
+    whether the work compiles programs, which the title then says."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as live:
         task = live.add_task(title, total=None)
 
-        def report(done: int, total: int, title: str | None = None) -> None:
-            live.update(task, completed=done, total=total, description=title)
+        said = title
 
-        yield report
+        def report(done: int, total: int, title: str | None = None) -> None:
+            nonlocal said
+            said = title or said
+            live.update(task, completed=done, total=total, description=said)
+
+        def compiling(begins: bool) -> None:
+            live.update(task, description=f"{said} (compiling)" if begins else said)
+
+        with told_of(compiling) if compiles and not live.disable else contextlib.nullcontext():
+            yield report
 
 
 @contextlib.contextmanager

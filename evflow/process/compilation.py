@@ -1,0 +1,72 @@
+"""Compiled programs: kept between runs of a command, and told of while they are made.
+
+The library sets nothing: where programs are kept is a matter of the process, and a command is one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # the last thing before compilation
+COMPILED = "/jax/core/compile/backend_compile_duration"
+JAX_OWN = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")
+
+
+def cache_folder(environ: Mapping[str, str], system: str = sys.platform) -> Path | None:
+    """Where this system keeps what can be made again: evflow's folder there; None without a
+    home."""
+    named = environ.get("LOCALAPPDATA" if system == "win32" else "XDG_CACHE_HOME", "")
+    try:
+        home = Path.home()
+    except RuntimeError:
+        return Path(named, "evflow") if Path(named).is_absolute() else None
+    usual = {"win32": "AppData/Local", "darwin": "Library/Caches"}.get(system, ".cache")
+    # The specification of XDG_CACHE_HOME has a relative path ignored.
+    return (Path(named) if Path(named).is_absolute() else home / usual) / "evflow"
+
+
+def remember(environ: Mapping[str, str] = os.environ) -> Path | None:
+    """Keep what this process compiles in the user's cache folder, for the next one; the folder.
+
+    None, and nothing is changed, where JAX's own variables say where or whether to, and where the
+    folder cannot be written."""
+    if any(name in environ for name in JAX_OWN):
+        return None
+    folder = cache_folder(environ)
+    try:
+        if folder is None:
+            return None
+        folder = folder / "programs"
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return None
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    for name, least in (("min_compile_time_secs", 0), ("min_entry_size_bytes", -1)):
+        if f"JAX_PERSISTENT_CACHE_{name.upper()}" not in environ:
+            jax.config.update(f"jax_persistent_cache_{name}", least)
+    return folder
+
+
+@contextlib.contextmanager
+def told_of(tell: Callable[[bool], None]) -> Iterator[None]:
+    """Call tell(True) when a program is about to be compiled in this block, or looked up, and
+    tell(False) when it is there."""
+    import jax
+
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
+        if event in (LOWERED, COMPILED):
+            tell(event == LOWERED)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
