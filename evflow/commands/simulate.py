@@ -84,9 +84,12 @@ class Simulate(Compiling):
     they see the mosaic itself.)"""
     full_scale: Annotated[float | None, value("DN")] = None
     """Value of white; without it 255, or 65535 in 16-bit images. 12-bit data: 4095."""
-    response: Literal["linear", "gamma", "srgb"] = "linear"
-    """How the frames code light: videos mostly as srgb, cameras with events linearly. Pixels see
-    light."""
+    response: Literal["auto", "linear", "gamma", "srgb", "log"] = "auto"
+    """How the frames code light, which is what pixels see. auto: videos and 8-bit images as srgb;
+    arrays, deeper images and a recording's own frames linearly. log: floats that are natural
+    logarithms of light, below that of --full-scale."""
+    background: Literal["black", "white"] = "black"
+    """What transparent images are laid over."""
     flip_frames: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirror the frames."""
     partial: bool = False
@@ -157,8 +160,8 @@ class Simulate(Compiling):
         return open_frames(
             self.video, fps=self.fps, timestamps=self.timestamps, colour=self.colour,
             time_unit=self.time_unit, full_scale=self.full_scale, partial=self.partial,
-            bayer=self.bayer, response=self.response, flip=self.flip_frames,
-            start_s=self.start, stop_s=self.stop)
+            bayer=self.bayer, response=self.response, background=self.background,
+            flip=self.flip_frames, start_s=self.start, stop_s=self.stop)
 
     def _seen_by(self, source: FrameSource) -> Photoreceptor:
         """The measured camera's photoreceptor; of its light and clock only in front of frames that

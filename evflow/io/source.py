@@ -1,5 +1,10 @@
 """Frames from whatever a user points at, one by one: a video file, a folder of images, a NumPy
-stack, or a recording with frames."""
+stack, or a recording with frames.
+
+How they code light is what the source usually does, where `response` is "auto": videos and 8-bit
+images are sRGB; raw mosaics, deeper images, arrays and what a camera recorded beside its events are
+linear.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from evflow.errors import EvflowDataError, naming
 from evflow.io.images.folder import open_folder
@@ -33,8 +40,9 @@ def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
 def _open(path: Path, told: FrameHints) -> FrameSource:
     if is_stack(path):
         stack = open_stack(path, told)
+        told, notes = _responding(told, "linear", "numbers of a stack")
         return _source(stack.size, len(stack.times_us), lambda: stack.images(told.partial), told,
-                       list(stack.notes))
+                       [*stack.notes, *notes])
     if not _is_recording(path):
         return _folder(path, told) if path.is_dir() else _video(path, told)
     return _recording(path, told)
@@ -54,13 +62,23 @@ def _folder(path: Path, told: FrameHints) -> FrameSource:
     folder = open_folder(path, told)
     first = next(folder.images()).pixels
     size = first.shape[1], first.shape[0]
-    return _source(size, len(folder.files), folder.images, told, list(folder.notes))
+    raw = told.bayer is not None or (first.ndim == 2 and told.colour != "luma")
+    told, notes = _responding(
+        told, *(("linear", "pixels of a raw mosaic") if raw else
+                ("linear", "images made from events") if folder.notes and any(
+                    note.code == "frames.made" for note in folder.notes) else
+                ("srgb", "8-bit images") if first.dtype == np.uint8 else
+                ("linear", "images of more than 8 bits")))
+    return _source(size, len(folder.files), folder.images, told, [*folder.notes, *notes])
 
 
 def _video(path: Path, told: FrameHints) -> FrameSource:
     from evflow.io.images.video import open_video
 
     video = open_video(path, told)
+    told, notes = _responding(told, *(("srgb", "videos") if told.bayer is None else
+                                      ("linear", "pixels of a raw mosaic")))
+    video.notes.extend(notes)
     return _source(video.size, video.claimed, video.images, told, video.notes)
 
 
@@ -76,6 +94,7 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
                               "Simulate a recording with frames, or a video.")
     white = told.full_scale or recording.full_scale
     told = dataclasses.replace(told, full_scale=white, start_s=None, stop_s=None)
+    told, notes = _responding(told, "linear", "a recording's own frames")
 
     def images() -> Iterator[Image]:
         for i, t in enumerate(recording.frame_times.tolist()):
@@ -83,7 +102,19 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
 
     return dataclasses.replace(
         _source(recording.events.size, len(recording.frames), images, told,
-                list(recording.notes)), recorded=True)
+                [*recording.notes, *notes]), recorded=True)
+
+
+def _responding(told: FrameHints, usual: str, what: str) -> tuple[FrameHints, tuple[Note, ...]]:
+    """The hints with a response, where it was left open the usual one, and what is said of it."""
+    if told.response != "auto":
+        return told, ()
+    said = {"srgb": "turned into light by the sRGB curve, as {} mostly are coded "
+                    "(--response linear: they are light already)",
+            "linear": "taken as linear in light, as {} mostly are (--response srgb: they are coded "
+                      "as videos are)"}[usual].format(what)
+    return (dataclasses.replace(told, response=usual),
+            (Note("frames.response", f"frames were {said}."),))
 
 
 def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:

@@ -25,6 +25,8 @@ LINLOG_KNEE = 20.0  # DN; v2e's threshold between the linear and the logarithmic
 LINLOG_SLOPE = float(np.log(LINLOG_KNEE) / LINLOG_KNEE)
 LOG_EPS = 1e-3
 MOST_LOG = 6.0  # more than the logarithm of 255 DN
+MOST_OF_ONE = 12.0  # of one pixel: a thousand times as bright as white
+SAMPLED = 61  # every so many values are compared with it
 
 
 def lin_log(dn: ArrayLike) -> Array:
@@ -87,12 +89,27 @@ def check_log(name: str, values: Any) -> None:
         wide = np.float64 if values.dtype.itemsize < 4 else None  # half precision overflows
         mean = values.sum(dtype=wide) / max(values.size, 1)
         if not (np.isfinite(mean) or np.isfinite(values).all()):
-            raise EvflowDataError("EV007", f"{name} holds NaN or infinite values.",
-                                  "The logarithm of 0 or of a missing pixel? Use intensity.to_log.")
-    if mean > MOST_LOG:
+            raise EvflowDataError(
+                "EV007", f"{name} holds NaN or infinite values.",
+                "The logarithm of 0 or of a missing pixel? Use evflow.light.log_maps.to_log.")
+    if 0 < mean < 1:
+        _check_no_fractions(name, values)
+    some = float(values.reshape(-1)[::SAMPLED].max(initial=0))
+    if mean > MOST_LOG or some > MOST_OF_ONE:
         raise EvflowDataError(
-            "EV003", f"{name} has a mean of {mean:.3g}, but white (255 DN) has 5.54.",
-            "Is it DN? Take intensity.to_log first.")
+            "EV003", f"{name} has a mean of {mean:.3g} and reaches {max(some, mean):.3g}, but "
+            "white (255 DN) has 5.54.",
+            "Is it DN? Take evflow.light.log_maps.to_log(frames) first.")
+
+
+def _check_no_fractions(name: str, values: np.ndarray) -> None:
+    """EV003 where all logarithms are those of DN below 7, and none is negative: fractions of white
+    are what is like that."""
+    low, high = values.min(), values.max()
+    if low >= 0 and high <= 1:
+        raise EvflowDataError(
+            "EV003", f"{name} spans {low:.3g}..{high:.3g}, but white (255 DN) has 5.54.",
+            "Fractions of white? Take evflow.light.log_maps.to_log(255 * frames) first.")
 
 
 def to_dn(frames: np.ndarray, full_scale: float) -> np.ndarray:
@@ -139,7 +156,7 @@ def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
             "EV002", f"the frames differ in shape: {before.shape} and {after.shape}.")
     if len({f.dtype for f in (before, after) if f.dtype in DEPTHS}) > 1:
         raise EvflowDataError("EV003", f"the frames are {before.dtype} and {after.dtype}.",
-                              "They are on different scales: intensity.to_dn for each.")
+                              "They are on different scales: evflow.light.log_maps.to_dn for each.")
     return to_log(after) - to_log(before)
 
 
@@ -170,4 +187,5 @@ def _check_frame(name: str, frame: Any) -> None:
     if low < 0 or high > 255.5 or 0 < high <= 1:
         raise EvflowDataError(
             "EV003", f"{name} reaches from {low:.4g} to {high:.4g}.",
-            "Expected DN on 0..255, not their logarithm nor 0..1; scale with intensity.to_dn.")
+            "Expected DN on 0..255, not their logarithm nor 0..1; scale with "
+            "evflow.light.log_maps.to_dn.")

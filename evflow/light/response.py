@@ -4,13 +4,16 @@ turned. Single frames (H, W) or (H, W, 3).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.notes import Note
 
 FLIPS: dict[str, tuple[int, ...]] = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}  # axes
-RESPONSES = ("linear", "gamma", "srgb")
+CURVES = ("gamma", "srgb")
+RESPONSES = ("linear", *CURVES, "log")  # log: float frames that are natural logarithms of light
 GAMMA = 2.2
 
 
@@ -23,10 +26,23 @@ def linear_light(frame: np.ndarray, response: str) -> np.ndarray:
     """
     if response == "linear":
         return frame
-    if response not in RESPONSES:
-        raise EvflowDataError(
-            "EV020", f"response={response!r}.", f"Choose from {', '.join(RESPONSES)}.")
-    code = frame.astype(np.float32) * np.float32(1 / 255)
+    if response not in CURVES:
+        raise EvflowDataError("EV020", f"response={response!r}.",
+                              f"Choose from {', '.join(('linear', *CURVES))}.")
+    if frame.dtype == np.uint8:
+        light: np.ndarray = _table(response)[frame]
+        return light
+    return _light(frame.astype(np.float32), response)
+
+
+@lru_cache
+def _table(response: str) -> np.ndarray:
+    """The light (256,) of each byte."""
+    return _light(np.arange(256, dtype=np.float32), response)
+
+
+def _light(dn: np.ndarray, response: str) -> np.ndarray:
+    code = dn * np.float32(1 / 255)
     light = code ** np.float32(GAMMA) if response == "gamma" else _srgb(code)
     return np.minimum(light, 1) * np.float32(255)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evflow.errors import EvflowDataError
+from evflow.light.ranges import DARKEST_DN, meaning
 
 
 def blocks(
@@ -46,7 +47,7 @@ def _single_frames(
     shape: tuple[int, ...],
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Validated (frame, time) pairs, whatever the blocks they came in."""
-    dtype, last, index, brightest = None, None, 0, 0.0
+    dtype, last, index, doubt, bright = None, None, 0, None, False
     for block, times in itertools.zip_longest(frames_iter, times_iter):
         if block is None or times is None:
             raise EvflowDataError(
@@ -55,7 +56,9 @@ def _single_frames(
         block, times = np.asarray(block), np.atleast_1d(np.asarray(times))
         block = block[None] if block.ndim == 2 else block
         _check_block(block, times, shape, dtype, index)
-        dtype, brightest = block.dtype, max(brightest, float(block.max(initial=0)))
+        if block.dtype.kind == "f" and not bright:
+            doubt, bright = doubt or meaning(block), float(block.max(initial=0)) > DARKEST_DN
+        dtype = block.dtype
         for frame, t in zip(block, times.tolist(), strict=True):
             if last is not None and t <= last:
                 raise EvflowDataError(
@@ -63,10 +66,10 @@ def _single_frames(
                     "Frame times must increase strictly.")
             last, index = t, index + 1
             yield frame, t
-    if dtype is not None and dtype.kind == "f" and 0 < brightest <= 1:
+    if doubt and not bright:
         raise EvflowDataError(
-            "EV003", f"no value of the float frames is above {brightest:.4g}.",
-            "Expected DN on 0..255; these seem to be on 0..1: multiply by 255.")
+            "EV003", f"no value of the float frames is above {DARKEST_DN:g} where white is 255: "
+            f"{doubt.what}?", doubt.fix)
 
 
 def _check_block(
@@ -99,7 +102,10 @@ def _check_block(
         raise EvflowDataError(
             "EV007", f"{bad.sum()} values of the frames are not finite, first in frame "
             f"{index + int(at[0])} at y={at[1]}, x={at[2]}.")
-    if block.min(initial=0.0) < 0 or block.max(initial=0.0) > 255.5:
+    low, high = block.min(initial=0.0), block.max(initial=0.0)
+    if low < 0 or high > 255.5:
+        doubt = meaning(block) if low < 0 else None
         raise EvflowDataError(
-            "EV003", f"float frames reach from {block.min():.4g} to {block.max():.4g}.",
-            "Expected DN on 0..255; scale with intensity.to_dn.")
+            "EV003", f"float frames reach from {low:.4g} to {high:.4g}, where DN are 0..255"
+            f"{f': {doubt.what}?' if doubt else '.'}",
+            doubt.fix if doubt else "Scale them: evflow.light.log_maps.to_dn(frames, white).")

@@ -18,6 +18,7 @@ from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
 from evflow.io.decode.units import UNITS_US
 from evflow.io.hints import Hints, check_choices, known
+from evflow.io.images import values
 from evflow.light import response
 from evflow.light.colour import (
     COLOURS,
@@ -32,7 +33,7 @@ from evflow.types import Events, Recording
 
 Frames = Iterator[tuple[np.ndarray, int]]
 
-WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # DN of a saturated pixel unless told
+Array = np.ndarray
 
 
 class Image(NamedTuple):
@@ -53,7 +54,9 @@ class FrameHints:
     full_scale: DN of white; None = 255 for uint8 and floats, 65535 for uint16.
     partial: use what can be read of a damaged or cut-off file.
     bayer: pattern of the raw mosaic that the frames are; they become its luma.
-    flip, response: mirror them; undo a gamma (see `light`).
+    flip: mirror them. response: how they code light (see `light.response`), or "auto": as the
+        source usually does, see `io.source`.
+    background: what transparent images are laid over, "black" or "white".
     start_s, stop_s: frames with start <= time < stop, in seconds from the first; of a recording
         from its first event.
     """
@@ -67,12 +70,14 @@ class FrameHints:
     bayer: str | None = None
     flip: str = "none"
     response: str = "linear"
+    background: str = "black"
     start_s: float | None = None
     stop_s: float | None = None
 
     def __post_init__(self) -> None:
         check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS,
-                      flip=("none", *response.FLIPS), response=response.RESPONSES)
+                      flip=("none", *response.FLIPS), response=("auto", *response.RESPONSES),
+                      background=tuple(values.BACKGROUNDS))
         Hints(start_s=self.start_s, stop_s=self.stop_s)  # EV020 where they are no range
         if self.bayer is not None and parse_pattern(self.bayer) and self.colour != "luma":
             raise EvflowDataError(
@@ -130,11 +135,13 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
     first: tuple[np.ndarray, np.dtype] | None = None
     last, bright = 0, False
     for image in images:
-        frame, bright = _seen(image, hints, bright)
+        frame, bright = _seen(image, hints, bright, notes)
         depth = image.pixels.dtype
         if first is None:
             first = frame, depth
-            notes += [n for n in _seen_first(image, frame, hints) if n not in notes]
+            said = {note.code for note in notes}  # of the response already, where it was left open
+            notes += [n for n in _seen_first(image, frame, hints) if n not in notes and not (
+                n.code == "frames.linearised" and "frames.response" in said)]
         elif image.time_us <= last:
             raise EvflowDataError(
                 "EV004", f"{image.where} is at {image.time_us} us, the frame before at {last} us.",
@@ -153,47 +160,27 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
         yield frame, last
 
 
-def _seen(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, bool]:
-    """The frame as light, and `bright` as `_frame` has it."""
-    if hints.bayer is not None:
-        image = image._replace(pixels=mosaic_luma(image.pixels, hints.bayer, image.where))
-    frame, bright = _frame(image, hints, bright)
-    frame = response.linear_light(frame, hints.response)
-    return frame if hints.flip == "none" else np.flip(frame, response.FLIPS[hints.flip]), bright
-
-
-def _frame(image: Image, hints: FrameHints, bright: bool) -> tuple[np.ndarray, bool]:
-    """The frame, and whether any float frame so far reached beyond 1 DN."""
+def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> tuple[Array, bool]:
+    """The frame as light, and `bright` as `values.as_dn` has it."""
     pixels, where = image.pixels, image.where
+    if hints.bayer is not None:
+        pixels = mosaic_luma(pixels, hints.bayer, where)
     if pixels.ndim == 3 and pixels.shape[-1] == 1:
         pixels = pixels[..., 0]
     if pixels.ndim != 2 and not (pixels.ndim == 3 and pixels.shape[-1] in (3, 4)):
         raise EvflowDataError(
             "EV002", f"{where} has shape {pixels.shape}.", "Expected (H, W) or (H, W, 3).")
     pixels = np.asarray(pixels, np.float32) if pixels.dtype.kind == "f" else pixels
-    white = hints.full_scale or WHITE.get(pixels.dtype.str[1:])
-    if white is None:
-        raise EvflowDataError(
-            "EV003", f"{where} is {pixels.dtype}.", "Expected uint8, uint16 or floats.")
-    if pixels.ndim == 3:  # a fourth channel is opacity, which a camera does not see
-        colour = np.ascontiguousarray(pixels[..., :3])
-        pixels = luma(colour) if hints.colour == "luma" else colour
-    if pixels.dtype == np.uint8 and white == 255:
-        return pixels, True
-    low, high = float(pixels.min()), float(pixels.max())
-    if not (np.isfinite(low) and np.isfinite(high)):
-        raise EvflowDataError(
-            "EV007", f"{where} holds {(~np.isfinite(pixels)).sum():,} NaN or infinite values.",
-            "The log of dark pixels? Give linear intensity.")
-    if low < 0 or high > white * 1.001:
-        raise EvflowDataError(
-            "EV003", f"{where} spans {low:g}..{high:g}, outside 0..{white:g}.",
-            "Pass the value of white: full_scale=1023, 4095, 65535 (--full-scale).")
-    if pixels.dtype == np.float32 and hints.full_scale is None and not bright and 0 < high <= 1:
-        raise EvflowDataError(
-            "EV003", f"{where} spans {low:g}..{high:g} where white is 255.",
-            "Floats on 0..1? Pass full_scale=1 (--full-scale 1); if it is that dark, 255.")
-    return pixels.astype(np.float32) * np.float32(255 / white), bright or high > 1
+    values.white_of(pixels.dtype, where)
+    if pixels.ndim == 3 and pixels.shape[-1] == 4:
+        pixels, through = values.opaque(pixels, hints.background)
+        if through and not any(note.code == "frames.alpha" for note in notes):
+            notes.append(Note("frames.alpha", f"images are transparent in part: laid over "
+                              f"{hints.background} (--background black|white)."))
+    frame, bright = values.as_dn(
+        np.ascontiguousarray(pixels), where, full_scale=hints.full_scale,
+        response=hints.response, colour=hints.colour, bright=bright)
+    return frame if hints.flip == "none" else np.flip(frame, response.FLIPS[hints.flip]), bright
 
 
 def _seen_first(image: Image, frame: np.ndarray, hints: FrameHints) -> list[Note]:

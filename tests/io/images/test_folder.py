@@ -71,9 +71,11 @@ def test_twelve_bits_in_sixteen(tmp_path: Path) -> None:
 def test_colour_and_alpha_images(tmp_path: Path) -> None:
     bgra = np.random.default_rng(0).integers(0, 256, (24, 32, 4), np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), bgra)
-    grey = cv2.cvtColor(bgra[..., :3].copy(), cv2.COLOR_BGR2GRAY)
+    laid = np.rint(bgra[..., :3] * (bgra[..., 3:] / 255.0)).astype(np.uint8)  # over black
+    grey = cv2.cvtColor(laid, cv2.COLOR_BGR2GRAY)
     np.testing.assert_array_equal(read(tmp_path, fps=1)[0][0], grey)
-    np.testing.assert_array_equal(read(tmp_path, fps=1, colour="rggb")[0][0], bgra[..., :3])
+    np.testing.assert_array_equal(read(tmp_path, fps=1, colour="rggb")[0][0], laid)
+    assert "laid over white" in read(tmp_path, fps=1, background="white")[2][0].text
     cv2.imwrite(str(tmp_path / "b.png"), grey)  # grey and colour mix as luma, not as a mosaic
     assert read(tmp_path, fps=1)[0].shape == (2, 24, 32)
     assert code_of(lambda: read(tmp_path, fps=1, colour="rggb")) == "EV003"

@@ -1,0 +1,116 @@
+"""Pixel values of a decoded image -> light on 0..255 DN, as one sensor pixel after the other sees
+it: uint8 as it is where that is what it says, all else float32. Nothing is clipped.
+
+The response is undone before colours are added up: a pixel adds light, not code values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.light.colour import luma
+from evflow.light.ranges import meaning
+from evflow.light.response import linear_light
+
+WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # DN of a saturated pixel unless told
+BACKGROUNDS = {"black": 0.0, "white": 1.0}
+
+
+def as_dn(
+    pixels: np.ndarray, where: str, *, full_scale: float | None, response: str, colour: str,
+    bright: bool,
+) -> tuple[np.ndarray, bool]:
+    """The frame (H, W), or (H, W, 3) unless colour is "luma", and whether any float frame so far
+    was plainly one in DN (`bright` says so of those before).
+
+    pixels: (H, W) or (H, W, 3) in B, G, R, of a depth in `WHITE`; where: names it in messages.
+    Raises EV003 (range), EV007 (NaN).
+    """
+    seen: Callable[[np.ndarray], np.ndarray] = (
+        luma if pixels.ndim == 3 and colour == "luma" else _as_it_is)
+    if response == "linear":  # integers are rounded as OpenCV rounds them
+        return _scaled(seen(pixels), where, full_scale, bright)
+    if response == "log":
+        light = _exponential(pixels, where, full_scale)
+        return seen(light), True
+    dn, bright = _scaled(pixels, where, full_scale, bright)
+    return seen(linear_light(dn, response)), bright
+
+
+def white_of(dtype: np.dtype, where: str) -> float:
+    """DN of a saturated pixel; EV003 where images have no such depth."""
+    if dtype.str[1:] not in WHITE:
+        raise EvflowDataError(
+            "EV003", f"{where} is {dtype}.", "Expected uint8, uint16 or floats.")
+    return WHITE[dtype.str[1:]]
+
+
+def opaque(pixels: np.ndarray, background: str) -> tuple[np.ndarray, bool]:
+    """(H, W, 3) of (H, W, 4), laid over a background ("black" or "white") as image viewers do, and
+    whether any of it shows through."""
+    colour, alpha = np.ascontiguousarray(pixels[..., :3]), pixels[..., 3:]
+    whole = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else (
+        1.0 if alpha.max(initial=0) <= 1 else 255.0)
+    if (alpha >= whole).all():
+        return colour, False
+    share = alpha.astype(np.float32) / np.float32(whole)
+    behind = BACKGROUNDS[background] * white_of(pixels.dtype, "an image")
+    laid = share * colour + (1 - share) * np.float32(behind)
+    return (np.rint(laid) if pixels.dtype.kind == "u" else laid).astype(pixels.dtype), True
+
+
+def _as_it_is(pixels: np.ndarray) -> np.ndarray:
+    return pixels
+
+
+def _scaled(
+    pixels: np.ndarray, where: str, full_scale: float | None, bright: bool
+) -> tuple[np.ndarray, bool]:
+    """Pixels as DN on 0..255, in range, and `bright` as `as_dn` has it."""
+    white = full_scale or white_of(pixels.dtype, where)
+    if pixels.dtype == np.uint8 and white == 255:
+        return pixels, True
+    _check_finite(pixels, where)
+    low, high = float(pixels.min()), float(pixels.max())
+    floats = pixels.dtype == np.float32
+    told = meaning(pixels) if (floats and full_scale is None and not bright) or low < 0 else None
+    if told:
+        raise EvflowDataError("EV003", f"{where} spans {low:g}..{high:g} where white is "
+                              f"{white:g}: {told.what}?", told.fix)
+    if high > white * 1.001:
+        raise EvflowDataError(
+            "EV003", f"{where} reaches {high:g}, beyond white at {white:g}.",
+            f"Pass the value of white: --full-scale {_likely_white(high, floats):g} (full_scale=).")
+    return pixels.astype(np.float32) * np.float32(255 / white), bright or high > 0
+
+
+def _exponential(pixels: np.ndarray, where: str, full_scale: float | None) -> np.ndarray:
+    """Light of natural logarithms of it."""
+    if pixels.dtype.kind != "f":
+        raise EvflowDataError("EV003", f"{where} is {pixels.dtype}: whole numbers are no "
+                              "logarithms.", "Leave out --response log.")
+    _check_finite(pixels, where)
+    white = full_scale or 255.0
+    if (high := float(pixels.max())) > np.log(white) + 1e-2:
+        raise EvflowDataError(
+            "EV003", f"{where} reaches {high:.4g}, but the logarithm of white, {white:g}, is "
+            f"{np.log(white):.4g}.", f"Pass the value of white: --full-scale {np.exp(high):.4g}, "
+            "or leave out --response log.")
+    return np.exp(pixels) * np.float32(255 / white)
+
+
+def _check_finite(pixels: np.ndarray, where: str) -> None:
+    finite = np.isfinite(pixels)
+    if not finite.all():
+        raise EvflowDataError(
+            "EV007", f"{where} holds {(~finite).sum():,} NaN or infinite values.",
+            "The log of dark pixels? Give linear intensity.")
+
+
+def _likely_white(high: float, floats: bool) -> float:
+    """The smallest usual white that is not below."""
+    usual = [float(2**bits - 1) for bits in (8, 10, 12, 14, 16)]
+    return high if floats else next((white for white in usual if high <= white), high)
