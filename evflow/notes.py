@@ -37,6 +37,7 @@ NOTES: dict[str, str] = {
     "frames.raw": "grey frames were taken as a colour mosaic",
     "frames.replaced": "frames are those of another file",
     "frames.response": "how frames code light was taken as usual",
+    "frames.stream": "which of several image streams was read",
     "frames.unit": "the unit of the frame times was inferred",
     "frames.unused": "frames were left out",
     "scene.static": "nothing moves: the noise alone was measured",
@@ -77,6 +78,12 @@ class Note:
 def texts(notes: Iterable[Note]) -> list[str]:
     """Their sentences, each once."""
     return list(dict.fromkeys(note.text for note in notes))
+
+
+def why_no_frames(notes: Iterable[Note]) -> str:
+    """For a message on a recording without frames: ": " and why those there were left out."""
+    why = texts(note for note in notes if note.code == "frames.unused")
+    return f": {'; '.join(why)}" if why else ""
 
 
 def as_dicts(notes: Iterable[Note]) -> list[dict[str, str]]:

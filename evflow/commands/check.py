@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from evflow.commands.options import Reading, own_first
+from evflow.commands.options import Reading, own_first, tell
 from evflow.errors import EvflowDataError
 
 
@@ -32,7 +32,7 @@ class Check(Reading):
         from evflow.recordings.check import Finding, Report, check
 
         try:
-            recording = self.read(self.recording)
+            recording = tell(self.read(self.recording))
         except EvflowDataError as error:
             report, what = Report((Finding.of(error),)), str(self.recording)
         else:

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from evflow.commands.options import Compiling, Reading, check_finite, own_first, refuse, write_json
+from evflow.commands.options import (
+    Compiling,
+    Reading,
+    check_finite,
+    own_first,
+    refuse,
+    tell,
+    write_json,
+)
 from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
@@ -79,7 +87,7 @@ class Estimate(Compiling, Reading):
             refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
         need_packages(self.recording, pictures=self.plots or (self.report and moving))
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
-            recording = self.read(self.recording)
+            recording = tell(self.read(self.recording))
             doubts = self._checked(recording)
             recording = self._reconstructed(recording) if self.reconstruct else recording
             found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)

@@ -28,6 +28,7 @@ LARGEST = 1e13  # of any number: as milliseconds since 1970 until 2286, and whol
 
 ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # of --frames
 CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer")  # of any frames
+OWN = ("frames_topic", "no_frames")  # of the recording's
 
 
 def value(metavar: str, *aliases: str) -> Any:
@@ -74,6 +75,11 @@ class Reading:
     before a time that goes back)."""
     drop_outside: bool = False
     """Leave out events outside the sensor instead of refusing them."""
+    frames_topic: Annotated[str | None, value("NAME")] = None
+    """The recording's images that are the frames of its events, where it holds several: a topic of
+    a bag, an output of DV. Without it raw images near the events, which a note names."""
+    no_frames: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Read the events alone, whatever the recording's frames are."""
     frames: Annotated[Path | None, value("PATH")] = None
     """Frames from elsewhere: a folder of images, a video, a stack (.npy, .npz)."""
     timestamps: Annotated[Path | None, value("FILE")] = None
@@ -105,14 +111,20 @@ class Reading:
             raise EvflowDataError(
                 "EV020", f"{told} without --frames: of frames from elsewhere.",
                 "Pass --frames too.")
+        if self.frames is not None and (told := given(self, OWN)):
+            raise EvflowDataError(
+                "EV020", f"{told} with --frames, which takes the place of the recording's own.",
+                "Give one of them.")
+        own = with_frames and self.frames is None
         recording = io.read_recording(
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
             polarity=self.polarity, size=parse_size(self.size), partial=self.partial,
-            drop_outside=self.drop_outside)
+            drop_outside=self.drop_outside, no_frames=self.no_frames or not own,
+            frames_topic=self.frames_topic if own else None)
         if with_frames and (self.frames is not None or recording.has_frames):
             return self._seeing(recording)
         if with_frames:
-            note_idle(self, f"{path} has no frames")
+            note_idle(self, f"{path} has no frames" if not self.no_frames else "--no-frames")
         return recording
 
     def _seeing(self, recording: Recording) -> Recording:
@@ -151,8 +163,16 @@ def given(options: Any, names: Iterable[str]) -> str:
 
 def note_idle(options: Reading, why: str) -> None:
     """Say which options of frames do nothing."""
-    if idle := given(options, ("frames", *ELSEWHERE, *CHANGES)):
+    if idle := given(options, ("frames_topic", "frames", *ELSEWHERE, *CHANGES)):
         print(f"note: {idle} without effect: {why}.", file=sys.stderr)
+
+
+def tell(recording: Recording) -> Recording:
+    """The recording, after its notes are printed to stderr: by commands that do not print them
+    with their own."""
+    for note in recording.notes:
+        print(f"note: {note}", file=sys.stderr)
+    return recording
 
 
 def flag(name: str, *, no: bool = False) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from evflow.commands.options import Reading, check_finite, note_idle, own_first, refuse, value
+from evflow.commands.options import Reading, check_finite, note_idle, own_first, refuse, tell, value
 from evflow.commands.writing import need_absent
 from evflow.notes import as_dicts
 
@@ -62,7 +62,7 @@ class Render(Reading):
         seen = self.over_frames or kind == ".png"
         if not seen:
             note_idle(self, "the film shows no frames without --over-frames")
-        recording = self.read(self.recording, with_frames=seen)
+        recording = tell(self.read(self.recording, with_frames=seen))
         if kind == ".png":
             said = write_sheet(self.out, recording, film, at_s=self.at, overwrite=self.overwrite)
         else:

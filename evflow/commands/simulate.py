@@ -90,6 +90,8 @@ class Simulate(Compiling):
     logarithms of light, below that of --full-scale."""
     background: Literal["black", "white"] = "black"
     """What transparent images are laid over."""
+    frames_topic: Annotated[str | None, value("NAME")] = None
+    """Of a recording with several streams of images the one whose images are the frames."""
     flip_frames: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirror the frames."""
     partial: bool = False
@@ -161,7 +163,8 @@ class Simulate(Compiling):
             self.video, fps=self.fps, timestamps=self.timestamps, colour=self.colour,
             time_unit=self.time_unit, full_scale=self.full_scale, partial=self.partial,
             bayer=self.bayer, response=self.response, background=self.background,
-            flip=self.flip_frames, start_s=self.start, stop_s=self.stop)
+            flip=self.flip_frames, start_s=self.start, stop_s=self.stop,
+            frames_topic=self.frames_topic)
 
     def _seen_by(self, source: FrameSource) -> Photoreceptor:
         """The measured camera's photoreceptor; of its light and clock only in front of frames that

@@ -48,6 +48,8 @@ class Told(TypedDict, total=False):
     size: Size | None
     partial: bool
     drop_outside: bool
+    frames_topic: str | None
+    no_frames: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +65,8 @@ class Hints:
     partial: of a damaged or cut-off file take what lies before the damage; of HDF5 and npz, which
         are sound or not as a whole, only what lies before a time that goes back.
     drop_outside: leave out events outside the sensor instead of refusing them.
+    frames_topic: of several streams of images the one whose images are the frames (see `streams`).
+    no_frames: read the events alone.
     """
 
     start_s: float | None = None
@@ -72,6 +76,8 @@ class Hints:
     size: Size | None = None
     partial: bool = False
     drop_outside: bool = False
+    frames_topic: str | None = None
+    no_frames: bool = False
 
     def __post_init__(self) -> None:
         check_choices(self, time_unit=("auto", *UNITS_US), polarity=POLARITIES)
@@ -84,6 +90,14 @@ class Hints:
         if self.stop_s is not None and self.stop_s <= (self.start_s or 0.0):
             raise EvflowDataError(
                 "EV020", f"stop_s={self.stop_s} is not after start_s={self.start_s or 0.0}.")
+        if self.frames_topic is not None and not (
+                isinstance(self.frames_topic, str) and self.frames_topic.strip("/")):
+            raise EvflowDataError("EV020", f"frames_topic={self.frames_topic!r}.",
+                                  "Give the name of a topic or data set.")
+        if self.frames_topic is not None and self.no_frames:
+            raise EvflowDataError(
+                "EV020", f"frames_topic={self.frames_topic!r} and no_frames contradict.",
+                "Give one of them (--frames-topic, --no-frames).")
         if self.size is not None:
             object.__setattr__(self, "size", check_size(self.size))
 

@@ -98,7 +98,8 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
         **hints: what the file does not tell. start_s, stop_s: the part to read, seconds from its
             first event; time_unit: "s", "ms", "us" or "ns"; polarity: "01", "pm1" or "invert";
             size: (width, height); partial: of a damaged file, what lies before the damage;
-            drop_outside: leave out events outside the sensor.
+            drop_outside: leave out events outside the sensor; frames_topic: which of several
+            streams of images holds the frames; no_frames: read the events alone.
 
     Returns:
         The recording; without frames in the file they are (0, H, W). Its notes say what was
@@ -123,6 +124,7 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
     try:
         with naming(path):
             recording = found.read(path, told)
+            _check_named(recording, told)
             events = recording.events
             check_seconds(events.t, events.size, told.time_unit, found.NAME)
     except MemoryError as e:
@@ -247,6 +249,14 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
             "EV020", f"the extension {suffix} of {path} stands for no format that can be written.",
             f"Take one of {kinds}, or pass format (--format): {', '.join(WRITERS)}.")
     return WRITERS[WRITTEN[suffix] if format is None else format]
+
+
+def _check_named(recording: Recording, told: Hints) -> None:
+    """EV020 where a stream of images was named to a format that has none."""
+    if told.frames_topic is not None and all(n.code != "frames.stream" for n in recording.notes):
+        raise EvflowDataError(
+            "EV020", f"frames_topic={told.frames_topic!r}, but no images stand beside the events.",
+            "Leave it out (--frames-topic); --frames takes images from elsewhere.")
 
 
 def _head(path: Path) -> bytes:

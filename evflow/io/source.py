@@ -21,7 +21,7 @@ from evflow.io.images.folder import open_folder
 from evflow.io.images.frames import FrameHints, Frames, FrameSource, Image, converted, existing
 from evflow.io.images.stacks import is_stack, open_stack
 from evflow.io.registry import find_format, read_recording
-from evflow.notes import Note
+from evflow.notes import Note, why_no_frames
 
 
 def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
@@ -44,6 +44,9 @@ def _open(path: Path, told: FrameHints) -> FrameSource:
         return _source(stack.size, len(stack.times_us), lambda: stack.images(told.partial), told,
                        [*stack.notes, *notes])
     if not _is_recording(path):
+        if told.frames_topic is not None:
+            raise EvflowDataError("EV020", f"{path} is no recording, with streams of images.",
+                                  "Leave out frames_topic (--frames-topic).")
         return _folder(path, told) if path.is_dir() else _video(path, told)
     return _recording(path, told)
 
@@ -88,10 +91,12 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
             "EV020", f"{path} is a recording, whose frames have their own times.",
             "Leave out --fps and --timestamps, or pass its images alone.")
     recording = read_recording(path, time_unit=told.time_unit, partial=told.partial,
-                               start_s=told.start_s, stop_s=told.stop_s)
+                               start_s=told.start_s, stop_s=told.stop_s,
+                               frames_topic=told.frames_topic)
     if not recording.has_frames:
-        raise EvflowDataError("EV011", f"{path} has events but no frames.",
-                              "Simulate a recording with frames, or a video.")
+        raise EvflowDataError(
+            "EV011", f"{path} has events but no frames{why_no_frames(recording.notes)}.",
+            "Simulate a recording with frames, or a video.")
     white = told.full_scale or recording.full_scale
     told = dataclasses.replace(told, full_scale=white, start_s=None, stop_s=None)
     told, notes = _responding(told, "linear", "a recording's own frames")

@@ -14,7 +14,7 @@ import numpy as np
 
 from evflow.checks import need
 from evflow.errors import EvflowDataError
-from evflow.notes import Note
+from evflow.notes import Note, why_no_frames
 from evflow.recordings.gaps import event_gaps
 from evflow.recordings.glitches import faulty_frames
 from evflow.types import Recording, Window
@@ -188,7 +188,8 @@ def check_overlap(recording: Recording) -> None:
         raise EvflowDataError("EV001", "the recording has no events.")
     if len(times) < 2:
         raise EvflowDataError(
-            "EV011", f"the recording has {len(times)} frames; a window lies between two.",
+            "EV011", f"the recording has {len(times)} frames{why_no_frames(recording.notes)}; a "
+            "window lies between two.",
             "Thresholds are measured against intensity: record or add frames.")
     start, stop = _covered(recording)
     if times[-1] <= start or times[0] >= stop:

@@ -44,12 +44,12 @@ def event_packet(events: Events) -> bytes:
             + struct.pack("<I", len(events)) + rows)
 
 
-def frame_packet(pixels: np.ndarray, t: int) -> bytes:
+def frame_packet(pixels: np.ndarray, t: int, origin: tuple[int, int] = (0, 0)) -> bytes:
     """The flatbuffer {t, begin, end, exposure begin, end i64; format i8; width, height, x, y i16;
     pixels [u8]}, its table at byte 36."""
     height, width = pixels.shape
     vtable = struct.pack("<13H", 26, 64, 8, 16, 24, 32, 40, 56, 48, 50, 52, 54, 4)
-    fields = struct.pack("<iI5q4hb7x", 28, 60, t, t - 9, t + 9, t - 5, t + 5, width, height, 0, 0,
-                         0)
+    fields = struct.pack("<iI5q4hb7x", 28, 60, t, t - 9, t + 9, t - 5, t + 5, width, height,
+                         *origin, 0)
     return (b"\x24\0\0\0FRME" + vtable + b"\0\0" + fields + struct.pack("<I", pixels.size)
             + pixels.tobytes())

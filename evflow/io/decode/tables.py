@@ -11,17 +11,20 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evflow.checks import Size, check_times
 from evflow.errors import EvflowDataError
 from evflow.io.decode.hdf5 import DAMAGE, MAGIC, MAX_RATIO, load_h5py, need_filters, plausible
-from evflow.io.decode.stream import Chunk
-from evflow.io.images.frames import FrameStack
+from evflow.io.decode.stream import Chunk, Gathered
+from evflow.io.hints import Hints
+from evflow.io.images.recorded import FrameStack
+from evflow.io.images.streams import ImageStream, choose, events_alone
+from evflow.io.images.times import beside_events
 from evflow.notes import Note
-from evflow.types import Events, Recording
+from evflow.types import Recording
 
 ROWS = 1 << 15  # events read at a time: 1 MiB of four float64 columns, which a cache holds
 
@@ -115,22 +118,38 @@ def same_length(path: Path, columns: dict[str, Any]) -> int:
     return next(iter(lengths.values()))
 
 
+class Images(NamedTuple):
+    """Images of a file that are decoded when they are wanted. stream: what they are; load():
+    their times (T,) as stored, and a function that decodes those of a slice."""
+
+    stream: ImageStream
+    load: Callable[[], tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]]
+
+
 def with_frames(
-    path: Path,
-    events: Events,
-    span: tuple[int, int],
-    times: np.ndarray,
-    images: Callable[[slice], Iterable[np.ndarray]],
-    notes: tuple[Note, ...],
+    path: Path, found: Gathered, hints: Hints, images: Images, native: str,
+    notes: tuple[Note, ...] = (), clock: tuple[Note, ...] = (),
 ) -> Recording:
-    """The recording with those frames whose times (T,) int64 us lie in [start, stop)."""
-    times = check_times(times, f"{path}: frame times", strict=True)
-    keep = slice(*(int(i) for i in np.searchsorted(times, np.array(span))))
-    stack = FrameStack(path)
-    if keep.start < keep.stop:
-        for image in images(keep):
-            stack.append(image)
-    return stack.beside(events, times[keep], notes)
+    """The recording with those of the images that are its frames, at times within its span.
+
+    native: unit of their times in the format; notes: on the recording; clock: on frames. What is
+    wrong with images keeps nobody from the events: `streams.events_alone`.
+    """
+    events, span, told = found
+    notes = (*notes, *told)
+    chosen = choose((images.stream,), hints, events.size)
+    if chosen.stream is None:
+        return Recording.of_events(events, (*notes, *chosen.notes))
+    with events_alone():
+        stamps, decode = images.load()
+        times, told = beside_events(stamps, path, native, hints, events)
+        times = check_times(times, f"{path}: frame times", strict=True)
+        keep = slice(*(int(i) for i in np.searchsorted(times, np.array(span))))
+        stack = FrameStack(path, events.size)
+        for image, time in zip(decode(keep), times[keep], strict=True) if (
+                keep.start < keep.stop) else ():
+            stack.append(image, time)
+        return stack.beside(events, hints, (*clock, *notes, *told, *chosen.notes))
 
 
 def stored_frames(data: Any, keep: slice) -> Iterator[np.ndarray]:
@@ -140,5 +159,17 @@ def stored_frames(data: Any, keep: slice) -> Iterator[np.ndarray]:
 
 
 def frame_size(data: Any) -> Size | None:
-    """(width, height) of frames (T, H, W) or (T, H, W, C)."""
-    return None if data is None else (int(data.shape[2]), int(data.shape[1]))
+    """(width, height) of frames (T, H, W) or (T, H, W, C); None of what is none."""
+    shape: tuple[int, ...] = getattr(data, "shape", ())
+    return (int(shape[2]), int(shape[1])) if len(shape) in (3, 4) and all(shape[1:3]) else None
+
+
+def dataset_images(path: Path, group: Any, name: str, times: str) -> Images:
+    """Frames in data set `name` of an HDF5 group, and their times in another."""
+    def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+        frames = dataset(path, group, name, (None, None, None))
+        stamps = dataset(path, group, times, (len(frames),))[:]
+        return stamps, lambda keep: stored_frames(frames, keep)
+
+    whole = f"{group.name}/{name}".strip("/")
+    return Images(ImageStream(whole, frame_size(group[name])), load)

@@ -14,14 +14,12 @@ import collections
 import contextlib
 import itertools
 import os
-import struct
 import sys
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 
@@ -31,8 +29,10 @@ from evflow.files.compressed import most_bytes
 from evflow.files.limits import FREE, RATIO
 from evflow.io.decode import tables
 from evflow.io.decode.stream import Chunk, Damage, Gathered, gather
+from evflow.io.formats.aedat4_header import read_header, stream_names
 from evflow.io.hints import Hints
-from evflow.io.images.frames import FrameStack, cut
+from evflow.io.images.recorded import FrameStack, cut
+from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
 from evflow.notes import Note
 from evflow.types import Recording
@@ -40,9 +40,6 @@ from evflow.types import Recording
 NAME = "aedat4"
 EXTENSIONS: tuple[str, ...] = (".aedat4",)
 
-MAGIC = b"#!AER-DAT4.0\r\n"
-TABLE_POSITION, INFO_NODE = 1, 2  # fields of the header's flatbuffer table: i64, XML
-MAX_DEPTH = 64  # of the XML; DV writes 5
 LATE_US = 1_000_000  # frames lie behind the events of their time by less than this
 
 
@@ -53,41 +50,48 @@ def sniff(path: Path, head: bytes) -> bool:
 def read(path: Path, hints: Hints) -> Recording:
     """Events (N,) and frames (T, H, W) uint8; colour frames become their luma.
 
-    Raises EV008 (no event stream, or several), EV009 (damaged), EV010 (no `aedat`), and what
+    Of several frame streams `streams.choose` takes one, by the names of their outputs in DV. Raises
+    EV008 (no event stream, or several), EV009 (damaged), EV010 (no `aedat`), and what
     `stream.gather` and `Recording` raise.
     """
-    packets_start, table = _check_header(path)
+    header = read_header(path)
     streams = _decoder(path).id_to_stream()
-    found = {kind: [i for i, s in streams.items() if s["type"] == kind]
-             for kind in ("events", "frame")}
-    if len(found["events"]) != 1 or len(found["frame"]) > 1:
+    events = [i for i, s in streams.items() if s["type"] == "events"]
+    if len(events) != 1:
         kinds = ", ".join(f"{i}: {s['type']}" for i, s in sorted(streams.items()))
         raise EvflowDataError(
             "EV008", f"{path} holds the streams {{{kinds}}}.",
-            "One event stream and at most one frame stream are read: export one camera alone.")
-    info = streams[found["events"][0]]
-    starts, damage = _packets(path, packets_start, table)
+            "One event stream is read: export one camera alone.")
+    info = streams[events[0]]
+    size = hints.size or (info["width"], info["height"])
+    frames = {i: s for i, s in streams.items() if s["type"] == "frame"}
+    names = stream_names(header.outputs, {*frames, *events})
+    chosen = choose([ImageStream(names[i], (s["width"], s["height"])) for i, s in frames.items()],
+                    hints, size, names[events[0]])
+    taken = [i for i in frames if chosen.stream and chosen.stream.name == names[i]]
+    starts, damage = _packets(path, header.packets, header.table)
     with _before(path, damage) as sound:
-        reading = _Reading(path, sound, starts, damage, hints)
+        reading = _Reading(path, sound, starts, damage, hints, FrameStack(path, size), taken)
         chunks = reading.chunks()
-        gathered = gather(path, chunks, hints, (info["width"], info["height"]))
+        gathered = gather(path, chunks, hints, size)
         if reading.last >= gathered.span[1]:  # frames that are late
             with contextlib.suppress(Damage):
                 collections.deque(chunks, 0)
-    return reading.beside(gathered)
+    return reading.beside(gathered, chosen.notes)
 
 
 class _Reading:
-    """Packets decoded in turn: events become chunks, frames are put aside. last: time of the last
-    event so far in us."""
+    """Packets decoded in turn: events become chunks, frames of the streams `taken` are put aside.
+    last: time of the last event so far in us."""
 
     def __init__(
-        self, path: Path, sound: Path, starts: Iterable[int], damage: Damage | None, hints: Hints
+        self, path: Path, sound: Path, starts: Iterable[int], damage: Damage | None, hints: Hints,
+        stack: FrameStack, taken: list[int],
     ) -> None:
         self.path, self.hints, self.damage = path, hints, damage
+        self.stack, self.taken = stack, taken
         self.decoder = iter(_decoder(sound))
         self.places = itertools.chain(starts, itertools.repeat(os.path.getsize(sound)))
-        self.stack, self.times = FrameStack(path), array.array("q")
         self.last, self.stop = 0, sys.maxsize
         self.begun = False
         self.warned: set[str] = set()
@@ -119,10 +123,8 @@ class _Reading:
                         found.append(packet["events"])
                         count += len(found[-1])
                         self._at(found[-1]["t"])
-                    elif "frame" in packet:
-                        self.times.append(_mid_exposure(packet["frame"]))
-                        pixels = packet["frame"]["pixels"]  # colours come as R, G, B(, A)
-                        self.stack.append(pixels if pixels.ndim == 2 else pixels[..., 2::-1])
+                    elif "frame" in packet and packet["stream_id"] in self.taken:
+                        self._take(packet["frame"])
             self.warned |= {str(w.message) for w in said}
         except (KeyboardInterrupt, SystemExit, EvflowDataError):
             raise
@@ -131,6 +133,13 @@ class _Reading:
             self.damage.__cause__ = e
         return found
 
+    def _take(self, frame: dict[str, Any]) -> None:
+        pixels = frame["pixels"]  # colours come as R, G, B(, A)
+        with events_alone():
+            self.stack.append(pixels if pixels.ndim == 2 else pixels[..., 2::-1],
+                              _mid_exposure(frame),
+                              (frame.get("offset_x", 0), frame.get("offset_y", 0)))
+
     def _at(self, t: np.ndarray) -> None:
         """Follow the time of events t as far as `stop_s` needs it."""
         if self.hints.stop_s is not None:
@@ -138,16 +147,18 @@ class _Reading:
             if not self.begun:
                 self.begun, self.stop = True, self.hints.span_us(self.hints.instant(t[0], "us"))[1]
 
-    def beside(self, found: Gathered) -> Recording:
+    def beside(self, found: Gathered, chosen: tuple[Note, ...]) -> Recording:
         """The recording of these events and the frames in their span."""
-        notes = (*found.notes, *(Note("events.unread", f"the decoder left something out: {said}")
-                                 for said in sorted(self.warned)))
-        if not self.times:
-            return Recording.of_events(found.events, notes)
-        times, told = beside_events(
-            np.array(self.times), self.path, "us", self.hints, found.events)
-        notes = (Note("frames.clock", "frame times are mid-exposure"), *notes, *told)
-        return cut(self.stack.beside(found.events, times, notes), found.span)
+        notes = (*found.notes, *chosen, *(Note(
+            "events.unread", f"the decoder left something out: {said}")
+            for said in sorted(self.warned)))
+        if not self.stack.times:
+            return self.stack.beside(found.events, self.hints, notes)
+        with events_alone():
+            times, told = beside_events(
+                np.array(self.stack.times), self.path, "us", self.hints, found.events)
+            notes = (Note("frames.clock", "frame times are mid-exposure"), *notes, *told)
+            return cut(self.stack.at(times, found.events, self.hints, notes), found.span)
 
 
 @contextlib.contextmanager
@@ -188,68 +199,6 @@ def _packets(path: Path, start: int, table: int) -> tuple[array.array[int], Dama
             starts.append(start)
             start += 8 + size
     return starts, None
-
-
-def _check_header(path: Path) -> tuple[int, int]:
-    """Where the packets start, and where their table is (-1: nowhere); EV009 unless the header is
-    a sound one."""
-    with open(path, "rb") as f:
-        magic, size = f.read(len(MAGIC)), int.from_bytes(f.read(4), "little")
-        header = f.read(min(size, os.path.getsize(path)))
-    try:
-        if magic != MAGIC or len(header) < size:
-            raise ValueError("cut off" if MAGIC.startswith(magic[:13]) else "wrong version line")
-        _check_xml(_info_node(header))
-        place = _field(header, TABLE_POSITION)
-        table = struct.unpack_from("<q", header, place)[0] if place else -1
-    except (ValueError, struct.error, expat.ExpatError) as e:
-        raise EvflowDataError(
-            "EV009", f"{path} has a damaged AEDAT4 header ({e}).", "Copy it again.") from e
-    return len(MAGIC) + 4 + size, table
-
-
-def _field(header: bytes, number: int) -> int:
-    """The byte of a field of the header's flatbuffer, root table -> vtable -> field; 0: absent."""
-    (table,) = struct.unpack_from("<I", header, 0)
-    vtable = table - struct.unpack_from("<i", header, table)[0]
-    if vtable < 0:
-        raise ValueError("its table lies before it")
-    if struct.unpack_from("<H", header, vtable)[0] < 6 + 2 * number:
-        return 0
-    (field,) = struct.unpack_from("<H", header, vtable + 4 + 2 * number)
-    return table + field if field else 0
-
-
-def _info_node(header: bytes) -> bytes:
-    """The XML string of the header's flatbuffer."""
-    pointer = _field(header, INFO_NODE)
-    if not pointer:
-        raise ValueError("it has no description")
-    string = pointer + struct.unpack_from("<I", header, pointer)[0]
-    (length,) = struct.unpack_from("<I", header, string)
-    if not 0 < length <= len(header) - string - 4:
-        raise ValueError("its description is cut off")
-    return header[string + 4 : string + 4 + length]
-
-
-def _check_xml(text: bytes) -> None:
-    """ValueError and ExpatError unless it is UTF-8 XML, of tags in tags to a bounded depth."""
-    depth = 0
-
-    def step(by: int) -> None:
-        nonlocal depth
-        depth += by
-        if depth > MAX_DEPTH:
-            raise ValueError(f"its description is nested more than {MAX_DEPTH} deep")
-
-    def refuse(*_: object) -> None:
-        raise ValueError("its description defines entities")
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = lambda *_: step(1)
-    parser.EndElementHandler = lambda _: step(-1)
-    parser.StartDoctypeDeclHandler = refuse
-    parser.Parse(text.decode("utf-8"), True)
 
 
 def _decoder(path: Path) -> Any:

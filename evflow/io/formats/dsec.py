@@ -23,7 +23,6 @@ from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import MAGIC, Hdf5Writer, plausible
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
-from evflow.io.images.times import beside_events
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
@@ -67,15 +66,11 @@ def read(path: Path, hints: Hints) -> Recording:
         if assumed and hints.size is None:
             notes += (assumed,)
         offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
-        events, span, told = gather(path, _chunks(columns, hints), hints, size, "us", offset)
-        notes += told
+        found = gather(path, _chunks(columns, hints), hints, size, "us", offset)
         if "frames" not in f:
-            return Recording.of_events(events, notes)
-        frames = tables.dataset(path, f, "frames", (None, None, None))
-        times = tables.dataset(path, f, "frame_times", (len(frames),))[:]
-        us, told = beside_events(times, path, "us", hints, events)
-        return tables.with_frames(path, events, span, us,
-                                  lambda keep: tables.stored_frames(frames, keep), notes + told)
+            return Recording.of_events(found.events, (*notes, *found.notes))
+        images = tables.dataset_images(path, f, "frames", "frame_times")
+        return tables.with_frames(path, found, hints, images, "us", notes)
 
 
 def _size(f: Any) -> tuple[Size | None, Note | None]:

@@ -9,6 +9,7 @@ without images the order in which all events fit.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import Hdf5Writer
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
-from evflow.io.images.times import beside_events
+from evflow.io.images.streams import ImageStream
 from evflow.io.writer import FLUSH, SECONDS_US
 from evflow.notes import Note
 from evflow.types import Events, Recording
@@ -41,21 +42,32 @@ def read(path: Path, hints: Hints) -> Recording:
         columns = {name: tables.dataset(path, f["events"], name, (None,)) for name in COLUMNS}
         n = tables.same_length(path, columns)
         xs, ys, ts, ps = columns.values()
-        names = sorted(f["images"]) if "images" in f else []
-        images = [_image(path, f["images"], name) for name in names]
-        size, notes = _size(f, images, columns)
+        seen = _image_size(f)
+        size, notes = _size(f, seen, columns)
         native = "s" if ts.dtype.kind == "f" else "us"
         chunks = tables.blocks(n, lambda part: (xs[part], ys[part], ts[part], ps[part]),
                                max(tables.stored_rows(column) for column in columns.values()))
-        events, span, told = gather(path, chunks, hints, size, native)
-        notes += told
-        if not images:
-            return Recording.of_events(events, notes)
-        stamps = np.array([_time(path, image) for image in images])
-        times, told = beside_events(stamps, path, native, hints, events)
-        return tables.with_frames(path, events, span, times,
-                                  lambda keep: (_pixels(image[:]) for image in images[keep]),
-                                  notes + told)
+        found = gather(path, chunks, hints, size, native)
+        if not _names(f):
+            return Recording.of_events(found.events, (*notes, *found.notes))
+
+        def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+            images = [_image(path, f["images"], name) for name in _names(f)]
+            stamps = np.array([_time(path, image) for image in images])
+            return stamps, lambda keep: (_pixels(image[:]) for image in images[keep])
+
+        images = tables.Images(ImageStream("images", seen), load)
+        return tables.with_frames(path, found, hints, images, native, notes)
+
+
+def _names(f: Any) -> list[str]:
+    return sorted(f["images"]) if hasattr(f.get("images"), "keys") else []
+
+
+def _image_size(f: Any) -> Size | None:
+    """(width, height) of the first image; None without one, or of none."""
+    shape: tuple[int, ...] = getattr(f["images"][_names(f)[0]], "shape", ()) if _names(f) else ()
+    return (int(shape[1]), int(shape[0])) if len(shape) in (2, 3) and all(shape[:2]) else None
 
 
 def _image(path: Path, group: Any, name: str) -> Any:
@@ -77,14 +89,15 @@ def _pixels(image: np.ndarray) -> np.ndarray:
 
 
 def _size(
-    f: Any, images: list[Any], columns: dict[str, Any]
+    f: Any, images: Size | None, columns: dict[str, Any]
 ) -> tuple[Size | None, tuple[Note, ...]]:
-    if images:
-        return (int(images[0].shape[1]), int(images[0].shape[0])), ()
+    """Of the sensor: of the images, unless sensor_resolution tells another in either order."""
     told = np.asarray(f.attrs.get("sensor_resolution", ())).ravel()
     if len(told) < 2 or told.dtype.kind not in "iuf" or not (told[:2] > 0).all():
-        return None, ()
+        return images, ()
     height, width = (int(v) for v in told[:2])
+    if images in ((width, height), (height, width)):
+        return images, ()
     if height <= width:  # as sensors are: no event can tell, and two columns need not be read twice
         return (width, height), ()
     reach = [0, 0]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,14 @@ from evflow.files.folders import atomic_folder
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
-from evflow.io.images.times import beside_events
+from evflow.io.images.streams import ImageStream
 from evflow.io.writer import SECONDS_US, EventWriter
 from evflow.types import Events, Recording
 
 NAME = "evreal"
 EXTENSIONS: tuple[str, ...] = ("",)
+
+IMAGES = "images.npy"
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -37,30 +40,48 @@ def read(path: Path, hints: Hints) -> Recording:
     ts, ps = (mapped(path / f"events_{name}.npy", (None,)) for name in ("ts", "p"))
     xy = mapped(path / "events_xy.npy", (None, 2))
     n = tables.same_length(path, {"ts": ts, "p": ps, "xy": xy})
-    images = _images(path)
-    size = _told_size(path) if images is None else tables.frame_size(images)
-    events, span, notes = gather(
+    seen = _image_size(path)
+    found = gather(
         path, tables.blocks(n, lambda part: (xy[part, 0], xy[part, 1], ts[part], ps[part])),
-        hints, size, _unit(ts))
-    if images is None:
-        return Recording.of_events(events, notes)
-    stamps = mapped(path / "images_ts.npy", (len(images),))
-    times, told = beside_events(np.asarray(stamps), path, _unit(stamps), hints, events)
-    return tables.with_frames(path, events, span, times,
-                              lambda keep: map(np.array, images[keep]), notes + told)
+        hints, _size(path, seen), _unit(ts))
+    if not (path / IMAGES).is_file():
+        return Recording.of_events(found.events, found.notes)
+
+    def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+        images = _images(path)
+        stamps = np.asarray(mapped(path / "images_ts.npy", (len(images),)))
+        return stamps, lambda keep: map(np.array, images[keep])
+
+    images = tables.Images(ImageStream(IMAGES, seen), load)
+    return tables.with_frames(path, found, hints, images, _unit(ts))
 
 
 def _unit(times: np.ndarray) -> str:
     return "s" if times.dtype.kind == "f" else "us"
 
 
-def _images(path: Path) -> np.ndarray | None:
-    if not (path / "images.npy").is_file():
-        return None
+def _images(path: Path) -> np.ndarray:
     try:
-        return mapped(path / "images.npy", (None, None, None))
+        return mapped(path / IMAGES, (None, None, None))
     except EvflowDataError:
-        return mapped(path / "images.npy", (None, None, None, 3))
+        return mapped(path / IMAGES, (None, None, None, 3))
+
+
+def _image_size(path: Path) -> Size | None:
+    with contextlib.suppress(EvflowDataError):  # `load` says what is wrong with them
+        return tables.frame_size(_images(path))
+    return None
+
+
+def _size(path: Path, images: Size | None) -> Size | None:
+    """Of the sensor: what metadata.json tells, in whichever order the images have; else theirs."""
+    try:
+        told = _told_size(path)
+    except EvflowDataError:
+        if images is None:
+            raise
+        return images
+    return images if told is None or images == told[::-1] else told
 
 
 def _told_size(path: Path) -> Size | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -23,7 +23,7 @@ from evflow.io.decode.stream import Chunk, gather
 from evflow.io.formats import plain_text
 from evflow.io.hints import Hints
 from evflow.io.images.folder import decode
-from evflow.io.images.times import beside_events
+from evflow.io.images.streams import ImageStream, events_alone
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -31,6 +31,7 @@ NAME = "ijrr"
 EXTENSIONS: tuple[str, ...] = (".zip", ".txt", "")
 
 EVENTS, IMAGES = "events.txt", "images.txt"
+CLOCK = Note("frames.clock", "frame times are those of images.txt")
 ROW = re.compile(rb"\d+\.\d+[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?")
 
 Root = Path | zipfile.Path
@@ -86,19 +87,35 @@ def _is_events(name: str) -> bool:
 
 def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
     """path: what messages name."""
-    seconds, names = _read_index(root / IMAGES) if name == EVENTS else (np.zeros(0), [])
-    size = _image(root, names[0]).shape[1::-1] if names else None
+    indexed = name == EVENTS and (root / IMAGES).is_file()
+    seen = _size(root, hints) if indexed else None
     with (root / name).open("rb") as f:
-        chunks, native, found = plain_text.events(path, f, hints)
-        size = size or found.size
-        events, span, notes = gather(path, _some(path, chunks, hints, size), hints, size, native)
-        notes = (*found.notes, *notes)
-    if not names:
-        return Recording.of_events(events, notes)
-    times, told = beside_events(seconds, root / IMAGES, "s", hints, events)
-    return tables.with_frames(
-        path, events, span, times, lambda keep: (_image(root, n) for n in names[keep]),
-        (Note("frames.clock", "frame times are those of images.txt"), *notes, *told))
+        chunks, native, told = plain_text.events(path, f, hints)
+        size = told.size or seen
+        found = gather(path, _some(path, chunks, hints, size), hints, size, native)
+    if not indexed:
+        return Recording.of_events(found.events, (*told.notes, *found.notes))
+
+    def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+        seconds, names = _read_index(root / IMAGES)
+        return seconds, lambda keep: (_image(root, n) for n in names[keep])
+
+    images = tables.Images(ImageStream(IMAGES, seen), load)
+    return tables.with_frames(path, found, hints, images, "s", told.notes, (CLOCK,))
+
+
+def _size(root: Root, hints: Hints) -> Size | None:
+    """Of the first image, from which alone the sensor's is known; raises what is wrong with it
+    unless it is not needed."""
+    try:
+        with events_alone():
+            _, names = _read_index(root / IMAGES)
+            shape = _image(root, names[0]).shape if names else None
+    except (EvflowDataError, ValueError):
+        if hints.size is None and not hints.no_frames:
+            raise
+        return None
+    return None if shape is None else (shape[1], shape[0])
 
 
 def _some(
@@ -114,10 +131,7 @@ def _some(
 
 
 def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
-    """Times (T,) as written, seconds by the format, and names of the images; none where there is no
-    images.txt."""
-    if not index.is_file():
-        return np.zeros(0), []
+    """Times (T,) as written, seconds by the format, and names of the images."""
     seconds, names = [], []
     for number, content in enumerate(index.read_bytes().split(b"\n"), 1):
         fields = content.partition(b"#")[0].split()

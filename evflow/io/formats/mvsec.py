@@ -16,7 +16,6 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
-from evflow.io.images.times import beside_events
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -48,12 +47,9 @@ def read(path: Path, hints: Hints) -> Recording:
             return x, y, t, p
 
         chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
-        events, span, told = gather(path, chunks, hints, SIZE, "s")
-        notes = (Note("sensor.camera", f"the {side} camera was read"), *told)
+        found = gather(path, chunks, hints, SIZE, "s")
+        notes = (Note("sensor.camera", f"the {side} camera was read"),)
         if "image_raw" not in camera:
-            return Recording.of_events(events, notes)
-        frames = tables.dataset(path, camera, "image_raw", (None, None, None))
-        times = tables.dataset(path, camera, "image_raw_ts", (len(frames),))[:]
-        us, told = beside_events(times, path, "s", hints, events)
-        return tables.with_frames(path, events, span, us,
-                                  lambda keep: tables.stored_frames(frames, keep), notes + told)
+            return Recording.of_events(found.events, (*notes, *found.notes))
+        images = tables.dataset_images(path, camera, "image_raw", "image_raw_ts")
+        return tables.with_frames(path, found, hints, images, "s", notes)

@@ -24,7 +24,8 @@ from evflow.files.whole import need_members
 from evflow.io.decode import tables
 from evflow.io.decode.stream import Gathered, gather
 from evflow.io.hints import Hints
-from evflow.io.images.frames import cut
+from evflow.io.images.recorded import cut
+from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
 from evflow.io.writer import EventWriter
 from evflow.types import Events, Recording
@@ -57,9 +58,23 @@ def read(path: Path, hints: Hints) -> Recording:
                 "Expected the keys t, x, y, p, size, and optionally frames, frame_times.")
         stored = found.get("size", found.get("wh"))
         size: Any = None if stored is None else tuple(stored.whole().ravel().tolist())
-        events, span, notes = _events(path, [found[name] for name in COLUMNS], hints, size)
+        events = _events(path, [found[name] for name in COLUMNS], hints, size)
         if "frames" not in found:
-            return Recording.of_events(events, notes)
+            return Recording.of_events(events.events, events.notes)
+        return _with_frames(path, found, events, hints)
+
+
+def _with_frames(
+    path: Path, found: dict[str, Member], gathered: Gathered, hints: Hints
+) -> Recording:
+    events, span, notes = gathered
+    shape = found["frames"].shape
+    size = (shape[2], shape[1]) if len(shape) == 3 else None
+    chosen = choose((ImageStream("frames", size),), hints, events.size)
+    notes = (*notes, *chosen.notes)
+    if chosen.stream is None:
+        return Recording.of_events(events, notes)
+    with events_alone():
         if "frame_times" not in found:
             raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
         times, told = beside_events(found["frame_times"].whole(), path, "us", hints, events)

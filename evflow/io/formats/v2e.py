@@ -14,7 +14,6 @@ import numpy as np
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
-from evflow.io.images.times import beside_events
 from evflow.types import Recording
 
 NAME = "v2e"
@@ -29,20 +28,15 @@ def read(path: Path, hints: Hints) -> Recording:
     """Raises EV008, EV009, EV010 (h5py) and what `stream.gather` and `Recording` raise."""
     with tables.opened(path) as f:
         data = tables.dataset(path, f, "events", (None, 4))
-        frames = None
-        if "frame" in f:
-            frames = tables.dataset(path, f, "frame", (None, None, None))
-        size = tables.frame_size(frames)
+        size = tables.frame_size(f.get("frame"))
 
         def rows(part: slice) -> tuple[Any, Any, Any, Any]:
             t, x, y, p = np.ascontiguousarray(data[part].T)
             return x, y, t, p
 
         chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
-        events, span, notes = gather(path, chunks, hints, size)
-        if frames is None:
-            return Recording.of_events(events, notes)
-        times = tables.dataset(path, f, "frame_ts", (len(frames),))[:]
-        us, told = beside_events(times, path, "us", hints, events)
-        return tables.with_frames(path, events, span, us,
-                                  lambda keep: tables.stored_frames(frames, keep), notes + told)
+        found = gather(path, chunks, hints, size)
+        if "frame" not in f:
+            return Recording.of_events(found.events, found.notes)
+        return tables.with_frames(
+            path, found, hints, tables.dataset_images(path, f, "frame", "frame_ts"), "us")

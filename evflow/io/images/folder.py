@@ -86,17 +86,22 @@ def decode(file: Path | zipfile.Path) -> np.ndarray:
 
     Raises EV009 (damaged, cut off), EV016 (not there).
     """
-    import cv2
-
     try:
         if not file.is_file():  # a pipe has no end
             raise OSError(0, "it is no regular file")
         data = file.read_bytes()
     except OSError as e:
         raise EvflowDataError("EV016", f"{file} cannot be read ({e.strerror}).") from e
+    return decoded(data, file)
+
+
+def decoded(data: bytes, where: object) -> np.ndarray:
+    """The same of the bytes of an image; EV009. where: names them in messages."""
+    import cv2
+
     claimed = claimed_bytes(data)
     if claimed is not None:
-        check_expansion(claimed, len(data), file)
+        check_expansion(claimed, len(data), where)
     # OpenCV fills what is missing of a cut-off JPEG or PNG with grey and says nothing.
     jpeg, png = data.startswith(b"\xff\xd8"), data.startswith(b"\x89PNG")
     whole = not ((jpeg and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
@@ -108,7 +113,7 @@ def decode(file: Path | zipfile.Path) -> np.ndarray:
         image = None
     if image is None or not whole:
         raise EvflowDataError(
-            "EV009", f"{file} ({len(data):,} bytes) is {'not a sound' if whole else 'a cut-off'} "
+            "EV009", f"{where} ({len(data):,} bytes) is {'not a sound' if whole else 'a cut-off'} "
             "image.", "Copy it again.")
     return image
 

@@ -15,21 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.files.spool import Spool
 from evflow.io.decode.units import UNITS_US
 from evflow.io.hints import Hints, check_choices, known
 from evflow.io.images import values
 from evflow.light import response
 from evflow.light.colour import (
     COLOURS,
-    CONVERTED,
-    luma,
     mosaic_luma,
     mosaic_note,
     parse_pattern,
 )
 from evflow.notes import Note
-from evflow.types import Events, Recording
 
 Frames = Iterator[tuple[np.ndarray, int]]
 
@@ -59,6 +55,7 @@ class FrameHints:
     background: what transparent images are laid over, "black" or "white".
     start_s, stop_s: frames with start <= time < stop, in seconds from the first; of a recording
         from its first event.
+    frames_topic: of a recording, the images to take (see `Hints`).
     """
 
     fps: float | None = None
@@ -73,12 +70,13 @@ class FrameHints:
     background: str = "black"
     start_s: float | None = None
     stop_s: float | None = None
+    frames_topic: str | None = None
 
     def __post_init__(self) -> None:
         check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS,
                       flip=("none", *response.FLIPS), response=("auto", *response.RESPONSES),
                       background=tuple(values.BACKGROUNDS))
-        Hints(start_s=self.start_s, stop_s=self.stop_s)  # EV020 where they are no range
+        Hints(start_s=self.start_s, stop_s=self.stop_s, frames_topic=self.frames_topic)  # EV020
         if self.bayer is not None and parse_pattern(self.bayer) and self.colour != "luma":
             raise EvflowDataError(
                 "EV020", f"bayer={self.bayer} makes luma of a mosaic, colour={self.colour} wants "
@@ -210,50 +208,3 @@ def existing(path: str | os.PathLike) -> Path:
             "EV016", f"no file or folder at {path}.",
             "For a sequence of images pass their folder." if pattern else "")
     return path
-
-
-class FrameStack:
-    """Images (H, W) or (H, W, 3) in B, G, R that come one by one, as the frames of a recording:
-    colour becomes luma. Kept as `Spool` does it. where: names their file in messages."""
-
-    def __init__(self, where: object) -> None:
-        self.where, self.count = where, 0
-        self._first: np.ndarray | None = None  # as it came
-        self._spool: Spool | None = None
-
-    def append(self, image: np.ndarray) -> None:
-        """Raises EV002 (no image), EV003 and EV015 (dtype or shape change), EV019 (disk full)."""
-        if self._first is None:
-            if image.ndim != 2 and not (image.ndim == 3 and image.shape[-1] in (3, 4)):
-                raise EvflowDataError(
-                    "EV002", f"{self.where} has a frame of shape {image.shape}.",
-                    "Expected (H, W) or (H, W, 3).")
-            self._first = image
-        if image.shape != self._first.shape:
-            raise EvflowDataError(
-                "EV015", f"{self.where} has frames of shapes {self._first.shape} and "
-                f"{image.shape}.", "Use those of one sensor.")
-        if image.dtype != self._first.dtype:
-            raise EvflowDataError(
-                "EV003", f"{self.where} has frames of {self._first.dtype} and {image.dtype}.",
-                "Use those of one bit depth.")
-        grey = image if image.ndim == 2 else luma(image[..., :3])
-        self._spool = self._spool or Spool(grey.dtype)
-        self._spool.append(grey.ravel())
-        self.count += 1
-
-    def beside(self, events: Events, times: np.ndarray, notes: tuple[Note, ...]) -> Recording:
-        """The recording of these events and all frames, at `times` (T,); raises what it raises."""
-        if self._first is None or self._spool is None:
-            return Recording.of_events(events, notes)
-        frames = self._spool.array().reshape(self.count, *self._first.shape[:2])
-        if self._first.ndim == 3:
-            notes = (*notes, CONVERTED)
-        return Recording(events, frames, times, notes)
-
-
-def cut(recording: Recording, span: tuple[int, int]) -> Recording:
-    """The recording with those frames alone that lie in [start, stop) us."""
-    keep = slice(*np.searchsorted(recording.frame_times, np.array(span)))
-    return dataclasses.replace(
-        recording, frames=recording.frames[keep], frame_times=recording.frame_times[keep])

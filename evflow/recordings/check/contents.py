@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from evflow.notes import why_no_frames
 from evflow.recordings.check.findings import Finding
 from evflow.recordings.faulty_pixels import MOVING_FACTOR, hot_among_neighbours
 from evflow.types import Recording
@@ -24,8 +25,8 @@ def contents(recording: Recording) -> list[Finding]:
                         "Check --start and --stop, and that the camera was recording.")]
     counts = events.count_map()
     found = [] if recording.has_frames else [Finding(
-        "EV011", "warning", "the recording has events but no frames: thresholds cannot be "
-        "measured without intensity.",
+        "EV011", "warning", "the recording has events but no frames"
+        f"{why_no_frames(recording.notes)}: thresholds cannot be measured without intensity.",
         "Give frames, --frames DIR --timestamps FILE, or let a network guess them (evflow estimate "
         "--reconstruct); of a static scene the noise alone can be estimated.")]
     return [*found, *_one_polarity(counts), *_few(counts), *_hot(counts.sum(0))]

@@ -138,7 +138,7 @@ def test_aedat4_frames_that_come_late_are_read(
 
 
 @pytest.mark.parametrize("streams", [
-    {"a": "imus"}, {"a": "events", "b": "events"}, {"a": "events", "b": "frame", "c": "frame"}])
+    {"a": "imus"}, {"a": "events", "b": "events"}])
 def test_aedat4_of_several_cameras_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, streams: dict[str, str]
 ) -> None:

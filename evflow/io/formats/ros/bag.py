@@ -1,9 +1,9 @@
 """Recordings out of bags of ROS 1 and ROS 2, which the package `rosbags` opens: one topic of
 events, and the images beside it.
 
-sensor_msgs/Image of the same name space become frames, at their header's time, where the events
-are on ROS time. Of several topics the first with events is read, and the others are named in a
-note.
+sensor_msgs/Image and CompressedImage become frames, at their header's time, where the events are on
+ROS time; of several topics of images `streams.choose` takes one. Of several topics the first with
+events is read, and the others are named in a note.
 """
 
 from __future__ import annotations
@@ -12,16 +12,23 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
 from evflow.io.decode.stream import Damage, gather
-from evflow.io.formats.ros.messages import EVENT_TYPES, IMAGE, Message, Packet
+from evflow.io.formats.ros.messages import (
+    COMPRESSED,
+    EVENT_TYPES,
+    IMAGES,
+    Message,
+    Packet,
+)
 from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded
 from evflow.io.hints import Hints
-from evflow.io.images.frames import FrameStack
+from evflow.io.images import encodings
+from evflow.io.images.pictures import claimed_size
+from evflow.io.images.recorded import FrameStack
+from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -39,15 +46,21 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
     first = bag.first(topic, kind)
     found = decoded(bag.path, first, bag.packets(topic, kind))
     events, span, told = gather(bag.path, found.chunks, hints, first.size, found.native)
-    told = (*found.notes(), *told)
-    image_topic = bag.image_beside(topic)
-    if image_topic is None:
-        return Recording.of_events(events, notes + told)
-    if first.encoding in OTHER_CLOCK:
-        return Recording.of_events(events, (*notes, Note(
-            "frames.unused", f"images of {image_topic} were not read: events are on another "
-            "clock"), *told))
-    return bag.with_images(image_topic, events, span, hints, notes + told)
+    notes += (*found.notes(), *told)
+    with events_alone():
+        images = bag.image_streams(hints)
+        own_clock = first.encoding in OTHER_CLOCK
+        if images and own_clock and hints.frames_topic is None:
+            return Recording.of_events(events, (*notes, Note(
+                "frames.unused", f"images of {', '.join(s.name for s in images)} were not read: "
+                "events are on another clock; --frames-topic NAME takes them as they are")))
+        chosen = choose(images, hints, events.size, topic)
+        notes += chosen.notes
+        if chosen.stream is None:
+            return Recording.of_events(events, notes)
+        stack = bag.stack(chosen.stream.name, events.size, hints, None if own_clock else span)
+        clock = Note("frames.clock", f"frame times are the header times of {chosen.stream.name}")
+        return stack.beside(events, hints, (clock, *notes))
 
 
 class Bag:
@@ -91,11 +104,24 @@ class Bag:
                  if c.msgtype in kinds}
         return sorted(found, key=lambda pair: (found[pair] == 0, *pair))
 
-    def image_beside(self, topic: str) -> str | None:
-        """The topic of images in the name space of `topic`, else the only one."""
-        images = [name for name, _ in self.topics((IMAGE,))]
-        beside = [name for name in images if name.rsplit("/", 1)[0] == topic.rsplit("/", 1)[0]]
-        return beside[0] if beside else images[0] if len(images) == 1 else None
+    def image_streams(self, hints: Hints) -> list[ImageStream]:
+        """The topics of images that have messages, by name; none where none are wanted."""
+        found = [] if hints.no_frames else self.reader.connections
+        kinds = {c.topic: c.msgtype for c in found if c.msgtype in IMAGES and c.msgcount}
+        return [self._image_stream(*pair) for pair in sorted(kinds.items())]
+
+    def _image_stream(self, topic: str, kind: str) -> ImageStream:
+        try:
+            message = next(self.messages(topic))
+            message.stamp_ns()
+            if kind == COMPRESSED:
+                size = claimed_size(message.compressed())
+                return ImageStream(topic, size, "" if size else "compressed as is not known")
+            size, encoding = message.picture()
+        except Damage as e:
+            return ImageStream(topic, unusable=f"damaged: {e.seen}")
+        why = encodings.unreadable(encoding)
+        return ImageStream(topic, size, why, () if why else encodings.notes(encoding))
 
     def messages(self, topic: str) -> Iterator[Message]:
         wanted = [c for c in self.reader.connections if c.topic == topic]
@@ -140,18 +166,17 @@ class Bag:
         return EvflowDataError(
             "EV009", f"{self.path}, topic {topic}, message {e.byte:,}: {e.seen}.", "Copy it again.")
 
-    def with_images(
-        self, topic: str, events: Any, span: tuple[int, int], hints: Hints, notes: tuple[Note, ...]
-    ) -> Recording:
-        times, images = [], FrameStack(self.path)
+    def stack(
+        self, topic: str, size: Size, hints: Hints, span: tuple[int, int] | None
+    ) -> FrameStack:
+        """The images of a topic whose times lie in [start, stop) us."""
+        found = FrameStack(topic, size)
+        kind = next(c.msgtype for c in self.reader.connections if c.topic == topic)
         try:
             for message in self.messages(topic):
                 stamp = hints.instant(message.stamp_ns(), "ns")
-                if span[0] <= stamp < span[1]:
-                    times.append(stamp)
-                    images.append(message.image())
+                if span is None or span[0] <= stamp < span[1]:
+                    found.append(message.image(kind), stamp)
         except Damage as e:
             raise self._wrong(topic, e) from e
-        return images.beside(
-            events, np.array(times, np.int64),
-            (*notes, Note("frames.clock", f"frame times are the header times of {topic}")))
+        return found

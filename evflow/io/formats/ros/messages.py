@@ -16,20 +16,20 @@ import numpy as np
 
 from evflow.checks import Size
 from evflow.io.decode.stream import Damage
+from evflow.io.images import encodings
+from evflow.io.images.folder import decoded
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 EVENT_TYPES = (*ARRAYS, "event_camera_msgs/msg/EventPacket")
 IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+IMAGES = (IMAGE, COMPRESSED)
 
 CDR_LITTLE = bytes((0, 1, 0, 0))
 EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 ALIGNED = np.dtype({
     "names": ["x", "y", "s", "ns", "p"], "formats": ["<u2", "<u2", "<u4", "<u4", "u1"],
     "offsets": [0, 2, 6, 10, 14], "itemsize": 16})
-
-PIXELS: dict[str, tuple[str, int]] = {  # encoding: dtype, channels
-    "mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
-    "bgr8": ("u1", 3), "rgb8": ("u1", 3)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,23 +129,26 @@ class Message:
             packed[name] = rows[name]
         return packed.tobytes()
 
-    def image(self) -> np.ndarray:
-        """The pixels, (H, W) or (H, W, 3) in B, G, R, of an image whose header was read."""
+    def picture(self) -> tuple[Size, str]:
+        """(width, height) and encoding of an Image whose header was read."""
         height, width = self.fields("II")
-        encoding = self.text()
+        return (width, height), self.text()
+
+    def compressed(self) -> bytes:
+        """The file of an image in a CompressedImage whose header was read."""
+        self.text()  # its format, which the file tells too
+        return self.block()
+
+    def image(self, kind: str) -> np.ndarray:
+        """The pixels of an image whose header was read, as `encodings.decode` has them."""
+        if kind == COMPRESSED:
+            return decoded(self.compressed(), f"message {self.index:,}")
+        size, encoding = self.picture()
         big_endian, step = self.fields("BI")
-        data = np.frombuffer(self.block(), np.uint8)
-        if encoding not in PIXELS:
-            raise Damage(self.index, f"images are encoded as {encoding[:20]!r}; known are "
-                         f"{', '.join(PIXELS)}", "message")
-        kind, channels = PIXELS[encoding]
-        row = width * channels * np.dtype(kind).itemsize
-        if not (0 < row <= step and step * height == len(data)):
-            raise Damage(self.index, f"an image of {width}x{height} {encoding} in rows of {step} "
-                         f"bytes has {len(data):,} bytes", "message")
-        rows = np.ascontiguousarray(data.reshape(height, step)[:, :row])
-        pixels = rows.view((">" if big_endian else "<") + kind).astype(kind)
-        if channels == 1:
-            return pixels
-        colour = pixels.reshape(height, width, channels)
-        return colour if encoding == "bgr8" else colour[..., ::-1]
+        data = self.block()
+        if why := encodings.unreadable(encoding):
+            raise Damage(self.index, f"it is {why}, as others of its topic are not", "message")
+        try:
+            return encodings.decode(encoding, data, size, step, big_endian=bool(big_endian))
+        except ValueError as e:
+            raise Damage(self.index, str(e), "message") from e

@@ -1,0 +1,116 @@
+"""The header of AEDAT 4: where its packets are, and which output of DV each stream was.
+
+#!AER-DAT4.0, then a size and a FlatBuffer with the place of the table of packets, and XML that
+describes the streams. It is checked here before any decoder sees it.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+from xml.parsers import expat
+
+from evflow.errors import EvflowDataError
+
+MAGIC = b"#!AER-DAT4.0\r\n"
+TABLE_POSITION, INFO_NODE = 1, 2  # fields of the header's flatbuffer table: i64, XML
+MAX_DEPTH = 64  # of the XML; DV writes 5
+
+
+class Header(NamedTuple):
+    """packets: the byte where they begin; table: where theirs is, -1 for nowhere; outputs: of each
+    stream {"originalModuleName": ..., "originalOutputName": ...}, as far as they are told."""
+
+    packets: int
+    table: int
+    outputs: dict[str, dict[str, str]]
+
+
+def stream_names(outputs: dict[str, dict[str, str]], streams: Iterable[int]) -> dict[int, str]:
+    """What users call the streams: "accumulator/frames", or "1" where that tells them not apart."""
+    names: dict[int, str] = {}
+    for i in sorted(streams):
+        told = outputs.get(str(i), {})
+        parts = [told[key] for key in ("originalModuleName", "originalOutputName") if told.get(key)]
+        name = "/".join(parts) or str(i)
+        names[i] = f"{name}/{i}" if name in names.values() else name
+    return names
+
+
+def read_header(path: Path) -> Header:
+    """EV009 unless the header is a sound one."""
+    with open(path, "rb") as f:
+        magic, size = f.read(len(MAGIC)), int.from_bytes(f.read(4), "little")
+        header = f.read(min(size, os.path.getsize(path)))
+    try:
+        if magic != MAGIC or len(header) < size:
+            raise ValueError("cut off" if MAGIC.startswith(magic[:13]) else "wrong version line")
+        outputs = _outputs(_info_node(header))
+        place = _field(header, TABLE_POSITION)
+        table = struct.unpack_from("<q", header, place)[0] if place else -1
+    except (ValueError, struct.error, expat.ExpatError) as e:
+        raise EvflowDataError(
+            "EV009", f"{path} has a damaged AEDAT4 header ({e}).", "Copy it again.") from e
+    return Header(len(MAGIC) + 4 + size, table, outputs)
+
+
+def _field(header: bytes, number: int) -> int:
+    """The byte of a field of the header's flatbuffer, root table -> vtable -> field; 0: absent."""
+    (table,) = struct.unpack_from("<I", header, 0)
+    vtable = table - struct.unpack_from("<i", header, table)[0]
+    if vtable < 0:
+        raise ValueError("its table lies before it")
+    if struct.unpack_from("<H", header, vtable)[0] < 6 + 2 * number:
+        return 0
+    (field,) = struct.unpack_from("<H", header, vtable + 4 + 2 * number)
+    return table + field if field else 0
+
+
+def _info_node(header: bytes) -> bytes:
+    """The XML string of the header's flatbuffer."""
+    pointer = _field(header, INFO_NODE)
+    if not pointer:
+        raise ValueError("it has no description")
+    string = pointer + struct.unpack_from("<I", header, pointer)[0]
+    (length,) = struct.unpack_from("<I", header, string)
+    if not 0 < length <= len(header) - string - 4:
+        raise ValueError("its description is cut off")
+    return header[string + 4 : string + 4 + length]
+
+
+def _outputs(text: bytes) -> dict[str, dict[str, str]]:
+    """The attributes of each node right below outInfo, of XML. ValueError and ExpatError unless it
+    is UTF-8 XML, of tags in tags to a bounded depth."""
+    nodes: list[str] = []
+    key = ""
+    found: dict[str, dict[str, str]] = {}
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal key
+        nodes.append(attributes.get("name", "") if tag == "node" else "")
+        if len(nodes) > MAX_DEPTH:
+            raise ValueError(f"its description is nested more than {MAX_DEPTH} deep")
+        key = attributes.get("key", "") if tag == "attr" else ""
+
+    def end(_: str) -> None:
+        nonlocal key
+        nodes.pop()
+        key = ""
+
+    def written(words: str) -> None:
+        if key and len(nodes) > 2 and nodes[-3] == "outInfo":
+            told = found.setdefault(nodes[-2], {})
+            told[key] = told.get(key, "") + words
+
+    def refuse(*_: object) -> None:
+        raise ValueError("its description defines entities")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.CharacterDataHandler = written
+    parser.StartDoctypeDeclHandler = refuse
+    parser.Parse(text.decode("utf-8"), True)
+    return found

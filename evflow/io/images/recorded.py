@@ -1,0 +1,83 @@
+"""Frames that a recording brings along: one by one as they are decoded, then beside its events."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.files.spool import Spool
+from evflow.io.hints import Hints
+from evflow.light.colour import CONVERTED, luma
+from evflow.notes import Note
+from evflow.types import Events, Recording
+
+
+class FrameStack:
+    """Images (H, W) or (H, W, 3) in B, G, R that come one by one, as the frames of a recording:
+    colour becomes luma. Kept as `Spool` does it.
+
+    where: names their file in messages; size: (width, height) of the sensor: images of another one,
+    a region of it among them, are left out and counted.
+    """
+
+    def __init__(self, where: object, size: Size) -> None:
+        self.where, self.size, self.colour = where, size, False
+        self.times: list[int] = []
+        self.left: collections.Counter[str] = collections.Counter()
+        self._spool: Spool | None = None
+
+    def append(self, image: np.ndarray, time: int, origin: tuple[int, int] = (0, 0)) -> None:
+        """An image, its time, and the pixel of the sensor where it begins (x, y).
+
+        Raises EV002 (no image), EV003 (the dtype changes), EV019 (disk full).
+        """
+        if image.ndim != 2 and not (image.ndim == 3 and image.shape[-1] in (3, 4)):
+            raise EvflowDataError(
+                "EV002", f"{self.where} has a frame of shape {image.shape}.",
+                "Expected (H, W) or (H, W, 3).")
+        width, height = self.size
+        if image.shape[:2] != (height, width):
+            region = image.shape[0] <= height and image.shape[1] <= width and any(origin)
+            self.left[f"{image.shape[1]}x{image.shape[0]}"
+                      + (f" from x={origin[0]}, y={origin[1]}" if region else "")] += 1
+            return
+        grey = image if image.ndim == 2 else luma(image[..., :3])
+        if self._spool is None:
+            self._spool = Spool(grey.dtype)
+        if grey.dtype != self._spool.dtype:
+            raise EvflowDataError(
+                "EV003", f"{self.where} has frames of {self._spool.dtype} and {grey.dtype}.",
+                "Use those of one bit depth.")
+        self._spool.append(grey.ravel())
+        self.colour |= image.ndim == 3
+        self.times.append(time)
+
+    def beside(self, events: Events, hints: Hints, notes: tuple[Note, ...]) -> Recording:
+        """The recording of these events and all frames; raises what it raises."""
+        return self.at(np.array(self.times, np.int64), events, hints, notes)
+
+    def at(
+        self, times: np.ndarray, events: Events, hints: Hints, notes: tuple[Note, ...]
+    ) -> Recording:
+        """The same, at other times (T,) int64 us."""
+        if self.left:
+            sizes = ", ".join(f"{n:,} of {what}" for what, n in self.left.most_common(4))
+            notes = (*notes, Note("frames.unused", f"images of another size than the sensor's "
+                     f"{self.size[0]}x{self.size[1]} were left out: {sizes}"))
+        if self._spool is None:
+            return Recording.of_events(events, notes)
+        frames = self._spool.array().reshape(-1, *self.size[::-1])
+        if self.colour:
+            notes = (*notes, CONVERTED)
+        return Recording(events, frames, times, notes)
+
+
+def cut(recording: Recording, span: tuple[int, int]) -> Recording:
+    """The recording with those frames alone that lie in [start, stop) us."""
+    keep = slice(*np.searchsorted(recording.frame_times, np.array(span)))
+    return dataclasses.replace(
+        recording, frames=recording.frames[keep], frame_times=recording.frame_times[keep])

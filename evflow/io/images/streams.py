@@ -1,0 +1,199 @@
+"""Which images of a recording are the frames of its events: the one place that decides.
+
+A recording may hold several streams of images: the camera's own, copies of them that were blurred
+or rectified, depth, flow, and pictures that are made of the events. What a stream shows is told by
+its name (a topic, a data set, an output of DV), its size and its encoding. Frames are the raw
+images that lie nearest to the events; what was taken, and what was not, is said in notes. Nothing
+here keeps events from being read: without a stream that can be their frames there are none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import re
+from collections.abc import Iterator, Sequence
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.io.hints import Hints
+from evflow.notes import Note
+
+# What the words of a name begin with that tells what its images are.
+MADE = re.compile("recon|accum|render|visuali|viz|surface|timesurface|sae|iwe|firenet|"
+                  "histogram|voxel|edge|polarit")  # of the events
+MADE_LAST = re.compile("event|dvs")  # in the last place alone: namespaces of cameras are called so
+OTHER = re.compile("depth|dispar|flow|normals?(map)?$|segment|semantic|mask|label|instance|"
+                   "confidence|thermal|infrared|debug|overlay|heatmap|preview")  # no brightness
+CHANGED = re.compile("corrupt|blur|nois|denois|rect|undist|crop|resiz|downs|warp")
+SIDES = {"left": "", "right": ""}
+WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageStream:
+    """Images of one source. name: as a user names it; size: of its first image, None where that
+    is not known; unusable: why they can be no frames, "" where they can; notes: what is to be said
+    of frames that are these."""
+
+    name: str
+    size: Size | None = None
+    unusable: str = ""
+    notes: tuple[Note, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Chosen:
+    """stream: the frames, or None; notes: what was taken and what was left, and why."""
+
+    stream: ImageStream | None
+    notes: tuple[Note, ...] = ()
+
+
+def choose(
+    streams: Sequence[ImageStream], hints: Hints, sensor: Size, events: str = ""
+) -> Chosen:
+    """The stream that belongs to the events of a sensor (width, height).
+
+    events: their name, as `ImageStream.name`. Raises EV020 (no stream of the name asked for) and
+    EV015 or EV008 (that one cannot be their frames).
+    """
+    if hints.no_frames:
+        return Chosen(None)
+    if hints.frames_topic is not None:
+        return _named(streams, hints.frames_topic, sensor, events)
+    why = {stream.name: _against(stream, sensor, events) for stream in streams}
+    fit = [stream for stream in streams if not why[stream.name]]
+    fit = [stream for stream in fit if _kind(stream.name, events) != "changed"] or fit
+    far = min((_distance(stream.name, events) for stream in fit), default=(0, 0))
+    nearest = [stream for stream in fit if _distance(stream.name, events) == far]
+    if len({_parts(stream.name)[:-1] for stream in nearest}) > 1:
+        why |= {stream.name: "not the only one" for stream in nearest}
+        nearest = []
+    if not nearest:
+        return Chosen(None, _left(streams, why, None))
+    best = min(nearest, key=lambda s: ("raw" not in _own(s.name, events), s.name))
+    told = _left(streams, why, best) if len(streams) > 1 else ()
+    return Chosen(best, (*told, *best.notes))
+
+
+@contextlib.contextmanager
+def events_alone() -> Iterator[None]:
+    """While frames are read: what is wrong with them keeps nobody from the events, and how to read
+    these is told."""
+    try:
+        yield
+    except EvflowDataError as e:
+        raise EvflowDataError(
+            e.code, e.seen, f"{e.fix} The events alone: --no-frames (no_frames=True).".lstrip()
+        ) from e
+
+
+def _named(
+    streams: Sequence[ImageStream], name: str, sensor: Size, events: str
+) -> Chosen:
+    """The stream of that name, or of the only one that ends so."""
+    ends = [s for s in streams if s.name == name] or [
+        s for s in streams if ("/" + s.name).endswith("/" + name.strip("/"))]
+    there = ", ".join(s.name for s in streams) or "none"
+    if len(ends) != 1:
+        raise EvflowDataError(
+            "EV020", f"frames_topic={name!r} names {len(ends)} streams of images.",
+            f"There are: {there}. Or read the events alone: --no-frames (no_frames=True).")
+    stream = ends[0]
+    if stream.unusable:
+        raise EvflowDataError(
+            "EV008", f"images of {stream.name} can be no frames: {stream.unusable}.",
+            f"There are: {there}. Or read the events alone: --no-frames (no_frames=True).")
+    if stream.size not in (None, sensor):
+        raise EvflowDataError(
+            "EV015", f"images of {stream.name} are {_size(stream.size)}, the sensor has "
+            f"{_size(sensor)}.", "Frames and events must come from the same pixels. Is --size "
+            "right? Or read the events alone: --no-frames (no_frames=True).")
+    made = _kind(stream.name, events) == "made"
+    notes = (Note("frames.made", f"images of {stream.name} are made of the events, by their "
+                  "name"),) if made else ()
+    others = {s.name: "" for s in streams if s is not stream}
+    return Chosen(stream, (*_left(streams, others, stream), *notes, *stream.notes))
+
+
+def _against(stream: ImageStream, sensor: Size, events: str) -> str:
+    """Why the images are not taken for the frames of these events; "" where nothing is."""
+    kind = _kind(stream.name, events)
+    if kind == "made":
+        return "by its name made of the events"
+    if kind == "other":
+        return "by its name no brightness"
+    if stream.unusable:
+        return stream.unusable
+    if stream.size not in (None, sensor):
+        swapped = ": width and height swapped?" if stream.size == sensor[::-1] else ""
+        return f"{_size(stream.size)}, the sensor has {_size(sensor)}{swapped}"
+    return "of another camera" if _another_camera(stream.name, events) else ""
+
+
+def _left(
+    streams: Sequence[ImageStream], why: dict[str, str], best: ImageStream | None
+) -> tuple[Note, ...]:
+    """What was not taken, and what instead."""
+    others = [s.name + (f" ({why[s.name]})" if why.get(s.name) else "")
+              for s in streams if s is not best]
+    if not others:
+        return () if best is None else (Note("frames.stream", f"frames are those of {best.name}"),)
+    left = ", ".join(others)
+    if best is None:
+        other = "; --frames-topic NAME takes one" if len(streams) > 1 else ""
+        return (Note("frames.unused", f"images were not read as frames: {left}{other}"),)
+    return (Note("frames.stream", f"frames are the images of {best.name}; not taken: {left}; "
+                 "--frames-topic NAME takes another"),)
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    return tuple(part for part in name.split("/") if part)
+
+
+def _shared(name: str, events: str) -> int:
+    """How many places the name has in common with that of the events, from the first on."""
+    common = 0
+    for one, other in zip(_parts(name)[:-1], _parts(events)[:-1], strict=False):
+        if one != other:
+            break
+        common += 1
+    return common
+
+
+def _distance(name: str, events: str) -> tuple[int, int]:
+    """The smaller, the nearer to the events: first by shared places, then by further ones."""
+    return -_shared(name, events), len(_parts(name))
+
+
+def _own(name: str, events: str) -> list[str]:
+    """The words of a name, in lower case, but of the places that it shares with the events."""
+    own = "/".join(_parts(name)[_shared(name, events):])
+    return [word.lower() for word in WORD.findall(own)]
+
+
+def _kind(name: str, events: str) -> str:
+    """"made" of the events, "other" than brightness, a "changed" image, or an "image"."""
+    words, last = _own(name, events), _own(_parts(name)[-1] if _parts(name) else "", "")
+    if "e2vid" in name.lower() or any(map(MADE.match, words)) or any(map(MADE_LAST.match, last)):
+        return "made"
+    if any(map(OTHER.match, words)):
+        return "other"
+    return "changed" if any(map(CHANGED.match, words)) else "image"
+
+
+def _another_camera(name: str, events: str) -> bool:
+    """Do two names differ by a number, or left and right, alone: /cam0/events and /cam1/image?"""
+    one, other = _parts(name)[:-1], _parts(events)[:-1]
+    return one != other and [_numberless(part) for part in one] == [
+        _numberless(part) for part in other]
+
+
+def _numberless(part: str) -> tuple[str, ...]:
+    words = (word.lower() for word in WORD.findall(part))
+    return tuple(SIDES.get(word, word) for word in words if not word.isdigit())
+
+
+def _size(size: Size | None) -> str:
+    return "x".join(map(str, size or ()))
