@@ -28,7 +28,9 @@ from evflow.io.formats import (
     evt2,
     evt3,
     evt21,
+    hdf5,
     ijrr,
+    metavision,
     mvsec,
     npz,
     plain_text,
@@ -56,8 +58,8 @@ class Format(Protocol):
 
 
 FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
-    aedat4, aedat2, evt2, evt21, evt3, dat, v2e, mvsec, event_utils, dsec, npz, evimo2, evreal,
-    e2vid, v2e_text, ijrr, plain_text, ros1, ros2)
+    aedat4, aedat2, evt2, evt21, evt3, dat, v2e, mvsec, event_utils, metavision, dsec, hdf5, npz,
+    evimo2, evreal, e2vid, v2e_text, ijrr, plain_text, ros1, ros2)
 WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
     dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
     npz.NpzWriter, Aedat4Writer)}

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from helpers import tables
 from helpers.fuzz_registry import HOSTILE, hostile
-from helpers.fuzz_samples import Sample, sample
+from helpers.fuzz_samples import SAMPLES, Sample, sample
 from helpers.recordings import make
 
 from evflow.io import write_events
@@ -19,6 +19,8 @@ from evflow.io import write_events
 PLACES = {"dsec": ("events/t", "events/x", "frames", "frame_times", "t_offset"),
           "v2e": ("events", "frame", "frame_ts"),
           "mvsec": ("davis/left/events", "davis/left/image_raw", "davis/left/image_raw_ts"),
+          "metavision": ("CD/events",), "hdf5-columns": ("prophesee/left/t",),
+          "hdf5-matrix": ("all",),
           "event_utils": ("events/ts", "events/ps", "images/image000000001")}
 COMPOUND = np.dtype([("a", "<u2"), ("b", "<f8")])
 
@@ -69,6 +71,8 @@ def hdf5(folder: Path, kind: str, place: str, what: str) -> Sample:
     if kind == "dsec":
         path = folder / "a.h5"
         write_events(path, make(50, 2))
+    elif kind in SAMPLES and kind not in tables.WRITERS:
+        path = SAMPLES[kind](folder).path
     else:
         path = tables.write(folder, kind, 50)
     with h5py.File(path, "a") as f:

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
-from helpers import bags, streams, tables
+from helpers import bags, ecf, streams, tables
 from helpers.fuzz_aedat4 import STREAM, XML, event_packet, frame_packet, header, packet
 from helpers.recordings import SIZE, make, write_ijrr, zipped
 from helpers.videos import drifting
@@ -80,6 +81,24 @@ def table(folder: Path, kind: str) -> Sample:
 def dsec(folder: Path) -> Sample:
     write_events(folder / "a.h5", make(N, FRAMES))
     return sample(folder / "a.h5", sealed=True)
+
+
+def metavision(folder: Path, forms: tuple[int | None, ...]) -> Sample:
+    return sample(ecf.write(folder / "a.hdf5", streams.clustered(N), forms, geometry="240x180"),
+                  counted=True)
+
+
+def flat_hdf5(folder: Path, kind: str) -> Sample:
+    """Columns in a group of another name, or N x 4."""
+    ev = make(N).events
+    columns = {"x": ev.x, "y": ev.y, "t": ev.t, "p": ev.p.astype(np.uint8)}
+    with h5py.File(folder / "a.h5", "w") as f:
+        for name, column in columns.items() if kind == "columns" else ():
+            f[f"prophesee/left/{name}"] = column
+        if kind == "matrix":
+            f["all"] = np.stack([columns[name].astype(np.float64) for name in "xytp"], 1)
+        f.attrs["width"], f.attrs["height"] = SIZE
+    return sample(folder / "a.h5", counted=True)
 
 
 def npz(folder: Path) -> Sample:
@@ -253,6 +272,10 @@ SAMPLES: dict[str, Callable[[Path], Sample]] = {
     **{kind: partial(stream, kind=kind) for kind in (
         "aedat2", "dat", "evt2", "evt2.1", "evt3")},
     **{kind: partial(table, kind=kind) for kind in tables.WRITERS},
+    "metavision": partial(metavision, forms=(0, 1, 2)),
+    "metavision-plain": partial(metavision, forms=()),
+    "hdf5-columns": partial(flat_hdf5, kind="columns"),
+    "hdf5-matrix": partial(flat_hdf5, kind="matrix"),
     "dsec": dsec, "npz": npz, "ijrr": ijrr, "ijrr-zip": ijrr_zip, "e2vid-text": e2vid_text,
     "images-png": partial(images, suffix="png"), "images-jpg": partial(images, suffix="jpg"),
     "images-tif": partial(images, suffix="tif"), "images-bmp": partial(images, suffix="bmp"),

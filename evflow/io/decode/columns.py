@@ -70,12 +70,11 @@ def written_size(words: str) -> Size | None:
 def order_of(rows: np.ndarray) -> str:
     """"txyp", "xypt" or another order of the columns of rows (n, 4) of numbers without names;
     "" where they cannot be events."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         fits = {order: _fits(rows, order) for order in (*KNOWN, *OTHERS)}
-    sound = [order for order, rising in fits.items() if rising]
-    if len(sound) > 1:
+        sound = [order for order, rising in fits.items() if rising]
         span = {order: float(np.ptp(rows[:, order.index("t")])) for order in sound}
-        sound.sort(key=lambda order: (-span[order], (*KNOWN, *OTHERS).index(order)))
+    sound.sort(key=lambda order: (-span[order], (*KNOWN, *OTHERS).index(order)))
     return next(iter(sound), next((o for o in KNOWN if fits[o] is not None), ""))
 
 
@@ -95,7 +94,8 @@ def _fits(rows: np.ndarray, order: str) -> bool | None:
 
 
 def whole(values: np.ndarray) -> bool:
-    return bool((values % 1 == 0).all())
+    with np.errstate(invalid="ignore"):
+        return bool((values % 1 == 0).all())
 
 
 def inferred(order: Collection[str]) -> Note:

@@ -45,12 +45,18 @@ def plausible(path: Path, data: Any) -> Any:
     return data
 
 
-def need_filters(path: Path, data: Any) -> None:
-    """Load hdf5plugin where a compression filter is not built in; EV010."""
-    h5py = load_h5py()
+def filters_of(data: Any) -> list[int]:
+    """The numbers of the filters that its blocks went through, the first one first."""
     plist = data.id.get_create_plist()
-    filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
-    if all(h5py.h5z.filter_avail(number) for number in filters):
+    return [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
+
+
+def need_filters(path: Path, data: Any, own: int | None = None) -> None:
+    """Load hdf5plugin where a compression filter is not built in; EV010. own: one that the caller
+    undoes, which must be the only one."""
+    h5py = load_h5py()
+    filters = filters_of(data)
+    if all(h5py.h5z.filter_avail(number) for number in filters) or filters == [own]:
         return
     try:
         import hdf5plugin  # noqa: F401 (registers the filters)
@@ -58,6 +64,11 @@ def need_filters(path: Path, data: Any) -> None:
         raise EvflowDataError(
             "EV010", f"{path} is compressed by HDF5 filter {max(filters)}, which needs the package "
             "'hdf5plugin'.", 'pip install "evflow-jax[io]"') from e
+    if missing := [number for number in filters if not h5py.h5z.filter_avail(number)]:
+        raise EvflowDataError(
+            "EV010", f"{path}: {data.name} is compressed by HDF5 filter {missing[0]}, which HDF5 "
+            "and hdf5plugin lack.", "Name its plugin's folder in HDF5_PLUGIN_PATH, or repack "
+            "the file where it was written: h5repack -f GZIP=1 in.h5 out.h5.")
 
 
 class Disk(io.FileIO):

@@ -63,8 +63,11 @@ def _file(path: Path) -> Any:
     return File(path)
 
 
-def dataset(path: Path, group: Any, name: str, shape: tuple[int | None, ...]) -> Any:
-    """Data set `name` of that shape (None: any length); EV008 (absent), EV009, EV010."""
+def dataset(
+    path: Path, group: Any, name: str, shape: tuple[int | None, ...], own_filter: int | None = None
+) -> Any:
+    """Data set `name` of that shape (None: any length); EV008 (absent), EV009, EV010. own_filter:
+    a compression that the caller undoes by himself."""
     if name not in group:
         raise EvflowDataError(
             "EV008", f"{path}: {group.name} holds {sorted(group)[:8]} but not {name!r}.",
@@ -76,7 +79,7 @@ def dataset(path: Path, group: Any, name: str, shape: tuple[int | None, ...]) ->
         raise EvflowDataError(
             "EV009", f"{path}: {name} of {group.name} has shape {found}; expected {shape}.",
             "Write the file again.")
-    need_filters(path, plausible(path, data))
+    need_filters(path, plausible(path, data), own_filter)
     block = math.prod(data.chunks or (0,)) * data.dtype.itemsize
     if block > MAX_RATIO * os.path.getsize(path) + (1 << 20):  # HDF5 decodes whole blocks
         raise EvflowDataError(

@@ -21,6 +21,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import MAGIC, Hdf5Writer, plausible
+from evflow.io.decode.hdf5_search import told_size
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
 from evflow.notes import Note
@@ -30,6 +31,7 @@ NAME = "dsec"
 EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5", "")
 
 EVENTS = "events.h5"
+COLUMNS = ("x", "y", "t", "p")
 RECTIFY = Note("sensor.unrectified", "rectify_map.h5 is not applied: events stay at the sensor's "
                "own pixels, which have the thresholds")
 DSEC_SIZE = (640, 480)
@@ -45,7 +47,8 @@ def sniff(path: Path, head: bytes) -> bool:
         return False
     try:
         with tables.opened(path) as f:
-            return "events" in f and hasattr(f["events"], "keys")
+            return "events" in f and hasattr(f["events"], "keys") and (
+                "ms_to_idx" in f or all(name in f["events"] for name in COLUMNS))
     except EvflowDataError:
         return True  # `read` says why
 
@@ -77,6 +80,8 @@ def _size(f: Any) -> tuple[Size | None, Note | None]:
     """Of the sensor, None where nothing tells; and what was assumed."""
     if "width" in f.attrs and "height" in f.attrs:
         return (int(f.attrs["width"]), int(f.attrs["height"])), None
+    if size := told_size(f, f["events"]):  # RVT: events/width, events/height
+        return size, None
     if "ms_to_idx" in f and "t_offset" in f:
         return DSEC_SIZE, Note(
             "sensor.size", "the sensor is taken as {}x{}, as DSEC's are: pass --size where it is "

@@ -33,7 +33,7 @@ COLUMNS = ("xs", "ys", "ts", "ps")
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    return tables.holds(head, path, lambda f: "events/xs" in f)
+    return tables.holds(head, path, lambda f: "events/xs" in f and "events/ts" in f)
 
 
 def read(path: Path, hints: Hints) -> Recording:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import codecs
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -22,6 +22,7 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import columns, text
+from evflow.io.decode.arrays import in_unit
 from evflow.io.decode.stream import Chunk, collect
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
@@ -70,14 +71,10 @@ def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str
     chunks = text.events(f, (len(found.order),), found.begin, found.order)
     if hints.time_unit != "auto":
         return chunks, hints.time_unit, found
-    if found.unit not in ("auto", "whole"):
-        return _in_us(chunks, found.unit), "us", found
-    if found.unit == "whole":
-        first = list(itertools.islice(chunks, 1))
-        chunks = itertools.chain(first, chunks)
-        if not first or columns.whole(first[0].t):
-            return _in_us(_all_whole(path, chunks), "us"), "us", found
-    return text.in_seconds(path, chunks), "s", found
+    if found.unit == "auto":
+        return text.in_seconds(path, chunks), "s", found
+    chunks, native = in_unit(path, chunks, "auto" if found.unit == "whole" else found.unit, hints)
+    return text.in_seconds(path, chunks) if native == "s" else chunks, native, found
 
 
 def layout(head: bytes) -> Layout | None:
@@ -162,20 +159,3 @@ def _order(words: str) -> str:
 
 def _counts(column: list[float]) -> bool:
     return all(b - a == 1 for a, b in itertools.pairwise(column))
-
-
-def _all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    """Chunks of times that were taken for microseconds; EV003 at the first fraction."""
-    for chunk in chunks:
-        if not columns.whole(chunk.t):
-            raise EvflowDataError(
-                "EV003", f"{path}: the first times are whole, later ones are not.",
-                "Microseconds or seconds? Pass time_unit='us' or 's' (--time-unit).")
-        yield chunk
-
-
-def _in_us(chunks: Iterable[Chunk], unit: str) -> Iterator[Chunk]:
-    """Chunks whose times are in that unit, with fractions or without."""
-    told = Hints(time_unit=unit)
-    for chunk in chunks:
-        yield chunk._replace(t=told.microseconds(chunk.t, unit))

@@ -21,7 +21,9 @@ EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    return tables.holds(head, path, lambda f: getattr(f.get("events"), "shape", ())[1:] == (4,))
+    """Integers; floats of that shape have another order."""
+    return tables.holds(head, path, lambda f: getattr(f.get("events"), "shape", ())[1:] == (4,)
+                        and f["events"].dtype.kind != "f")
 
 
 def read(path: Path, hints: Hints) -> Recording:

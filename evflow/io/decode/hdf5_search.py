@@ -1,0 +1,144 @@
+"""Where events lie in an HDF5 file of any layout, and the size that stands beside them.
+
+Events are four data sets of one length in one group, by their names (x y t p, xs ys ts ps, x y
+timestamp polarity), a compound data set, or N x 4 numbers.
+"""
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.io.decode import arrays, columns, tables
+from evflow.io.decode.hdf5 import DAMAGE
+from evflow.io.decode.units import written_unit
+
+MOST = 2000  # groups and data sets looked at
+PAIRS = ("resolution", "sensor_resolution", "sensor_size", "geometry", "size")
+
+
+def walk(f: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Every group, the outer first, and its data sets by name; what cannot be opened is passed
+    over."""
+    queue, seen = collections.deque([f]), 0
+    while queue:
+        group = queue.popleft()
+        found: dict[str, Any] = {}
+        for name in group:
+            seen += 1
+            if seen > MOST:
+                return
+            try:
+                member = group[name]
+            except (EvflowDataError, *DAMAGE):
+                continue
+            if hasattr(member, "keys"):
+                queue.append(member)
+            elif hasattr(member, "dtype") and getattr(member, "shape", None) is not None:
+                found[name] = member
+        yield group, found
+
+
+def tables_of(path: Path, f: Any) -> list[tuple[Any, arrays.Table]]:
+    """(the group, the events) of all that may be events: named columns before compounds, those
+    before matrices, the outer before the inner, a left camera before others."""
+    ranked: list[tuple[tuple[int, int, bool, str], Any, arrays.Table]] = []
+    for group, found in walk(f):
+        for kind, table in _in_group(path, group, found):
+            name = table.name
+            rank = (kind, name.count("/"), "left" not in name.lower(), name)
+            ranked.append((rank, group, table))
+    ranked.sort(key=lambda entry: entry[0])
+    best = ranked[0][0][0] if ranked else 0
+    return [(group, table) for rank, group, table in ranked if rank[0] == best]
+
+
+def _in_group(
+    path: Path, group: Any, found: dict[str, Any]
+) -> Iterator[tuple[int, arrays.Table]]:
+    flat = [name for name, data in found.items()
+            if len(data.shape) == 1 and data.dtype.kind in "biuf"]
+    if chosen := columns.by_name(flat):
+        of = {c: found[name] for c, name in chosen.items()}
+        if len({len(data) for data in of.values()}) == 1:
+            of = {c: tables.dataset(path, group, name, (None,)) for c, name in chosen.items()}
+            yield 0, arrays.named(group.name, of, len(of["t"]), _unit(chosen["t"], of["t"]))
+    for name, data in found.items():
+        if len(data.shape) == 1 and data.dtype.fields and (table := arrays.structured(
+                data.name, tables.dataset(path, group, name, (None,)))):
+            yield 1, table
+        elif len(data.shape) == 2 and 4 in data.shape and (table := arrays.matrix(
+                data.name, tables.dataset(path, group, name, (None, None)))):
+            yield 2, table
+
+
+def _unit(name: str, data: Any) -> str:
+    """Of times, by their attributes, else by their name."""
+    for key in ("unit", "units"):
+        if isinstance(told := text(data.attrs.get(key)), str) and told:
+            return written_unit(f"[{told}]")
+    return written_unit(name)
+
+
+def text(value: Any) -> str | None:
+    """A string that an attribute holds, None where it holds something else."""
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
+    return str(value) if isinstance(value, str) else None
+
+
+def told_size(f: Any, group: Any) -> Size | None:
+    """(width, height) by the attributes or data sets of the group, its `calib`, or the root."""
+    calib = group.get("calib")
+    places = [group, *([calib] if hasattr(calib, "keys") else []), f]
+    for place in places:
+        for get in (place.attrs.get, lambda name, at=place: _small(at, name)):
+            if size := _size(get):
+                return size
+    return None
+
+
+def _size(get: Any) -> Size | None:
+    sides = [_numbers(get(name)) for name in ("width", "height")]
+    if len(sides[0]) == len(sides[1]) == 1:
+        return sides[0][0], sides[1][0]
+    for name in PAIRS:
+        value = get(name)
+        if isinstance(words := text(value), str):
+            if size := columns.written_size(f"{name} {words}"):
+                return size
+        elif len(pair := _numbers(value)) >= 2:
+            return max(pair[:2]), min(pair[:2])  # some write the height first; sensors are wide
+    return None
+
+
+def _small(group: Any, name: str) -> Any:
+    """The value of a small data set, None where there is none."""
+    if name not in group:
+        return None
+    data = group[name]
+    return data[()] if getattr(data, "size", None) and data.size <= 4 and not data.chunks else None
+
+
+def _numbers(value: Any) -> list[int]:
+    """Whole positive numbers of a value, none where it is something else."""
+    found = np.asarray(() if value is None else value).ravel()
+    if found.dtype.kind not in "iuf" or not len(found) or len(found) > 4:
+        return []
+    if not (np.isfinite(found).all() and (found > 0).all() and (found < 1 << 16).all()):
+        return []
+    return [int(v) for v in found]
+
+
+def listing(f: Any) -> str:
+    """The data sets of a file with their shapes, for messages."""
+    found = [f"{data.name} {data.dtype if data.dtype.names is None else data.dtype.names} "
+             f"{data.shape}" for _, members in walk(f) for data in members.values()]
+    more = f" and {len(found) - 12:,} more" if len(found) > 12 else ""
+    return (", ".join(found[:12]) or "no data set") + more

@@ -1,0 +1,57 @@
+"""HDF5 of any layout that names its columns, or holds N x 4 numbers: M3ED (prophesee/left/{x, y, t,
+p}, calib/resolution), e2calib and other flat files, compound data sets. See `hdf5_search`.
+
+Times that are whole are us, seconds where they have fractions, unless a name or an attribute tells
+the unit; a data set t_offset is added. Images are not read: their clock is each file's own.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from evflow.errors import EvflowDataError
+from evflow.io.decode import hdf5_search, tables
+from evflow.io.hints import Hints
+from evflow.notes import Note
+from evflow.types import Recording
+
+NAME = "hdf5"
+EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """Any: what other formats do not claim, `read` lists."""
+    return tables.holds(head, path, lambda f: True)
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises EV008 (nothing that could be events), EV009, EV010 (h5py or a filter) and what
+    `stream.gather` raises."""
+    with tables.opened(path) as f:
+        found = hdf5_search.tables_of(path, f)
+        if not found:
+            raise EvflowDataError(
+                "EV008", f"{path} is HDF5 without a layout that is known. It holds "
+                f"{hdf5_search.listing(f)}.",
+                "Name the events x, y, t, p in one group: with h5py, h5py.File(path, 'a') as f, "
+                "f['events/x'] = f['the/name/of/x'], and so for y, t (us) and p; no data is "
+                "copied.")
+        group, table = found[0]
+        size = hdf5_search.told_size(f, group)
+        gathered = table.gather(path, hints, size, _offset(hints, group))
+        return Recording.of_events(gathered.events, (*_said(found), *gathered.notes))
+
+
+def _offset(hints: Hints, group: Any) -> int:
+    if "t_offset" not in group or getattr(group["t_offset"], "size", None) != 1:
+        return 0
+    return hints.instant(group["t_offset"][()], "us")
+
+
+def _said(found: list[Any]) -> tuple[Note, ...]:
+    """Which of several was read."""
+    names = [table.name for _, table in found]
+    return () if len(names) == 1 else (Note(
+        "sensor.camera", f"of the events in {', '.join(names[:6])} those of {names[0]} were "
+        "read"),)

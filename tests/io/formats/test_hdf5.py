@@ -1,0 +1,155 @@
+"""HDF5 of other layouts: M3ED, RVT, e2calib, compounds, N x 4; and what is said where none fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from helpers.recordings import SIZE, equal, make, refused
+
+from evflow.io import read_events, read_recording
+from evflow.io.registry import find_format
+from evflow.types import Events
+
+EVENTS = make(300, 0).events
+COLUMNS = {"x": EVENTS.x, "y": EVENTS.y, "t": EVENTS.t, "p": EVENTS.p.astype(np.uint8)}
+SIGNED = np.where(EVENTS.p, 1, -1).astype(np.int8)
+
+
+def group(place: Any, names: str = "x y t p", **changed: Any) -> None:
+    for name, column in zip(names.split(), "xytp", strict=True):
+        place.create_dataset(name, data=changed.get(column, COLUMNS[column]))
+
+
+def rvt(f: Any) -> None:
+    group(f.create_group("events"))
+    f["events/width"], f["events/height"], f["events/divider"] = *SIZE, 10**6
+
+
+def m3ed(f: Any) -> None:
+    for side in ("right", "left"):
+        group(f.create_group(f"prophesee/{side}"), y=EVENTS.y * (side == "left"))
+        f[f"prophesee/{side}/calib/resolution"] = SIZE
+        f[f"prophesee/{side}/ms_map_idx"] = np.arange(9)
+    f["ovc/left/data"] = np.zeros((3, 4, 5, 1), np.uint8)
+
+
+def flat(f: Any) -> None:
+    group(f)
+    f.attrs["sensor_resolution"] = SIZE[::-1]
+
+
+def words(f: Any) -> None:
+    group(f.create_group("cam0/dvs"), "x y timestamp polarity", p=SIGNED)
+    f["cam0/dvs"].attrs.update(width=SIZE[0], height=SIZE[1])
+
+
+def nanoseconds(f: Any) -> None:
+    group(f.create_group("events"), "xs ys t_ns ps", t=EVENTS.t * 1000)
+    f.attrs["geometry"] = "64x48"
+
+
+def milliseconds(f: Any) -> None:
+    group(f, "u v time pol", t=EVENTS.t / 1e3)
+    f["time"].attrs["units"] = b"ms"
+    f["resolution"] = SIZE
+
+
+def offset(f: Any) -> None:
+    group(f.create_group("dvs"), t=(EVENTS.t - EVENTS.t[0]).astype(np.uint32))
+    f["dvs/t_offset"] = EVENTS.t[0]
+    f["dvs/size"] = SIZE
+
+
+def compound(f: Any) -> None:
+    kind = [("t", "i8"), ("x", "u2"), ("y", "u2"), ("on", "?")]
+    f["events"] = np.array(list(zip(EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p, strict=True)), kind)
+    f["events"].attrs["unit"] = "us"
+    f.attrs["width"], f.attrs["height"] = SIZE
+
+
+def matrix(f: Any) -> None:
+    """MVSEC's order at the root, whole us in floats."""
+    f["events"] = np.stack([EVENTS.x, EVENTS.y, EVENTS.t, SIGNED], 1).astype(np.float64)
+    f.attrs["resolution"] = SIZE
+
+
+def across(f: Any) -> None:
+    f["davis240/all"] = np.stack([EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p])
+    f.attrs["resolution"] = SIZE
+
+
+LAYOUTS: dict[str, Callable[[Any], None]] = {make.__name__: make for make in (
+    rvt, m3ed, flat, words, nanoseconds, milliseconds, offset, compound, matrix, across)}
+
+
+def write(folder: Path, kind: str) -> Path:
+    with h5py.File(folder / "a.h5", "w") as f:
+        LAYOUTS[kind](f)
+    return folder / "a.h5"
+
+
+@pytest.mark.parametrize("kind", LAYOUTS)
+def test_layouts(tmp_path: Path, kind: str) -> None:
+    path = write(tmp_path, kind)
+    name = find_format(path).NAME
+    assert name == ("dsec" if kind == "rvt" else "hdf5")
+    found = read_recording(path)
+    equal(found.events, EVENTS)
+    first = int(EVENTS.t[0])
+    part = read_events(path, start_s=0.1, stop_s=0.2)
+    equal(part, EVENTS.slice(first + 10**5, first + 2 * 10**5))
+    codes = {"m3ed": ["sensor.camera"], "matrix": ["events.layout"], "across": ["events.layout"]}
+    assert [note.code for note in found.notes] == codes.get(kind, [])
+
+
+def test_the_camera_that_was_read_is_named(tmp_path: Path) -> None:
+    note, = read_recording(write(tmp_path, "m3ed")).notes
+    assert "/prophesee/left, /prophesee/right those of /prophesee/left" in note.text
+
+
+def test_other_layouts_are_listed_and_the_advice_holds(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as f:
+        group(f.create_group("raw"), "column_index line stamp sign")
+        f["raw/gyro"] = np.zeros((7, 3))
+        f["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/x")
+    error = refused(path, size=SIZE)
+    assert error.code == "EV008"
+    for seen in ("/raw/column_index uint16 (300,)", "/raw/stamp int64", "/raw/gyro float64 (7, 3)"):
+        assert seen in error.seen
+    with h5py.File(path, "a") as f:
+        for name, old in zip("xytp", ("column_index", "line", "stamp", "sign"), strict=True):
+            f[f"events/{name}"] = f[f"raw/{old}"]
+    equal(read_events(path, size=SIZE), EVENTS)
+
+
+@pytest.mark.parametrize(("change", "code", "seen"), [
+    ({"t": EVENTS.t[::-1]}, "EV004", "goes back"),
+    ({"x": np.full(300, 64)}, "EV005", "outside 64x48"),
+    ({"x": EVENTS.x / 7}, "EV003", "undistorted"),
+    ({"p": np.full(300, 255, np.uint8)}, "EV006", "255"),
+    ({"t": np.full(300, np.nan)}, "EV007", "nan"),
+    ({"p": COLUMNS["p"][:-1]}, "EV008", "/p uint8 (299,)")])
+def test_values_that_cannot_be(tmp_path: Path, change: Any, code: str, seen: str) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as f:
+        group(f, **change)
+    error = refused(tmp_path / "a.h5", size=SIZE)
+    assert error.code == code
+    assert seen in str(error)
+
+
+def test_a_matrix_that_is_none_of_events(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as f:
+        f["poses"] = np.random.default_rng(0).normal(size=(50, 4))
+    assert refused(tmp_path / "a.h5", size=SIZE).code == "EV008"
+
+
+def test_no_event_at_all(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as f:
+        group(f, **{name: column[:0] for name, column in COLUMNS.items()})
+    equal(read_events(tmp_path / "a.h5", size=SIZE), Events([], [], [], [], SIZE))
