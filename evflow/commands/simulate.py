@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,8 +22,11 @@ from evflow.notes import as_dicts
 if TYPE_CHECKING:
     from evflow.camera.sensors import SensorModel
     from evflow.io.images.frames import Frames, FrameSource
-    from evflow.io.writer import EventWriter
     from evflow.simulator.photoreceptor import Photoreceptor
+
+
+Pair = tuple[np.ndarray, int]  # frame, time in us
+DEPTH = 8  # frames made ahead of the simulation, and blocks of events that wait to be written
 
 
 @own_first
@@ -113,17 +118,14 @@ class Simulate(Compiling):
         import jax
 
         from evflow import io
-        from evflow.light.colour import as_seen
         from evflow.process.terminal import bar
+        from evflow.process.threads import ahead, behind
         from evflow.simulator import simulate_stream
-        from evflow.simulator.interpolate import unzip, upsample
-        from evflow.simulator.photoreceptor import seen_frames
+        from evflow.simulator.interpolate import unzip
 
         format = named(self.format, self.out)
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
         source = self._source()
-        camera = _camera(self, source.size)
-        sensor = self._model()
         count = frames = 0
 
         def shown(done: int, total: int) -> None:
@@ -131,20 +133,16 @@ class Simulate(Compiling):
             frames = done
             progress(done, total)
 
-        with bar("simulating") as progress, io.open_writer(
-                self.out, source.size, format, overwrite=self.overwrite) as writer:
-            limit = self.max_motion_px if self.interpolate else 0.0
-            video = source.watched(shown)
-            if self.frames_too:
-                video = _recorded(video, self.colour, writer)
-            pairs = as_seen(
-                video, self.colour, None if limit == 0 else lambda slow, pixel:
-                upsample(slow, max_motion_px=pixel * limit, warn=source.notes.append))
-            pairs = seen_frames(pairs, self._seen_by(source))
-            for events in simulate_stream(jax.random.key(self.seed), *unzip(pairs), camera,
-                                          model=sensor):
-                writer.append(events)
-                count += len(events)
+        with bar("simulating") as progress, ahead(self._frames(source, shown), DEPTH) as made:
+            camera, sensor = _camera(self, source.size), self._model()
+            with io.open_writer(
+                self.out, source.size, format, overwrite=self.overwrite
+            ) as writer, behind(DEPTH) as later:
+                pairs = _recorded(made, partial(later, writer.append_frames))
+                for events in simulate_stream(jax.random.key(self.seed), *unzip(pairs), camera,
+                                              model=sensor):
+                    later(writer.append, events)
+                    count += len(events)
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": count, "frames": frames,
@@ -165,6 +163,26 @@ class Simulate(Compiling):
             bayer=self.bayer, response=self.response, background=self.background,
             flip=self.flip_frames, start_s=self.start, stop_s=self.stop,
             frames_topic=self.frames_topic)
+
+    def _frames(
+        self, source: FrameSource, shown: Callable[[int, int], None]
+    ) -> Iterator[tuple[Pair, list[Pair]]]:
+        """The frames that the pixels are shown; and beside each those that have come since the one
+        before, to be written, if they are."""
+        from evflow.light.colour import as_seen
+        from evflow.simulator.interpolate import upsample
+        from evflow.simulator.photoreceptor import seen_frames
+
+        limit = self.max_motion_px if self.interpolate else 0.0
+        video, came = source.watched(shown), list[Pair]()
+        if self.frames_too:
+            video = _kept(video, self.colour, came)
+        pairs = as_seen(
+            video, self.colour, None if limit == 0 else lambda slow, pixel:
+            upsample(slow, max_motion_px=pixel * limit, warn=source.notes.append))
+        for pair in seen_frames(pairs, self._seen_by(source)):
+            yield pair, came.copy()
+            came.clear()
 
     def _seen_by(self, source: FrameSource) -> Photoreceptor:
         """The measured camera's photoreceptor; of its light and clock only in front of frames that
@@ -188,14 +206,23 @@ class Simulate(Compiling):
         return model
 
 
-def _recorded(video: Frames, colour: str, writer: EventWriter) -> Frames:
-    """The frames on their way, each written as the pixels see it."""
+def _kept(video: Frames, colour: str, came: list[Pair]) -> Frames:
+    """The frames on their way, each added to `came` as the pixels see it."""
     from evflow.light.colour import as_seen
 
     for frame, time in video:
-        seen, _ = next(as_seen(iter([(frame, time)]), colour))
-        writer.append_frames(seen[None], np.array([time]))
+        came += as_seen(iter([(frame, time)]), colour)
         yield frame, time
+
+
+def _recorded(
+    made: Iterator[tuple[Pair, list[Pair]]], write: Callable[[np.ndarray, np.ndarray], None]
+) -> Frames:
+    """The frames of `Simulate._frames` on their way, those beside them written."""
+    for pair, came in made:
+        for frame, time in came:
+            write(frame[None], np.array([time]))
+        yield pair
 
 
 def _camera(command: Simulate, size: tuple[int, int]) -> Any:

@@ -1,0 +1,106 @@
+"""Steps of a long work at the same time, in threads: reading ahead, and writing behind.
+
+For steps that spend their time where Python lets others run: in OpenCV, XLA, HDF5. Order, and so
+the result, is that of one thread. Signals reach the main thread alone, wherever it is: so the
+queues are those that no signal can leave locked, and each block ends with its thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+@contextlib.contextmanager
+def ahead(items: Iterable[T], depth: int) -> Iterator[Iterator[T]]:
+    """The same items, made by a thread up to `depth` + 1 ahead of the reader. What making them
+    raises is raised in its place, to the reader."""
+    made: SimpleQueue[tuple[T] | BaseException | None] = SimpleQueue()
+    room = _room(depth)
+    stopped = False
+
+    def make() -> None:
+        end: BaseException | None = None
+        try:
+            source = iter(items)
+            with contextlib.ExitStack() as closing:
+                closing.callback(getattr(source, "close", lambda: None))
+                for item in source:
+                    room.get()
+                    if stopped:
+                        break
+                    made.put((item,))
+        except BaseException as e:
+            end = e
+        made.put(end)
+
+    def read() -> Iterator[T]:
+        while isinstance(one := made.get(), tuple):
+            room.put(None)
+            yield one[0]
+        if one is not None:
+            raise one
+
+    thread = threading.Thread(target=make, daemon=True)
+    try:
+        thread.start()
+        yield read()
+    finally:
+        stopped = True
+        room.put(None)
+        thread.join()
+
+
+@contextlib.contextmanager
+def behind(depth: int) -> Iterator[Callable[..., None]]:
+    """A function later(do, *arguments): a thread makes these calls, one after the other, up to
+    `depth` behind. At the end of the block all are made; where it raises, those that wait are
+    dropped. What a call raises ends them, and comes out of the next `later` or of the block."""
+    calls: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
+    room = _room(depth)
+    dropped = False
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        while (call := calls.get()) is not None:
+            try:
+                if not (failed or dropped):
+                    call()
+            except BaseException as e:
+                failed.append(e)
+            room.put(None)
+
+    def later(do: Callable[..., Any], *arguments: Any) -> None:
+        room.get()
+        if failed:
+            raise failed[0]
+        calls.put(partial(do, *arguments))
+
+    thread = threading.Thread(target=work, daemon=True)
+    try:
+        thread.start()
+        yield later
+        calls.put(None)
+        thread.join()
+    except BaseException:
+        dropped = True
+        raise
+    finally:
+        calls.put(None)
+        thread.join()
+    if failed:
+        raise failed[0]
+
+
+def _room(depth: int) -> SimpleQueue[None]:
+    """A queue of `depth` places."""
+    room: SimpleQueue[None] = SimpleQueue()
+    for _ in range(depth):
+        room.put(None)
+    return room

@@ -1,0 +1,107 @@
+"""Reading ahead and writing behind: the order of one thread, its errors, and no thread left."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from evflow.process.threads import ahead, behind
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_is_left() -> Iterator[None]:
+    before = threading.active_count()
+    yield
+    assert threading.active_count() == before
+
+
+def counted(log: list[str], wrong_at: int = -1) -> Iterator[int]:
+    try:
+        for i in range(1000):
+            if i == wrong_at:
+                raise ValueError("no such frame")
+            log.append(f"made {i}")
+            yield i
+    finally:
+        log.append("closed by " + ("main" if threading.current_thread() is threading.main_thread()
+                                   else "a thread"))
+
+
+def test_items_come_in_order_from_a_thread() -> None:
+    log: list[str] = []
+    with ahead(counted(log), 3) as items:
+        assert list(items) == list(range(1000))
+    assert log[-1] == "closed by a thread"
+
+
+def test_only_so_many_are_made_ahead_and_the_rest_never() -> None:
+    log: list[str] = []
+    with ahead(counted(log), 3) as items:
+        assert [next(items), next(items)] == [0, 1]
+    assert len(log) <= 2 + 3 + 1 + 1  # taken, ahead, in hand, closed
+    assert log[-1] == "closed by a thread"
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_error_comes_after_the_items_before_it(error: type[BaseException]) -> None:
+    def items() -> Iterator[int]:
+        yield from range(5)
+        raise error("no such frame")
+
+    got: list[int] = []
+    with pytest.raises(error, match="no such frame"), ahead(items(), 2) as made:
+        got.extend(made)
+    assert got == list(range(5))
+
+
+def test_calls_are_made_in_order_and_all_by_the_end() -> None:
+    done: list[int] = []
+    with behind(2) as later:
+        for i in range(100):
+            later(done.append, i)
+            assert len(done) >= i - 3
+    assert done == list(range(100))
+
+
+def test_what_a_call_raises_ends_them_and_comes_out() -> None:
+    done: list[int] = []
+
+    def write(i: int) -> None:
+        if i == 3:
+            raise OSError("disk full")
+        done.append(i)
+
+    def written(last: int) -> None:
+        with behind(2) as later:
+            for i in range(last + 1):
+                later(write, i)
+
+    for last in (3, 99):  # at the end of the block; in the middle of it
+        done.clear()
+        with pytest.raises(OSError, match="disk full"):
+            written(last)
+        assert done == [0, 1, 2]
+
+
+def test_calls_that_wait_are_dropped_where_the_block_raises() -> None:
+    done: list[int] = []
+    begun, go = threading.Event(), threading.Event()
+
+    def slow() -> None:
+        begun.set()
+        go.wait(10)
+        done.append(0)
+
+    def interrupted() -> None:
+        with behind(5) as later:
+            later(slow)
+            later(done.append, 1)
+            begun.wait(10)
+            threading.Timer(0.02, go.set).start()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert done == [0]  # what was under way was finished
