@@ -19,6 +19,7 @@ from evflow.dataset.sequence import EventSequence, sequence_names
 from evflow.dataset.store import SUFFIXES, Format
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
+from evflow.files.regular import need_regular
 from evflow.process.provenance import sha256
 
 Record = dict[str, Any]
@@ -215,11 +216,11 @@ def _fault(folder: Path, entry: Record, *, deep: bool) -> str | None:
 def _read(path: Path) -> dict[str, Any]:
     """One manifest; EV009 where it is cut off or is none."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(need_regular(path).read_text())
         shapes = {"dataset": dict, "sequences": dict, "made_by": list}
         if not all(isinstance(content[k], kind) for k, kind in shapes.items()):
             raise TypeError("not a manifest")
-    except (ValueError, TypeError, KeyError) as e:
+    except (ValueError, TypeError, KeyError, RecursionError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is cut off or no manifest ({type(e).__name__}: {e}).",
             "--only-missing removes it and makes what no other manifest records.") from e

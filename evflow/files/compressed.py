@@ -1,16 +1,54 @@
-"""How much zstd and LZ4 frames can expand to, by the headers of their blocks alone.
+"""Frames of zstd, LZ4 and bzip2, unpacked no further than told; and how much zstd and LZ4 frames
+can expand to, by the headers of their blocks alone.
 
-Decoders that take no limit are asked only after this: a zstd block of 4 bytes stands for 128 KiB of
-one byte, so that 1 MB of them fill 32 GB (RFC 8878, 3.1.1; lz4_Frame_format.md).
+A zstd block of 4 bytes stands for 128 KiB of one byte, so that 1 MB of them fill 32 GB (RFC 8878,
+3.1.1; lz4_Frame_format.md). Decoders that take no limit are asked only after `most_bytes`.
 """
 
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 ZSTD, LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
+SKIPPED = b"\x2a\x4d\x18"  # behind a byte of 0x50 to 0x5f: a frame of no data, of either kind
 ZSTD_BLOCK = 1 << 17
 LZ4_RATIO = 255
+
+
+def decoder_of(kind: str) -> Any:
+    """A decoder of "zstd", "lz4" or "bz2" with decompress(data, max_length), eof and unused_data;
+    ImportError where its package is missing, ValueError for other kinds."""
+    if kind == "zstd":
+        try:
+            from compression import zstd  # type: ignore[import-not-found, unused-ignore]
+        except ImportError:
+            from backports import zstd
+        return zstd.ZstdDecompressor()
+    if kind == "lz4":
+        from lz4.frame import LZ4FrameDecompressor
+
+        return LZ4FrameDecompressor()
+    if kind == "bz2":
+        import bz2
+
+        return bz2.BZ2Decompressor()
+    raise ValueError(f"compression {kind[:20]!r} is not known")
+
+
+def unpack(data: bytes, kind: str, most: int) -> bytes:
+    """What all frames of `data` hold; ValueError where that is more than `most` bytes, or they are
+    cut off, and what the decoder raises on damage."""
+    parts, left, rest = list[bytes](), most, data
+    while rest:
+        decoder = decoder_of(kind)
+        parts.append(decoder.decompress(rest, max_length=left + 1))
+        left -= len(parts[-1])
+        if left < 0 or not decoder.eof:
+            raise ValueError(f"{len(data):,} bytes of {kind} are cut off, or expand to more than "
+                             f"{most:,}")
+        rest = decoder.unused_data or b""
+    return b"".join(parts)
 
 
 def most_bytes(data: bytes) -> int:
@@ -19,9 +57,14 @@ def most_bytes(data: bytes) -> int:
     read = {ZSTD: _zstd, LZ4: _lz4}
     at = total = 0
     try:
-        while (magic := bytes(data[at : at + 4])) in read:
-            at, size = read[magic](data, at + 4)
-            total += size
+        while magic := bytes(data[at : at + 4]):
+            if magic[:1] and magic[0] >> 4 == 5 and magic[1:] == SKIPPED:
+                at += 8 + struct.unpack_from("<I", data, at + 4)[0]
+            elif magic in read:
+                at, size = read[magic](data, at + 4)
+                total += size
+            else:
+                break
     except (struct.error, IndexError):
         pass
     return max(total, len(data))

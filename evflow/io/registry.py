@@ -14,6 +14,7 @@ from typing import Protocol, Unpack
 
 from evflow.checks import Size, need
 from evflow.errors import EvflowDataError, naming
+from evflow.files.regular import need_regular
 from evflow.io.decode.text import HEAD
 from evflow.io.decode.units import check_seconds
 from evflow.io.formats import (
@@ -262,7 +263,5 @@ def _check_named(recording: Recording, told: Hints) -> None:
 
 
 def _head(path: Path) -> bytes:
-    if path.exists() and not path.is_file():  # to open a pipe would wait for its writer
-        raise OSError("it is no regular file")
-    with open(path, "rb") as f:
+    with open(need_regular(path), "rb") as f:
         return f.read(HEAD)

@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 
 from evflow.files.atomic import atomic_write
+from evflow.files.regular import is_there
 from evflow.process import devices
 from evflow.process.terminal import bar
 
@@ -87,7 +88,7 @@ class Log:
 def lines_until(path: Path, step: int) -> Iterator[str]:
     """The lines of a log up to `step`; none where there is no log. A line that a crash cut short
     lies beyond the last checkpoint."""
-    for line in path.read_text().splitlines() if path.exists() else ():
-        with contextlib.suppress(json.JSONDecodeError):
+    for line in path.read_text(errors="replace").splitlines() if is_there(path) else ():
+        with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
             if json.loads(line)["step"] <= step:
                 yield line

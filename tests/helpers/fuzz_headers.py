@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers import bags
 from helpers.fuzz_aedat4 import STREAM, XML, event_packet, header
 from helpers.fuzz_archives import BOMB
 from helpers.fuzz_registry import each, hostile
@@ -178,35 +177,3 @@ def coco(folder: Path, case: str) -> Sample:
     made = SAMPLES["coco"](folder)
     made.path.write_text(case)
     return made
-
-
-# --------------------------------------------------------------------------------------- ROS bags
-
-if "rosbag" in SAMPLES:
-    @hostile
-    def bag_bomb(folder: Path) -> Sample:
-        """A chunk of some 700 bytes of bzip2 in place of one that holds the messages."""
-        from rosbags.rosbag1 import Writer
-
-        messages = bags.array_messages(make(50).events)
-        long = b"".join(messages[0][3:]) + bytes(1 << 27)
-        path = folder / "a.bag"
-        writer = Writer(path)
-        writer.set_compression(writer.CompressionFormat.BZ2)
-        with writer:
-            topic, kind, ns, _ = messages[0]
-            connection = writer.add_connection(topic, kind, msgdef="uint8 x\n", md5sum="0" * 32)
-            writer.write(connection, ns, long)
-        return sample(path)
-
-    @hostile
-    def bag2_bomb(folder: Path) -> Sample:
-        """A message of zeros in a chunk of some 12 kB."""
-        import numpy as np
-        from helpers import bags2
-
-        store = bags2.Store.new()
-        kind, ns, packet = store.packets(make(50).events, "mono")[0]
-        packet.events = np.zeros(1 << 27, np.uint8)
-        return sample(store.write(folder / "bag", {"/events": [(kind, ns, packet)]}, "MCAP",
-                                  "STORAGE"))

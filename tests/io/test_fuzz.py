@@ -204,6 +204,7 @@ def test_an_npy_header_is_read_no_further_than_numpy_would(tmp_path: Path) -> No
     (b"\x28\xb5\x2f\xfd\x20\x05" + b"\x29\0\0hello", 14),  # raw; never less than is there
     (b"\x28\xb5\x2f\xfd\0\x38" + b"\x02\0\x10\0" * 9 + b"\x03\0\x10\0", 10 << 17),  # one byte each
     (b"\x28\xb5\x2f\xfd\0\x38" + b"\x25\0\0" + bytes(4), 1 << 17),
+    (b"\x5a\x2a\x4d\x18\x02\0\0\0ab\x28\xb5\x2f\xfd\0\x38" + b"\x03\0\x10\0", 1 << 17),
     (b"\x04\x22\x4d\x18\x60\x40\0" + b"\x0a\0\0\0" + bytes(10) + bytes(4), 2550),
     (b"\x04\x22\x4d\x18\x60\x40\0" + b"\0\x04\0\0" + bytes(1024) + bytes(4), 1 << 16),
     (b"\x04\x22\x4d\x18\x60\x40\0" + b"\xe8\3\0\x80" + bytes(1000) + bytes(4), 1015)])

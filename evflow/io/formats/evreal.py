@@ -17,6 +17,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.arrays import GrowingArray, mapped
 from evflow.files.folders import atomic_folder
+from evflow.files.regular import is_there
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
@@ -60,7 +61,13 @@ def _unit(times: np.ndarray) -> str:
     return "s" if times.dtype.kind == "f" else "us"
 
 
+<<<<<<< HEAD
 def _images(path: Path) -> np.ndarray:
+=======
+def _images(path: Path) -> np.ndarray | None:
+    if not is_there(path / "images.npy"):
+        return None
+>>>>>>> 077d66c (ROS 2 bags are read without trust: bounded unpacking, plain tables, no YAML; pipes and devices are refused wherever a file is read)
     try:
         return mapped(path / IMAGES, (None, None, None))
     except EvflowDataError:
@@ -86,7 +93,7 @@ def _size(path: Path, images: Size | None) -> Size | None:
 
 def _told_size(path: Path) -> Size | None:
     file = path / "metadata.json"
-    if not file.is_file() or file.stat().st_size > 1 << 20:
+    if not is_there(file) or file.stat().st_size > 1 << 20:
         return None
     try:
         height, width = json.loads(file.read_text("utf-8"))["sensor_resolution"][:2]

@@ -18,6 +18,7 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.archives import DAMAGE, unzipped
+from evflow.files.regular import is_there
 from evflow.io.decode import tables, text
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.formats import plain_text
@@ -131,7 +132,14 @@ def _some(
 
 
 def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
+<<<<<<< HEAD
     """Times (T,) as written, seconds by the format, and names of the images."""
+=======
+    """Times (T,) as written, seconds by the format, and names of the images; none where there is no
+    images.txt."""
+    if not is_there(index):
+        return np.zeros(0), []
+>>>>>>> 077d66c (ROS 2 bags are read without trust: bounded unpacking, plain tables, no YAML; pipes and devices are refused wherever a file is read)
     seconds, names = [], []
     for number, content in enumerate(index.read_bytes().split(b"\n"), 1):
         fields = content.partition(b"#")[0].split()

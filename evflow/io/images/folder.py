@@ -12,6 +12,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
+from evflow.files.regular import is_there
 from evflow.io.images.frames import FrameHints, Image
 from evflow.io.images.pictures import claimed_bytes
 from evflow.io.images.times import read_times
@@ -150,7 +151,7 @@ def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:
     if hints.timestamps is not None:
         return Path(hints.timestamps)
     found = [p for place in dict.fromkeys((folder, root)) for name in TIMES
-             if (p := place / name).is_file()]
+             if is_there(p := place / name)]
     if found:
         return found[0]
     near = [str(p) for name in TIMES if (p := folder.parent / name).is_file()]

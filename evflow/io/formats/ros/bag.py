@@ -1,5 +1,4 @@
-"""Recordings out of bags of ROS 1 and ROS 2, which the package `rosbags` opens: one topic of
-events, and the images beside it.
+"""Recordings out of bags of ROS 1 and ROS 2: one topic of events, and the images beside it.
 
 sensor_msgs/Image and CompressedImage become frames, at their header's time, where the events are on
 ROS time; of several topics of images `streams.choose` takes one. Of several topics the first with
@@ -64,10 +63,10 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
 
 
 class Bag:
-    """A bag, read message by message; whatever `rosbags` raises becomes EV009.
+    """A bag, read message by message; whatever its reader raises becomes EV009.
 
-    open_reader: gives the open reader of `rosbags`; aligned: messages are those of ROS 2; mend:
-    the command that repairs a bag."""
+    open_reader: gives an open reader, as those of `rosbags` are; aligned: messages are those of
+    ROS 2; mend: the command that repairs a bag."""
 
     def __init__(
         self, path: Path, open_reader: Callable[[Path], Any], *, aligned: bool, mend: str
@@ -77,12 +76,10 @@ class Bag:
         self.stored = sum(file.stat().st_size for file in files)
         try:
             self.reader = open_reader(path)
-        except ImportError as e:
-            raise EvflowDataError(
-                "EV010", f"reading {path} needs the package 'rosbags'.",
-                'pip install "evflow-jax[ros]"') from e
+        except (EvflowDataError, MemoryError):
+            raise
         except Exception as e:
-            raise self._damaged(e) from e
+            raise self._failed(e) from e
 
     def __enter__(self) -> Bag:
         return self
@@ -90,7 +87,11 @@ class Bag:
     def __exit__(self, *_: object) -> None:
         self.reader.close()
 
-    def _damaged(self, e: Exception) -> EvflowDataError:
+    def _failed(self, e: Exception) -> EvflowDataError:
+        """What the reader's exception says of the bag, or of the packages that are there."""
+        if isinstance(e, ImportError):
+            return EvflowDataError("EV010", f"reading {self.path} needs the package 'rosbags'.",
+                                   'pip install "evflow-jax[ros]"')
         return EvflowDataError(
             "EV009", f"{self.path} is cut off or damaged ({e or type(e).__name__}).",
             f"Copy it again; if its recording was interrupted, run `{self.mend}` on it.")
@@ -132,10 +133,10 @@ class Bag:
                 _, _, raw = next(source)
             except StopIteration:
                 return
-            except MemoryError:
+            except (EvflowDataError, MemoryError):
                 raise
             except Exception as e:  # ReaderError, and what bz2, lz4 and struct raise
-                raise self._damaged(e) from e
+                raise self._failed(e) from e
             read += len(raw)
             check_expansion(read, self.stored, f"the index of {self.path}")
             yield Message(bytes(raw), index, self.aligned)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from evflow.files import compressed
 from evflow.files.bounded import BoundedPath
 from evflow.files.limits import RATIO
 from evflow.io.formats.ros.bag import Bag, read_bag
@@ -41,18 +42,9 @@ def _open(path: Path) -> Any:
 
 def _bounded(unpack: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
     """The same for a chunk that expands within `limits`; ValueError for others."""
-    from lz4.frame import LZ4FrameDecompressor, decompress
+    from lz4.frame import decompress
 
-    makers: dict[Any, Any] = {bz2.decompress: bz2.BZ2Decompressor, decompress: LZ4FrameDecompressor}
-    if unpack not in makers:  # not compressed
+    kinds: dict[Any, str] = {bz2.decompress: "bz2", decompress: "lz4"}
+    if unpack not in kinds:  # not compressed
         return unpack
-
-    def bounded(data: bytes) -> bytes:
-        decoder = makers[unpack]()
-        out: bytes = decoder.decompress(data, max_length=CHUNK + RATIO * len(data))
-        if not decoder.eof:
-            raise ValueError(f"a chunk of {len(data):,} bytes that is cut off, or expands to more "
-                             f"than {len(out):,}")
-        return out
-
-    return bounded
+    return lambda data: compressed.unpack(data, kinds[unpack], CHUNK + RATIO * len(data))

@@ -1,13 +1,26 @@
-"""ROS 2 bags, see bag.py: a folder with its metadata.yaml, or one of its files alone."""
+"""ROS 2 bags, see bag.py: a folder with its metadata.yaml, or one of its files alone.
+
+Of the metadata only the names of the files are read: all else is in the files themselves, packed
+whole or message by message, or not, as their first bytes tell.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+import contextlib
+import errno
+import tempfile
+from collections.abc import Collection, Iterator
+from pathlib import Path, PurePath
+from typing import IO, NamedTuple
 
-from evflow.files.bounded import BoundedPath
-from evflow.files.limits import RATIO
+from evflow.errors import EvflowDataError
+from evflow.files.compressed import ZSTD, decoder_of, unpack
+from evflow.files.limits import FREE, RATIO
+from evflow.files.regular import is_there
+from evflow.io.formats.ros import database, mcap
 from evflow.io.formats.ros.bag import Bag, read_bag
+from evflow.io.formats.ros.database import Database
+from evflow.io.formats.ros.mcap import Mcap
 from evflow.io.hints import Hints
 from evflow.types import Recording
 
@@ -15,57 +28,133 @@ NAME = "rosbag2"
 DATABASE = ".db3"
 EXTENSIONS: tuple[str, ...] = (".mcap", DATABASE)
 
-METADATA = "metadata.yaml"
-LARGEST_CHUNK = 1 << 26  # bytes, beyond which it must not expand more than recordings do
-LARGEST_PAGE = 65536  # which two bytes of a header can't say
+METADATA, LIST = "metadata.yaml", "relative_file_paths:"
+MOST_METADATA = 1 << 24  # bytes; a recording of a thousand files has 300 kB
+LARGEST_MESSAGE = 1 << 26  # bytes, beyond which it must not expand more than recordings do
+BLOCK = 1 << 20
 
 
 def sniff(path: Path, head: bytes) -> bool:
     if path.is_dir():
         metadata = path / METADATA
-        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:4096]
-    return head.startswith(b"\x89MCAP0\r\n") or (
-        head.startswith(b"SQLite format 3\0") and path.suffix == DATABASE)
+        return metadata.is_file() and b"rosbag2_bagfile_information" in _begin(metadata, 4096)
+    return head.startswith(mcap.MAGIC) or (
+        head.startswith(database.MAGIC) and path.suffix == DATABASE)
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV010 (no `rosbags`) and what `read_bag` raises."""
-    with Bag(path, _open, aligned=True, mend="ros2 bag reindex") as bag:
+    """Raises EV010 (no `rosbags`, for what is compressed) and what `read_bag` raises."""
+    with Bag(path, Reader, aligned=True, mend="ros2 bag reindex") as bag:
         return read_bag(bag, hints)
 
 
-def _open(path: Path) -> Any:
-    from rosbags.rosbag2 import Reader
+class Connection(NamedTuple):
+    """A topic, its type of message and how many there are, as `Bag` asks for them."""
 
-    for file in path.glob("*") if path.is_dir() else (path,):
-        if file.suffix == DATABASE:
-            _whole(file)
-    reader = Reader(BoundedPath(path))
-    reader.open()
+    topic: str
+    msgtype: str
+    msgcount: int
+
+
+class Reader:
+    """All files of a bag, one after the other."""
+
+    def __init__(self, path: Path) -> None:
+        with contextlib.ExitStack() as stack:
+            files = _files(path) if path.is_dir() else [path]
+            self.storages = [_storage(file, stack) for file in files]
+            self._open = stack.pop_all()
+        counts = sum((storage.counts for storage in self.storages[1:]),
+                     self.storages[0].counts.copy())
+        topics = {topic for storage in self.storages for topic in storage.counts}
+        self.connections = [Connection(*topic, counts[topic]) for topic in sorted(topics)]
+
+    def close(self) -> None:
+        self._open.close()
+
+    def messages(
+        self, connections: Collection[Connection]
+    ) -> Iterator[tuple[Connection | None, int, bytes]]:
+        """(None, 0, the message) of these, as `Bag` takes them."""
+        topics = {connection.topic for connection in connections}
+        for storage in self.storages:
+            for raw in storage.messages(topics):
+                if raw.startswith(ZSTD):  # messages of ROS 2 begin with 0
+                    raw = unpack(raw, "zstd", LARGEST_MESSAGE + RATIO * len(raw))
+                yield None, 0, raw
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files that the metadata list, which rosbag2 writes one a line; ValueError where one is
+    missing or none is listed."""
+    text = _begin(folder / METADATA, MOST_METADATA).decode("utf-8", "replace")
+    listed = text.partition(LIST)[2]
+    names, lines = list[str](), iter(listed.splitlines())
+    rest = next(lines, "").strip()
+    if rest.startswith("["):  # all on one line
+        names = [name.strip(" '\"") for name in rest.strip("[]").split(",")]
+    else:
+        for line in map(str.strip, lines):
+            if not line.startswith("- "):
+                break
+            names.append(line[2:].strip(" '\""))
+    if not names or not all(names):
+        raise ValueError(f"{METADATA} lists no files")
+    files = [folder / PurePath(name).name for name in names]
+    if missing := [file.name for file in files if not is_there(file)]:
+        raise ValueError(f"{', '.join(missing[:5])} of its files are not there")
+    return files
+
+
+def _storage(path: Path, stack: contextlib.ExitStack) -> Database | Mcap:
+    """The open file, unpacked into a temporary one where it is packed."""
+    head = _begin(path, 16)
+    if head.startswith(ZSTD):
+        path = _unpacked(path, stack)
+        head = _begin(path, 16)
+    if not head.startswith((mcap.MAGIC, database.MAGIC)):
+        raise ValueError(f"{path.name} is neither an MCAP file nor a database")
+    storage = Mcap(path) if head.startswith(mcap.MAGIC) else Database(path)
+    stack.callback(storage.close)
+    return storage
+
+
+def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
+    """A temporary file of what a packed one holds; EV019 where the disk is full."""
+    out = tempfile.NamedTemporaryFile(prefix="evflow-", suffix=path.stem)  # noqa: SIM115
+    stack.enter_context(out)
+    left = FREE + RATIO * path.stat().st_size
     try:
-        _check_chunks(reader.storage)
-    except ValueError:
-        reader.close()
-        raise
-    return reader
+        with path.open("rb") as packed:
+            for part in _parts(packed):
+                left -= len(part)
+                if left < 0:
+                    raise ValueError(f"{path.name} expands beyond measure")
+                out.write(part)
+        out.flush()
+    except OSError as e:
+        if e.errno != errno.ENOSPC:
+            raise
+        raise EvflowDataError(
+            "EV019", f"{tempfile.gettempdir()}, where {path} is unpacked, is full.",
+            "Set TMPDIR to a folder with room, or unpack it: zstd -d.") from e
+    return Path(out.name)
 
 
-def _check_chunks(storage: Any) -> None:
-    """ValueError where a chunk claims to expand beyond what recordings do."""
-    for part in getattr(storage, "storages", (storage,)):
-        for chunk in getattr(part, "chunks", ()):
-            if chunk.uncompressed_size > LARGEST_CHUNK + RATIO * chunk.compressed_size:
-                raise ValueError(f"a chunk of {chunk.compressed_size:,} bytes claims "
-                                 f"{chunk.uncompressed_size:,}")
+def _parts(packed: IO[bytes]) -> Iterator[bytes]:
+    """What a file of zstd frames holds, block by block; EOFError where it is cut off."""
+    decoder, waiting = decoder_of("zstd"), b""
+    while block := waiting or packed.read(BLOCK):
+        if decoder.eof:
+            decoder = decoder_of("zstd")
+        yield decoder.decompress(block, max_length=BLOCK)
+        while not (decoder.eof or decoder.needs_input):
+            yield decoder.decompress(b"", max_length=BLOCK)
+        waiting = decoder.unused_data if decoder.eof else b""
+    if not decoder.eof:
+        raise EOFError("it is cut off")
 
 
-def _whole(path: Path) -> None:
-    """ValueError where a database ends before its last page, of which SQLite says nothing: rows
-    are missing, or stand in for others. Its header: www.sqlite.org/fileformat.html, 1.3."""
+def _begin(path: Path, size: int) -> bytes:
     with path.open("rb") as file:
-        head = file.read(100)
-    page, changed, pages, valid = (int.from_bytes(head[a:b], "big") for a, b in (
-        (16, 18), (24, 28), (28, 32), (92, 96)))
-    claimed = pages * (LARGEST_PAGE if page == 1 else page)
-    if changed == valid and path.stat().st_size < claimed:
-        raise ValueError(f"{path.name} has {path.stat().st_size:,} of {claimed:,} bytes")
+        return file.read(size)

@@ -1,0 +1,112 @@
+"""SQLite databases of ROS 2 (rosbag2_storage_sqlite3): tables `topics` and `messages`.
+
+A database is a program as well: views, generated columns and virtual tables make rows that are not
+in the file. Only plain tables are asked, and for the types and lengths of their values before the
+values. ValueError and sqlite3.Error where they are not those of a bag.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sqlite3
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+MAGIC = b"SQLite format 3\0"
+LARGEST = 1 << 28  # bytes of one message
+MOST_TOPICS, LONGEST_NAME = 1 << 14, 1 << 12
+STEPS = 10_000  # of SQLite's machine, between two looks at how many there were
+LEAST_STEPS, BYTES_A_LOOK = 1000, 200  # looks, and more of them for more bytes: 50 steps a byte
+LARGEST_PAGE = 65536  # which two bytes of a header can't say
+
+
+class Database:
+    """An open database. counts: messages by (topic, type)."""
+
+    def __init__(self, path: Path) -> None:
+        _check_whole(path)
+        # Immutable: nothing beside the file is looked at or made. Quoted: `?` and `%` are names.
+        self._open = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1",
+                                     uri=True, check_same_thread=False)
+        try:
+            self._open.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
+            self._open.execute("PRAGMA trusted_schema = OFF")
+            stored = os.path.getsize(path)
+            self._bound(LEAST_STEPS + stored // BYTES_A_LOOK)
+            self._check_tables()
+            self._check_values(stored)
+            counted = dict(self._open.execute(
+                "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+            self._topics = {number: (name, kind) for number, name, kind in self._open.execute(
+                "SELECT id, name, type FROM topics ORDER BY id")}
+        except BaseException:
+            self.close()
+            raise
+        if strays := counted.keys() - self._topics.keys():
+            raise ValueError(f"messages of topic {min(strays)}, which it does not describe")
+        self.counts: Counter[tuple[str, str]] = Counter()
+        for number, topic in self._topics.items():
+            self.counts[topic] += counted.get(number, 0)
+
+    def close(self) -> None:
+        self._open.close()
+
+    def messages(self, topics: Collection[str]) -> Iterator[bytes]:
+        """Those of the topics, in the order of their times."""
+        wanted = [number for number, (name, _) in self._topics.items() if name in topics]
+        rows = self._open.execute(
+            "SELECT data FROM messages WHERE topic_id IN "
+            f"({','.join(map(str, wanted))}) ORDER BY timestamp")
+        for (data,) in rows:
+            yield data
+
+    def _bound(self, looks: int) -> None:
+        """End, with an error, what takes more steps: pages that have themselves as children stand
+        for rows without end. In C, as an exception, Ctrl-C too, would be lost in a callback."""
+        allowed = itertools.chain(itertools.repeat(0, looks), itertools.repeat(1))
+        self._open.set_progress_handler(allowed.__next__, STEPS)
+
+    def _check_tables(self) -> None:
+        """ValueError unless both are tables of stored rows."""
+        for table in ("topics", "messages"):
+            found = self._open.execute(
+                "SELECT rootpage FROM sqlite_master WHERE name = ? AND type = 'table' "
+                "AND typeof(rootpage) = 'integer'", (table,)).fetchall()
+            if len(found) != 1 or found[0][0] <= 0:
+                raise ValueError(f"it has no table of {table}")
+            columns = self._open.execute(f"PRAGMA table_xinfo({table})").fetchall()
+            if len(columns) > 64 or any(column[6] for column in columns):
+                raise ValueError(f"its table of {table} has columns that are computed")
+
+    def _check_values(self, stored: int) -> None:
+        """ValueError where a value is of another kind than a bag's, or longer than the file."""
+        odd, many = self._open.execute(
+            "SELECT total(typeof(id) != 'integer' OR typeof(name) != 'text' OR typeof(type) != "
+            "'text' OR length(name) > ?1 OR length(type) > ?1 OR serialization_format != 'cdr'), "
+            "count(*) FROM topics", (LONGEST_NAME,)).fetchone()
+        if odd or many > MOST_TOPICS:
+            raise ValueError(f"of its {many:,} topics {int(odd):,} are not those of a bag")
+        odd, longest, total = self._open.execute(
+            "SELECT total(typeof(topic_id) != 'integer' OR typeof(timestamp) != 'integer' OR "
+            "typeof(data) != 'blob'), max(length(data)), total(length(data)) FROM messages"
+        ).fetchone()
+        if odd:
+            raise ValueError(f"{int(odd):,} messages have values of the wrong type")
+        if (longest or 0) > LARGEST or total > stored:
+            raise ValueError(f"messages of up to {longest:,} bytes, {total:,.0f} in all, in a file "
+                             f"of {stored:,}")
+
+
+def _check_whole(path: Path) -> None:
+    """ValueError where a database ends before its last page, of which SQLite says nothing: rows
+    are missing, or stand in for others. Its header: www.sqlite.org/fileformat.html, 1.3."""
+    with path.open("rb") as file:
+        head = file.read(100)
+    page, changed, pages, valid = (int.from_bytes(head[a:b], "big") for a, b in (
+        (16, 18), (24, 28), (28, 32), (92, 96)))
+    claimed = pages * (LARGEST_PAGE if page == 1 else page)
+    if changed == valid and path.stat().st_size < claimed:
+        raise ValueError(f"{path.name} has {path.stat().st_size:,} of {claimed:,} bytes")
