@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from evflow.errors import EvflowDataError
 
-AnyPath = TypeVar("AnyPath", Path, zipfile.Path)
+AnyPath = TypeVar("AnyPath", bound=Path | zipfile.Path)
 
 
 def need_regular(path: AnyPath) -> AnyPath:
