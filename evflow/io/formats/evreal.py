@@ -45,7 +45,7 @@ def read(path: Path, hints: Hints) -> Recording:
     found = gather(
         path, tables.blocks(n, lambda part: (xy[part, 0], xy[part, 1], ts[part], ps[part])),
         hints, _size(path, seen), _unit(ts))
-    if not (path / IMAGES).is_file():
+    if not is_there(path / IMAGES):
         return Recording.of_events(found.events, found.notes)
 
     def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
@@ -61,13 +61,7 @@ def _unit(times: np.ndarray) -> str:
     return "s" if times.dtype.kind == "f" else "us"
 
 
-<<<<<<< HEAD
 def _images(path: Path) -> np.ndarray:
-=======
-def _images(path: Path) -> np.ndarray | None:
-    if not is_there(path / "images.npy"):
-        return None
->>>>>>> 077d66c (ROS 2 bags are read without trust: bounded unpacking, plain tables, no YAML; pipes and devices are refused wherever a file is read)
     try:
         return mapped(path / IMAGES, (None, None, None))
     except EvflowDataError:

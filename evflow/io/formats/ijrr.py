@@ -88,7 +88,7 @@ def _is_events(name: str) -> bool:
 
 def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
     """path: what messages name."""
-    indexed = name == EVENTS and (root / IMAGES).is_file()
+    indexed = name == EVENTS and is_there(root / IMAGES)
     seen = _size(root, hints) if indexed else None
     with (root / name).open("rb") as f:
         chunks, native, told = plain_text.events(path, f, hints)
@@ -132,14 +132,7 @@ def _some(
 
 
 def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
-<<<<<<< HEAD
     """Times (T,) as written, seconds by the format, and names of the images."""
-=======
-    """Times (T,) as written, seconds by the format, and names of the images; none where there is no
-    images.txt."""
-    if not is_there(index):
-        return np.zeros(0), []
->>>>>>> 077d66c (ROS 2 bags are read without trust: bounded unpacking, plain tables, no YAML; pipes and devices are refused wherever a file is read)
     seconds, names = [], []
     for number, content in enumerate(index.read_bytes().split(b"\n"), 1):
         fields = content.partition(b"#")[0].split()

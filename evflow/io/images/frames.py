@@ -15,11 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evflow.errors import EvflowDataError
-<<<<<<< HEAD
-=======
 from evflow.files.regular import need_regular
-from evflow.files.spool import Spool
->>>>>>> 077d66c (ROS 2 bags are read without trust: bounded unpacking, plain tables, no YAML; pipes and devices are refused wherever a file is read)
 from evflow.io.decode.units import UNITS_US
 from evflow.io.hints import Hints, check_choices, known
 from evflow.io.images import values
@@ -212,55 +208,4 @@ def existing(path: str | os.PathLike) -> Path:
         raise EvflowDataError(
             "EV016", f"no file or folder at {path}.",
             "For a sequence of images pass their folder." if pattern else "")
-<<<<<<< HEAD
-    return path
-=======
     return need_regular(path)
-
-
-class FrameStack:
-    """Images (H, W) or (H, W, 3) in B, G, R that come one by one, as the frames of a recording:
-    colour becomes luma. Kept as `Spool` does it. where: names their file in messages."""
-
-    def __init__(self, where: object) -> None:
-        self.where, self.count = where, 0
-        self._first: np.ndarray | None = None  # as it came
-        self._spool: Spool | None = None
-
-    def append(self, image: np.ndarray) -> None:
-        """Raises EV002 (no image), EV003 and EV015 (dtype or shape change), EV019 (disk full)."""
-        if self._first is None:
-            if image.ndim != 2 and not (image.ndim == 3 and image.shape[-1] in (3, 4)):
-                raise EvflowDataError(
-                    "EV002", f"{self.where} has a frame of shape {image.shape}.",
-                    "Expected (H, W) or (H, W, 3).")
-            self._first = image
-        if image.shape != self._first.shape:
-            raise EvflowDataError(
-                "EV015", f"{self.where} has frames of shapes {self._first.shape} and "
-                f"{image.shape}.", "Use those of one sensor.")
-        if image.dtype != self._first.dtype:
-            raise EvflowDataError(
-                "EV003", f"{self.where} has frames of {self._first.dtype} and {image.dtype}.",
-                "Use those of one bit depth.")
-        grey = image if image.ndim == 2 else luma(image[..., :3])
-        self._spool = self._spool or Spool(grey.dtype)
-        self._spool.append(grey.ravel())
-        self.count += 1
-
-    def beside(self, events: Events, times: np.ndarray, notes: tuple[Note, ...]) -> Recording:
-        """The recording of these events and all frames, at `times` (T,); raises what it raises."""
-        if self._first is None or self._spool is None:
-            return Recording.of_events(events, notes)
-        frames = self._spool.array().reshape(self.count, *self._first.shape[:2])
-        if self._first.ndim == 3:
-            notes = (*notes, CONVERTED)
-        return Recording(events, frames, times, notes)
-
-
-def cut(recording: Recording, span: tuple[int, int]) -> Recording:
-    """The recording with those frames alone that lie in [start, stop) us."""
-    keep = slice(*np.searchsorted(recording.frame_times, np.array(span)))
-    return dataclasses.replace(
-        recording, frames=recording.frames[keep], frame_times=recording.frame_times[keep])
->>>>>>> 077d66c (ROS 2 bags are read without trust: bounded unpacking, plain tables, no YAML; pipes and devices are refused wherever a file is read)
