@@ -42,8 +42,9 @@ class Simulate(Compiling):
     """
 
     video: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
-    """A video file; a folder of images (png, jpg, tif, bmp, pgm; 8 or 16 bits); a stack of frames
-    (.npy, .npz); or a recording of any known format, whose frames are used at their own times."""
+    """A video file; a folder of images (png, jpg, tif, bmp, pgm; 8 or 16 bits; hdr, exr: radiance);
+    a stack of frames (.npy, .npz); or a recording of any known format, whose frames are used at
+    their own times."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
     aedat4, none (a folder) evreal."""
@@ -88,7 +89,8 @@ class Simulate(Compiling):
     """The frames are a raw colour mosaic whose cells begin so: pixels see its luma. (--colour rggb:
     they see the mosaic itself.)"""
     full_scale: Annotated[float | None, value("DN")] = None
-    """Value of white; without it 255, or 65535 in 16-bit images. 12-bit data: 4095."""
+    """Value of white; without it 255, 65535 in 16-bit images, and of radiance what 99 % of the
+    first image lie below. 12-bit data: 4095."""
     response: Literal["auto", "linear", "gamma", "srgb", "log"] = "auto"
     """How the frames code light, which is what pixels see. auto: videos and 8-bit images as srgb;
     arrays, deeper images and a recording's own frames linearly. log: floats that are natural

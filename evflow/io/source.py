@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError, naming
-from evflow.io.images.folder import open_folder
+from evflow.io.images import values
+from evflow.io.images.folder import RADIANCE, open_folder
 from evflow.io.images.frames import FrameHints, Frames, FrameSource, Image, converted, existing
 from evflow.io.images.stacks import is_stack, open_stack
 from evflow.io.registry import find_format, read_recording
@@ -72,6 +73,10 @@ def _folder(path: Path, told: FrameHints) -> FrameSource:
                     note.code == "frames.made" for note in folder.notes) else
                 ("srgb", "8-bit images") if first.dtype == np.uint8 else
                 ("linear", "images of more than 8 bits")))
+    if folder.files[0].suffix.lower() in RADIANCE:
+        white, said = values.white_of_radiance(first, told.full_scale)
+        told = dataclasses.replace(told, full_scale=white, clip=True)
+        notes = (*notes, said)
     return _source(size, len(folder.files), folder.images, told, [*folder.notes, *notes])
 
 

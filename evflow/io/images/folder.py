@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +16,14 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
 from evflow.files.regular import is_there
+from evflow.io.images import exr
 from evflow.io.images.frames import FrameHints, Image
 from evflow.io.images.pictures import claimed_bytes
 from evflow.io.images.times import read_times
 from evflow.notes import Note
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
+RADIANCE = (".hdr", ".exr", ".pfm")  # whose numbers have no white
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RADIANCE)
 MADE = "made from the events by"  # how `evflow reconstruct` marks images in their file of times
 TIMES = ("timestamps.txt", "images.txt", "image_timestamps.txt", "timestamp.txt", "times.txt",
          "info.txt", "rgb.txt", "data.csv", "timestamps.csv", "timestamps.npy")
@@ -85,7 +90,8 @@ def natural(name: str) -> tuple[list[str | int], str]:
 def decode(file: Path | zipfile.Path) -> np.ndarray:
     """One image at its full bit depth: (H, W) or (H, W, 3 or 4) in B, G, R(, A).
 
-    Raises EV009 (damaged, cut off), EV016 (not there).
+    Raises EV008 (an EXR that this OpenCV does not read), EV009 (damaged, cut off), EV016 (not
+    there).
     """
     try:
         if not file.is_file():  # a pipe has no end
@@ -98,7 +104,6 @@ def decode(file: Path | zipfile.Path) -> np.ndarray:
 
 def decoded(data: bytes, where: object) -> np.ndarray:
     """The same of the bytes of an image; EV009. where: names them in messages."""
-    import cv2
 
     claimed = claimed_bytes(data)
     if claimed is not None:
@@ -107,16 +112,42 @@ def decoded(data: bytes, where: object) -> np.ndarray:
     jpeg, png = data.startswith(b"\xff\xd8"), data.startswith(b"\x89PNG")
     whole = not ((jpeg and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
                  or (png and b"IEND" not in data))
-    try:
-        image = (None if claimed is None else
-                 cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
-    except cv2.error:
-        image = None
+    image = (None if claimed is None else
+             _exr(data, where) if data.startswith(exr.MAGIC) else _by_opencv(data))
     if image is None or not whole:
         raise EvflowDataError(
             "EV009", f"{where} ({len(data):,} bytes) is {'not a sound' if whole else 'a cut-off'} "
             "image.", "Copy it again.")
     return image
+
+
+def _by_opencv(data: bytes) -> np.ndarray | None:
+    import cv2
+
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+
+
+def _exr(data: bytes, file: object) -> np.ndarray | None:
+    """An EXR, None where it is damaged; EV008 where nothing here reads its kind."""
+    try:
+        head = exr.header(data)
+        if not (kind := exr.unread(head)):
+            return exr.decode(data, head)
+    except (ValueError, IndexError, struct.error, zlib.error):
+        return None
+    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # what reads it is off by default
+    image = _by_opencv(data)
+    if image is None:
+        import cv2
+
+        raise EvflowDataError(
+            "EV008", f"{file} is an EXR with {kind}, which this OpenCV ({cv2.__version__}) does "
+            "not read.", "Save it as scan lines with ZIP or no compression, or as .hdr; or take "
+            "Debian's python3-opencv, which reads it.")
+    return image[..., :3] if image.ndim == 3 else image
 
 
 def _find(root: Path) -> tuple[Path, list[Path]]:

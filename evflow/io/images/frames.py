@@ -57,6 +57,8 @@ class FrameHints:
     start_s, stop_s: frames with start <= time < stop, in seconds from the first; of a recording
         from its first event.
     frames_topic: of a recording, the images to take (see `Hints`).
+    clip: take what is brighter than full_scale as white and what is negative as black, as in
+        radiance, which has no upper end, instead of refusing it.
     """
 
     fps: float | None = None
@@ -72,6 +74,7 @@ class FrameHints:
     start_s: float | None = None
     stop_s: float | None = None
     frames_topic: str | None = None
+    clip: bool = False
 
     def __post_init__(self) -> None:
         check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS,
@@ -171,6 +174,8 @@ def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> t
             "EV002", f"{where} has shape {pixels.shape}.", "Expected (H, W) or (H, W, 3).")
     pixels = np.asarray(pixels, np.float32) if pixels.dtype.kind == "f" else pixels
     values.white_of(pixels.dtype, where)
+    if hints.clip:
+        pixels = np.clip(pixels, 0, np.float32(hints.full_scale or np.inf))
     if pixels.ndim == 3 and pixels.shape[-1] == 4:
         pixels, through = values.opaque(pixels, hints.background)
         if through and not any(note.code == "frames.alpha" for note in notes):

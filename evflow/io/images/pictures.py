@@ -1,7 +1,8 @@
 """What the header of a picture claims, before a decoder takes memory for it.
 
 OpenCV takes memory for as many pixels as a header names, up to 2^30, whatever follows it. Known
-are the formats of `images.SUFFIXES`: PNG, JPEG, TIFF, BMP, PGM and PPM, WebP.
+are the formats of `images.SUFFIXES`: PNG, JPEG, TIFF, BMP, PGM and PPM, WebP, and of radiance HDR,
+EXR and PFM.
 """
 
 from __future__ import annotations
@@ -10,11 +11,15 @@ import re
 import struct
 from collections.abc import Callable
 
+from evflow.io.images import exr
+
 Size = tuple[int, int]
 
-PIXEL = 8  # bytes at most: four channels of 16 bits
+PIXEL, PIXEL_OF_FLOATS = 8, 16  # bytes at most: four channels
 # A comment right behind a number begins another one to some decoders: blanks come first.
 NETPBM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})\s(?:\s+|#[^\n]*\n)*(\d{1,9})\s")
+PFM = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
+RADIANCE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
 TIFF_SIZE = (256, 257)  # tags ImageWidth, ImageLength
 TIFF_KINDS = {3: "H", 4: "I", 16: "Q"}
 JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
@@ -26,7 +31,7 @@ def claimed_size(data: bytes) -> Size | None:
         if data.startswith(magic):
             try:
                 return read(data)
-            except (struct.error, IndexError):
+            except (struct.error, IndexError, ValueError):
                 return None
     return None
 
@@ -34,7 +39,8 @@ def claimed_size(data: bytes) -> Size | None:
 def claimed_bytes(data: bytes) -> int | None:
     """Memory that the decoded picture may take."""
     size = claimed_size(data)
-    return None if size is None else size[0] * size[1] * PIXEL
+    pixel = PIXEL_OF_FLOATS if data.startswith(FLOATS) else PIXEL
+    return None if size is None else size[0] * size[1] * pixel
 
 
 def _png(data: bytes) -> Size:
@@ -51,6 +57,16 @@ def _bmp(data: bytes) -> Size:
 def _netpbm(data: bytes) -> Size | None:
     match = NETPBM.match(data)
     return None if match is None else (int(match[1]), int(match[2]))
+
+
+def _pfm(data: bytes) -> Size | None:
+    match = PFM.match(data)
+    return None if match is None else (int(match[1]), int(match[2]))
+
+
+def _radiance(data: bytes) -> Size | None:
+    match = RADIANCE.search(data, 0, 1 << 16)
+    return None if match is None else (int(match[2]), int(match[1]))
 
 
 def _webp(data: bytes) -> Size | None:
@@ -97,7 +113,9 @@ def _tiff(data: bytes) -> Size | None:
     return (sides[256], sides[257]) if len(sides) == 2 else None
 
 
+FLOATS = (b"PF", b"Pf", b"#?", exr.MAGIC)
 READERS: dict[bytes, Callable[[bytes], Size | None]] = {
     b"\x89PNG\r\n\x1a\n": _png, b"\xff\xd8": _jpeg, b"BM": _bmp, b"RIFF": _webp,
     b"II*\0": _tiff, b"MM\0*": _tiff, b"II+\0": _tiff, b"MM\0+": _tiff,
-    **{b"P%d" % kind: _netpbm for kind in range(1, 7)}}
+    **{b"P%d" % kind: _netpbm for kind in range(1, 7)}, b"PF": _pfm, b"Pf": _pfm,
+    b"#?": _radiance, exr.MAGIC: exr.claimed_size}

@@ -14,8 +14,10 @@ from evflow.errors import EvflowDataError
 from evflow.light.colour import luma
 from evflow.light.ranges import meaning
 from evflow.light.response import linear_light
+from evflow.notes import Note
 
 WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # DN of a saturated pixel unless told
+WHITE_PERCENT = 99.0
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 
 
@@ -46,6 +48,20 @@ def white_of(dtype: np.dtype, where: str) -> float:
         raise EvflowDataError(
             "EV003", f"{where} is {dtype}.", "Expected uint8, uint16 or floats.")
     return WHITE[dtype.str[1:]]
+
+
+def white_of_radiance(pixels: np.ndarray, full_scale: float | None) -> tuple[float, Note]:
+    """What is white where numbers are radiance, without an upper end: `full_scale`, or what all
+    but a hundredth of the first image's pixels stay below. With what is said of it."""
+    if full_scale is not None:
+        return full_scale, Note("frames.white", f"radiance of {full_scale:g} is white; what is "
+                                "brighter is taken as white.")
+    grey = luma(pixels[..., :3].astype(np.float32)) if pixels.ndim == 3 else pixels
+    finite = grey[np.isfinite(grey) & (grey > 0)]
+    white = float(np.percentile(finite, WHITE_PERCENT)) if finite.size else 1.0
+    return white, Note(
+        "frames.white", f"radiance of {white:.4g} is white: {WHITE_PERCENT:g} % of the first image "
+        "is darker, and what is brighter is taken as white; --full-scale tells another.")
 
 
 def opaque(pixels: np.ndarray, background: str) -> tuple[np.ndarray, bool]:
