@@ -23,6 +23,7 @@ NOTES: dict[str, str] = {
     "sensor.unrectified": "events stay at the sensor's own pixels",
     "frames.alpha": "transparent images were laid over a background",
     "frames.clock": "where the times of the frames come from",
+    "frames.dark": "values of frames below their reset are 0",
     "frames.depth": "16-bit frames that do not reach white",
     "frames.fast": "motion too fast to interpolate well",
     "frames.flipped": "frames were mirrored",

@@ -270,7 +270,7 @@ def coco(folder: Path) -> Sample:
 
 SAMPLES: dict[str, Callable[[Path], Sample]] = {
     **{kind: partial(stream, kind=kind) for kind in (
-        "aedat2", "dat", "evt2", "evt2.1", "evt3")},
+        "aedat2", "aedat3", "dat", "evt2", "evt2.1", "evt3")},
     **{kind: partial(table, kind=kind) for kind in tables.WRITERS},
     "metavision": partial(metavision, forms=(0, 1, 2)),
     "metavision-plain": partial(metavision, forms=()),

@@ -15,7 +15,8 @@ from evflow.io import read_events
 from evflow.types import Events
 
 SIZE = (240, 180)
-TURN = {"evt2": 2**34, "evt2.1": 2**34, "evt3": 2**24, "dat": 2**32, "aedat2": 2**32}
+TURN = {"evt2": 2**34, "evt2.1": 2**34, "evt3": 2**24, "dat": 2**32, "aedat2": 2**32,
+        "aedat3": 2**31}
 
 
 def clustered(n: int = 400, first: int = 1000, pause: int = 300, seed: int = 0) -> Events:
@@ -115,12 +116,39 @@ def aedat2(events: Events, header: bytes = b"#!AER-DAT2.0\r\n# AEChip: a.b.DAVIS
         for x, y, t, p in listed(events))
 
 
-ENCODERS = {"evt2": evt2, "evt2.1": evt21, "evt3": evt3, "dat": dat, "aedat2": aedat2}
+def aedat3_packet(
+    kind: int, size: int, body: bytes, *, overflow: int = 0, source: int = 1,
+    capacity: int | None = None, number: int | None = None,
+) -> bytes:
+    number = len(body) // size if number is None else number
+    return struct.pack("<hhiiiiii", kind, source, size, 4, overflow,
+                       number if capacity is None else capacity, number, number) + body
+
+
+def aedat3(
+    events: Events, header: bytes = b"#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS240C\r\n"
+    b"#Start-Time: 2016-08-17 17:30:50 (TZ+0200)\r\n#!END-HEADER\r\n", most: int = 100,
+) -> bytes:
+    """Packets of at most so many events; a new one where the high bits of time change."""
+    out, rows, i = header, listed(events), 0
+    while i < len(rows):
+        high, body = rows[i][2] >> 31, b""
+        while i < len(rows) and rows[i][2] >> 31 == high and len(body) < 8 * most:
+            x, y, t, p = rows[i]
+            body += struct.pack("<Ii", x << 17 | y << 2 | p << 1 | 1, t & (1 << 31) - 1)
+            i += 1
+        out += aedat3_packet(1, 8, body, overflow=high)
+    return out
+
+
+ENCODERS = {"evt2": evt2, "evt2.1": evt21, "evt3": evt3, "dat": dat, "aedat2": aedat2,
+            "aedat3": aedat3}
 each = pytest.mark.parametrize("kind", ENCODERS)
 
 
 def write(folder: Path, kind: str, events: Events) -> Path:
-    path = folder / f"a.{'aedat' if kind == 'aedat2' else 'dat' if kind == 'dat' else 'raw'}"
+    suffix = "aedat" if kind.startswith("aedat") else "dat" if kind == "dat" else "raw"
+    path = folder / f"a.{suffix}"
     path.write_bytes(ENCODERS[kind](events))
     return path
 

@@ -10,11 +10,9 @@ matter.
 from __future__ import annotations
 
 import array
-import collections
 import contextlib
 import itertools
 import os
-import sys
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
@@ -28,19 +26,16 @@ from evflow.errors import EvflowDataError
 from evflow.files.compressed import most_bytes
 from evflow.files.limits import FREE, RATIO
 from evflow.io.decode import tables
-from evflow.io.decode.stream import Chunk, Damage, Gathered, gather
+from evflow.io.decode.stream import Chunk, Damage
 from evflow.io.formats.aedat4_header import read_header, stream_names
 from evflow.io.hints import Hints
-from evflow.io.images.recorded import FrameStack, cut
-from evflow.io.images.streams import ImageStream, choose, events_alone
-from evflow.io.images.times import beside_events
+from evflow.io.images.aside import Aside
+from evflow.io.images.streams import ImageStream, choose
 from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "aedat4"
 EXTENSIONS: tuple[str, ...] = (".aedat4",)
-
-LATE_US = 1_000_000  # frames lie behind the events of their time by less than this
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -71,29 +66,22 @@ def read(path: Path, hints: Hints) -> Recording:
     taken = [i for i in frames if chosen.stream and chosen.stream.name == names[i]]
     starts, damage = _packets(path, header.packets, header.table)
     with _before(path, damage) as sound:
-        reading = _Reading(path, sound, starts, damage, hints, FrameStack(path, size), taken)
-        chunks = reading.chunks()
-        gathered = gather(path, chunks, hints, size)
-        if reading.last >= gathered.span[1]:  # frames that are late
-            with contextlib.suppress(Damage):
-                collections.deque(chunks, 0)
-    return reading.beside(gathered, chosen.notes)
+        reading = _Reading(sound, starts, damage, Aside(path, hints, size), taken)
+        return reading.aside.collect(
+            reading.chunks(), lambda: (*chosen.notes, *reading.notes()))
 
 
 class _Reading:
-    """Packets decoded in turn: events become chunks, frames of the streams `taken` are put aside.
-    last: time of the last event so far in us."""
+    """Packets decoded in turn: events become chunks, frames of the streams `taken` are put
+    aside."""
 
     def __init__(
-        self, path: Path, sound: Path, starts: Iterable[int], damage: Damage | None, hints: Hints,
-        stack: FrameStack, taken: list[int],
+        self, sound: Path, starts: Iterable[int], damage: Damage | None, aside: Aside,
+        taken: list[int],
     ) -> None:
-        self.path, self.hints, self.damage = path, hints, damage
-        self.stack, self.taken = stack, taken
+        self.damage, self.aside, self.taken = damage, aside, taken
         self.decoder = iter(_decoder(sound))
         self.places = itertools.chain(starts, itertools.repeat(os.path.getsize(sound)))
-        self.last, self.stop = 0, sys.maxsize
-        self.begun = False
         self.warned: set[str] = set()
 
     def chunks(self) -> Iterator[Chunk]:
@@ -113,7 +101,7 @@ class _Reading:
         try:
             with warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
-                while count < tables.ROWS and self.last < self.stop + LATE_US:
+                while count < tables.ROWS and not self.aside.done:
                     byte = next(self.places)
                     packet = next(self.decoder, None)
                     if packet is None:
@@ -122,7 +110,7 @@ class _Reading:
                     if len(packet.get("events", ())):
                         found.append(packet["events"])
                         count += len(found[-1])
-                        self._at(found[-1]["t"])
+                        self.aside.follow(found[-1]["t"])
                     elif "frame" in packet and packet["stream_id"] in self.taken:
                         self._take(packet["frame"])
             self.warned |= {str(w.message) for w in said}
@@ -135,30 +123,13 @@ class _Reading:
 
     def _take(self, frame: dict[str, Any]) -> None:
         pixels = frame["pixels"]  # colours come as R, G, B(, A)
-        with events_alone():
-            self.stack.append(pixels if pixels.ndim == 2 else pixels[..., 2::-1],
-                              _mid_exposure(frame),
-                              (frame.get("offset_x", 0), frame.get("offset_y", 0)))
+        self.aside.append(pixels if pixels.ndim == 2 else pixels[..., 2::-1],
+                          _mid_exposure(frame),
+                          (frame.get("offset_x", 0), frame.get("offset_y", 0)))
 
-    def _at(self, t: np.ndarray) -> None:
-        """Follow the time of events t as far as `stop_s` needs it."""
-        if self.hints.stop_s is not None:
-            self.last = self.hints.instant(t[-1], "us")
-            if not self.begun:
-                self.begun, self.stop = True, self.hints.span_us(self.hints.instant(t[0], "us"))[1]
-
-    def beside(self, found: Gathered, chosen: tuple[Note, ...]) -> Recording:
-        """The recording of these events and the frames in their span."""
-        notes = (*found.notes, *chosen, *(Note(
-            "events.unread", f"the decoder left something out: {said}")
-            for said in sorted(self.warned)))
-        if not self.stack.times:
-            return self.stack.beside(found.events, self.hints, notes)
-        with events_alone():
-            times, told = beside_events(
-                np.array(self.stack.times), self.path, "us", self.hints, found.events)
-            notes = (Note("frames.clock", "frame times are mid-exposure"), *notes, *told)
-            return cut(self.stack.at(times, found.events, self.hints, notes), found.span)
+    def notes(self) -> tuple[Note, ...]:
+        return tuple(Note("events.unread", f"the decoder left something out: {said}")
+                     for said in sorted(self.warned))
 
 
 @contextlib.contextmanager

@@ -54,9 +54,10 @@ def test_wraparound(
     equal(read_events(write(tmp_path, kind, events)), events)
 
 
-@each
+@pytest.mark.parametrize("kind", [kind for kind in ENCODERS if kind != "aedat3"])
 def test_cut_tails(tmp_path: Path, kind: str) -> None:
-    """A cut at a word reads a prefix; one inside a word is told, with the part that is sound."""
+    """A cut at a word reads a prefix; one inside a word is told, with the part that is sound. The
+    packets of AEDAT 3 say how long they are."""
     events = clustered(300)
     path = write(tmp_path, kind, events)
     source = path.read_bytes()
@@ -124,7 +125,7 @@ def test_time_that_goes_back_is_told_with_its_byte(
         error = refused(path)
         assert error.code == "EV004"
         byte = int(re.findall(r"at byte ([\d,]+) of", str(error))[0].replace(",", ""))
-        assert len(sound) <= byte < len(sound) + 10
+        assert len(sound) <= byte < len(sound) + 40  # behind the header of a packet
         assert "50 events" in str(error)
         assert "joined" in error.fix
 

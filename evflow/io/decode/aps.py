@@ -1,0 +1,131 @@
+"""Frames of a DAVIS out of the samples of its converter: each pixel is read after its reset, and
+again after its exposure; the difference is the light.
+
+Columns are read one after another. Under a global shutter all resets come before all signals, and
+the exposure lies between them; under a rolling one each column has its own, and they are mixed. A
+frame begins where the resets go back to the first column.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.notes import Note
+
+RESET, SIGNAL = 0, 1  # kinds of samples
+WHITE = 1023  # of 10 bits
+NONE = -1  # a pixel that was not read
+SURE = 8  # steps of a coordinate by which it is told which is the slower, and which way it goes
+
+
+class Aps:
+    """Samples, any number at a time, into frames (H, W) float32, on a scale on which the range of
+    the converter is 255. done(frame, its mid-exposure in us) is called for each that is complete.
+    """
+
+    def __init__(self, size: Size, done: Callable[[np.ndarray, int], Any]) -> None:
+        self.size, self.done = size, done
+        self.incomplete = self.dark = self.outside = 0
+        self.slow, self.way, self.last = "", 0, NONE
+        self._clear()
+
+    def _clear(self) -> None:
+        self.values = np.full((2, *self.size[::-1]), NONE, np.int16)
+        self.seen: list[_Reads] = [_Reads(), _Reads()]
+
+    def add(
+        self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
+    ) -> None:
+        """Samples (n,) in the order of the file: t int64 us, x and y from the top left."""
+        inside = (x >= 0) & (x < self.size[0]) & (y >= 0) & (y < self.size[1])
+        self.outside += int((~inside).sum())
+        if not inside.all():
+            kind, x, y, t, value = (column[inside] for column in (kind, x, y, t, value))
+        resets = np.flatnonzero(kind == RESET)
+        begins = resets[self._starts(x[resets], y[resets])]
+        edges = [0, *begins.tolist(), len(kind)]
+        for i, (begin, end) in enumerate(itertools.pairwise(edges)):
+            if i:
+                self.finish()
+            part = slice(begin, end)
+            self._put(kind[part], x[part], y[part], t[part], value[part])
+
+    def _starts(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Which of these resets (n,) begin a frame: the column goes back."""
+        if not len(x):
+            return np.zeros(0, bool)
+        if not self.slow:
+            steps = {"x": np.diff(x), "y": np.diff(y)}
+            changes = {name: int(np.count_nonzero(step)) for name, step in steps.items()}
+            if max(changes.values()) >= SURE:
+                self.slow = min(changes, key=lambda name: changes[name])
+                self.way = 1 if np.sign(steps[self.slow]).sum() > 0 else -1
+        column = x if self.slow != "y" else y
+        step = np.diff(column, prepend=column[0] if self.last == NONE else self.last)
+        self.last = int(column[-1])
+        return step * self.way < 0
+
+    def _put(
+        self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
+    ) -> None:
+        for which in (RESET, SIGNAL):
+            of = np.flatnonzero(kind == which)
+            if len(of):
+                self.values[which, y[of], x[of]] = value[of]
+                self.seen[which].add(t[of])
+        if min(reads.count for reads in self.seen) >= self.size[0] * self.size[1]:
+            self.finish()
+
+    def finish(self) -> None:
+        """What was read since the last frame is one, if it is complete: at the end of the file."""
+        read = self.values >= 0
+        if read.all():
+            light = self.values[RESET].astype(np.int32) - self.values[SIGNAL]
+            self.dark += int((light < 0).sum())
+            frame = np.maximum(light, 0).astype(np.float32) * np.float32(255 / WHITE)
+            self.done(frame, _middle(*self.seen))
+        elif read.any():
+            self.incomplete += 1
+        self._clear()
+
+    def notes(self) -> tuple[Note, ...]:
+        said = []
+        if self.dark:
+            said.append(Note("frames.dark", f"{self.dark:,} values of frames that lay below their "
+                             "reset are 0"))
+        if self.incomplete:
+            said.append(Note("frames.unused", f"{self.incomplete:,} frames of which samples are "
+                             "missing were left out"))
+        if self.outside:
+            said.append(Note("events.unread", f"{self.outside:,} APS samples outside the sensor "
+                             "were left out"))
+        return tuple(said)
+
+
+@dataclasses.dataclass
+class _Reads:
+    """When the samples of one kind were read, us."""
+
+    first: int = 0
+    last: int = 0
+    total: int = 0
+    count: int = 0
+
+    def add(self, t: np.ndarray) -> None:
+        self.first = self.first if self.count else int(t[0])
+        self.last = int(t[-1])
+        self.total += int(t.sum())
+        self.count += len(t)
+
+
+def _middle(resets: _Reads, signals: _Reads) -> int:
+    """Mid-exposure: between the last reset and the first signal, or on the mean of all columns."""
+    if resets.last <= signals.first:
+        return (resets.last + signals.first) // 2
+    return round((resets.total / resets.count + signals.total / signals.count) / 2)

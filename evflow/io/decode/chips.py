@@ -1,0 +1,17 @@
+"""The sizes of iniVation's sensors, by the names that their files have."""
+
+from __future__ import annotations
+
+from evflow.checks import Size
+
+DVS128: Size = (128, 128)
+CHIPS: dict[str, Size] = {
+    "DAVIS240": (240, 180), "DAVIS346": (346, 260), "DAVIS640": (640, 480),
+    "DAVIS208": (208, 192), "DAVIS128": DVS128, "DVS128": DVS128, "TMPDIFF128": DVS128,
+}
+
+
+def chip_size(name: str | None) -> Size | None:
+    """(width, height) of the sensor of that name, "DAVIS240C" or "Davis346blue"; None where it is
+    not known."""
+    return next((size for chip, size in CHIPS.items() if name and chip in name.upper()), None)

@@ -1,0 +1,255 @@
+"""AEDAT 3.1 and 3.0 (cAER, the IBM gestures; inivation.com, AEDAT file formats): `#` lines up to
+`#!END-HEADER`, then packets of events of one type, little-endian.
+
+A packet: i16 type, i16 source, i32 size of an event, offset and overflow of its time (t = overflow
+<< 31 | time), capacity, number and valid. Type 1: u32 x [31:17], y [16:2], ON [1], valid [0]; i32
+us. Type 2, a frame: u32 valid [0], channels [3:1], colour filter [7:4]; i32 begin and end of the
+frame and of its exposure; width, height, x, y of its place; u16 pixels, on 0..65535. Other types
+are counted, not read. The size is that of the chip that `#Source` names. 3.0 has the origin at the
+bottom, and no end of its header.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.errors import EvflowDataError
+from evflow.io.decode import tables
+from evflow.io.decode.chips import CHIPS, chip_size
+from evflow.io.decode.stream import Chunk, Damage
+from evflow.io.hints import Hints
+from evflow.io.images.aside import Aside
+from evflow.io.images.streams import ImageStream, choose
+from evflow.notes import Note
+from evflow.types import Recording
+
+NAME = "aedat3"
+EXTENSIONS: tuple[str, ...] = (".aedat", ".aedat3")
+
+MAGIC, FIRST = b"#!AER-DAT3.", b"#!AER-DAT3.0"
+MAX_HEADER = 1 << 20  # bytes
+LINE = re.compile(rb"#[\x20-\x7e\t\x80-\xff]*\r?\n")
+SOURCE = re.compile(rb"#-?Source (\d{1,5}): *([^\r\n]*)")
+HEADER = struct.Struct("<hhiiiiii")
+FRAME = struct.Struct("<Iiiiiiiii")
+EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
+POLARITY, IMAGE = 1, 2
+TYPES = {0: "special events", 3: "IMU samples", 4: "IMU samples"}
+COMPRESSED = 0x8000  # of the type, by formats other than RAW
+MOST_TYPES, MOST_BYTES = 64, 1 << 26  # of types; of one event
+
+
+class Part(NamedTuple):
+    """Events of a packet, the overflow of their time, and the byte where they begin."""
+
+    events: np.ndarray
+    overflow: int
+    begin: int
+
+
+class Packet(NamedTuple):
+    """A header, without its offset; begin: the byte behind it."""
+
+    kind: int
+    source: int
+    size: int
+    overflow: int
+    capacity: int
+    number: int
+    begin: int
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    return head.startswith(MAGIC)
+
+
+def read(path: Path, hints: Hints) -> Recording:
+    """Raises EV008 (compressed packets), EV009 (damaged), EV015 (the chip is not known) and what
+    `Aside.collect` raises."""
+    with open(path, "rb") as f:
+        head = f.read(MAX_HEADER)
+    start, chips = 0, []
+    while line := LINE.match(head, start):
+        start = line.end()
+        if source := SOURCE.match(line[0]):
+            chips.append(source[2].decode("latin-1").strip())
+        if line[0].startswith(b"#!END-HEADER"):
+            break
+    size = hints.size or next(filter(None, map(chip_size, chips)), None)
+    if size is None:
+        raise EvflowDataError(
+            "EV015", f"the header of {path} names the sources {chips or 'none'}, of unknown size.",
+            f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.")
+    chosen = choose([ImageStream("frames", size)], hints, size)
+    reading = _Reading(Aside(path, hints, size), size, head.startswith(FIRST),
+                       chosen.stream is not None)
+    with open(path, "rb") as f:
+        f.seek(start)
+        return reading.aside.collect(reading.chunks(path, f), reading.notes)
+
+
+class _Reading:
+    """Packets decoded in turn: events become chunks, frames are put aside. turned: y counts from
+    the bottom; frames: are they asked for?"""
+
+    def __init__(self, aside: Aside, size: Size, turned: bool, frames: bool) -> None:
+        self.aside, self.size, self.turned, self.frames = aside, size, turned, frames
+        self.left: collections.Counter[str] = collections.Counter()
+        self.source: int | None = None  # of the events
+        self.mosaic = False
+
+    def chunks(self, path: Path, f: IO[bytes]) -> Iterator[Chunk]:
+        found: list[Part] = []
+        damage: Damage | None = None
+        more = True
+        while more and not self.aside.done:
+            try:
+                more = self._packet(path, f, found)
+            except Damage as e:
+                damage, more = e, False
+            if sum(len(part.events) for part in found) >= tables.ROWS:
+                yield self._decode(found)
+                found = []
+        if found:
+            yield self._decode(found)
+        if damage:
+            raise damage
+
+    def _packet(self, path: Path, f: IO[bytes], found: list[Part]) -> bool:
+        """Read the next packet, its events into `found`; False at the end of the file."""
+        packet = _next(path, f)
+        if packet is None:
+            return False
+        if packet.kind == POLARITY and packet.size != EVENT.itemsize:
+            raise Damage(packet.begin - HEADER.size, f"events of {packet.size} bytes; expected 8")
+        if packet.kind == POLARITY and packet.number and self.source in (None, packet.source):
+            self.source = packet.source
+            body = f.read(packet.number * packet.size)
+            events = np.frombuffer(body, EVENT, len(body) // EVENT.itemsize)
+            if len(events):
+                found.append(Part(events, packet.overflow, packet.begin))
+                self.aside.follow(_times(events["t"][-1:], packet.overflow))
+        elif packet.kind == IMAGE and self.frames:
+            self._take(f, packet)
+        elif packet.number:
+            self.left[TYPES.get(packet.kind, "other events")] += packet.number
+        _pass(path, f, packet)
+        return True
+
+    def _decode(self, found: list[Part]) -> Chunk:
+        rows = np.concatenate([part.events for part in found])
+        lengths = [len(part.events) for part in found]
+        ends = np.cumsum(lengths)
+        data = rows["data"]
+        valid = np.flatnonzero(data & 1)
+        if len(valid) < len(data):
+            self.left["events marked as invalid"] += len(data) - len(valid)
+        overflow = np.repeat(np.array([part.overflow for part in found], np.int64), lengths)
+        t = _times(rows["t"], overflow)[valid]
+        data = data[valid]
+        y = (data >> 2 & 0x7FFF).astype(np.int32)
+
+        def where(i: int) -> int:
+            row = int(valid[i])
+            part = int(np.searchsorted(ends, row, "right"))
+            first = int(ends[part]) - lengths[part]
+            return found[part].begin + EVENT.itemsize * (row - first)
+
+        return Chunk((data >> 17).astype(np.uint16), self.size[1] - 1 - y if self.turned else y, t,
+                     data & 2 != 0, where)
+
+    def _take(self, f: IO[bytes], packet: Packet) -> None:
+        """The frames of a packet."""
+        if packet.size < FRAME.size:
+            raise Damage(packet.begin - HEADER.size, f"frames of {packet.size} bytes")
+        for k in range(packet.number):
+            body = f.read(packet.size)
+            if len(body) < packet.size:
+                return
+            info, *stamps, width, height, x, y = FRAME.unpack_from(body)
+            channels = info >> 1 & 7
+            if not info & 1:
+                self.left["frames marked as invalid"] += 1
+                continue
+            if min(width, height, channels) < 1 or (
+                    FRAME.size + 2 * width * height * channels > packet.size):
+                raise Damage(packet.begin + k * packet.size, f"a frame of {width}x{height} with "
+                             f"{channels} channels in {packet.size:,} bytes")
+            pixels = np.frombuffer(body, "<u2", width * height * channels, FRAME.size)
+            image = pixels.reshape(height, width, channels)
+            self.mosaic |= channels == 1 and bool(info >> 4 & (7 if self.turned else 15))
+            image = image[..., 0] if channels < 3 else image[..., 2::-1]  # R, G, B(, A)
+            image = image[::-1] if self.turned else image
+            begin, end = stamps[2:] if 0 < stamps[2] <= stamps[3] else stamps[:2]
+            self.aside.append(image.astype(np.float32) * np.float32(255 / 65535),
+                              (packet.overflow << 31) + (begin + end) // 2, (x, y))
+
+    def notes(self) -> tuple[Note, ...]:
+        said = [Note("events.unread", f"{n:,} {name} were not read")
+                for name, n in self.left.items() if n]
+        if self.mosaic:
+            said.append(Note("frames.mosaic", "frames are the raw mosaic of a colour sensor: "
+                             "--bayer converts them to luma"))
+        return tuple(said)
+
+
+def _times(t: np.ndarray, overflow: np.ndarray | int) -> np.ndarray:
+    us: np.ndarray = t.astype(np.int64) + (np.int64(1 << 31) * overflow)
+    return us
+
+
+def _next(path: Path, f: IO[bytes]) -> Packet | None:
+    """The header of the next packet, None at the end of the file; EV008, Damage."""
+    at = f.tell()
+    data = f.read(HEADER.size)
+    if not data:
+        return None
+    if len(data) < HEADER.size:
+        raise Damage(at, f"it ends {len(data)} bytes into the header of a packet")
+    packet = _parsed(data, at)
+    if not _sound(packet._replace(kind=packet.kind & ~COMPRESSED)):
+        raise Damage(at, f"no packet begins so (type {packet.kind}, {packet.number:,} events of "
+                     f"{packet.size:,} bytes)")
+    if packet.kind & COMPRESSED:
+        raise EvflowDataError(
+            "EV008", f"{path} is AEDAT 3 of a compressed format (the packet at byte {at:,}).",
+            "Convert it to AEDAT 4 with DV.")
+    return packet
+
+
+def _parsed(data: bytes, at: int) -> Packet:
+    kind, source, size, _, overflow, capacity, number, _ = HEADER.unpack(data)
+    return Packet(kind & 0xFFFF, source, size, overflow, capacity, number, at + HEADER.size)
+
+
+def _sound(packet: Packet) -> bool:
+    return packet.kind < MOST_TYPES and 0 < packet.size <= MOST_BYTES and (
+        0 <= packet.number <= packet.capacity) and packet.overflow >= 0
+
+
+def _pass(path: Path, f: IO[bytes], packet: Packet) -> None:
+    """Go to the end of a packet; Damage where the file ends before. Some writers fill packets up
+    to their capacity."""
+    total = os.path.getsize(path)
+    end, full = (packet.begin + n * packet.size for n in (packet.number, packet.capacity))
+    if end > total:
+        raise Damage(total, f"it ends in a packet of {packet.number:,} events")
+    if end < full <= total and not _begins(f, end, total) and _begins(f, full, total):
+        end = full
+    f.seek(end)
+
+
+def _begins(f: IO[bytes], at: int, total: int) -> bool:
+    """Does a packet begin there, or the file end?"""
+    f.seek(at)
+    data = f.read(HEADER.size)
+    return at == total or (len(data) == HEADER.size and _sound(_parsed(data, at)))

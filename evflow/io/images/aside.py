@@ -1,0 +1,71 @@
+"""Frames that stand among the events of a file, put aside while the events are read.
+
+A frame lies behind the events of its time, by less than `LATE_US`: so much further than `stop_s`
+a file is read.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from evflow.checks import Size
+from evflow.io.decode.stream import Chunk, Damage, gather
+from evflow.io.hints import Hints
+from evflow.io.images.recorded import FrameStack, cut
+from evflow.io.images.streams import events_alone
+from evflow.io.images.times import beside_events
+from evflow.notes import Note
+from evflow.types import Recording
+
+LATE_US = 1_000_000
+MID_EXPOSURE = Note("frames.clock", "frame times are mid-exposure")
+
+
+class Aside:
+    """stack: the frames so far; last: time of the last event so far, us."""
+
+    def __init__(self, path: Path, hints: Hints, size: Size) -> None:
+        self.path, self.hints, self.size = path, hints, size
+        self.stack = FrameStack(path, size)
+        self.last, self.stop, self.begun = 0, sys.maxsize, False
+
+    def append(self, image: np.ndarray, time_us: int, origin: tuple[int, int] = (0, 0)) -> None:
+        """A frame, as `FrameStack` has it."""
+        with events_alone():
+            self.stack.append(image, time_us, origin)
+
+    def follow(self, t: np.ndarray) -> None:
+        """Follow the time of events t (n,) us as far as `stop_s` needs it."""
+        if self.hints.stop_s is not None and len(t):
+            self.last = self.hints.instant(t[-1], "us")
+            if not self.begun:
+                self.begun, self.stop = True, self.hints.span_us(self.hints.instant(t[0], "us"))[1]
+
+    @property
+    def done(self) -> bool:
+        """Have the frames from before `stop_s` come?"""
+        return self.last >= self.stop + LATE_US
+
+    def collect(
+        self, chunks: Iterator[Chunk], notes: Callable[[], tuple[Note, ...]] = tuple
+    ) -> Recording:
+        """The recording of events and frames. `chunks` calls `append` and `follow`, and ends where
+        it is `done`; `notes` is called at the end. Raises what `gather` and `Recording` raise."""
+        found = gather(self.path, chunks, self.hints, self.size)
+        if self.last >= found.span[1]:
+            with contextlib.suppress(Damage):
+                collections.deque(chunks, 0)
+        said = (*found.notes, *notes())
+        if not self.stack.times:
+            return self.stack.beside(found.events, self.hints, said)
+        with events_alone():
+            times, told = beside_events(
+                np.array(self.stack.times), self.path, "us", self.hints, found.events)
+            said = (MID_EXPOSURE, *said, *told)
+            return cut(self.stack.at(times, found.events, self.hints, said), found.span)
