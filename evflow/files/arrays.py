@@ -17,8 +17,9 @@ from evflow.files.archives import npy_header
 from evflow.files.whole import need_size
 
 
-def mapped(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
+def mapped(path: Path, shape: tuple[int | None, ...], *, fields: bool = False) -> np.ndarray:
     """A memory-mapped .npy of numbers; trailing axes of length 1 beyond `shape` are dropped.
+    fields: of records with fields instead.
 
     Raises EV009 (damaged, pickled, another shape), EV016 (absent).
     """
@@ -33,7 +34,7 @@ def mapped(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
             "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
             "Copy or export it again.") from e
     need, size = start + math.prod(found) * dtype.itemsize, os.path.getsize(path)
-    if dtype.kind not in "biuf" or need > size:
+    if not (dtype.fields if fields else dtype.kind in "biuf") or need > size:
         raise EvflowDataError(
             "EV009", f"{path} claims {found} {dtype}, {need:,} bytes, and has {size:,}.",
             "Cut off? Copy or export it again.")

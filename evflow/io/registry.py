@@ -34,6 +34,7 @@ from evflow.io.formats import (
     ijrr,
     metavision,
     mvsec,
+    npy,
     npz,
     plain_text,
     v2e,
@@ -61,7 +62,7 @@ class Format(Protocol):
 
 FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
     aedat4, aedat3, aedat2, evt2, evt21, evt3, dat, v2e, mvsec, event_utils, metavision, dsec, hdf5,
-    npz, evimo2, evreal, e2vid, v2e_text, ijrr, plain_text, ros1, ros2)
+    npz, npy, evimo2, evreal, e2vid, v2e_text, ijrr, plain_text, ros1, ros2)
 WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
     dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
     npz.NpzWriter, Aedat4Writer)}

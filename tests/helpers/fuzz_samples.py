@@ -101,6 +101,17 @@ def flat_hdf5(folder: Path, kind: str) -> Sample:
     return sample(folder / "a.h5", counted=True)
 
 
+def npy(folder: Path, kind: str) -> Sample:
+    """N x 4, or records."""
+    ev = make(N).events
+    columns = {"x": ev.x, "y": ev.y, "t": ev.t, "p": ev.p}
+    if kind == "matrix":
+        np.save(folder / "a.npy", np.stack([columns[c].astype(np.int64) for c in "xytp"], 1))
+    else:
+        np.save(folder / "a.npy", np.rec.fromarrays(list(columns.values()), names="x,y,t,p"))
+    return sample(folder / "a.npy", counted=True, size=SIZE)
+
+
 def npz(folder: Path) -> Sample:
     write_events(folder / "a.npz", make(N, FRAMES), "npz")
     return sample(folder / "a.npz", sealed=True)
@@ -276,6 +287,7 @@ SAMPLES: dict[str, Callable[[Path], Sample]] = {
     "metavision-plain": partial(metavision, forms=()),
     "hdf5-columns": partial(flat_hdf5, kind="columns"),
     "hdf5-matrix": partial(flat_hdf5, kind="matrix"),
+    "npy-matrix": partial(npy, kind="matrix"), "npy-records": partial(npy, kind="records"),
     "dsec": dsec, "npz": npz, "ijrr": ijrr, "ijrr-zip": ijrr_zip, "e2vid-text": e2vid_text,
     "images-png": partial(images, suffix="png"), "images-jpg": partial(images, suffix="jpg"),
     "images-tif": partial(images, suffix="tif"), "images-bmp": partial(images, suffix="bmp"),

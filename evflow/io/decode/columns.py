@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ SIDE = re.compile(r"@(\d{1,5})$")  # faery's x@640
 PAIR = re.compile(r"\b(?:geometry|resolution|size)\b\D{0,3}(\d{1,5})\s*[x,;\s]\s*(\d{1,5})\b", re.I)
 SIDES = re.compile(r"\b(width|height)\b\W{0,3}(\d{1,5})\b", re.I)
 POLARITIES = {-1.0, 0.0, 1.0}
+PAIRS = ("resolution", "sensor_resolution", "sensor_size", "geometry", "size", "wh")
 PROPHESEE = "xypt"
 KNOWN = ("txyp", PROPHESEE)
 OTHERS = tuple(
@@ -65,6 +67,38 @@ def written_size(words: str) -> Size | None:
         if (side := SIDE.search(field)) and meaning(field) in ("x", "y"):
             sides["width" if meaning(field) == "x" else "height"] = side[1]
     return (int(sides["width"]), int(sides["height"])) if len(sides) == 2 else None
+
+
+def stated_size(get: Callable[[str], Any]) -> Size | None:
+    """(width, height) by values that stand under usual names; get(name): one, or None."""
+    sides = [_numbers(get(name)) for name in ("width", "height")]
+    if len(sides[0]) == len(sides[1]) == 1:
+        return sides[0][0], sides[1][0]
+    for name in PAIRS:
+        value = get(name)
+        if isinstance(words := text(value), str):
+            if size := written_size(f"{name} {words}"):
+                return size
+        elif len(pair := _numbers(value)) >= 2:
+            return max(pair[:2]), min(pair[:2])  # some write the height first; sensors are wide
+    return None
+
+
+def text(value: Any) -> str | None:
+    """A string that an attribute holds, None where it holds something else."""
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
+    return str(value) if isinstance(value, str) else None
+
+
+def _numbers(value: Any) -> list[int]:
+    """Whole positive numbers of a value, none where it is something else."""
+    found = np.asarray(() if value is None else value).ravel()
+    if found.dtype.kind not in "iuf" or not len(found) or len(found) > 4:
+        return []
+    if not (np.isfinite(found).all() and (found > 0).all() and (found < 1 << 16).all()):
+        return []
+    return [int(v) for v in found]
 
 
 def order_of(rows: np.ndarray) -> str:

@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import arrays, columns, tables
@@ -20,7 +18,6 @@ from evflow.io.decode.hdf5 import DAMAGE
 from evflow.io.decode.units import written_unit
 
 MOST = 2000  # groups and data sets looked at
-PAIRS = ("resolution", "sensor_resolution", "sensor_size", "geometry", "size")
 
 
 def walk(f: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
@@ -81,16 +78,9 @@ def _in_group(
 def _unit(name: str, data: Any) -> str:
     """Of times, by their attributes, else by their name."""
     for key in ("unit", "units"):
-        if isinstance(told := text(data.attrs.get(key)), str) and told:
+        if isinstance(told := columns.text(data.attrs.get(key)), str) and told:
             return written_unit(f"[{told}]")
     return written_unit(name)
-
-
-def text(value: Any) -> str | None:
-    """A string that an attribute holds, None where it holds something else."""
-    if isinstance(value, bytes):
-        return value.decode("latin-1")
-    return str(value) if isinstance(value, str) else None
 
 
 def told_size(f: Any, group: Any) -> Size | None:
@@ -99,22 +89,8 @@ def told_size(f: Any, group: Any) -> Size | None:
     places = [group, *([calib] if hasattr(calib, "keys") else []), f]
     for place in places:
         for get in (place.attrs.get, lambda name, at=place: _small(at, name)):
-            if size := _size(get):
+            if size := columns.stated_size(get):
                 return size
-    return None
-
-
-def _size(get: Any) -> Size | None:
-    sides = [_numbers(get(name)) for name in ("width", "height")]
-    if len(sides[0]) == len(sides[1]) == 1:
-        return sides[0][0], sides[1][0]
-    for name in PAIRS:
-        value = get(name)
-        if isinstance(words := text(value), str):
-            if size := columns.written_size(f"{name} {words}"):
-                return size
-        elif len(pair := _numbers(value)) >= 2:
-            return max(pair[:2]), min(pair[:2])  # some write the height first; sensors are wide
     return None
 
 
@@ -124,16 +100,6 @@ def _small(group: Any, name: str) -> Any:
         return None
     data = group[name]
     return data[()] if getattr(data, "size", None) and data.size <= 4 and not data.chunks else None
-
-
-def _numbers(value: Any) -> list[int]:
-    """Whole positive numbers of a value, none where it is something else."""
-    found = np.asarray(() if value is None else value).ravel()
-    if found.dtype.kind not in "iuf" or not len(found) or len(found) > 4:
-        return []
-    if not (np.isfinite(found).all() and (found > 0).all() and (found < 1 << 16).all()):
-        return []
-    return [int(v) for v in found]
 
 
 def listing(f: Any) -> str:

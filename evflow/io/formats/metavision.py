@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.decode import arrays, ecf, prophesee, tables
+from evflow.io.decode import arrays, columns, ecf, prophesee, tables
 from evflow.io.decode.hdf5 import filters_of
-from evflow.io.decode.hdf5_search import text
 from evflow.io.decode.stream import Chunk, Damage, collect
 from evflow.io.hints import Hints
 from evflow.types import Recording
@@ -35,7 +34,7 @@ def read(path: Path, hints: Hints) -> Recording:
     `stream.collect` raises."""
     with tables.opened(path) as f:
         fields = {key.lower(): value for key in f.attrs
-                  if (value := text(f.attrs[key])) is not None}
+                  if (value := columns.text(f.attrs[key])) is not None}
         size, notes = prophesee.Header(fields, 0).size()
         data = tables.dataset(path, f, EVENTS, (None,), ecf.FILTER)
         table = arrays.structured(EVENTS, data)

@@ -1,5 +1,6 @@
 """evflow's own .npz: t (int64 us), x, y, p, size = (width, height); frames and frame_times beside
-them where there are any. `wh` is read as another name of `size`. Pickles are never loaded.
+them where there are any. Read are other names of these, too (`decode.columns`), and one array of
+records or N x 4 numbers (`decode.arrays`). Pickles are never loaded.
 
 Members are checked against the bytes that the archive really holds before memory is taken, and
 columns are decompressed side by side, block by block.
@@ -8,6 +9,7 @@ columns are decompressed side by side, block by block.
 from __future__ import annotations
 
 import contextlib
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,9 @@ from evflow.files.arrays import GrowingArray
 from evflow.files.atomic import aside
 from evflow.files.moves import remove
 from evflow.files.whole import need_members
-from evflow.io.decode import tables
+from evflow.io.decode import arrays, columns, tables
 from evflow.io.decode.stream import Gathered, gather
+from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
 from evflow.io.images.recorded import cut
 from evflow.io.images.streams import ImageStream, choose, events_alone
@@ -51,17 +54,49 @@ def read(path: Path, hints: Hints) -> Recording:
     and `Recording` raise.
     """
     with members(path) as found:
-        missing = [name for name in ("t", "x", "y", "p") if name not in found]
-        if missing:
-            raise EvflowDataError(
-                "EV008", f"{path} holds {sorted(found)} but not {missing}.",
-                "Expected the keys t, x, y, p, size, and optionally frames, frame_times.")
-        stored = found.get("size", found.get("wh"))
-        size: Any = None if stored is None else tuple(stored.whole().ravel().tolist())
-        events = _events(path, [found[name] for name in COLUMNS], hints, size)
+        chosen = columns.by_name(found)
+        size = _size(found)
+        if chosen:
+            events = _events(path, {c: found[name] for c, name in chosen.items()}, hints, size,
+                             written_unit(chosen["t"]) if chosen["t"] != "t" else "us")
+        else:
+            events = _table(path, found).gather(path, hints, size)
         if "frames" not in found:
             return Recording.of_events(events.events, events.notes)
         return _with_frames(path, found, events, hints)
+
+
+def _size(found: dict[str, Member]) -> Any:
+    """Of the sensor, as the archive has it: `size` says (width, height) even where that is odd."""
+    for name in ("size", "wh"):
+        if name in found:
+            return tuple(found[name].whole().ravel().tolist())
+
+    def small(name: str) -> Any:
+        member = found.get(name)
+        return None if member is None or math.prod(member.shape) > 4 else member.whole()
+
+    return columns.stated_size(small)
+
+
+def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
+    """The one array that may be events; EV008 where there is none, or several."""
+    fit = []
+    for name, member in found.items():
+        many = len(member.shape) == 2 and 4 in member.shape and member.dtype.kind in "biuf"
+        if many or (len(member.shape) == 1 and member.dtype.fields):
+            data = member.whole()
+            table = arrays.matrix(name, data) if many else arrays.structured(name, data)
+            fit += [table] if table else []
+    if len(fit) == 1:
+        return fit[0]
+    held = ", ".join(f"{name} {member.dtype} {member.shape}" for name, member in found.items())
+    missing = [c for c in ("t", "x", "y", "p") if c not in map(columns.meaning, found)]
+    raise EvflowDataError(
+        "EV008", f"{path} holds {held[:400] or 'nothing'}, but not {missing}." if not fit else
+        f"{path} holds several arrays that may be events: {', '.join(t.name for t in fit)}.",
+        "Expected the keys t, x, y, p, size, and optionally frames, frame_times; or one array of "
+        "events alone.")
 
 
 def _with_frames(
@@ -82,27 +117,30 @@ def _with_frames(
 
 
 def _events(
-    path: Path, columns: list[Member], hints: Hints, size: Size | None
+    path: Path, found: dict[str, Member], hints: Hints, size: Size | None, unit: str
 ) -> Gathered:
     """What `gather` makes of the columns; damage is told before what it makes of them."""
-    check_columns(*(np.broadcast_to(np.int8(0), column.shape) for column in columns))
+    members = [found[name] for name in COLUMNS]
+    check_columns(*(np.broadcast_to(np.int8(0), member.shape) for member in members))
 
     def rows(part: slice) -> Any:
-        return tuple(column.take(part.stop - part.start) for column in columns)
+        return tuple(member.take(part.stop - part.start) for member in members)
 
-    chunks = tables.blocks(columns[0].shape[0], rows)
+    chunks, native = tables.blocks(members[0].shape[0], rows), "us"
     try:
-        gathered = gather(path, chunks, hints, None if size is None else hints.sensor(size))
+        if unit != "us":
+            chunks, native = arrays.in_unit(path, chunks, unit, hints)
+        gathered = gather(path, chunks, hints, None if size is None else hints.sensor(size), native)
     except EvflowDataError:
-        _finish(columns)
+        _finish(members)
         raise
-    _finish(columns)
+    _finish(members)
     return gathered
 
 
-def _finish(columns: list[Member]) -> None:
-    for column in columns:
-        column.finish()
+def _finish(members: list[Member]) -> None:
+    for member in members:
+        member.finish()
 
 
 class NpzWriter(EventWriter):
