@@ -13,6 +13,7 @@ from evflow.errors import CODES
 
 NOTES: dict[str, str] = {
     "events.layout": "how the file is laid out was inferred",
+    "events.late": "events whose time goes back were left out, sorted or joined",
     "events.outside": "events outside the sensor were left out",
     "events.partial": "only the part before the damage was read",
     "events.timeless": "events before the first time word were left out",
@@ -27,6 +28,7 @@ NOTES: dict[str, str] = {
     "frames.depth": "16-bit frames that do not reach white",
     "frames.fast": "motion too fast to interpolate well",
     "frames.flipped": "frames were mirrored",
+    "frames.late": "frames whose time goes back were left out or sorted",
     "frames.light": "pixels see more or less light than the frames show",
     "frames.linearised": "a response was undone",
     "frames.luma": "colour frames were converted to luma",

@@ -75,6 +75,10 @@ class Reading:
     before a time that goes back)."""
     drop_outside: bool = False
     """Leave out events outside the sensor instead of refusing them."""
+    late: Literal["stop", "drop", "sort", "join"] = "stop"
+    """Events whose time goes back: stop refuses them (with --partial, ends there); drop leaves out
+    as few events as make the others ordered; sort puts them in their place; join takes them for
+    another clock, which is put behind the first."""
     frames_topic: Annotated[str | None, value("NAME")] = None
     """The recording's images that are the frames of its events, where it holds several: a topic of
     a bag, an output of DV. Without it raw images near the events, which a note names."""
@@ -120,7 +124,7 @@ class Reading:
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
             polarity=self.polarity, size=parse_size(self.size), partial=self.partial,
             drop_outside=self.drop_outside, no_frames=self.no_frames or not own,
-            frames_topic=self.frames_topic if own else None)
+            frames_topic=self.frames_topic if own else None, late=self.late)
         if with_frames and (self.frames is not None or recording.has_frames):
             return self._seeing(recording)
         if with_frames:

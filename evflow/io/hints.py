@@ -18,6 +18,7 @@ from evflow.io.decode.units import UNITS_US, since_1970
 from evflow.notes import Note
 
 POLARITIES = ("auto", "01", "pm1", "invert")
+LATE = ("stop", "drop", "sort", "join")
 
 
 def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
@@ -50,6 +51,7 @@ class Told(TypedDict, total=False):
     drop_outside: bool
     frames_topic: str | None
     no_frames: bool
+    late: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +69,9 @@ class Hints:
     drop_outside: leave out events outside the sensor instead of refusing them.
     frames_topic: of several streams of images the one whose images are the frames (see `streams`).
     no_frames: read the events alone.
+    late: what becomes of times that go back: "stop" = they are refused, or with `partial` end the
+        reading; "drop" leaves out as few events as make the others ordered; "sort" puts them in
+        their place; "join" puts one clock behind the other.
     """
 
     start_s: float | None = None
@@ -78,9 +83,11 @@ class Hints:
     drop_outside: bool = False
     frames_topic: str | None = None
     no_frames: bool = False
+    late: str = "stop"
 
     def __post_init__(self) -> None:
-        check_choices(self, time_unit=("auto", *UNITS_US), polarity=POLARITIES)
+        check_choices(
+            self, time_unit=("auto", *UNITS_US), polarity=POLARITIES, late=LATE)
         for name in ("start_s", "stop_s"):
             value = getattr(self, name)
             number = isinstance(value, int | float | np.number)

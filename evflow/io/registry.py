@@ -104,7 +104,8 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
             first event; time_unit: "s", "ms", "us" or "ns"; polarity: "01", "pm1" or "invert";
             size: (width, height); partial: of a damaged file, what lies before the damage;
             drop_outside: leave out events outside the sensor; frames_topic: which of several
-            streams of images holds the frames; no_frames: read the events alone.
+            streams of images holds the frames; no_frames: read the events alone; late: "drop",
+            "sort" or "join" events whose time goes back.
 
     Returns:
         The recording; without frames in the file they are (0, H, W). Its notes say what was

@@ -9,35 +9,22 @@ matter. Memory: the temporaries of a chunk, and of the columns kept, 13 bytes pe
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from evflow.checks import COLUMNS, RESET_US, Size
-from evflow.errors import EvflowDataError
-from evflow.files.spool import Spool
-from evflow.io.hints import Hints, dropped, within
+from evflow.checks import Size
+from evflow.io.decode.chunk import Chunk
+from evflow.io.decode.gathering import Gathering
+from evflow.io.decode.late import Dropped
+from evflow.io.hints import Hints
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
 CHUNK = 1 << 18  # bytes decoded at a time: the temporaries of 64k words stay in a core's cache
 MOST_RESERVED = 0.125, 16  # of the words of a chunk, and at least; of random ones a third are
-KINDS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": bool}
-
-
-class Chunk(NamedTuple):
-    """Consecutive events, (n,) each: x, y whole numbers, t in the format's own unit, p bool,
-    {0, 1} or {-1, 1}. Event i is written at `unit` number `where(i)` of the file."""
-
-    x: np.ndarray
-    y: np.ndarray
-    t: np.ndarray
-    p: np.ndarray
-    where: Callable[[int], int]
-    unit: str = "byte"
 
 
 class Gathered(NamedTuple):
@@ -181,175 +168,24 @@ def gather(
     Raises EV001 (no event in the range), EV003 and EV007 (not whole), EV004 (order), EV005
     (outside the sensor), EV006 (polarity), EV009 (damage), EV015 (size unknown).
     """
-    gathering = _Gathering(path, hints, hints.size or size, native, offset_us)
+    gathering = Gathering(path, hints, hints.size or size, native, offset_us)
+    dropped = Dropped(_sound(chunks, gathering)) if hints.late == "drop" else None
+    for chunk in _sound(chunks, gathering) if dropped is None else dropped:
+        if len(chunk.t) and gathering.add(chunk):
+            break
+    gathering.check_damage()
+    if dropped is not None:
+        gathering.notes += dropped.notes()
+    return Gathered(*gathering.result(size))
+
+
+def _sound(chunks: Iterable[Chunk], gathering: Gathering) -> Iterator[Chunk]:
+    """The chunks before the damage, if there is any."""
     try:
-        for chunk in chunks:
-            if len(chunk.t) and gathering.add(chunk):
-                break
+        for chunk in chunks:  # noqa: UP028 (`yield from` would close them: others go on reading)
+            yield chunk
     except Damage as e:
-        error = EvflowDataError(
-            "EV009", f"{path} is cut off or damaged at {_place(path, e.unit, e.byte)}: {e.seen}"
-            f"{gathering.so_far()}", "Copy it again" + gathering.sound_part())
-        error.__cause__ = e
-        gathering.notes.append(hints.forgive(error, gathering.kept > 0))
-    return gathering.result(size)
-
-
-class _Gathering:
-    """The events kept so far. first, last: times of all events seen, in us."""
-
-    def __init__(
-        self, path: Path, hints: Hints, size: Size | None, native: str, offset: int
-    ) -> None:
-        self.path, self.hints, self.size = path, hints, size
-        self.native, self.offset = native, offset
-        self.columns = {name: Spool(KINDS[name]) for name in COLUMNS}
-        self.signs: set[int] = set()  # values of p kept, where they are not bool
-        self.seen = self.kept = self.first = self.last = self.outside = 0
-        self.reach = (0, 0)
-        self.notes: list[Note] = []
-        self.start, self.stop = hints.span_us(0)
-
-    def add(self, chunk: Chunk) -> bool:
-        """Take what lies in the range; True where the rest of the file lies behind it."""
-        if chunk.t.dtype.kind == "f" and not (told := np.abs(chunk.t) < 2.0**63).all():
-            raise self._odd(chunk, "t", int(np.argmin(told)))
-        t = self.hints.microseconds(chunk.t, self.native, self.offset)
-        if not self.seen:
-            self.first = self.last = int(t[0])
-            self.start, self.stop = self.hints.span_us(self.first)
-        x, y, p = (self._whole(chunk, name) for name in ("x", "y", "p"))
-        if p.dtype != bool:  # its convention is told when all of them are there
-            if p.min() < -1 or p.max() > 1:
-                raise self._odd(chunk, "p", int(np.argmax((p < -1) | (p > 1))))
-            p = p.astype(np.int8)
-        chunk = chunk._replace(x=x, y=y, p=p)
-        if self.hints.drop_outside and self.size:
-            chunk, t = self._inside(chunk, t, self.size)
-            if not len(t):
-                return False
-        wrong = self._first_wrong(chunk, t)
-        self._keep(chunk, t[:wrong])
-        if wrong < len(t) and self.last < self.stop:
-            self.notes.append(self.hints.forgive(self._wrong(chunk, t, wrong), self.kept > 0))
-            return True
-        return self.last >= self.stop and self.kept > 0
-
-    def _inside(self, chunk: Chunk, t: np.ndarray, size: Size) -> tuple[Chunk, np.ndarray]:
-        """The events on the sensor alone."""
-        inside = within(chunk.x, chunk.y, size)
-        if inside.all():
-            return chunk, t
-        self.outside += int((~inside).sum())
-        kept = np.flatnonzero(inside)
-        return Chunk(chunk.x[kept], chunk.y[kept], chunk.t[kept], chunk.p[kept],
-                     lambda i: chunk.where(int(kept[i])), chunk.unit), t[kept]
-
-    def _whole(self, chunk: Chunk, name: str) -> np.ndarray:
-        """A column without fractions as integers or bool."""
-        column: np.ndarray = getattr(chunk, name)
-        if column.dtype.kind in "biu":
-            return column
-        if column.dtype.kind != "f":
-            raise EvflowDataError(
-                "EV003", f"{self.path}: {name} has dtype {column.dtype}.", "Expected numbers.")
-        with np.errstate(invalid="ignore"):
-            whole = column.astype(np.int64)  # of NaN and infinity some integer, not equal to them
-        same = whole == column
-        if not same.all():
-            raise self._odd(chunk, name, int(np.argmin(same)))
-        return whole
-
-    def _odd(self, chunk: Chunk, name: str, i: int) -> EvflowDataError:
-        """The error for a value that no event has."""
-        value = getattr(chunk, name)[i]
-        code = "EV007" if not np.isfinite(value) else "EV006" if name == "p" else "EV003"
-        fix = {"t": "Times are seconds or whole numbers: export it again.",
-               "p": "Polarity is 0 or 1, or -1 or 1; a -1 stored as unsigned reads 255."}
-        place = self._place(chunk, i) + self.so_far(chunk, i)
-        return EvflowDataError(
-            code, f"{self.path}: {name} is {value} at {place}",
-            fix.get(name, "Coordinates are raw integer pixels: were they undistorted? Use the raw "
-                    "ones."))
-
-    def _first_wrong(self, chunk: Chunk, t: np.ndarray) -> int:
-        """Index of the first event out of order or outside the sensor; len(t) for none."""
-        first = 0 if t[0] < self.last else len(t)
-        back = t[1:] < t[:-1]
-        if back.any():
-            first = min(first, int(np.argmax(back)) + 1)
-        for a, limit in zip((chunk.x, chunk.y), self.size or (1 << 16, 1 << 16), strict=True):
-            if a.max() >= limit or (a.dtype.kind != "u" and a.min() < 0):
-                first = min(first, int(np.argmax((a >= limit) | (a < 0))))
-        return first
-
-    def _place(self, chunk: Chunk, i: int) -> str:
-        return _place(self.path, chunk.unit, chunk.where(i))
-
-    def _wrong(self, chunk: Chunk, t: np.ndarray, i: int) -> EvflowDataError:
-        place, before = self._place(chunk, i), int(t[i - 1]) if i else self.last
-        if t[i] < before:
-            fix = ("A camera reset, or two recordings joined? Split them there"
-                   if before - t[i] > RESET_US else "A damaged time? Copy it again")
-            return EvflowDataError(
-                "EV004", f"{self.path}: time goes back from {before:,} to {t[i]:,} us at {place}"
-                f"{self.so_far()}", fix + self.sound_part())
-        width, height = self.size or (1 << 16, 1 << 16)
-        return EvflowDataError(
-            "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "
-            f"{width}x{height}, at {place}{self.so_far()}",
-            "Wrong size? Pass size=(width, height), --size WxH; if it is right the file is "
-            "damaged: copy it again" + self.sound_part())
-
-    def _keep(self, chunk: Chunk, t: np.ndarray) -> None:
-        if not len(t):
-            return
-        self.seen += len(t)
-        self.last = int(t[-1])
-        a, b = 0, len(t)
-        if not self.hints.whole:
-            a, b = (int(i) for i in np.searchsorted(t, np.array([self.start, self.stop])))
-        if self.size is None:
-            x, y = self.reach
-            self.reach = max(x, int(chunk.x.max())), max(y, int(chunk.y.max()))
-        if a < b:
-            self.kept += b - a
-            if chunk.p.dtype != bool:
-                self.signs.update(v for v in (-1, 0, 1) if (chunk.p[a:b] == v).any())
-            for name, column in zip(COLUMNS, (chunk.x, chunk.y, t, chunk.p > 0), strict=True):
-                self.columns[name].append(column[a:b])
-
-    def so_far(self, chunk: Chunk | None = None, begun: int = 0) -> str:
-        """What was sound; of a chunk that was not kept, its first `begun` events too."""
-        first, last = self.first, self.last
-        if chunk is not None and begun:
-            ends = self.hints.microseconds(chunk.t[[0, begun - 1]], self.native, self.offset)
-            first, last = first if self.seen else int(ends[0]), int(ends[1])
-        span = (last - first) // 1000 / 1000
-        return f"; {self.seen + begun:,} events up to {span:.3f} s before that are sound."
-
-    def sound_part(self) -> str:
-        until = (self.last - self.first) // 1000 / 1000  # rounded down: up to it all is sound
-        return (f", or read the sound part: stop_s={until:.3f} (--stop), or --partial."
-                if until else ".")
-
-    def result(self, size: Size | None) -> Gathered:
-        if self.seen and not self.kept:
-            raise self.hints.empty(self.last - self.first)
-        if self.outside and self.size:
-            self.notes.append(dropped(self.outside, self.seen + self.outside, self.size))
-        size = self.hints.sensor(size, reach=self.reach if self.seen else None)
-        self.hints.on(np.array(sorted(self.signs), np.int8))  # is it one convention?
-        x, y, t, on = (self.columns.pop(name).array() for name in COLUMNS)
-        if self.hints.polarity == "invert":
-            np.logical_not(on, out=on)
-        return Gathered(Events.unchecked(x, y, t, on, size), (self.start, self.stop),
-                        tuple(self.notes))
-
-
-def _place(path: Path, unit: str, number: int) -> str:
-    total = f" of {os.path.getsize(path):,}" if unit == "byte" else ""
-    return f"{unit} {number:,}{total}"
+        gathering.damaged(e.byte, e.seen, e.unit, e)
 
 
 def hold(carried: int, values: np.ndarray, at: np.ndarray, n: int) -> np.ndarray:

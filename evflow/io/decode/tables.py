@@ -20,7 +20,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode.hdf5 import DAMAGE, MAGIC, MAX_RATIO, load_h5py, need_filters, plausible
 from evflow.io.decode.stream import Chunk, Gathered
 from evflow.io.hints import Hints
-from evflow.io.images.recorded import FrameStack
+from evflow.io.images.recorded import FrameStack, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
 from evflow.notes import Note
@@ -146,12 +146,14 @@ def with_frames(
     with events_alone():
         stamps, decode = images.load()
         times, told = beside_events(stamps, path, native, hints, events)
-        times = check_times(times, f"{path}: frame times", strict=True)
-        keep = slice(*(int(i) for i in np.searchsorted(times, np.array(span))))
+        order, _ = in_order(times, hints)
+        check_times(times if order is None else times[order], f"{path}: frame times", strict=True)
+        within = np.flatnonzero((times >= span[0]) & (times < span[1]))
+        keep = slice(int(within[0]), int(within[-1]) + 1) if len(within) else slice(0)
         stack = FrameStack(path, events.size)
-        for image, time in zip(decode(keep), times[keep], strict=True) if (
-                keep.start < keep.stop) else ():
-            stack.append(image, time)
+        for image, time in zip(decode(keep), times[keep], strict=True) if len(within) else ():
+            if span[0] <= time < span[1]:
+                stack.append(image, time)
         return stack.beside(events, hints, (*clock, *notes, *told, *chosen.notes))
 
 

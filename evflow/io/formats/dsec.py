@@ -37,6 +37,7 @@ RECTIFY = Note("sensor.unrectified", "rectify_map.h5 is not applied: events stay
 DSEC_SIZE = (640, 480)
 FLUSH = 1 << 20  # events rewritten at a time where t widens
 INDEX_MS = 1 << 20  # milliseconds indexed at a time: 8 MiB, however long the camera was silent
+AROUND, PLACES = 2, 17  # times looked at around one, and places at which they must rise
 MAX_MS = 10**8  # 28 hours; beyond that two clocks were joined and ms_to_idx would not fit
 
 
@@ -186,14 +187,24 @@ def _chunks(columns: dict[str, Any], hints: Hints) -> Iterator[Chunk]:
 
 
 def _range(t: Any, hints: Hints) -> tuple[int, int]:
-    """The first event to read, and the first not to."""
-    if hints.whole or len(t) == 0:
+    """The first event to read, and the first not to; `gather` finds the very ones among them. All
+    where times go back on the whole, or may."""
+    if hints.whole or not len(t) or hints.late != "stop" or not _rises(t):
         return 0, len(t)
 
-    def us(value: Any) -> int:
-        return hints.instant(value, "us")
+    def us(at: int) -> int:
+        near = np.sort(t[max(at - AROUND, 0) : at + AROUND + 1])  # a single time may be wrong
+        return hints.instant(near[len(near) // 2], "us")
 
-    first, last = (bisect.bisect_left(t, value, key=us) for value in hints.span_us(us(t[0])))
+    first, last = (bisect.bisect_left(range(len(t)), value, key=us)
+                   for value in hints.span_us(hints.instant(t[0], "us")))
     if first >= last:
-        raise hints.empty(us(t[-1]) - us(t[0]))
-    return first, last
+        raise hints.empty(us(len(t) - 1) - us(0))
+    return max(first - 2 * AROUND, 0), min(last + 2 * AROUND, len(t))
+
+
+def _rises(t: Any) -> bool:
+    """Do times rise from place to place, evenly spread?"""
+    places = np.unique(np.linspace(0, len(t) - 1, PLACES).astype(int))
+    medians = [np.median(t[max(at - AROUND, 0) : at + AROUND + 1]) for at in places.tolist()]
+    return bool((np.diff(medians) >= 0).all())

@@ -27,7 +27,7 @@ from evflow.io.decode import arrays, columns, tables
 from evflow.io.decode.stream import Gathered, gather
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
-from evflow.io.images.recorded import cut
+from evflow.io.images.recorded import cut, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
 from evflow.io.writer import EventWriter
@@ -113,7 +113,11 @@ def _with_frames(
         if "frame_times" not in found:
             raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
         times, told = beside_events(found["frame_times"].whole(), path, "us", hints, events)
-        return cut(Recording(events, found["frames"].spooled(), times, notes + told), span)
+        frames = found["frames"].spooled()
+        order, late = in_order(times, hints)
+        if order is not None and len(frames) == len(times):
+            frames, times = frames[order], times[order]
+        return cut(Recording(events, frames, times, (*notes, *told, *late)), span)
 
 
 def _events(

@@ -10,6 +10,7 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
+from evflow.io.decode.late import longest
 from evflow.io.hints import Hints
 from evflow.light.colour import CONVERTED, luma
 from evflow.notes import Note
@@ -73,7 +74,26 @@ class FrameStack:
         frames = self._spool.array().reshape(-1, *self.size[::-1])
         if self.colour:
             notes = (*notes, CONVERTED)
-        return Recording(events, frames, times, notes)
+        order, told = in_order(times, hints)
+        if order is not None:
+            frames, times = frames[order], times[order]
+        return Recording(events, frames, times, (*notes, *told))
+
+
+def in_order(times: np.ndarray, hints: Hints) -> tuple[np.ndarray | None, tuple[Note, ...]]:
+    """Indices that make frame times (T,) rise as `hints.late` wants it, and what is to be said;
+    None where they do, or are left to be refused."""
+    if hints.late not in ("drop", "sort") or bool((np.diff(times) > 0).all()):
+        return None, ()
+    if hints.late == "sort":
+        order = np.unique(times, return_index=True)[1]
+        return order, (Note("frames.late", "frames came late and were put in their place; "
+                            f"{len(times) - len(order):,} of the same time were left out "
+                            "(--late sort)"),)
+    kept = longest(times)
+    kept = kept[np.diff(times[kept], prepend=times[kept[0]] - 1) > 0]
+    return kept, (Note("frames.late", f"{len(times) - len(kept):,} of {len(times):,} frames whose "
+                       "time goes back, or repeats, were left out (--late drop)"),)
 
 
 def cut(recording: Recording, span: tuple[int, int]) -> Recording:

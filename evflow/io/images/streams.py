@@ -60,6 +60,9 @@ def choose(
     """
     if hints.no_frames:
         return Chosen(None)
+    if hints.late == "join" and streams:
+        return Chosen(None, (Note("frames.unused", "frames were not read: --late join moves the "
+                                  "clock of the events"),))
     if hints.frames_topic is not None:
         return _named(streams, hints.frames_topic, sensor, events)
     why = {stream.name: _against(stream, sensor, events) for stream in streams}

@@ -23,6 +23,7 @@ from evflow.io.formats.ros.messages import EVENT, Packet
 from evflow.notes import Note
 
 CAER = np.dtype([("data", "<u4"), ("t", "<u4")])
+LEAST = 1 << 11  # events of a chunk, where there are as many
 OTHER_CLOCK = ("evt3", "mono")  # encodings whose times are not those of other topics
 
 
@@ -48,11 +49,28 @@ def decoded(path: Path, first: Packet, packets: Iterable[Packet]) -> Decoded:
     return Decoded(_counted(known[first.encoding](packets)), "ns")
 
 
-def _counted(parts: Iterator[tuple[np.ndarray, ...]]) -> Iterator[Chunk]:
-    n = 0
-    for x, y, t, p in parts:
-        yield Chunk(x, y, t, p, lambda i, n=n: n + i, "event")  # type: ignore[misc]
-        n += len(t)
+def _counted(parts: Iterable[tuple[np.ndarray, ...]]) -> Iterator[Chunk]:
+    """Chunks of the events of several messages: one alone may hold two."""
+    done = count = 0
+    waiting: list[tuple[np.ndarray, ...]] = []
+    try:
+        for part in parts:
+            waiting.append(part)
+            count += len(part[2])
+            if count >= LEAST:
+                yield _chunk(waiting, done)
+                done, count, waiting = done + count, 0, []
+    except Damage:
+        if count:
+            yield _chunk(waiting, done)
+        raise
+    if count:
+        yield _chunk(waiting, done)
+
+
+def _chunk(parts: list[tuple[np.ndarray, ...]], done: int) -> Chunk:
+    x, y, t, p = parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
+    return Chunk(x, y, t, p, lambda i: done + i, "event")
 
 
 def _words(packets: Iterable[Packet]) -> Iterator[tuple[int, np.ndarray]]:

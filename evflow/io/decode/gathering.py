@@ -1,0 +1,247 @@
+"""The events of a file that are kept, chunk by chunk, and what is wrong with the others.
+
+Faults are told with their place: times that go back, coordinates outside the sensor, values that
+no event has. Only what lies in the range that was asked for is judged.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from evflow.checks import COLUMNS, RESET_US, Size
+from evflow.errors import EvflowDataError
+from evflow.files.spool import Spool
+from evflow.io.decode import late
+from evflow.io.decode.chunk import Chunk
+from evflow.io.hints import Hints, dropped, within
+from evflow.notes import Note
+from evflow.types import Events
+
+KINDS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": bool}
+
+
+class Gathering:
+    """The events kept so far. first, last: times of all events seen, in us."""
+
+    def __init__(
+        self, path: Path, hints: Hints, size: Size | None, native: str, offset: int
+    ) -> None:
+        self.path, self.hints, self.size = path, hints, size
+        self.native, self.offset = native, offset
+        self.columns = {name: Spool(KINDS[name]) for name in COLUMNS}
+        self.signs: set[int] = set()  # values of p kept, where they are not bool
+        self.seen = self.kept = self.first = self.last = self.outside = 0
+        self.reach = (0, 0)
+        self.notes: list[Note] = []
+        self.start, self.stop = hints.span_us(0)
+        self.begun = hints.start_s is None  # has the range begun?
+        self.passed = False  # has its end been seen? a jump there may still be a wrong time
+        self.damage: tuple[EvflowDataError, BaseException] | None = None
+        self.joint = late.Joint() if hints.late == "join" else None
+        self.lateness = late.Lateness() if hints.late == "sort" else None
+
+    def add(self, chunk: Chunk) -> bool:
+        """Take what lies in the range; True where the rest of the file lies behind it."""
+        t = self._times(chunk)
+        x, y, p = (self._whole(chunk, name) for name in ("x", "y", "p"))
+        if p.dtype != bool:  # its convention is told when all of them are there
+            if p.min() < -1 or p.max() > 1:
+                raise self._odd(chunk, "p", int(np.argmax((p < -1) | (p > 1))))
+            p = p.astype(np.int8)
+        chunk = chunk._replace(x=x, y=y, p=p)
+        if self.hints.drop_outside and self.size:
+            chunk, t = self._inside(chunk, t, self.size)
+            if not len(t):
+                return False
+        return self._unsorted(chunk, t) if self.lateness else self._sorted(chunk, t)
+
+    def _times(self, chunk: Chunk) -> np.ndarray:
+        if chunk.t.dtype.kind == "f" and not (told := np.abs(chunk.t) < 2.0**63).all():
+            raise self._odd(chunk, "t", int(np.argmin(told)))
+        t = self.hints.microseconds(chunk.t, self.native, self.offset)
+        t = self.joint(t) if self.joint else t
+        if not self.seen:
+            self.first = self.last = int(t[0])
+            self.start, self.stop = self.hints.span_us(self.first)
+        return t
+
+    def _sorted(self, chunk: Chunk, t: np.ndarray) -> bool:
+        """Take what lies in the range as far as it is in order and on the sensor."""
+        if self.passed and t[0] >= self.stop:
+            return True
+        begin = 0 if self.begun else late.begin(t, self.start)
+        back = begin + late.back_at(t[begin:], self.last if self.begun and self.seen else None)
+        end = begin + int(np.searchsorted(t[begin:back], self.stop))
+        ahead = late.ahead_of(t[begin:], back - begin) if back < len(t) else 0
+        jump = begin <= end < len(t) and self._jumps(t, end)
+        if end < back - ahead and not (jump and back < len(t) and t[back] < self.stop):
+            back = len(t)  # the range ends before time goes back
+        else:
+            end = back
+        wrong = min(back, begin + self._first_outside(chunk, begin, end))
+        self._keep(chunk, t, begin, min(wrong, end))
+        self.begun |= begin < len(t)
+        if wrong < min(end, len(t)) or (wrong == back < len(t)):
+            error = self._wrong(chunk, t, wrong, ahead)
+            self.notes.append(self.hints.forgive(error, self.kept > 0))
+            return True
+        self.last = int(t[-1])
+        self.passed = end < len(t)
+        return self.passed and self.kept > 0 and not (jump and len(t) - end <= late.FEW)
+
+    def _jumps(self, t: np.ndarray, i: int) -> bool:
+        """Does time jump at event i so far that it may be wrong?"""
+        return int(t[i]) - (int(t[i - 1]) if i else self.last) > RESET_US
+
+    def _unsorted(self, chunk: Chunk, t: np.ndarray) -> bool:
+        """Take what lies in the range in whatever order."""
+        assert self.lateness
+        self.lateness.see(t)
+        if (at := self._first_outside(chunk, 0, len(t))) < len(t):
+            raise self._wrong(chunk, t, at, 0)
+        kept = np.flatnonzero((t >= self.start) & (t < self.stop))
+        self._keep(chunk.only(kept), t[kept], 0, len(kept))
+        self.seen += len(t) - len(kept)
+        self.last = max(self.last, int(t.max()))
+        self.passed |= int(t[-1]) >= self.stop
+        return bool(t.min() >= self.stop + RESET_US) and self.kept > 0
+
+    def _inside(self, chunk: Chunk, t: np.ndarray, size: Size) -> tuple[Chunk, np.ndarray]:
+        """The events on the sensor alone."""
+        inside = within(chunk.x, chunk.y, size)
+        if inside.all():
+            return chunk, t
+        self.outside += int((~inside).sum())
+        kept = np.flatnonzero(inside)
+        return chunk.only(kept), t[kept]
+
+    def _whole(self, chunk: Chunk, name: str) -> np.ndarray:
+        """A column without fractions as integers or bool."""
+        column: np.ndarray = getattr(chunk, name)
+        if column.dtype.kind in "biu":
+            return column
+        if column.dtype.kind != "f":
+            raise EvflowDataError(
+                "EV003", f"{self.path}: {name} has dtype {column.dtype}.", "Expected numbers.")
+        with np.errstate(invalid="ignore"):
+            whole = column.astype(np.int64)  # of NaN and infinity some integer, not equal to them
+        same = whole == column
+        if not same.all():
+            raise self._odd(chunk, name, int(np.argmin(same)))
+        return whole
+
+    def _odd(self, chunk: Chunk, name: str, i: int) -> EvflowDataError:
+        """The error for a value that no event has."""
+        value = getattr(chunk, name)[i]
+        code = "EV007" if not np.isfinite(value) else "EV006" if name == "p" else "EV003"
+        fix = {"t": "Times are seconds or whole numbers: export it again.",
+               "p": "Polarity is 0 or 1, or -1 or 1; a -1 stored as unsigned reads 255."}
+        place = self._place(chunk, i) + self.so_far(chunk, i)
+        return EvflowDataError(
+            code, f"{self.path}: {name} is {value} at {place}",
+            fix.get(name, "Coordinates are raw integer pixels: were they undistorted? Use the raw "
+                    "ones."))
+
+    def _first_outside(self, chunk: Chunk, begin: int, end: int) -> int:
+        """Index behind `begin` of the first event outside the sensor; what is left for none."""
+        first = len(chunk.t) - begin
+        if begin >= end:
+            return first
+        for a, limit in zip((chunk.x, chunk.y), self.size or (1 << 16, 1 << 16), strict=True):
+            a = a[begin:end]
+            if a.max() >= limit or (a.dtype.kind != "u" and a.min() < 0):
+                first = min(first, int(np.argmax((a >= limit) | (a < 0))))
+        return first
+
+    def _place(self, chunk: Chunk, i: int) -> str:
+        return place(self.path, chunk.unit, chunk.where(i))
+
+    def _wrong(self, chunk: Chunk, t: np.ndarray, i: int, ahead: int) -> EvflowDataError:
+        spot, before = self._place(chunk, i), int(t[i - 1]) if i else self.last
+        if t[i] < before and not self.lateness:
+            if ahead:
+                self.last = int(t[i - ahead - 1])
+            return EvflowDataError(
+                "EV004", f"{self.path}: time goes back from {before:,} to {t[i]:,} us at {spot}"
+                f"{self.so_far()}", late.advice(t, i, before) + self.sound_part())
+        width, height = self.size or (1 << 16, 1 << 16)
+        return EvflowDataError(
+            "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "
+            f"{width}x{height}, at {spot}{self.so_far()}",
+            "Wrong size? Pass size=(width, height), --size WxH; if it is right the file is "
+            "damaged: copy it again" + self.sound_part())
+
+    def _keep(self, chunk: Chunk, t: np.ndarray, a: int, b: int) -> None:
+        """Keep the events from a to b; those before a are passed over."""
+        self.seen += b
+        if self.size is None and b:
+            x, y = self.reach
+            self.reach = max(x, int(chunk.x[:b].max())), max(y, int(chunk.y[:b].max()))
+        if a < b:
+            self.last = int(t[b - 1])
+            self.kept += b - a
+            if chunk.p.dtype != bool:
+                self.signs.update(v for v in (-1, 0, 1) if (chunk.p[a:b] == v).any())
+            for name, column in zip(COLUMNS, (chunk.x, chunk.y, t, chunk.p > 0), strict=True):
+                self.columns[name].append(column[a:b])
+
+    def damaged(self, at: int, seen: str, unit: str, e: BaseException) -> None:
+        """Where the bytes stop making sense: it is told by `check_damage`."""
+        error = EvflowDataError(
+            "EV009", f"{self.path} is cut off or damaged at {place(self.path, unit, at)}: {seen}")
+        self.damage = error, e
+
+    def check_damage(self) -> None:
+        """EV009 where there is damage, unless it lies behind the range, or is forgiven."""
+        if self.damage is None or (self.passed and self.kept):
+            return
+        error, e = self.damage
+        error = EvflowDataError(
+            error.code, error.seen + self.so_far(), "Copy it again" + self.sound_part())
+        error.__cause__ = e
+        self.notes.append(self.hints.forgive(error, self.kept > 0))
+
+    def so_far(self, chunk: Chunk | None = None, begun: int = 0) -> str:
+        """What was sound; of a chunk that was not kept, its first `begun` events too."""
+        first, last = self.first, self.last
+        if chunk is not None and begun:
+            ends = self.hints.microseconds(chunk.t[[0, begun - 1]], self.native, self.offset)
+            first, last = first if self.seen else int(ends[0]), int(ends[1])
+        span = (last - first) // 1000 / 1000
+        return f"; {self.seen + begun:,} events up to {span:.3f} s before that are sound."
+
+    def sound_part(self) -> str:
+        until = (self.last - self.first) // 1000 / 1000  # rounded down: up to it all is sound
+        return (f", or read the sound part: stop_s={until:.3f} (--stop), or --partial."
+                if until > 0 else ".")
+
+    def result(self, size: Size | None) -> tuple[Events, tuple[int, int], tuple[Note, ...]]:
+        """The events, the range in us that was asked for, and what obeying cost."""
+        if self.seen and not self.kept:
+            raise self.hints.empty(self.last - self.first)
+        if self.outside and self.size:
+            self.notes.append(dropped(self.outside, self.seen + self.outside, self.size))
+        size = self.hints.sensor(size, reach=self.reach if self.seen else None)
+        self.hints.on(np.array(sorted(self.signs), np.int8))  # is it one convention?
+        x, y, t, on = self._columns()
+        if self.hints.polarity == "invert":
+            np.logical_not(on, out=on)
+        self.notes += self.joint.notes() if self.joint else ()
+        return Events.unchecked(x, y, t, on, size), (self.start, self.stop), tuple(self.notes)
+
+    def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """x, y, t, p of the events kept, in order."""
+        x, y, t, on = (self.columns.pop(name).array() for name in COLUMNS)
+        if self.lateness is None or (order := self.lateness.order(t)) is None:
+            return x, y, t, on
+        self.notes += self.lateness.notes()
+        return x[order], y[order], t[order], on[order]
+
+
+def place(path: Path, unit: str, number: int) -> str:
+    """Where something stands in a file: "byte 12 of 3,456"."""
+    total = f" of {os.path.getsize(path):,}" if unit == "byte" else ""
+    return f"{unit} {number:,}{total}"

@@ -1,0 +1,202 @@
+"""Events whose time goes back: what it probably means, and what `--late` makes of them.
+
+Late events come behind others of a later time, as packets do that were overtaken. Where a few
+events are ahead of all that follow, these are wrong. Where time goes back for good, another
+clock begins. `dropped` leaves out as few events as make the others ordered, which tells the three
+apart as far as it looks ahead; `order` sorts; a `Joint` puts one clock behind the other.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from evflow.checks import RESET_US
+from evflow.io.decode.chunk import Chunk, joined
+from evflow.notes import Note
+
+LOOK = 1 << 16  # events looked at behind the first that goes back
+FEW = 16  # so many events ahead of what follows may be wrong
+
+
+def back_at(t: np.ndarray, last: float | None = None) -> int:
+    """Index of the first of t (N,) before the one in front of it, of `last` to begin with; N."""
+    if last is not None and len(t) and t[0] < last:
+        return 0
+    back = t[1:] < t[:-1]
+    return int(np.argmax(back)) + 1 if back.any() else len(t)
+
+
+def ahead_of(t: np.ndarray, i: int) -> int:
+    """How many events right before t[i], where time first goes back, are ahead of what follows; 0
+    where event i is the late one."""
+    ahead = i - int(np.searchsorted(t[:i], t[i], "right"))
+    behind = int(np.count_nonzero(t[i : i + LOOK] < t[i - 1])) if i else 0
+    return ahead if ahead <= min(FEW, i - 1) and ahead < behind else 0
+
+
+def advice(t: np.ndarray, i: int, before: int) -> str:
+    """What it means that t[i] lies before `before`, the time in front of it, and what to do."""
+    if ahead := ahead_of(t, i):
+        return (f"The {ahead} before it lie ahead of all that follows: damaged times? Leave them "
+                "out: --late drop (late='drop')")
+    if before - int(t[i]) > RESET_US and not (t[i : i + LOOK] >= before).any():
+        return ("A camera reset, or two recordings joined? Read one behind the other: --late join "
+                "(late='join')")
+    return ("Packets that were overtaken? Leave out what is late: --late drop (late='drop'), put "
+            "it in its place: --late sort")
+
+
+def begin(t: np.ndarray, start: int) -> int:
+    """Index of the first of t (N,) at or after `start`, single events ahead of the rest apart."""
+    if back_at(t) == len(t):
+        return int(np.searchsorted(t, start))
+    reached = np.concatenate([[0], (t >= start).astype(np.int8), [0]])
+    firsts, ends = (np.flatnonzero(np.diff(reached) == step) for step in (1, -1))
+    lasting = (ends - firsts > FEW) | (ends == len(t))
+    return int(firsts[np.argmax(lasting)]) if lasting.any() else len(t)
+
+
+class Dropped:
+    """The chunks without the events that must go for the others to be in order, as few as
+    possible among `LOOK`; count: how many went, of `seen`."""
+
+    def __init__(self, chunks: Iterable[Chunk]) -> None:
+        self.chunks, self.count, self.seen = chunks, 0, 0
+        self._last: float | None = None
+
+    def __iter__(self) -> Iterator[Chunk]:
+        held: list[Chunk] = []
+        for chunk in self.chunks:
+            if not len(chunk.t):
+                continue
+            if held:
+                block, n = joined([*held, chunk]), sum(len(part.t) for part in held)
+                if len(block.t) < LOOK and back_at(block.t, self._last) < len(block.t):
+                    held.append(chunk)
+                    continue
+                kept = self._kept(block.t)
+                yield self._released(block, kept[kept < n], n)
+            held = [chunk]
+        if held:
+            block = joined(held)
+            yield self._released(block, self._kept(block.t), len(block.t))
+
+    def _kept(self, t: np.ndarray) -> np.ndarray:
+        if t.dtype.kind == "f" and np.isnan(t).any():  # what reads them says where
+            return np.arange(len(t))
+        return longest(t, self._last)
+
+    def _released(self, block: Chunk, kept: np.ndarray, of: int) -> Chunk:
+        self.seen += of
+        self.count += of - len(kept)
+        if len(kept):
+            self._last = block.t[kept[-1]]
+        return block.only(kept)
+
+    def notes(self) -> tuple[Note, ...]:
+        if not self.count:
+            return ()
+        return (Note("events.late", f"{self.count:,} of {self.seen:,} events whose time goes back, "
+                     "or lies ahead of what follows, were left out (--late drop)"),)
+
+
+def longest(t: np.ndarray, least: float | None = None) -> np.ndarray:
+    """Indices of as many of t (N,) as do not decrease, none below `least`.
+
+    A time that is no smaller than all before and no larger than all after belongs to them
+    wherever it stands: only what lies between two such is searched.
+    """
+    if back_at(t, least) == len(t):
+        return np.arange(len(t))
+    at = np.arange(len(t)) if least is None else np.flatnonzero(t >= least)
+    t = t[at]
+    if not len(t):
+        return at
+    before = np.maximum.accumulate(t)
+    after = np.minimum.accumulate(t[::-1])[::-1]
+    fixed = (t == before) & (t == after)
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], fixed, [True]]).astype(np.int8)))
+    parts = [np.flatnonzero(fixed)]
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        parts.append(first + _longest(t[first:end].tolist()))
+    return at[np.sort(np.concatenate(parts))]
+
+
+def _longest(values: list[float]) -> np.ndarray:
+    """The same by patience sorting: tops[k] ends the lowest of the runs of k + 1."""
+    tops: list[float] = []
+    places: list[int] = []
+    previous = [-1] * len(values)
+    for i, value in enumerate(values):
+        k = bisect_right(tops, value)
+        previous[i] = places[k - 1] if k else -1
+        if k == len(tops):
+            tops.append(value)
+            places.append(i)
+        else:
+            tops[k], places[k] = value, i
+    run, i = [], places[-1]
+    while i >= 0:
+        run.append(i)
+        i = previous[i]
+    return np.array(run[::-1])
+
+
+class Joint:
+    """Clocks one behind the other: where times go back by more than a late packet would, all that
+    follows is moved to where the clock stood. count: how often."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._last: int | None = None
+        self._shift = 0
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        """Times (N,) int64 us that continue those of the calls before."""
+        if not len(t):
+            return t
+        steps = np.diff(t, prepend=t[0] if self._last is None else self._last)
+        self._last = int(t[-1])
+        reset = steps < -RESET_US
+        if not reset.any():
+            return t + self._shift
+        shift = self._shift + np.cumsum(np.where(reset, -steps, 0))
+        self._shift, self.count = int(shift[-1]), self.count + int(reset.sum())
+        return t + shift
+
+    def notes(self) -> tuple[Note, ...]:
+        if not self.count:
+            return ()
+        return (Note("events.late", f"the clock began anew {self.count:,} times; what lies behind "
+                     "follows on what lies before (--late join)"),)
+
+
+class Lateness:
+    """How many events came late, and by how much at most, while they are collected to be sorted.
+    disorder: the first of their rows that is out of order."""
+
+    def __init__(self) -> None:
+        self.count, self.most_us = 0, 0
+        self._last: int | None = None
+
+    def see(self, t: np.ndarray) -> None:
+        highest = np.maximum.accumulate(
+            t if self._last is None else np.maximum(t, self._last))
+        late = highest - t
+        if late.any():
+            self.count += int(np.count_nonzero(late))
+            self.most_us = max(self.most_us, int(late.max()))
+        self._last = int(highest[-1])
+
+    def order(self, t: np.ndarray) -> np.ndarray | None:
+        """Indices that sort t; None where it is sorted."""
+        return np.argsort(t, kind="stable") if self.count else None
+
+    def notes(self) -> tuple[Note, ...]:
+        if not self.count:
+            return ()
+        return (Note("events.late", f"{self.count:,} events that came up to "
+                     f"{self.most_us / 1e3:,.3f} ms late were put in their place (--late sort)"),)
