@@ -2,13 +2,15 @@
 
 A checkpoint holds the whole TrainState (parameters, average, optimiser, key, step); the
 configuration lies beside it as config.json, so a run explains itself. It is written by all
-processes of a run together (they share the folder) and restored onto any devices.
+processes of a run together (they share the folder) and restored onto any devices. One that cannot
+be read is set aside, and the run goes on from the one before.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,66 +18,156 @@ import jax
 import orbax.checkpoint as ocp
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import aside, atomic_write
+from evflow.files.regular import is_there
+from evflow.process import devices
+
+ANEW = "choose another --out"
 
 
 class Checkpoints:
     """The checkpoints of one run in `folder`; a context manager that waits for writes. Raises
-    EV019 where that is a file."""
+    EV019 where that is a file, or cannot be made."""
 
     def __init__(self, folder: str | os.PathLike, keep: int = 2) -> None:
         self.folder = Path(folder).absolute()
-        if self.folder.exists() and not self.folder.is_dir():
-            raise EvflowDataError("EV019", f"{self.folder} is a file, and no folder of a run.",
-                                  "Choose another --out.")
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep, create=True, cleanup_tmp_directories=True)
-        self._manager = ocp.CheckpointManager(self.folder / "steps", options=options)
+        self.steps = self.folder / "steps"
+        for place in (self.folder, self.steps):
+            if place.exists() and not place.is_dir():
+                raise EvflowDataError("EV019", f"{place} is a file, and no folder of a run.",
+                                      "Choose another --out.")
+        try:
+            self.steps.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            raise EvflowDataError("EV019", f"{self.steps} cannot be made ({e.strerror}).",
+                                  "Choose another --out.") from e
+        self._keep = keep
+        self._writer: Any = None
 
     def __enter__(self) -> Checkpoints:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:  # an error may be the death of a process, which a write would wait for
-            self._manager.wait_until_finished()
-            self._manager.close()
+        if kind is None and self._writer is not None:
+            # not after an error: it may be the death of a process, which a write would wait for
+            self._writer.wait_until_finished()
+            self._writer.close()
 
     @property
     def latest(self) -> int | None:
-        """The last complete step, or None."""
-        return self._manager.latest_step()
+        """The last step that is there, sound or not, or None."""
+        return max(self._found(), default=None)
+
+    def _found(self) -> list[int]:
+        """All steps, the last one first; a file in place of a folder is a damaged one."""
+        names = [path.name for path in self.steps.iterdir()] if self.steps.is_dir() else []
+        return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
 
     def save(self, step: int, state: Any) -> None:
         """Write `state` as `step`, in the background; an existing step is left as it is."""
-        if step not in self._manager.all_steps():
-            self._manager.save(step, args=ocp.args.StandardSave(state))
+        manager = self._manager()
+        if step not in manager.all_steps():
+            manager.save(step, args=ocp.args.StandardSave(state))
+
+    def _manager(self) -> Any:
+        """What writes steps and removes old ones; it looks at all that are there, so that damaged
+        ones must be gone before. EV009 where it cannot."""
+        if self._writer is None:
+            options = ocp.CheckpointManagerOptions(
+                max_to_keep=self._keep, create=True, cleanup_tmp_directories=True)
+            try:
+                self._writer = ocp.CheckpointManager(self.steps, options=options)
+            except Exception as e:  # as in `restore`
+                raise EvflowDataError(
+                    "EV009", f"a step in {self.steps} is damaged ({type(e).__name__}: {e}).",
+                    f"Remove all but the last of steps {self._found()}, or {ANEW}.") from e
+        return self._writer
 
     def restore(self, like: Any) -> Any:
-        """The latest state, in the structure (and on the devices) of `like`."""
-        if self.latest is None:
+        """The latest state that can be read, in the structure (and on the devices) of `like`.
+
+        What cannot is set aside, with a word on stderr. Raises EV009 where no step can be read,
+        EV016 where there is none, EV018 where those that can are of another network.
+        """
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        faults: dict[int, str] = {}
+        for step in self._found():
+            try:
+                with ocp.StandardCheckpointer() as reader:
+                    state = reader.restore(self.steps / str(step) / "default", abstract)
+            except MemoryError:
+                raise
+            except Exception as e:  # of orbax, tensorstore and json: a dozen kinds
+                faults[step] = (str(e).strip() or type(e).__name__).splitlines()[0][:200]
+            if devices.agree(step in faults):
+                faults.setdefault(step, "another process cannot read it")
+            else:
+                self._set_aside(faults, step)
+                return state
+        if not faults:
             raise EvflowDataError("EV016", f"no checkpoint in {self.folder}.",
                                   "Start the run with --resume auto.")
-        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
-        try:
-            return self._manager.restore(self.latest, args=ocp.args.StandardRestore(abstract))
-        except (ValueError, KeyError) as e:
-            raise EvflowDataError(
+        raise self._unreadable(faults, like)
+
+    def _set_aside(self, faults: dict[int, str], used: int) -> None:
+        """Move damaged steps out of the way of those to come."""
+        for step, fault in faults.items() if devices.is_main() else ():
+            place = aside(self.folder / f"damaged-{step}", "old")
+            place = place.with_name(place.name.lstrip("."))
+            try:
+                os.replace(self.steps / str(step), place)
+            except OSError as e:
+                raise EvflowDataError(
+                    "EV019", f"step {step} in {self.steps / str(step)} is damaged ({fault}) and "
+                    f"cannot be moved away ({e.strerror}).",
+                    f"Remove that folder: the run then goes on from step {used}.") from e
+            print(f"step {step} cannot be read ({fault}): going on from step {used}. It was moved "
+                  f"to {place}, which may be removed.", file=sys.stderr)
+        if faults:
+            devices.agree(True)  # nobody goes on before they are moved
+        self._manager()
+
+    def _unreadable(self, faults: dict[int, str], like: Any) -> EvflowDataError:
+        """EV018 where steps are sound ones of another network, else EV009."""
+        others = [step for step in faults if self._is_other(step, like)]
+        names = "; ".join(f"step {step} in {self.steps / str(step)}: {fault}"
+                          for step, fault in faults.items())
+        if others:
+            return EvflowDataError(
                 "EV018", f"the checkpoint in {self.folder} does not fit this configuration "
-                f"({str(e).splitlines()[0]}).", "Resume with the configuration in its config.json.",
-            ) from e
+                f"({names}).", "Resume with the configuration in its config.json, by the version "
+                f"that made it, or {ANEW}.")
+        return EvflowDataError(
+            "EV009", f"no checkpoint in {self.folder} can be read ({names}).",
+            f"Restore one from a copy, or remove {self.steps} and {self.folder / 'config.json'} "
+            f"to begin anew, or {ANEW}.")
+
+    def _is_other(self, step: int, like: Any) -> bool:
+        """Whether the arrays of a step are of other shapes, as far as it can be read."""
+        try:
+            with ocp.StandardCheckpointer() as reader:
+                found = reader.metadata(self.steps / str(step) / "default").item_metadata
+            shapes = sorted(array.shape for array in jax.tree.leaves(found.tree))
+        except Exception:  # it is damaged
+            return False
+        return shapes != sorted(_stored_shape(leaf) for leaf in jax.tree.leaves(like))
 
     def check_config(self, config: dict[str, Any]) -> None:
-        """Raise EV013, naming the fields, where the saved configuration is not `config`; EV016
-        where none is saved."""
+        """Raise EV013, naming the fields, where the saved configuration is not `config`; EV009
+        where it is damaged, EV016 where none is saved, EV018 where another version saved it."""
         path = self.folder / "config.json"
-        if not path.exists():
+        if not is_there(path):
             raise EvflowDataError("EV016", f"no run in {self.folder} (no config.json).",
                                   "Start the run with --resume auto.")
-        saved, given = (_flat(c) for c in (json.loads(path.read_text()), _as_json(config)))
+        saved, given = _flat(_read(path)), _flat(_as_json(config))
+        if unknown := sorted(saved.keys() - given.keys()):
+            raise EvflowDataError(
+                "EV018", f"{path} has options that this version does not know "
+                f"({', '.join(unknown[:8])}): another version of evflow began this run.",
+                f"Go on with that version, or {ANEW}.")
         absent = "absent"
-        differ = [f"{k}: {saved.get(k, absent)} there, {given.get(k, absent)} here"
-                  for k in sorted(saved.keys() | given.keys())
-                  if saved.get(k, absent) != given.get(k, absent)]
+        differ = [f"{k}: {saved.get(k, absent)} there, {given[k]} here" for k in sorted(given)
+                  if saved.get(k, absent) != given[k]]
         if differ:
             raise EvflowDataError(
                 "EV013", f"{self.folder} holds a run of another configuration "
@@ -87,6 +179,26 @@ class Checkpoints:
         path = self.folder / "config.json"
         with atomic_write(path, overwrite=True) as temporary:
             temporary.write_text(json.dumps(_as_json(config), indent=2) + "\n")
+
+
+def _stored_shape(leaf: Any) -> tuple[int, ...]:
+    """As a checkpoint has it: keys are their data."""
+    keys = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return tuple((jax.random.key_data(leaf) if keys else leaf).shape)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A configuration; EV009 where it is damaged."""
+    try:
+        saved = json.loads(path.read_text())
+        if not isinstance(saved, dict):
+            raise ValueError("it is no configuration")
+    except (OSError, ValueError, RecursionError) as e:
+        raise EvflowDataError(
+            "EV009", f"{path} is damaged ({e}).",
+            f"Restore it from a copy, or {ANEW}: without it nobody can tell what the run was."
+        ) from e
+    return saved
 
 
 def _as_json(config: dict[str, Any]) -> Any:
