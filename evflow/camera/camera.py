@@ -290,7 +290,9 @@ def sample_pixels(
         draw = median[..., None, None] + sigma[..., None, None] * jax.random.normal(k, size)
         return jnp.maximum(draw, THETA_MIN)
 
-    spread = jnp.exp(eta_spread * jax.random.normal(k_eta, (2, *size)))
+    spread = jnp.ones((2, *size))
+    if eta_spread:
+        spread = jnp.exp(eta_spread * jax.random.normal(k_eta, spread.shape))
     return Camera(
         theta(k_on, nominal.theta_on, nominal.sigma_on),
         theta(k_off, nominal.theta_off, nominal.sigma_off),

@@ -102,15 +102,17 @@ def sample_nominal(
     theta = jax.random.uniform(k_theta, (2, *batch), minval=prior.theta[0], maxval=prior.theta[1])
     sigma = jax.random.uniform(
         k_sigma, (2, *batch), minval=prior.mismatch[0], maxval=prior.mismatch[1])
+    if prior.noise == "none":
+        return Summary(*theta, *jnp.zeros_like(theta), *sigma)
     gain = jax.random.uniform(k_gain, (2, *batch), minval=0.25)
     if factor is not None:
         exact = 0.5 if prior.noise == "mixed" else 1.0
         gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), exact, batch),
                          factor, gain)
-    tied = noise_of_threshold(theta) * gain
-    lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])
-    free = jnp.exp(jax.random.uniform(k_free, (2, *batch), minval=lo, maxval=hi))
-    either = jnp.where(jax.random.bernoulli(k_link, 0.5, batch), tied, free)
-    eta = {"eq12": tied, "independent": free, "mixed": either,
-           "none": jnp.zeros_like(tied)}[prior.noise]
+    eta = noise_of_threshold(theta) * gain
+    if prior.noise != "eq12":
+        lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])
+        free = jnp.exp(jax.random.uniform(k_free, (2, *batch), minval=lo, maxval=hi))
+        tied = jax.random.bernoulli(k_link, 0.5, batch) & (prior.noise == "mixed")
+        eta = jnp.where(tied, eta, free)
     return Summary(*theta, *eta, *sigma)
