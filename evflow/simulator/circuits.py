@@ -27,6 +27,7 @@ from evflow.simulator.active import BLOCK, Block, Exit
 from evflow.simulator.pack import Keys
 from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor, SimState
+from evflow.simulator.sizes import ACTIVE, sizes
 
 Array = jax.Array
 Packed = tuple[Keys, list[np.ndarray]]  # events in no order, and how they are integers
@@ -36,9 +37,6 @@ Stepped = tuple[list[Piece], Block, np.ndarray]  # a block, and the ticks of its
 Spiked = tuple[np.ndarray, np.ndarray, np.ndarray]  # pixel, fraction of the interval, whether ON
 
 SALTED = 64 * BLOCK  # intervals whose salts are drawn at a time
-# Active pixels that are stepped at a time, padded to one of these: a call hands work to another
-# thread and back, which costs more than arrays that leave the cache.
-ACTIVE: tuple[int, ...] = (4096, 8192, 12288, 16384, 20480)
 
 
 class Circuit(Protocol):
@@ -145,6 +143,7 @@ class _Thresholds(_Blocks):
     def __init__(self, exit: Exit, *sensor: Any) -> None:
         super().__init__(*sensor)
         self.exit = exit
+        self.sizes = sizes(self.before.size, self.model, exit, self.before.dtype)
 
     def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
         """What comes of each block; the device may still be at it."""
@@ -158,12 +157,12 @@ class _Thresholds(_Blocks):
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Block]]:
         """The pixels `at` some at a time, the same padded with numbers beyond the last pixel, and
         the block as these see it."""
-        count, sizes = self.here.words.size, ACTIVE
-        if self.model.timestamps == "v2e":  # its slots depend on all pixels
-            at, sizes = np.arange(count), (count,)
-        for first in range(0, len(at), sizes[-1]):
-            some = at[first : first + sizes[-1]]
-            size = next(n for n in sizes if n >= len(some))
+        count, most = self.here.words.size, ACTIVE[-1]
+        if slots := self.model.timestamps == "v2e":  # which depend on all pixels
+            at, most = np.arange(count), count
+        for first in range(0, len(at), most):
+            some = at[first : first + most]
+            size = count if slots else self.sizes.of(len(some))
             padded = np.append(some, np.arange(count, count + size - len(some)))
             # NumPy takes a quarter of the time that XLA does; "clip" takes half as long again.
             seen = np.empty((BLOCK + 1, size), self.before.dtype)

@@ -1,0 +1,41 @@
+"""How many pixels a program steps at a time.
+
+The pixels that may fire in a block are padded to one of a few sizes, as XLA compiles a program for
+each. A short video gains nothing by many: a smaller size gets its program once the padding without
+it has taken about as long as compiling it. What the padding does is thrown away, so the events are
+the same.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Hashable
+
+# A call hands work to another thread and back, which costs more than arrays that leave the cache.
+ACTIVE: tuple[int, ...] = (4096, 8192, 12288, 16384, 20480)
+PATIENCE = 1 << 21  # pixels of padding in a block: .2 to .3 s on one core
+
+
+class Sizes:
+    """The sizes that have a program. pixels: of the sensor."""
+
+    def __init__(self, pixels: int) -> None:
+        self.ready = [next((size for size in ACTIVE if size >= pixels), ACTIVE[-1])]
+        self.padding: Counter[int] = Counter()  # that each size would have saved
+
+    def of(self, count: int) -> int:
+        """The size for `count` pixels, up to the largest."""
+        fits = next(size for size in ACTIVE if size >= count)
+        size = min(size for size in self.ready if size >= fits)
+        self.padding[fits] += size - fits
+        if self.padding[fits] > PATIENCE:
+            self.ready.append(fits)
+            return fits
+        return size
+
+
+@functools.lru_cache(maxsize=256)
+def sizes(pixels: int, *program: Hashable) -> Sizes:
+    """Those of a program, as long as the process runs. program: what else it is compiled for."""
+    return Sizes(pixels)
