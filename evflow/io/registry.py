@@ -34,9 +34,11 @@ from evflow.io.formats import (
     ijrr,
     metavision,
     mvsec,
+    nmnist,
     npy,
     npz,
     plain_text,
+    unread,
     v2e,
     v2e_text,
 )
@@ -62,7 +64,7 @@ class Format(Protocol):
 
 FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
     aedat4, aedat3, aedat2, evt2, evt21, evt3, dat, v2e, mvsec, event_utils, metavision, dsec, hdf5,
-    npz, npy, evimo2, evreal, e2vid, v2e_text, ijrr, plain_text, ros1, ros2)
+    npz, npy, evimo2, evreal, e2vid, v2e_text, ijrr, plain_text, ros1, ros2, nmnist)
 WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
     dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
     npz.NpzWriter, Aedat4Writer)}
@@ -86,6 +88,8 @@ def find_format(path: str | os.PathLike) -> Format:
         return claims[0]
     if not path.is_dir() and not head:
         raise EvflowDataError("EV009", f"{path} is empty (0 bytes).", "Copy it again.")
+    if not path.is_dir() and (other := unread.known(path, head)):
+        raise EvflowDataError("EV008", f"{path} is {other.what}.", other.fix)
     seen = (f"the folder holds {sorted(p.name for p in path.iterdir())[:5]}" if path.is_dir()
             else f"it begins with {head[:16]!r}")
     raise EvflowDataError(

@@ -112,6 +112,15 @@ def npy(folder: Path, kind: str) -> Sample:
     return sample(folder / "a.npy", counted=True, size=SIZE)
 
 
+def nmnist(folder: Path) -> Sample:
+    """Times within 23 bits; an overflow among the events."""
+    ev = streams.clustered(N)
+    rows = [bytes([x, y, p << 7 | t >> 16, t >> 8 & 255, t & 255])
+            for x, y, t, p in streams.listed(ev)]
+    (folder / "a.bin").write_bytes(b"".join([*rows[:50], bytes([0, 240, 0, 0, 0]), *rows[50:]]))
+    return sample(folder / "a.bin")
+
+
 def npz(folder: Path) -> Sample:
     write_events(folder / "a.npz", make(N, FRAMES), "npz")
     return sample(folder / "a.npz", sealed=True)
@@ -287,7 +296,8 @@ SAMPLES: dict[str, Callable[[Path], Sample]] = {
     "metavision-plain": partial(metavision, forms=()),
     "hdf5-columns": partial(flat_hdf5, kind="columns"),
     "hdf5-matrix": partial(flat_hdf5, kind="matrix"),
-    "npy-matrix": partial(npy, kind="matrix"), "npy-records": partial(npy, kind="records"),
+    "nmnist": nmnist, "npy-matrix": partial(npy, kind="matrix"),
+    "npy-records": partial(npy, kind="records"),
     "dsec": dsec, "npz": npz, "ijrr": ijrr, "ijrr-zip": ijrr_zip, "e2vid-text": e2vid_text,
     "images-png": partial(images, suffix="png"), "images-jpg": partial(images, suffix="jpg"),
     "images-tif": partial(images, suffix="tif"), "images-bmp": partial(images, suffix="bmp"),

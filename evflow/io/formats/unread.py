@@ -1,0 +1,98 @@
+"""Files that are known, but not read: what they are, and what to do with them."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+from evflow.files.archives import DAMAGE, npy_header
+
+
+class Known(NamedTuple):
+    """What a file is, and what to do."""
+
+    what: str
+    fix: str
+
+
+NPZ = "np.savez('events.npz', t=t, x=x, y=y, p=p, size=(width, height)), t in microseconds"
+VIDEO = Known(
+    "a video or image: it holds frames, not events",
+    "Simulate its events (evflow simulate), or pass it beside a recording (--frames).")
+MAGICS: tuple[tuple[int, bytes, Known], ...] = (  # at a byte of the file
+    (0, b"Event Stream", Known(
+        "an Event Stream (.es)", "Convert it with faery (pip install faery): faery input file a.es "
+        "output file a.csv.")),
+    (0, b"MATLAB 5.0 MAT-file", Known(
+        "a MATLAB file", f"In Python, scipy.io.loadmat(path) has its arrays: write {NPZ}.")),
+    (0, b"MATLAB 7.3 MAT-file", Known(
+        "a MATLAB file of version 7.3, which is HDF5", "In Python, h5py.File(path) has its arrays: "
+        f"write {NPZ}.")),
+    (0, b"#!AER-DAT", Known("AEDAT of a version that is not known",
+                            "Versions 1 to 4 are read: log it again with DV or jAER.")),
+    (0, b"\x1f\x8b", Known("compressed by gzip", "Unpack it first: gunzip.")),
+    (0, b"\x28\xb5\x2f\xfd", Known("compressed by zstd", "Unpack it first: zstd -d.")),
+    (0, b"BZh", Known("compressed by bzip2", "Unpack it first: bunzip2.")),
+    (0, b"\xfd7zXZ\0", Known("compressed by xz", "Unpack it first: unxz.")),
+    (0, b"\x04\x22\x4d\x18", Known("compressed by lz4", "Unpack it first: lz4 -d.")),
+    (0, b"7z\xbc\xaf\x27\x1c", Known("a 7z archive", "Unpack it first: 7z x.")),
+    (0, b"Rar!", Known("a RAR archive", "Unpack it first.")),
+    (257, b"ustar", Known("a tar archive", "Unpack it first: tar -xf.")),
+    (0, b"PAR1", Known("a Parquet file", f"In Python, pandas.read_parquet(path) has its columns: "
+                       f"write {NPZ}.")),
+    (0, b"ARROW1", Known("a Feather file", "In Python, pandas.read_feather(path) has its columns: "
+                         f"write {NPZ}.")),
+    (0, b"\x80\x04", Known("a pickle of Python", "It could run any program, and is never opened: "
+                           f"where it was made, write {NPZ}.")),
+    (0, b"SQLite format 3\0", Known(
+        "an SQLite database without ROS 2 messages", "Of a ROS 2 bag pass the folder, or the .db3 "
+        "with its metadata.yaml.")),
+    (0, b"\x89PNG\r\n", VIDEO), (0, b"\xff\xd8\xff", VIDEO), (0, b"GIF8", VIDEO),
+    (0, b"II*\0", VIDEO), (0, b"MM\0*", VIDEO), (4, b"ftyp", VIDEO), (0, b"\x1aE\xdf\xa3", VIDEO),
+    (0, b"RIFF", VIDEO),
+)
+PICKLES = tuple(bytes([0x80, version]) for version in (2, 3, 5))
+
+
+def known(path: Path, head: bytes) -> Known | None:
+    """What a file is that begins so and that no format claims; None where that is not known."""
+    for at, magic, found in MAGICS:
+        if head.startswith(magic, at):
+            return found
+    if head.startswith(PICKLES):
+        return next(found for _, magic, found in MAGICS if magic == b"\x80\x04")
+    if head.startswith(b"\x93NUMPY"):
+        return _array(head)
+    if head.startswith(b"PK"):
+        return _archive(path)
+    if path.suffix.lower() == ".raw":
+        return Known("no Prophesee RAW: that begins with lines `% key value`",
+                     "Was it exported without its header, or is it raw video? Record it again, or "
+                     "put the header of another recording of the camera before it.")
+    if path.suffix.lower() in (".aedat", ".dat") and b"\0" in head[:64]:
+        return Known("data without a header, as AEDAT 1 of old jAER may be",
+                     "Open it in jAER, and log it again: that writes AEDAT 2.")
+    return None
+
+
+def _array(head: bytes) -> Known | None:
+    try:
+        shape, _, dtype = npy_header(io.BytesIO(head))
+    except ValueError as e:
+        return Known(f"a damaged .npy ({e})", "Copy or export it again; of Python objects save "
+                     "arrays of numbers.")
+    return Known(f"an array {shape} of {dtype}", "Events are N x 4 numbers, or records with t, x, "
+                 "y and p; frames (T, H, W) go to evflow simulate, or beside a recording "
+                 "(--frames).")
+
+
+def _archive(path: Path) -> Known | None:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = sorted(archive.namelist())
+    except DAMAGE:
+        return Known("a damaged zip archive", "Copy it again.")
+    return Known(f"a zip archive of {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}",
+                 "Unpack it, and pass the file or folder of events.")

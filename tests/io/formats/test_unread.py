@@ -1,0 +1,63 @@
+"""Files that are named rather than read, each with what to do."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import pickle
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.recordings import refused
+
+from evflow.io.source import open_frames
+
+
+def npy(array: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    np.save(out, array, allow_pickle=True)
+    return out.getvalue()
+
+
+def zipped(*names: str) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name in names:
+            archive.writestr(name, "x")
+    return out.getvalue()
+
+
+FILES = {  # name: bytes, and what the message says
+    "a.es": (b"Event Stream\2\0\0\1@\x000\0", "faery input file a.es output file a.csv"),
+    "a.mat": (b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(200), "scipy.io.loadmat"),
+    "b.mat": (b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(600), "h5py.File(path)"),
+    "a.csv.gz": (gzip.compress(b"0.1 3 4 1\n" * 9), "gunzip"),
+    "a.zst": (b"\x28\xb5\x2f\xfd" + bytes(20), "zstd -d"),
+    "a.parquet": (b"PAR1" + bytes(99), "pandas.read_parquet"),
+    "a.pkl": (pickle.dumps({"t": [1]}), "never opened"),
+    "a.tar": (b"events.txt".ljust(257, b"\0") + b"ustar\0" + bytes(249), "tar -xf"),
+    "a.mp4": (b"\0\0\0\x20ftypisom" + bytes(99), "evflow simulate"),
+    "a.avi": (b"RIFF\x99\0\0\0AVI LIST" + bytes(99), "--frames"),
+    "a.npy": (npy(np.zeros((5, 4, 3), np.uint8)), "an array (5, 4, 3) of uint8"),
+    "b.npy": (npy(np.array([None])), "Python objects"),
+    "a.zip": (zipped("left/a.raw", "right/b.raw"), "a zip archive of left/a.raw, right/b.raw"),
+    "a.raw": (bytes(range(99)), "begins with lines `% key value`"),
+    "old.dat": (b"\0\1\0\2\0\3" * 9, "AEDAT 1"),
+    "new.aedat": (b"#!AER-DAT5.0\r\n" + bytes(99), "version that is not known"),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_is_named(tmp_path: Path, name: str) -> None:
+    data, said = FILES[name]
+    (tmp_path / name).write_bytes(data)
+    error = refused(tmp_path / name)
+    assert error.code == "EV008"
+    assert said in str(error)
+
+
+def test_frames_are_still_frames(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((3, 48, 64), np.uint8))
+    assert open_frames(tmp_path / "a.npy", fps=25).size == (64, 48)
