@@ -14,6 +14,11 @@ import numpy as np
 from evflow.checks import require
 from evflow.errors import EvflowDataError
 
+SENSOR_SIZES: dict[str, tuple[int, int]] = {  # (width, height)
+    "dvs128": (128, 128), "davis240": (240, 180), "atis": (304, 240), "davis346": (346, 260),
+    "dvxplorerlite": (320, 240), "genx320": (320, 320), "dvxplorer": (640, 480), "gen3": (640, 480),
+    "gen31": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "evk4": (1280, 720),
+    "celex5": (1280, 800)}
 LogMap = Literal["auto", "linlog", "log_eps"]
 KINDS = ("v2e", "esim", "voltmeter", "paper")
 # Options that a kind of circuit has no part for.

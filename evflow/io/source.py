@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError, naming
-from evflow.io.images import values
-from evflow.io.images.folder import RADIANCE, open_folder
+from evflow.io.images import repeats, values
+from evflow.io.images.folder import RADIANCE, SUFFIXES, ImageFolder, open_folder
 from evflow.io.images.frames import FrameHints, Frames, FrameSource, Image, converted, existing
 from evflow.io.images.stacks import is_stack, open_stack
 from evflow.io.registry import find_format, read_recording
@@ -44,6 +44,8 @@ def _open(path: Path, told: FrameHints) -> FrameSource:
         told, notes = _responding(told, "linear", "numbers of a stack")
         return _source(stack.size, len(stack.times_us), lambda: stack.images(told.partial), told,
                        [*stack.notes, *notes])
+    if told.picture and path.suffix.lower() in SUFFIXES:
+        return _of_images(ImageFolder((path,), np.zeros(1, np.int64), ()), told)
     if not _is_recording(path):
         if told.frames_topic is not None:
             raise EvflowDataError("EV020", f"{path} is no recording, with streams of images.",
@@ -63,7 +65,10 @@ def _is_recording(path: Path) -> bool:
 
 
 def _folder(path: Path, told: FrameHints) -> FrameSource:
-    folder = open_folder(path, told)
+    return _of_images(open_folder(path, told), told)
+
+
+def _of_images(folder: ImageFolder, told: FrameHints) -> FrameSource:
     first = next(folder.images()).pixels
     size = first.shape[1], first.shape[0]
     raw = told.bayer is not None or (first.ndim == 2 and told.colour != "luma")
@@ -150,6 +155,10 @@ def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:
 def _source(size: tuple[int, int], count: int, images: Any, told: FrameHints,
             notes: list[Note]) -> FrameSource:
     def frames() -> Frames:
-        return converted(_between(images(), told), told, notes)
+        seen = repeats.Count()
+        shown = converted(_between(images(), told), told, notes)
+        yield from repeats.watched(shown, told.repeated == "drop", seen)
+        if note := seen.note(dropped=told.repeated == "drop"):
+            notes.append(note)
 
     return FrameSource(size, count, frames, notes)

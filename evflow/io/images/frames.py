@@ -57,6 +57,8 @@ class FrameHints:
     start_s, stop_s: frames with start <= time < stop, in seconds from the first; of a recording
         from its first event.
     frames_topic: of a recording, the images to take (see `Hints`).
+    repeated: "keep" or "drop" frames that repeat the one before (`repeats`). picture: the source
+        may be one picture.
     clip: take what is brighter than full_scale as white and what is negative as black, as in
         radiance, which has no upper end, instead of refusing it.
     """
@@ -74,12 +76,14 @@ class FrameHints:
     start_s: float | None = None
     stop_s: float | None = None
     frames_topic: str | None = None
+    repeated: str = "keep"
+    picture: bool = False
     clip: bool = False
 
     def __post_init__(self) -> None:
         check_choices(self, time_unit=("auto", *UNITS_US), colour=COLOURS,
                       flip=("none", *response.FLIPS), response=("auto", *response.RESPONSES),
-                      background=tuple(values.BACKGROUNDS))
+                      background=tuple(values.BACKGROUNDS), repeated=("keep", "drop"))
         Hints(start_s=self.start_s, stop_s=self.stop_s, frames_topic=self.frames_topic)  # EV020
         if self.bayer is not None and parse_pattern(self.bayer) and self.colour != "luma":
             raise EvflowDataError(

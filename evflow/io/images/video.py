@@ -140,7 +140,8 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
     path, hints = existing(path), hints or FrameHints()
     if path.suffix.lower() in SUFFIXES:
         raise EvflowDataError(
-            "EV008", f"{path} is one picture.", "For a sequence of images pass their folder.")
+            "EV008", f"{path} is one picture.", "For a sequence of images pass their folder; to "
+            "move a sensor over one picture, --saccades 10 (evflow simulate).")
     with _capture(path) as capture:
         if not capture.isOpened():
             raise EvflowDataError(

@@ -1,0 +1,145 @@
+"""Options of the camera whose pixels see a video: measured or not, its circuit, thresholds and
+noise."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from evflow.commands.options import refuse, value
+from evflow.errors import EvflowDataError
+
+if TYPE_CHECKING:
+    from evflow.camera import Camera
+    from evflow.camera.sensors import SensorModel
+    from evflow.simulator.photoreceptor import Photoreceptor
+
+THRESHOLDS = ("theta_on", "theta_off", "mismatch", "eta_on", "eta_off")
+CIRCUIT = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pixels:
+    """Whose pixels see; what a command that simulates inherits."""
+
+    camera: Annotated[Path | None, value("FILE")] = None
+    """camera.npz from evflow estimate, its photoreceptor's cutoff included, and, where VIDEO is a
+    recording, the light that its frames lack; without it the thresholds below, or the sensor's
+    own."""
+    draw: bool = False
+    """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
+    the most likely values are too even."""
+    sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
+    """Pixel circuit. clean, noisy: v2e's presets; v2e: its defaults; esim; dvs346, dvs240:
+    DVS-Voltmeter's; paper: the paper's. The options below change parts of it."""
+    theta_on: Annotated[float | None, value("THETA")] = None
+    """ON threshold of every pixel (natural log); without it the sensor's, with its mismatch."""
+    theta_off: Annotated[float | None, value("THETA")] = None
+    """OFF threshold of every pixel."""
+    mismatch: Annotated[float | None, value("SIGMA")] = None
+    """Standard deviation of both thresholds over pixels; v2e's default is .03."""
+    eta_on: Annotated[float | None, value("HZ")] = None
+    """Noise events per second and pixel, ON, added to the sensor's own."""
+    eta_off: Annotated[float | None, value("HZ")] = None
+    """The same, OFF."""
+    cutoff_hz: Annotated[float | None, value("HZ", "--cutoff")] = None
+    """Corner of the photoreceptor's low-pass at white; 0: none."""
+    refractory_s: Annotated[float | None, value("SECONDS", "--refractory")] = None
+    """Time after an event in which a pixel sends no other (v2e: .0005)."""
+    leak_hz: Annotated[float | None, value("HZ", "--leak")] = None
+    """ON events per second and pixel that leak without light."""
+    leak_jitter: Annotated[float | None, value("SHARE")] = None
+    """Relative jitter of the leak (v2e: .1)."""
+    leak_fpn_decades: Annotated[float | None, value("DECADES")] = None
+    """Spread of the leak over pixels (v2e: .1)."""
+    shot_hz: Annotated[float | None, value("HZ", "--shot")] = None
+    """Shot noise of v2e's pixel in the dark, both polarities together; a quarter in white."""
+    noise_resets_memory: bool = True
+    """A noise event stores the present intensity, as in real pixels (v2e's sensors)."""
+    seed: int = 0
+    """Of noise, and of what is drawn: the same seed gives the same events."""
+
+    def model(self) -> SensorModel:
+        """The pixels' circuit; EV020 where it has no such part."""
+        from evflow.camera.sensors import known_sensor
+
+        model = known_sensor(self.sensor).model
+        told: dict[str, Any] = {name: number for name in CIRCUIT
+                                if (number := getattr(self, name)) is not None}
+        if model.kind == "v2e":
+            told["noise_resets_memory"] = self.noise_resets_memory
+        else:
+            refuse(self, ("noise_resets_memory",), f"--sensor {self.sensor} has no such choice")
+        return dataclasses.replace(model, **told)
+
+    def seen_by(self, recorded: bool) -> Photoreceptor:
+        """The measured camera's photoreceptor, unless --cutoff-hz names another; of its light and
+        clock only in front of frames that a camera recorded beside its events."""
+        from evflow.camera.optics import Optics, read_sensor
+        from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
+
+        if self.camera is None or self.sensor != "clean":
+            return IDEAL
+        sensor, optics = read_sensor(self.camera)
+        if self.cutoff_hz is not None:
+            sensor = dataclasses.replace(sensor, cutoff_hz=0.0)
+        return Photoreceptor.of(sensor, optics if recorded else Optics())
+
+    def pixels(self, size: tuple[int, int]) -> Camera:
+        """The camera asked for; EV015 where its size is not (width, height) of the video."""
+        if self.draw and not self.camera:
+            raise EvflowDataError("EV020", "--draw without --camera.",
+                                  "It draws a measured camera.")
+        camera = self._measured(self.camera) if self.camera else self._drawn((size[1], size[0]))
+        if camera.shape != size[::-1]:
+            width, height = camera.shape[::-1]
+            raise EvflowDataError(
+                "EV015", f"the video is {size[0]}x{size[1]}, the camera {width}x{height}.",
+                f"Pass --sensor-size {width}x{height}: the video is scaled and cropped to it.")
+        return camera
+
+    def _measured(self, path: Path) -> Camera:
+        import jax
+
+        from evflow.camera import Camera
+
+        refuse(self, THRESHOLDS, "the camera's own are those of --camera")
+        if self.sensor != "clean":
+            print(f"note: --sensor {self.sensor} adds its own noise and limits to the camera's "
+                  "measured noise.", file=sys.stderr)
+        camera, std = Camera.load_with_std(path)
+        if self.draw:
+            if std is None:
+                raise EvflowDataError("EV020", f"{path} holds no standard deviations.",
+                                      "--draw needs the camera.npz of evflow estimate.")
+            camera = camera.drawn(jax.random.key(self.seed), std)
+        return camera
+
+    def _drawn(self, shape: tuple[int, int]) -> Camera:
+        """Thresholds of the sensor with its mismatch; those that are told are the same everywhere,
+        unless --mismatch is."""
+        import jax
+        import jax.numpy as jnp
+
+        from evflow.camera import PARAMETERS, Camera, CameraPrior
+        from evflow.camera.camera import sample_pixels
+        from evflow.camera.prior import Summary
+        from evflow.camera.sensors import known_sensor
+
+        key, known = jax.random.key(self.seed), known_sensor(self.sensor)
+        told: dict[str, float] = {
+            name: number for name in PARAMETERS if (number := getattr(self, name)) is not None}
+        even = {name: jnp.full(shape, number, jnp.float32) for name, number in told.items()}
+        if self.mismatch is None:
+            drawn = Camera.sample(key, shape, CameraPrior(
+                (known.theta,) * 2, (known.mismatch,) * 2, noise="none"))
+            return dataclasses.replace(drawn, **even).validate()
+        if not self.mismatch >= 0:
+            raise EvflowDataError("EV020", f"--mismatch {self.mismatch}.", "It must be >= 0.")
+        Camera.constant((1, 1), **told)  # EV014, before they are spread
+        values = {"theta_on": known.theta, "theta_off": known.theta, "eta_on": 0.0, "eta_off": 0.0,
+                  **told, "sigma_on": self.mismatch, "sigma_off": self.mismatch}
+        nominal = Summary(**{name: jnp.float32(number) for name, number in values.items()})
+        return sample_pixels(key, nominal, shape).validate()

@@ -1,0 +1,149 @@
+"""Frames laid on a sensor: cropped and scaled; and their times, where a video shows life slower.
+
+What is scaled is light: averages over the area of a new pixel, which is what a pixel collects.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from evflow.camera.sensors import SENSOR_SIZES
+from evflow.checks import Size, check_size
+from evflow.errors import EvflowDataError
+from evflow.io.images.frames import Frames, FrameSource
+from evflow.notes import Note
+
+Array = np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Lay:
+    """Columns and rows of a frame that are used, and the size that they are scaled to."""
+
+    left: int
+    top: int
+    used: Size
+    size: Size
+
+    def __call__(self, frame: Array) -> Array:
+        """The frame (H, W) or (H, W, 3), float32 where it is scaled."""
+        part = frame[self.top : self.top + self.used[1], self.left : self.left + self.used[0]]
+        return np.ascontiguousarray(part) if self.used == self.size else scaled(part, self.size)
+
+
+def laid(
+    source: FrameSource, *, crop: str | None = None, resize: str | None = None,
+    sensor_size: str | None = None,
+) -> FrameSource:
+    """The source with its frames cropped ("WxH" of the middle, or "WxH+X+Y"), then scaled ("WxH");
+    or scaled and cropped to fill a sensor (a name, or "WxH"). Raises EV020 where that is no part,
+    or a raw mosaic would be scaled."""
+    lay = lay_of(source.size, crop, resize, sensor_size)
+    if lay == Lay(0, 0, source.size, source.size):
+        return source
+    note = Note("frames.laid", f"of {source.size[0]}x{source.size[1]} pixels "
+                f"{lay.used[0]}x{lay.used[1]} from column {lay.left}, row {lay.top} are seen by "
+                f"{lay.size[0]}x{lay.size[1]} pixels.")
+
+    def frames() -> Frames:
+        for frame, time in source.open():
+            check_mosaic(lay, frame, source.notes)
+            yield lay(frame), time
+
+    source.notes.append(note)
+    return dataclasses.replace(source, size=lay.size, open=frames)
+
+
+def lay_of(size: Size, crop: str | None, resize: str | None, sensor_size: str | None) -> Lay:
+    """Which part of frames of this size (width, height) is seen by how many pixels; EV020."""
+    left, top, *used = (0, 0, *size) if crop is None else _part(crop, size)
+    if resize is not None and sensor_size is not None:
+        raise EvflowDataError("EV020", f"--resize {resize} and --sensor-size {sensor_size} are "
+                              "two sizes.", "Give one of them.")
+    if sensor_size is None:
+        wanted = (used[0], used[1]) if resize is None else _size(resize, "--resize")
+        return Lay(left, top, (used[0], used[1]), wanted)
+    wanted = _sensor(sensor_size)
+    ratio = min(used[0] / wanted[0], used[1] / wanted[1])  # the largest part of its proportions
+    part = [max(1, min(n, round(ratio * w))) for n, w in zip(used, wanted, strict=True)]
+    return Lay(left + (used[0] - part[0]) // 2, top + (used[1] - part[1]) // 2,
+               (part[0], part[1]), wanted)
+
+
+def check_mosaic(lay: Lay, frame: Array, notes: list[Note]) -> None:
+    """EV020 where a raw mosaic would be scaled, or cut between its cells."""
+    raw = any(note.code == "frames.raw" for note in notes) and frame.ndim == 2
+    if raw and (lay.used != lay.size or lay.left % 2 or lay.top % 2):
+        raise EvflowDataError(
+            "EV020", "a raw mosaic cannot be scaled, nor cropped from an odd column or row.",
+            "Crop from an even one, or take its luma: --bayer instead of --colour.")
+
+
+def scaled(frame: Array, size: Size) -> Array:
+    """float32 (H, W) or (H, W, 3) of another size (width, height): area means of what shrinks."""
+    light = frame.astype(np.float32)
+    shrinks = size[0] <= frame.shape[1] and size[1] <= frame.shape[0]
+    out: Array = cv2.resize(light, size, interpolation=cv2.INTER_AREA if shrinks else
+                            cv2.INTER_LINEAR)
+    return out
+
+
+def slowed(source: FrameSource, factor: float) -> FrameSource:
+    """The source with its times divided by `factor`, by which a video shows life slower. Raises
+    EV004 (frames less than a microsecond apart), EV020."""
+    if not 1e-6 <= factor <= 1e6:
+        raise EvflowDataError("EV020", f"--slow-motion {factor:g}.", "Give a factor from 1e-6 to "
+                              "1e6; 10 where the video is ten times slower than life.")
+
+    def frames() -> Frames:
+        first, last = None, -1
+        for frame, time in source.open():
+            first = time if first is None else first
+            now = first + round((time - first) / factor)
+            if now <= last and last >= 0:
+                raise EvflowDataError(
+                    "EV004", f"frames are less than a microsecond apart (at {now} us) with "
+                    f"--slow-motion {factor:g}.", "Give a smaller factor.")
+            last = now
+            yield frame, now
+
+    source.notes.append(Note("frames.slowed", f"the video is {factor:g} times slower than life: "
+                             "its times were divided by that."))
+    return dataclasses.replace(source, open=frames)
+
+
+def _part(text: str, size: Size) -> tuple[int, int, int, int]:
+    """(left, top, width, height) of "WxH" or "WxH+X+Y"."""
+    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})(?:\+(\d{1,6})\+(\d{1,6}))?", text)
+    if match is None:
+        raise EvflowDataError("EV020", f"--crop {text!r}.", "Give it as WxH or WxH+X+Y: 346x260, "
+                              "346x260+10+0.")
+    width, height = int(match[1]), int(match[2])
+    left, top = ((size[0] - width) // 2, (size[1] - height) // 2) if match[3] is None else (
+        int(match[3]), int(match[4]))
+    if min(width, height) < 1 or min(left, top) < 0 or (
+            left + width > size[0] or top + height > size[1]):
+        raise EvflowDataError("EV020", f"--crop {text} reaches beyond frames of "
+                              f"{size[0]}x{size[1]}.", "Give a part of them.")
+    return left, top, width, height
+
+
+def _size(text: str, option: str) -> Size:
+    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", text)
+    if match is None:
+        raise EvflowDataError("EV020", f"{option} {text!r}.", "Give it as WxH: 346x260.")
+    return check_size((int(match[1]), int(match[2])))
+
+
+def _sensor(text: str) -> Size:
+    known: Callable[[str], Size | None] = SENSOR_SIZES.get
+    plain = known(re.sub(r"[^a-z0-9]", "", text.lower()))
+    if plain is None and not re.fullmatch(r"\d+[xX]\d+", text):
+        raise EvflowDataError("EV020", f"--sensor-size {text!r}.", "Give it as WxH, or one of "
+                              f"{', '.join(SENSOR_SIZES)}.")
+    return plain or _size(text, "--sensor-size")

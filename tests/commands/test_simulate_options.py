@@ -1,0 +1,89 @@
+"""What users of other simulators look for in `evflow simulate`: the pixels' circuit, the sensor's
+size, slow motion, saccades."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.videos import drifting
+
+from evflow import read_events
+from evflow.camera.sensors import SENSORS
+from evflow.cli import main
+from evflow.commands.pixels import Pixels
+from evflow.types import Events
+
+Run = tuple[Events, dict[str, Any]]
+BASE = ["--fps", "100", "--no-interpolate"]
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    np.save(tmp_path / "v.npy", drifting(10, (24, 32)))
+    return tmp_path / "v.npy"
+
+
+def run(video: Path, *options: str, capsys: pytest.CaptureFixture[str]) -> Run:
+    out = video.with_name("out.h5")
+    assert main(["simulate", str(video), "-o", str(out), "--json", "--overwrite", *options]) == 0
+    return read_events(out), json.loads(capsys.readouterr().out)
+
+
+def test_the_circuit_from_the_command_line() -> None:
+    """Each option is that field of the sensor's model, and no other."""
+    told = {"cutoff_hz": 80.0, "refractory_s": 0.002, "leak_hz": 0.5, "leak_jitter": 0.2,
+            "leak_fpn_decades": 0.3, "shot_hz": 4.0}
+    for name, number in told.items():
+        model = Pixels(sensor="noisy", **{name: number}).model()
+        assert getattr(model, name) == number
+        for other in set(told) - {name}:
+            assert getattr(model, other) == getattr(SENSORS["noisy"].model, other)
+    assert Pixels().model().cutoff_hz == 0
+
+
+def test_thresholds_that_differ_from_pixel_to_pixel() -> None:
+    uneven = Pixels(theta_on=0.3, mismatch=0.04, eta_off=2.0).pixels((200, 100))
+    for name, middle in (("theta_on", 0.3), ("theta_off", SENSORS["clean"].theta)):
+        values = np.asarray(getattr(uneven, name))
+        assert np.mean(values) == pytest.approx(middle, abs=0.002)
+        assert np.std(values) == pytest.approx(0.04, rel=0.05)
+    assert abs(np.corrcoef(np.ravel(uneven.theta_on), np.ravel(uneven.theta_off))[0, 1]) < 0.05
+    assert float(np.median(uneven.eta_off)) == 2.0
+    assert float(np.max(uneven.eta_on)) == 0.0
+
+
+def test_a_sensor_s_size_and_slow_motion(
+    video: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain, _ = run(video, *BASE, capsys=capsys)
+    small, facts = run(video, *BASE, "--sensor-size", "16x12", "--slow-motion", "10", capsys=capsys)
+    assert small.size == (16, 12)
+    assert plain.t[-1] > 80_000 > 9_000 >= small.t[-1] > 8_000
+    assert {"frames.laid", "frames.slowed"} <= {note["code"] for note in facts["notes"]}
+
+
+def test_a_picture_by_saccades(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each of the three moves is seen; at rest between them hardly anything is."""
+    cv2.imwrite(str(tmp_path / "cat.png"), drifting(1, (24, 32))[0])
+    events, facts = run(tmp_path / "cat.png", "--saccades", "4", capsys=capsys)
+    assert "frames.swept" in {note["code"] for note in facts["notes"]}
+    rates = np.histogram(events.t, 30, (0, 300_000))[0].reshape(3, 10)
+    assert (rates.sum(1) > 100).all()
+    assert (rates[:, [0, 9]].max(1) < 0.2 * rates.max(1)).all()
+
+
+@pytest.mark.parametrize(("options", "code"), [
+    (["--shot-hz", "-1"], "EV020"), (["--sensor", "esim", "--cutoff-hz", "30"], "EV020"),
+    (["--mismatch", "-0.1"], "EV020"), (["--mismatch", "0.1", "--theta-on", "0"], "EV014"),
+    (["--saccades", "5"], "EV020"), (["--crop", "99x9"], "EV020"),
+    (["--slow-motion", "0"], "EV020")])
+def test_options_out_of_range(
+    video: Path, options: list[str], code: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", str(video), "-o", str(video.with_name("out.h5")), *BASE, *options])
+    assert capsys.readouterr().err.startswith(code)
