@@ -34,11 +34,12 @@ class Export:
     def run(self) -> None:
         from evflow.camera import Camera
         from evflow.camera.exports import export_camera, write_export
+        from evflow.camera.optics import read_sensor
 
         need_folder(self.out)
         need_absent(self.out, self.overwrite, self.camera)
         camera, std = Camera.load_with_std(self.camera)
-        export, maps = export_camera(camera, self.to, std)
+        export, maps = export_camera(camera, self.to, std, read_sensor(self.camera)[0])
         write_export(self.out, export, maps, overwrite=self.overwrite)
         files = [*sorted([*export.scripts, *export.arrays]), "maps.npz", "README.txt"]
         facts = {"out": str(self.out), "to": self.to, "files": files, "text": export.text}

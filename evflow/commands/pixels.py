@@ -13,6 +13,7 @@ from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
     from evflow.camera import Camera
+    from evflow.camera.optics import Optics
     from evflow.camera.sensors import SensorModel
     from evflow.simulator.photoreceptor import Photoreceptor
 
@@ -25,9 +26,9 @@ class Pixels:
     """Whose pixels see; what a command that simulates inherits."""
 
     camera: Annotated[Path | None, value("FILE")] = None
-    """camera.npz from evflow estimate, its photoreceptor's cutoff included, and, where VIDEO is a
-    recording, the light that its frames lack; without it the thresholds below, or the sensor's
-    own."""
+    """camera.npz from evflow estimate, its photoreceptor's cutoff and dead time included, and, where
+    VIDEO is a recording, the light that its frames lack; without it the thresholds below, or the
+    sensor's own."""
     draw: bool = False
     """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
     the most likely values are too even."""
@@ -66,6 +67,8 @@ class Pixels:
         from evflow.camera.sensors import known_sensor
 
         model = known_sensor(self.sensor).model
+        if dead_s := self._circuit()[0].refractory_s:
+            model = dataclasses.replace(model, refractory_s=dead_s)
         told: dict[str, Any] = {name: number for name in CIRCUIT
                                 if (number := getattr(self, name)) is not None}
         if model.kind == "v2e":
@@ -77,15 +80,22 @@ class Pixels:
     def seen_by(self, recorded: bool) -> Photoreceptor:
         """The measured camera's photoreceptor, unless --cutoff-hz names another; of its light and
         clock only in front of frames that a camera recorded beside its events."""
-        from evflow.camera.optics import Optics, read_sensor
-        from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
+        from evflow.camera.optics import Optics
+        from evflow.simulator.photoreceptor import Photoreceptor
 
-        if self.camera is None or self.sensor != "clean":
-            return IDEAL
-        sensor, optics = read_sensor(self.camera)
+        sensor, optics = self._circuit()
         if self.cutoff_hz is not None:
             sensor = dataclasses.replace(sensor, cutoff_hz=0.0)
         return Photoreceptor.of(sensor, optics if recorded else Optics())
+
+    def _circuit(self) -> tuple[SensorModel, Optics]:
+        """Of the measured camera; ideal without one, or beside another sensor."""
+        from evflow.camera.optics import Optics, read_sensor
+        from evflow.camera.sensors import SensorModel
+
+        if self.camera is None or self.sensor != "clean":
+            return SensorModel(), Optics()
+        return read_sensor(self.camera)
 
     def pixels(self, size: tuple[int, int]) -> Camera:
         """The camera asked for; EV015 where its size is not (width, height) of the video."""

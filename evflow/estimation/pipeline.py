@@ -22,7 +22,9 @@ from jax.typing import ArrayLike
 
 from evflow import io
 from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
+from evflow.estimation.dead_time import DeadTime, dead_time
 from evflow.estimation.one_polarity import untold, without
 from evflow.estimation.pixel_noise import pixel_rates, quiet_time
 from evflow.estimation.refine import (
@@ -144,15 +146,16 @@ def estimate_camera(
         len(plan.pairs),
         (*condensed(plan.skipped), *_notes(stats, unknown, n_events, summary, hot, dead),
          *_receptor_notes(found)),
-        tuple(f"theta_{name}" for name in unknown), **_measured(found))
+        tuple(f"theta_{name}" for name in unknown),
+        **_measured(found, dead_time(recording.events)))
 
 
-def _measured(found: Found | None) -> dict[str, Any]:
+def _measured(found: Found | None, dead: DeadTime) -> dict[str, Any]:
     """The fields of a CameraEstimate that are not per pixel."""
-    if found is None:
-        return {}
-    sensor, std = found.sensor
-    return {"sensor": sensor, "sensor_std": std, "optics": found.optics}
+    sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
+    fields = {"sensor": dataclasses.replace(sensor, refractory_s=dead.seconds),
+              "sensor_std": {**std, "refractory_s": dead.std_s}}
+    return {**fields, "optics": found.optics} if found else fields
 
 
 def _receptor_notes(found: Found | None) -> list[Note]:

@@ -37,7 +37,7 @@ class CameraEstimate:
         undetermined: those of `THRESHOLDS` that the recording does not tell: their values, and
             widths, are the prior's.
         sensor: the pixel circuit as far as it was measured: cutoff_hz, 0 where the photoreceptor
-            is too fast to be seen.
+            is too fast to be seen; refractory_s, 0 where too few pixels change that fast.
         sensor_std: its standard deviations by field, NaN where nothing was measured.
         optics: what the frames show beside what the pixels saw.
     """

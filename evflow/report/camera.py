@@ -144,7 +144,8 @@ def gather(
             raise EvflowDataError("EV017", "the thresholds are undetermined.")
         runs = usable_runs(recording)
         trial = resimulate(recording, found.camera, busiest(recording, runs), seed,
-                           Photoreceptor.of(found.sensor, found.optics))
+                           Photoreceptor.of(found.sensor, found.optics),
+                           found.sensor.refractory_s)
     except EvflowDataError as error:
         why = why_held = error.seen
     step()

@@ -90,12 +90,13 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
 
 
 def resimulate(
-    recording: Recording, camera: Camera, run: Run, seed: int, seen_by: Photoreceptor = IDEAL
+    recording: Recording, camera: Camera, run: Run, seed: int, seen_by: Photoreceptor = IDEAL,
+    dead_s: float = 0.0,
 ) -> Trial:
     """Simulate the frames of `run` twice, interpolated to 1 px of motion and put through what its
-    pixels see them by, and compare."""
+    pixels see them by, and compare. dead_s: the pixels' dead time in seconds."""
     notes: list[Note] = []
-    model = SensorModel(noise_resets_memory=True)
+    model = SensorModel(refractory_s=dead_s, noise_resets_memory=True)
 
     def seen(key: jax.Array) -> Events:
         pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
@@ -137,4 +138,5 @@ def held_out(
     found = estimate_camera(half, params, min_window_us=min_window_us)
     seen_by = Photoreceptor.of(found.sensor, found.optics)
     return found, resimulate(
-        recording, found.camera, busiest(recording, [(middle, last)]), seed, seen_by)
+        recording, found.camera, busiest(recording, [(middle, last)]), seed, seen_by,
+        found.sensor.refractory_s)

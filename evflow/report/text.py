@@ -29,8 +29,10 @@ def describe(found: CameraEstimate) -> str:
 
 def measured(found: CameraEstimate) -> list[str]:
     """Of the circuit and the frames, a line for what was measured."""
-    optics, cutoff = found.optics, found.sensor.cutoff_hz
-    rows = [("cutoff (Hz at 255 DN)", cutoff, found.sensor_std.get("cutoff_hz", math.nan), 0),
+    optics, sensor, std = found.optics, found.sensor, found.sensor_std
+    rows = [("cutoff (Hz at 255 DN)", sensor.cutoff_hz, std.get("cutoff_hz", math.nan), 0),
+            ("dead time (ms)", 1e3 * sensor.refractory_s,
+             1e3 * std.get("refractory_s", math.nan), 2),
             ("light added (DN)", optics.offset_dn, optics.offset_dn_std, 1),
             ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std, 2)]
     return [f"{name:24} {value:5.{digits}f} ± {std:.{digits}f}"

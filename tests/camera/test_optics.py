@@ -14,7 +14,7 @@ from evflow.errors import EvflowDataError
 
 
 def test_it_is_read_as_it_was_written(tmp_path: Path) -> None:
-    sensor = SensorModel(cutoff_hz=150.0, noise_resets_memory=True)
+    sensor = SensorModel(cutoff_hz=150.0, refractory_s=2e-3, noise_resets_memory=True)
     optics = Optics(20.0, 1e-3, 4.0, 5e-4)
     path = tmp_path / "camera.npz"
     Camera.constant((4, 5)).save(path, **as_arrays(sensor, {"cutoff_hz": 30.0}, optics))
@@ -25,7 +25,7 @@ def test_it_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_a_camera_without_any_has_an_ideal_pixel(tmp_path: Path) -> None:
     Camera.constant((4, 5)).save(tmp_path / "camera.npz")
     sensor, optics = read_sensor(tmp_path / "camera.npz")
-    assert sensor.cutoff_hz == optics.offset_dn == optics.delay_s == 0
+    assert sensor.cutoff_hz == sensor.refractory_s == optics.offset_dn == optics.delay_s == 0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.zeros(2), "fast"])

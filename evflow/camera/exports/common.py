@@ -7,6 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from evflow.camera.sensors import SensorModel
+
 Maps = Mapping[str, np.ndarray]
 GREY = 1 - 0.75 * (128 + 20) / 275  # shot noise of v2e and of OpenEB at 128 DN over that at 0 DN
 MAD = 1.4826  # standard deviations in a median absolute deviation of a normal distribution
@@ -40,7 +42,8 @@ def add_noise(x, y, t_us, p, maps, start, stop, seed=0):
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """The scalars nearest to a camera's maps: medians over the pixels, thresholds in natural-log
-    units, rates in Hz per pixel and polarity; sigma: the spread of a threshold over the pixels."""
+    units, rates in Hz per pixel and polarity; sigma: the spread of a threshold over the pixels.
+    cutoff_hz (at 255 DN), dead_s: of the circuit, 0 where they were not measured."""
 
     width: int
     height: int
@@ -50,11 +53,13 @@ class Settings:
     sigma_off: float
     eta_on: float
     eta_off: float
+    cutoff_hz: float = 0.0
+    dead_s: float = 0.0
 
     @staticmethod
-    def of(maps: Maps, std: Maps | None = None) -> Settings:
-        """From maps (H, W) and their standard deviations; hot and dead pixels move neither median
-        nor spread, which is that of the estimates and that within each, together."""
+    def of(maps: Maps, std: Maps | None = None, sensor: SensorModel = SensorModel()) -> Settings:
+        """From maps (H, W), their standard deviations and the circuit; hot and dead pixels move
+        neither median nor spread, which is that of the estimates and that within each, together."""
         middle = {name: float(np.median(values)) for name, values in maps.items()}
         sigma = {}
         for name in ("theta_on", "theta_off"):
@@ -62,7 +67,15 @@ class Settings:
             within = float(np.median(std[name])) if std else 0.0
             sigma[name.replace("theta", "sigma")] = float(np.hypot(spread, within))
         height, width = maps["theta_on"].shape
-        return Settings(width, height, **middle, **sigma)
+        return Settings(width, height, **middle, **sigma, cutoff_hz=sensor.cutoff_hz,
+                        dead_s=sensor.refractory_s)
+
+    @property
+    def circuit(self) -> str:
+        """What was measured of the circuit, in words."""
+        cutoff = f"cutoff {self.cutoff_hz:.0f} Hz at 255 DN" if self.cutoff_hz else "no cutoff"
+        dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
+        return f"{cutoff}, {dead}"
 
     @property
     def sigma(self) -> float:

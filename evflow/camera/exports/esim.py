@@ -17,7 +17,7 @@ import numpy as np
 from add_noise import add_noise
 
 maps = np.load(Path(__file__).with_name("maps.npz"))
-simulator = esim_py.EventSimulator({theta_on:.5f}, {theta_off:.5f}, 0.0, 1e-3, True)
+simulator = esim_py.EventSimulator({theta_on:.5f}, {theta_off:.5f}, {dead_s:.6f}, 1e-3, True)
 x, y, t, p = simulator.generateFromFolder(sys.argv[1], sys.argv[2]).reshape(-1, 4).T
 start, *_, stop = np.rint(np.loadtxt(sys.argv[2], ndmin=1) * 1e6).astype(np.int64)
 x, y, t, p = add_noise(x.astype(int), y.astype(int), np.rint(t * 1e6).astype(np.int64),
@@ -32,7 +32,7 @@ esim_py, noise added:
     python run_esim.py IMAGES TIMESTAMPS.txt EVENTS.npz
 esim_torch, without noise:
     python esim_torch/scripts/generate_events.py -i FRAMES -o OUT \\
-        -cp {theta_on:.4f} -cn {theta_off:.4f} -rp 0
+        -cp {theta_on:.4f} -cn {theta_off:.4f} -rp {dead_ns}
 
 What ESIM cannot represent
 - Thresholds per pixel: it has one number per polarity, here the medians. The measured spread, ON
@@ -40,6 +40,8 @@ What ESIM cannot represent
   substitute: it draws anew for every pixel and frame.)
 - Noise: it has none. add_noise.py adds the measured rates, ON {eta_on:.4f} and OFF {eta_off:.4f} Hz
   at the median pixel, to its output; the pixels' memories do not know of it.
+- The photoreceptor's low-pass (measured: {circuit}): it has none. Within the dead time it loses
+  contrast, where v2e's pixels, and evflow's, keep it for later.
 - The log map: ESIM's is log(I / 255 + eps), evflow measures against v2e's, linear below 20 DN. Dark
   scenes give other counts: 22 % fewer on one video, with eps = 1e-3.
 '''
@@ -47,5 +49,6 @@ What ESIM cannot represent
 
 def export(maps: Maps, s: Settings) -> Export:
     """The medians, and a script that adds the noise."""
-    return Export(TEXT.format(**vars(s)),
+    values = vars(s) | {"circuit": s.circuit, "dead_ns": round(s.dead_s * 1e9)}
+    return Export(TEXT.format(**values),
                   {"run_esim.py": SCRIPT.format(**vars(s)), "add_noise.py": NOISE})

@@ -13,6 +13,7 @@ import numpy as np
 
 from evflow.camera.exports.common import Export, Maps, Settings
 
+USUAL_DEAD_US = 100  # in IEBCS's examples
 FREQUENCIES = np.concatenate([np.arange(1, 10) * 10.0**k for k in range(-3, 5)])
 
 SCRIPT = '''"""A video through IEBCS with the measured thresholds and noise; run in its root folder.
@@ -35,7 +36,7 @@ maps = np.load(folder / "maps.npz")
 sensor = DvsSensor("measured")
 sensor.set_shape({width}, {height})
 sensor.set_dvs_sensor(th_pos={theta_on:.5f}, th_neg={theta_off:.5f}, th_n=0.0, lat=100, tau=40,
-                      jit=10, bgnp={bgnp:.5f}, bgnn={bgnn:.5f}, ref=100)
+                      jit=10, bgnp={bgnp:.5f}, bgnn={bgnn:.5f}, ref={dead_us})
 sensor.init_bgn_hist(str(folder / "noise_pos.npy"), str(folder / "noise_neg.npy"))
 video, step, events, frame = cv2.VideoCapture(sys.argv[1]), 1e6 / float(sys.argv[2]), None, 0
 while True:
@@ -59,7 +60,7 @@ TEXT = '''The camera for IEBCS (https://github.com/neuromorphicsystems/IEBCS)
     python run_iebcs.py VIDEO FPS EVENTS.dat                     (in the root of IEBCS)
 
 Scalars only: set_dvs_sensor(th_pos={theta_on:.4f}, th_neg={theta_off:.4f}, th_n={sigma:.4f},
-    lat=100, tau=40, jit=10, bgnp={bgnp:.4f}, bgnn={bgnn:.4f}, ref=100)
+    lat=100, tau=40, jit=10, bgnp={bgnp:.4f}, bgnn={bgnn:.4f}, ref={dead_us})
 
 What IEBCS cannot represent
 - Thresholds of a pixel: it draws each anew after every event, around one mean (th_n is a noise in
@@ -69,8 +70,8 @@ What IEBCS cannot represent
   rate of each pixel, but IEBCS gives them to its pixels at random: the distribution of rates is
   kept, the places are not. Rates go by its bins, 1 to 9 times a power of ten. A silent pixel fires
   once in 1000 s. A noise event stores the present intensity.
-- Latency, time constant, jitter and refractory period (lat, tau, jit, ref) are not measured by
-  evflow: the values above are IEBCS's own examples.
+- Latency, time constant and jitter (lat, tau, jit) are IEBCS's own examples, and so is the dead
+  time (ref, microseconds) where none was measured (here: {circuit}). Its latency is no low-pass.
 - The log map is log(I + 1) with white at 1e4, evflow measures against v2e's, linear below 20 DN.
 '''
 
@@ -79,7 +80,8 @@ def export(maps: Maps, s: Settings) -> Export:
     """Scalars, a script, and spectra of the noise."""
     slowest = float(FREQUENCIES[0])  # IEBCS divides by the rate
     rates = {"bgnp": max(s.eta_on, slowest), "bgnn": max(s.eta_off, slowest)}
-    values = vars(s) | rates | {"sigma": s.sigma}
+    values = vars(s) | rates | {
+        "sigma": s.sigma, "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}
     return Export(TEXT.format(**values), {"run_iebcs.py": SCRIPT.format(**values)}, arrays)
 

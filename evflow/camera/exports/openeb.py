@@ -20,7 +20,8 @@ from add_noise import add_noise
 from metavision_core_ml.video_to_event.simulator import EventSimulator
 
 maps = np.load(Path(__file__).with_name("maps.npz"))
-simulator = EventSimulator({height}, {width}, {theta_on:.5f}, {theta_off:.5f}, 0)
+simulator = EventSimulator(
+    {height}, {width}, {theta_on:.5f}, {theta_off:.5f}, {dead_us}, cutoff_hz={cutoff_hz:.1f})
 simulator.Cps = np.clip(maps["theta_on"], 0.01, 1)
 simulator.Cns = np.clip(maps["theta_off"], 0.01, 1)
 video, step, found, frame = cv2.VideoCapture(sys.argv[1]), 1e6 / float(sys.argv[2]), [], 0
@@ -46,8 +47,8 @@ Every pixel (recommended):
 
 Scalars only, its own sample:
     python viz_video_to_event_simulator.py VIDEO --Cp {theta_on:.4f} --Cn {theta_off:.4f} \\
-        --sigma_threshold {sigma:.4f} --refractory_period 0 --cutoff_hz 0 --leak_rate_hz 0 \\
-        --shot_noise_rate_hz {shot:.4f}
+        --sigma_threshold {sigma:.4f} --refractory_period {dead_us} --cutoff_hz {cutoff_hz:.1f} \\
+        --leak_rate_hz 0 --shot_noise_rate_hz {shot:.4f}
 
 What OpenEB cannot represent
 - The command line has one sigma for both polarities (measured ON {sigma_on:.4f}, OFF
@@ -55,6 +56,7 @@ What OpenEB cannot represent
 - Noise: one rate for ON and OFF together, in the dark; and its simulator makes shot noise only in
   intervals in which some pixel has an event, 0 in a static scene. So the script leaves it off, and
   add_noise.py adds the measured maps; the pixels' memories do not know of it.
+- Its low-pass has two poles where one was measured ({circuit}).
 - The log map is log(I / 255 + 1e-7), evflow measures against v2e's, linear below 20 DN: dark scenes
   give other counts.
 '''
@@ -65,7 +67,8 @@ def export(maps: Maps, s: Settings) -> Export:
     thetas = maps["theta_on"], maps["theta_off"]
     outside = sum(int(((theta < LOW) | (theta > HIGH)).sum()) for theta in thetas)
     clipped = f"; {outside:,} of the measured ones are" if outside else ""
-    values = vars(s) | {"sigma": s.sigma, "clipped": clipped,
-                        "shot": (s.eta_on + s.eta_off) / GREY}
+    values = vars(s) | {
+        "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
+        "clipped": clipped, "shot": (s.eta_on + s.eta_off) / GREY}
     return Export(TEXT.format(**values),
-                  {"run_openeb.py": SCRIPT.format(**vars(s)), "add_noise.py": NOISE})
+                  {"run_openeb.py": SCRIPT.format(**values), "add_noise.py": NOISE})

@@ -11,6 +11,7 @@ import numpy as np
 from evflow.camera.camera import PARAMETERS, Camera
 from evflow.camera.exports import esim, iebcs, openeb, v2e
 from evflow.camera.exports.common import Export, Maps, Settings
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.folders import atomic_folder
 from evflow.files.whole import need_members
@@ -19,9 +20,11 @@ TARGETS: Mapping[str, Callable[[Maps, Settings], Export]] = {
     "v2e": v2e.export, "esim": esim.export, "openeb": openeb.export, "iebcs": iebcs.export}
 
 
-def export_camera(camera: Camera, to: str, std: Camera | None = None) -> tuple[Export, Maps]:
+def export_camera(
+    camera: Camera, to: str, std: Camera | None = None, sensor: SensorModel = SensorModel()
+) -> tuple[Export, Maps]:
     """A camera of maps (H, W) in the words of a simulator, and the maps as float32. std: of an
-    estimate's maps, which are more even than the camera.
+    estimate's maps, which are more even than the camera; sensor: its circuit, as measured.
 
     Raises EV020 (no such simulator), EV002 (several cameras at once).
     """
@@ -33,7 +36,7 @@ def export_camera(camera: Camera, to: str, std: Camera | None = None) -> tuple[E
     maps, errors = ({name: np.asarray(getattr(c, name), np.float32) for name in PARAMETERS}
                     if c is not None else None for c in (camera, std))
     assert maps is not None
-    return TARGETS[to](maps, Settings.of(maps, errors)), maps
+    return TARGETS[to](maps, Settings.of(maps, errors, sensor)), maps
 
 
 def write_export(

@@ -23,8 +23,9 @@ GREY = 0.59636  # v2e's shot noise at 128 DN over that in the dark
 
 maps = {{k: torch.tensor(v) for k, v in np.load(Path(__file__).with_name("maps.npz")).items()}}
 emulator = EventEmulator(
-    pos_thres={theta_on:.5f}, neg_thres={theta_off:.5f}, sigma_thres=0.01, cutoff_hz=0.0,
-    leak_rate_hz=0.0, refractory_period_s=0.0, shot_noise_rate_hz=2 / GREY, device="cpu")
+    pos_thres={theta_on:.5f}, neg_thres={theta_off:.5f}, sigma_thres=0.01,
+    cutoff_hz={cutoff_hz:.1f}, leak_rate_hz=0.0, refractory_period_s={dead_s:.6f},
+    shot_noise_rate_hz=2 / GREY, device="cpu")
 video, step, found, frame = cv2.VideoCapture(sys.argv[1]), 1 / float(sys.argv[2]), [], 0
 while True:
     more, image = video.read()
@@ -59,6 +60,8 @@ What v2e cannot represent
 - Noise is one rate on the command line, times nominal over actual threshold; in the script it is
   the measured map, exact at 128 DN.
 - A noise event stores the present intensity in the pixel's memory.
+- Its circuit is the measured one ({circuit}), if the frames come at several times the cutoff: its
+  low-pass is exact for short steps only, and its dead time delays events by whole frames.
 - All events of a pixel between two frames share v2e's time slots; its times are float32 seconds.
 '''
 
@@ -70,11 +73,12 @@ def export(maps: Maps, s: Settings) -> Export:
     command = (
         f"v2e -i VIDEO -o OUT --output_width {s.width} --output_height {s.height} "
         f"--pos_thres {s.theta_on:.4f} --neg_thres {s.theta_off:.4f} --sigma_thres {s.sigma:.4f} "
-        f"--cutoff_hz 0 --leak_rate_hz {leak:.4f} --shot_noise_rate_hz {shot:.4f} "
-        "--refractory_period 0 --dvs_h5 events.h5")
+        f"--cutoff_hz {s.cutoff_hz:.1f} --leak_rate_hz {leak:.4f} --shot_noise_rate_hz {shot:.4f} "
+        f"--refractory_period {s.dead_s:.6f} --dvs_h5 events.h5")
     excess = (
         "the OFF noise (measured {eta_off:.4f} Hz); what\n  ON has more of it ({eta_on:.4f} Hz) is "
         "--leak_rate_hz, a regular drift" if leak else
         "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))
-    values = vars(s) | {"sigma": s.sigma, "command": command, "excess": excess}
+    values = vars(s) | {
+        "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess}
     return Export(TEXT.format(**values), {"run_v2e.py": SCRIPT.format(**vars(s))})

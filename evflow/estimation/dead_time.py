@@ -1,0 +1,74 @@
+"""The dead time (refractory period) of a camera, from the intervals between a pixel's events.
+
+Below the dead time there are none but noise, from it on there are many: a pixel whose light goes on
+changing fires as soon as it can. A recording in which few pixels change that fast shows no such
+edge, and then nothing is known of it but that it is shorter than what is usual there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from evflow.types import Events
+
+MOST_EVENTS = 2_000_000  # that are looked at: of a longer recording, those of some of the pixels
+SHORTEST_US, LONGEST_US = 20.0, 50_000.0
+STEP = 1.03  # from one candidate to the next
+ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # of a candidate: where there are many, and where few
+ENOUGH = 200  # intervals just above
+SHARP = 8.0  # times as dense above as below: a slow pixel's densities rise by 2 over this distance
+LATTICE = 20  # different intervals within an octave: times in steps have an edge at each
+FEW_SHORTER = 0.05  # of all intervals may be shorter than a dead time: noise that does not know it
+
+
+@dataclasses.dataclass(frozen=True)
+class DeadTime:
+    """seconds, std_s: of the dead time, 0 and NaN where the recording shows none."""
+
+    seconds: float = 0.0
+    std_s: float = float("nan")
+
+    @property
+    def measured(self) -> bool:
+        return self.seconds > 0
+
+
+def dead_time(events: Events) -> DeadTime:
+    """The dead time of a stream's pixels, where at least ENOUGH intervals lie at its edge."""
+    intervals = np.sort(own_intervals(events))
+    edges = SHORTEST_US * STEP ** np.arange(int(np.log(LONGEST_US / SHORTEST_US) / np.log(STEP)))
+
+    def between(low: float, high: float) -> np.ndarray:
+        return np.diff(np.searchsorted(intervals, [edges * low, edges * high]), axis=0)[0]
+
+    many, few = between(*ABOVE), between(*BELOW)
+    density = (ABOVE[1] - ABOVE[0]) / (BELOW[1] - BELOW[0])
+    sharpness = many / (few * density + 1.0) * (many >= ENOUGH)
+    best = int(np.argmax(sharpness))
+    if sharpness[best] < SHARP:
+        return DeadTime()
+    near = intervals[slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.1])))]
+    octave = intervals[slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.9])))]
+    shorter = np.searchsorted(intervals, 0.95 * edges[best]) / len(intervals)
+    if len(np.unique(octave)) < LATTICE or shorter > FEW_SHORTER:
+        return DeadTime()
+    low, middle = np.quantile(near, [0.05, 0.5])
+    return DeadTime(float(low) * 1e-6, float(max(middle - low, 0.02 * low)) * 1e-6)
+
+
+def own_intervals(events: Events) -> np.ndarray:
+    """(N,) int64, microseconds between successive events of a pixel, whatever their polarity."""
+    width, height = events.size
+    pixel = events.y.astype(np.int64) * width + events.x
+    t = events.t
+    if len(pixel) > MOST_EVENTS:
+        share = -(-len(pixel) // MOST_EVENTS)
+        # Every k-th pixel of a shuffled order: rows and columns of a sensor may differ.
+        used = np.random.default_rng(0).permutation(height * width) % share == 0
+        kept = used[pixel]
+        pixel, t = pixel[kept], t[kept]
+    order = np.argsort(pixel, kind="stable")
+    pixel, t = pixel[order], t[order]
+    return np.diff(t)[np.diff(pixel) == 0]
