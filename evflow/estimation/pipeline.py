@@ -26,7 +26,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.dead_time import DeadTime, dead_time
 from evflow.estimation.one_polarity import untold, without
-from evflow.estimation.pixel_noise import pixel_rates, quiet_time
+from evflow.estimation.pixel_noise import pixel_rates, quiet_time, threshold_law
 from evflow.estimation.refine import (
     Chunk,
     Found,
@@ -290,9 +290,10 @@ def _with_rates(
     """The maps with each pixel's noise rates from its quiet time: a window holds too little noise
     of a pixel for the network to say more than the camera's."""
     rates, errors = {}, {}
-    for name, (events, seconds) in zip(("eta_on", "eta_off"), quiet, strict=True):
+    law = threshold_law(quiet, np.stack([camera.theta_on, camera.theta_off]), hot)
+    for name, (events, seconds), relative in zip(("eta_on", "eta_off"), quiet, law, strict=True):
         mean, error = (float(getattr(s, name)) for s in (summary, summary_std))
-        rate, own = pixel_rates(events, seconds, mean, hot)
+        rate, own = pixel_rates(events, seconds, mean, hot, relative)
         rates[name] = jnp.asarray(rate, jnp.float32)
         errors[name] = jnp.asarray(np.hypot(own, rate * (error / mean)), jnp.float32)
     return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)

@@ -3,7 +3,8 @@
 Over pixels the rates are gamma-distributed around the camera's, counts are Poisson: given the
 spread, the posterior of a pixel's rate is a gamma distribution again. The spread itself is what
 makes the counts of all pixels likely (a negative binomial), so that pixels differ by as much as
-the recording shows them to, and a short one leaves all of them at the camera's rate.
+the recording shows them to, and a short one leaves all of them at the camera's rate. Where it
+makes the counts likelier, rates go as one over the pixel's threshold, as v2e's shot noise does.
 """
 
 from __future__ import annotations
@@ -16,22 +17,48 @@ Array = np.ndarray
 SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate over its mean
 SPREAD, SPREAD_ERROR = 0.05, 0.6  # expected before any data, and the std of its log
 NEGLIGIBLE = 1e-4  # probability of a spread that is left out
+LEAST_THETA = 0.01  # log units: thresholds are clamped there
+LAW_ODDS = 3.0  # log odds that it takes to let rates follow the thresholds
 
 AROUND = 9  # pixels: side of the neighbourhood in which events are company
 STILL = 0.05  # log units: of 3x3 pixels from frame to frame; less than any threshold of use
 DRIFT = 0.1  # log units per second, of 5x5 pixels: slower than a frame's noise, yet it sends events
 
 
+def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
+    """Rates (2, H, W), ON and OFF, relative to the camera's: 1, or as one over the thresholds
+    theta (2, H, W) where quiet (2, 2, H, W) of `quiet_time` makes that the likelier."""
+    watched = quiet[:, 1] * ~hot
+    law = 1.0 / np.maximum(np.asarray(theta, np.float64), LEAST_THETA)
+    law *= (watched.sum((1, 2)) / np.maximum((watched * law).sum((1, 2)), 1e-30))[:, None, None]
+    odds = sum(_likelihood(n, w * r, hot) - _likelihood(n, w, hot)
+               for n, w, r in zip(quiet[:, 0], quiet[:, 1], law, strict=True))
+    return law if odds > LAW_ODDS else np.ones_like(law)
+
+
+def _likelihood(events: Array, expected: Array, hot: Array) -> float:
+    """Log of the probability of events (H, W) that are expected in this proportion."""
+    used = ~hot & (expected > 0)
+    n, expected = events[used].astype(np.float64), expected[used].astype(np.float64)
+    if not n.sum():
+        return 0.0
+    expected *= n.sum() / expected.sum()
+    log_p = _log_shapes(n, expected)
+    return float(np.logaddexp.reduce(log_p) + (n * np.log(expected)).sum())
+
+
 def pixel_rates(
-    events: Array, seconds: Array, rate_hz: float, hot: Array
+    events: Array, seconds: Array, rate_hz: float, hot: Array, relative: Array | float = 1.0
 ) -> tuple[Array, Array]:
     """Noise rates (H, W) in Hz and their std, around the camera's, which is rate_hz.
 
     events (H, W): sent in the seconds (H, W) for which the pixel was watched, 0 for never. Pixels
     are compared with each other, so that what few events are not noise cancel. hot (H, W) bool:
-    pixels unlike the others, whose rates follow from their own events alone.
+    pixels unlike the others, whose rates follow from their own events alone. relative (H, W):
+    rates expected before, of `threshold_law`.
     """
     n, seconds = events.astype(np.float64), np.asarray(seconds, np.float64)
+    law, seconds = np.broadcast_to(relative, n.shape), seconds * relative
     sent, watched = float(n[~hot].sum()), float(seconds[~hot].sum())
     expected = seconds * (sent / watched if watched > 0 else 0.0)
     mean, square = np.zeros(n.shape), np.zeros(n.shape)
@@ -39,25 +66,31 @@ def pixel_rates(
         relative = (n + shape) / (expected + shape)
         mean += weight * relative
         square += weight * relative * (relative + 1.0 / (expected + shape))
-    rate, std = rate_hz * mean, rate_hz * np.sqrt(square - mean**2)
+    rate, std = rate_hz * law * mean, rate_hz * law * np.sqrt(square - mean**2)
     own = hot & (n > 0)
-    rate[own], std[own] = n[own] / seconds[own], np.sqrt(n[own] + 1.0) / seconds[own]
+    alone = seconds[own] / law[own]
+    rate[own], std[own] = n[own] / alone, np.sqrt(n[own] + 1.0) / alone
     return rate, std
 
 
 def _shapes(n: Array, expected: Array) -> tuple[Array, Array]:
     """Shapes of the gamma distribution, and how probable the counts (N,) make each."""
+    shapes, log_p = SPREADS**-2.0, _log_shapes(n, expected)
+    weights = np.exp(log_p - log_p.max())
+    weights /= weights.sum()
+    used = weights > NEGLIGIBLE
+    return shapes[used], weights[used] / weights[used].sum()
+
+
+def _log_shapes(n: Array, expected: Array) -> Array:
+    """Log probability of the counts (N,) and of each spread, but for what all share."""
     shapes = SPREADS**-2.0
     above = np.bincount(n.astype(np.int64), minlength=1)[::-1].cumsum()[::-1][1:]
     k = np.arange(len(above))  # `above`: how many pixels sent more than k
     log_p = np.array([(above * np.log(a + k)).sum()
                       - (a * np.log1p(expected / a) + n * np.log(a + expected)).sum()
                       for a in shapes])
-    log_p -= 0.5 * (np.log(SPREADS / SPREAD) / SPREAD_ERROR) ** 2
-    weights = np.exp(log_p - log_p.max())
-    weights /= weights.sum()
-    used = weights > NEGLIGIBLE
-    return shapes[used], weights[used] / weights[used].sum()
+    return log_p - 0.5 * (np.log(SPREADS / SPREAD) / SPREAD_ERROR) ** 2
 
 
 def quiet_time(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evflow.estimation.pixel_noise import _shapes, pixel_rates, quiet_time
+from evflow.estimation.pixel_noise import _shapes, pixel_rates, quiet_time, threshold_law
 
 SHAPE = (96, 128)
 NONE_HOT = np.zeros(SHAPE, bool)
@@ -99,3 +99,28 @@ def test_hot_pixels_are_no_company() -> None:
     on, _ = watched(counts, np.zeros(SHAPE, np.float32), hot)
     assert (on[1] == np.float32(0.05)).all()
     assert on[0, 40, 50] == 3
+
+
+def quiet_counts(rates: np.ndarray, seconds: float) -> np.ndarray:
+    """Events and seconds (2, 2, H, W) of pixels with the rates (2, H, W)."""
+    rng = np.random.default_rng(4)
+    return np.stack([np.stack([rng.poisson(r * seconds), np.full(SHAPE, seconds)]) for r in rates])
+
+
+def test_rates_follow_the_thresholds_where_the_events_say_so() -> None:
+    theta = np.maximum(np.random.default_rng(3).normal(0.3, 0.12, (2, *SHAPE)), 0.03)
+    rates = 0.2 * np.median(theta, (1, 2), keepdims=True) / theta
+    quiet = quiet_counts(rates, 2.0)
+    law = threshold_law(quiet, theta, NONE_HOT)
+    np.testing.assert_allclose(law, rates / rates.mean((1, 2), keepdims=True), rtol=1e-9)
+    found, std = pixel_rates(*quiet[0], rates[0].mean(), NONE_HOT, law[0])
+    assert found.mean() == pytest.approx(rates[0].mean(), rel=0.05)
+    assert np.median(found) == pytest.approx(np.median(rates[0]), rel=0.05)
+    assert (np.abs(found - rates[0]) < 2 * std).mean() > 0.9
+
+
+def test_rates_of_their_own_do_not_follow_the_thresholds() -> None:
+    theta = np.maximum(np.random.default_rng(3).normal(0.3, 0.12, (2, *SHAPE)), 0.03)
+    for rates in (0.2 * np.ones((2, *SHAPE)), np.zeros((2, *SHAPE))):
+        law = threshold_law(quiet_counts(rates, 2.0), theta, NONE_HOT)
+        np.testing.assert_array_equal(law, 1.0)
