@@ -26,9 +26,9 @@ class Pixels:
     """Whose pixels see; what a command that simulates inherits."""
 
     camera: Annotated[Path | None, value("FILE")] = None
-    """camera.npz from evflow estimate, its photoreceptor's cutoff and dead time included, and, where
-    VIDEO is a recording, the light that its frames lack; without it the thresholds below, or the
-    sensor's own."""
+    """camera.npz from evflow estimate, with its cutoff and dead time, and, where VIDEO is a
+    recording, the light that its frames lack; without it the thresholds below, or the sensor's
+    own."""
     draw: bool = False
     """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
     the most likely values are too even."""
