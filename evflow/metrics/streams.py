@@ -15,6 +15,7 @@ import numpy as np
 
 from evflow.checks import need
 from evflow.errors import EvflowDataError
+from evflow.metrics.space_time import space_time_r
 from evflow.types import Events
 
 CURVE_STEPS = 120  # about as many points as a rate curve has
@@ -47,8 +48,9 @@ def compare(
         rate_hz: events per second and pixel, per polarity, and their ratio synthetic / real;
         on_off: ON events per OFF event; curve: the rates over time and their correlation r;
         counts: correlation r of the events per pixel; net_r: of ON less OFF events over cells of
-        8x8 pixels and 20 ms, negative where polarity is swapped; active: share of pixels that
-        fire, and `common`, those in both over those in either;
+        8x8 pixels and 20 ms, negative where polarity is swapped; space_time_r: the same over
+        3x3 pixels and 2 ms, how alike they are in detail; active: share of pixels that fire, and
+        `common`, those in both over those in either;
         intervals: between successive events of a pixel; neighbours: since the latest event of the
         eight pixels around, with `alone`, the share of events without one within 5 ms (mostly
         noise). Both have ks (Kolmogorov-Smirnov, 0..1), wasserstein_decades (of log10 time),
@@ -84,6 +86,7 @@ def compare(
         "counts": {"r": {p: _correlation(_side(counts["real"], p), _side(counts["synthetic"], p))
                          for p in ("on", "off", "both")}},
         "net_r": _correlation(*(_net(side, t0, t1) for side in sides.values())),
+        "space_time_r": space_time_r(sides["real"], sides["synthetic"], t0, t1),
         "active": _active(counts["real"].sum(0) > 0, counts["synthetic"].sum(0) > 0),
         **_company(sides),
     }
