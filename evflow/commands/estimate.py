@@ -74,6 +74,7 @@ class Estimate(Compiling, Reading):
 
     def run(self) -> None:
         from evflow.files.folders import staged
+        from evflow.recordings.repeats import without_repeats
         from evflow.report import plots
         from evflow.report.text import describe
 
@@ -89,6 +90,7 @@ class Estimate(Compiling, Reading):
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording = tell(self.read(self.recording))
             doubts = self._checked(recording)
+            recording = without_repeats(recording)
             recording = self._reconstructed(recording) if self.reconstruct else recording
             found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
             found = dataclasses.replace(found, notes=(*doubts, *found.notes))

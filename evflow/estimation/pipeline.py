@@ -48,6 +48,7 @@ from evflow.notes import Note
 from evflow.recordings.check.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels
 from evflow.recordings.glitches import exposed
+from evflow.recordings.repeats import without_repeats
 from evflow.recordings.stillness import stands_still
 from evflow.recordings.windows import condensed, iter_windows, plan_windows
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
@@ -97,6 +98,7 @@ def estimate_camera(
     recording = recording_or_path
     if not isinstance(recording, Recording):
         recording = io.read_recording(recording)
+    recording = without_repeats(recording)
     if not recording.has_frames or stands_still(recording):
         return estimate_noise(recording)
     params = load_weights() if params is None else params
@@ -145,7 +147,7 @@ def estimate_camera(
         camera, std, summary, summary_std, (n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         len(plan.pairs),
         (*condensed(plan.skipped), *_notes(stats, unknown, n_events, summary, hot, dead),
-         *_receptor_notes(found)),
+         *_receptor_notes(found), *(n for n in recording.notes if n.code == "frames.repeated")),
         tuple(f"theta_{name}" for name in unknown),
         **_measured(found, dead_time(recording.events)))
 

@@ -6,11 +6,11 @@ import numpy as np
 
 from evflow.light.colour import LUMA
 from evflow.recordings.check.findings import Finding
+from evflow.recordings.repeats import repeated_frames
 from evflow.types import Recording
 
 WHITE_DN, BLACK_DN = 254.5, 0.5
 FRAME_SHARE, ALL_SHARE = 0.5, 0.25  # of the pixels of one frame, and of all frames
-FIRING_SHARE = 0.01  # of the pixels have events where a frame should have changed
 DEPTHS = {255: 8, 1023: 10, 4095: 12, 16383: 14, 65535: 16}
 
 
@@ -42,19 +42,13 @@ def _exposure(recording: Recording) -> list[Finding]:
 
 
 def _repeated(recording: Recording) -> list[Finding]:
-    frames, times = recording.frames, recording.frame_times
-    same = [i for i in range(1, len(frames)) if np.array_equal(frames[i], frames[i - 1])
-            and _fires(recording, int(times[i - 1]), int(times[i]))]
-    if not same:
+    same = repeated_frames(recording)
+    if not len(same):
         return []
     return [Finding(
-        "EV028", "warning", f"{len(same)} of {len(frames)} frames repeat the one before while "
-        f"pixels fire, first frame {same[0]}: shown twice by a converter?",
-        "Remove the repeated frames, or export at the camera's own frame rate.")]
-
-
-def _fires(recording: Recording, t0: int, t1: int) -> bool:
-    return bool((recording.events.slice(t0, t1).count_map().sum(0) > 0).mean() > FIRING_SHARE)
+        "EV028", "warning", f"{len(same)} of {len(recording.frames)} frames repeat the one "
+        f"before while pixels fire, first frame {same[0]}: shown twice by a converter?",
+        "An estimate leaves them out; better, export at the camera's own frame rate.")]
 
 
 def _depth(recording: Recording) -> list[Finding]:

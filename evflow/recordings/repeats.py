@@ -1,0 +1,82 @@
+"""Frames of a recording that repeat the one before while its pixels fire: shown twice by a
+converter, or by a camera that had no new one.
+
+The time of a repeat is no time of what it shows. Without repeats a frame stands at its first
+showing; where a converter made more frames of fewer at regular places (24 to 30 a second), those in
+between were evenly spaced before, and are again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from evflow.notes import Note
+from evflow.types import Recording
+
+Array = np.ndarray
+
+LONGEST = 4  # showings of a frame; more often, and the scene stands still
+FIRING_SHARE = 0.01  # of the pixels have events where a frame should have changed
+STRIDE = 4  # every 4th pixel of every 4th row is compared first
+LEAST_CYCLES, REGULAR = 3, 0.8  # repeats, and the share of them that are equally far apart
+EVEN = 1.5  # times the usual change after a repeat: less, and the frames were evenly spaced
+
+
+def repeated_frames(recording: Recording) -> Array:
+    """Indices (R,) of frames that equal the one before while pixels fire."""
+    frames, times = recording.frames, recording.frame_times
+    return np.array([i for i in range(1, len(frames)) if _equal(frames[i - 1], frames[i])
+                     and _fires(recording, int(times[i - 1]), int(times[i]))], int)
+
+
+def without_repeats(recording: Recording) -> Recording:
+    """The recording without frames shown up to LONGEST times, and a note; itself where there is
+    none."""
+    found = repeated_frames(recording)
+    runs = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
+    at = np.concatenate([run for run in runs if len(run) < LONGEST] or [found[:0]])
+    if not len(at):
+        return recording
+    kept = np.delete(np.arange(len(recording.frames)), at)
+    times = recording.frame_times[kept]
+    even = _evenly(recording, at, kept)
+    note = Note("frames.repeated", f"{len(at)} of {len(recording.frames)} frames repeat the one "
+                "before while pixels fire, and are left out"
+                + ("" if even is None else "; the others are evenly spaced again") + ".")
+    return dataclasses.replace(
+        recording, frames=recording.frames[kept], frame_times=times if even is None else even,
+        notes=(*recording.notes, note))
+
+
+def _evenly(recording: Recording, at: Array, kept: Array) -> Array | None:
+    """Times (K,) of the kept frames where a converter repeated frames at regular places, None
+    where a camera had no new one: there as much happens in twice the time."""
+    gaps = np.diff(at)
+    if len(at) < LEAST_CYCLES or len(kept) < 4 or np.median(gaps) < 3 or (
+            (gaps == np.median(gaps)).mean() < REGULAR):
+        return None
+    some = recording.frames[:, ::STRIDE, ::STRIDE].astype(np.float32)[kept]
+    change = np.abs(np.diff(some, axis=0)).mean((1, 2))
+    long = np.diff(kept) > 1
+    if np.median(change[long]) > EVEN * np.median(change[~long]):
+        return None
+    anchors = np.searchsorted(kept, at - 1)  # among the kept: what is shown again right after
+    times = recording.frame_times[at - 1]
+    step = np.median(np.diff(times) / np.diff(anchors))
+    ends = np.array([0, len(kept) - 1])
+    outside = times[[0, -1]] + (ends - anchors[[0, -1]]) * step
+    places = np.concatenate([ends[:1] - 1, anchors, ends[1:] + 1])
+    known = np.concatenate([outside[:1] - step, times, outside[1:] + step])
+    even: Array = np.rint(np.interp(np.arange(len(kept)), places, known)).astype(np.int64)
+    return even if (np.diff(even) > 0).all() else None
+
+
+def _equal(a: Array, b: Array) -> bool:
+    some = np.s_[::STRIDE, ::STRIDE]
+    return np.array_equal(a[some], b[some]) and np.array_equal(a, b)
+
+
+def _fires(recording: Recording, t0: int, t1: int) -> bool:
+    return bool((recording.events.slice(t0, t1).count_map().sum(0) > 0).mean() > FIRING_SHARE)
