@@ -8,6 +8,7 @@ wrong with a file comes out as an `EvflowDataError`.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Protocol, Unpack
@@ -16,7 +17,7 @@ from evflow.checks import Size, need
 from evflow.errors import EvflowDataError, naming
 from evflow.files.regular import need_regular
 from evflow.io.decode.text import HEAD
-from evflow.io.decode.units import check_seconds
+from evflow.io.decode.units import check_seconds, doubt
 from evflow.io.formats import (
     aedat2,
     aedat3,
@@ -46,6 +47,7 @@ from evflow.io.formats.ros import ros1, ros2
 from evflow.io.formats.write_aedat4 import Aedat4Writer
 from evflow.io.hints import Hints, Told
 from evflow.io.writer import EventWriter, copy
+from evflow.notes import Note
 from evflow.types import Events, Recording
 
 
@@ -137,6 +139,8 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
             _check_named(recording, told)
             events = recording.events
             check_seconds(events.t, events.size, told.time_unit, found.NAME)
+            if told.time_unit == "auto":
+                recording = _doubted(recording, found.NAME)
     except MemoryError as e:
         raise EvflowDataError(
             "EV009", f"{path} asks for more memory than there is.",
@@ -259,6 +263,16 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
             "EV020", f"the extension {suffix} of {path} stands for no format that can be written.",
             f"Take one of {kinds}, or pass format (--format): {', '.join(WRITERS)}.")
     return WRITERS[WRITTEN[suffix] if format is None else format]
+
+
+def _doubted(recording: Recording, format: str) -> Recording:
+    """The recording, with a note where another unit of its times is likelier; EV023 where that must
+    be answered."""
+    found = doubt(recording.events, recording.frame_times, format)
+    if found is None:
+        return recording
+    note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
+    return dataclasses.replace(recording, notes=(*recording.notes, note))
 
 
 def _check_named(recording: Recording, told: Hints) -> None:

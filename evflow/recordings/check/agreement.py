@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.decode.units import too_few
 from evflow.recordings.check.findings import Finding
 from evflow.recordings.windows import plan_windows
 from evflow.types import Events, Recording
@@ -175,11 +176,9 @@ def _missing(steps: Steps) -> list[Finding]:
     count = sum(len(steps.events.slice(int(t0), int(t1))) for t0, t1 in steps.bounds)
     if shown < LEAST_CHANGE or count > shown / MOST_THETA:
         return []
-    return [Finding(
-        "EV023", "warning", f"frames change by {shown:,.0f} log units where they change most, "
-        f"which is as many events at thresholds of 1, but {count:,} events happen meanwhile.",
-        "Event times a thousand times too long? Pass --time-unit ns where they "
-        "were read in us, us where in ms, ms where in s; or frames of another recording.")]
+    wrong = too_few(count, shown)
+    return [Finding("EV023", "warning", wrong.seen, f"Event times too long? Pass --time-unit "
+                    f"{wrong.unit}; or frames of another recording.")]
 
 
 def frames_offset(recording: Recording) -> int:

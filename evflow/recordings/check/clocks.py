@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.io.decode.units import misread
-from evflow.recordings.check.findings import Finding
+from evflow.recordings.check.findings import Finding, Severity
 from evflow.recordings.gaps import event_gaps
 from evflow.recordings.windows import DROPPED
 from evflow.types import Recording
@@ -16,10 +16,13 @@ JUMP_US = 10_000_000  # a jump is longer, and longer than all the rest of the re
 def clocks(recording: Recording) -> list[Finding]:
     """EV023 (unit), EV025 (gaps), EV026 (jump), EV030 (dropped frames)."""
     wrong = misread(recording.events, recording.frame_times)
+    said = [note.text for note in recording.notes if note.code == "events.unit"]
     if wrong is None:
         return [*_gaps(recording), *_dropped(recording)]
-    return [Finding("EV023", "error" if wrong.certain else "warning", wrong.seen,
-                    f"Pass --time-unit {wrong.unit}.")]
+    severity: Severity = "error" if wrong.certain else "warning"
+    if said:  # by the reader, who knows the unit that it took
+        return [Finding("EV023", severity, f"{said[0]}.")]
+    return [Finding("EV023", severity, wrong.seen, f"Pass --time-unit {wrong.unit}.")]
 
 
 def _gaps(recording: Recording) -> list[Finding]:

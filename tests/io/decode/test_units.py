@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from helpers.recordings import refused
 
+from evflow import check
+from evflow.io import read_recording
 from evflow.io.decode.units import (
     UNITS_US,
     misread,
@@ -81,3 +86,87 @@ def test_the_rate_alone_tells_too() -> None:
     assert found is not None
     assert not found.certain
     assert misread(events(2), few) is None
+
+
+def noisy(folder: Path, name: str, unit: str, hz: float, *, ticks: int = 1, zero: int = 0) -> Path:
+    """4 s of noise, of that rate per pixel, with times in that unit: in a file whose unit is told
+    by nothing but its kind. ticks: us between times."""
+    n, rng = round(4 * hz * 64 * 48), np.random.default_rng(1)
+    us = zero + ticks * np.sort(rng.integers(0, 4_000_000 // ticks, n))
+    t = us / UNITS_US[unit] + (rng.integers(0, 999, n) if unit == "ns" and ticks == 1 else 0)
+    t = np.sort(t if unit == "s" else np.rint(t).astype(np.int64))
+    x, y, p = rng.integers(0, 64, n), rng.integers(0, 48, n), rng.integers(0, 2, n)
+    path = folder / name
+    if name.endswith(".npz"):
+        np.savez(path, t=t, x=x, y=y, p=p, size=(64, 48))
+    elif name.endswith(".h5"):
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as f:
+            f.attrs["width"], f.attrs["height"] = 64, 48
+            for column, values in zip("txyp", (t, x, y, p), strict=True):
+                f[f"events/{column}"] = values
+    else:
+        lines = "".join(f"{a!r} {b} {c} {d}\n" for a, b, c, d in zip(
+            t.tolist(), x.tolist(), y.tolist(), p.tolist(), strict=True))
+        path.write_text(lines)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5"])
+def test_whole_numbers_in_another_unit_are_never_read_in_silence(
+    tmp_path: Path, name: str
+) -> None:
+    """Without frames: by the rate of events alone, as a note or, where ticks tell too, a question;
+    and what it advises is right."""
+    path = noisy(tmp_path, name, "ns", 0.5)
+    found = read_recording(path)
+    (note,) = [note for note in found.notes if note.code == "events.unit"]
+    assert "0.0005 per second and pixel" in note.text
+    assert "--time-unit ns" in note.text
+    assert [f.severity for f in check(found).findings if f.code == "EV023"] == ["warning"]
+    right = read_recording(path, time_unit="ns")
+    assert right.events.duration_us / 1e6 == pytest.approx(4, rel=0.01)
+    assert "events.unit" not in {note.code for note in right.notes}
+    error = refused(noisy(tmp_path, name, "ns", 0.5, ticks=1000))
+    assert error.code == "EV023"
+    assert "--time-unit ns" in error.fix
+    assert "events.unit" in {n.code for n in read_recording(noisy(tmp_path, name, "ms", 9)).notes}
+    for hz in (0.08, 20.0):
+        assert not read_recording(noisy(tmp_path, name, "us", hz)).notes
+
+
+def test_dates_beyond_this_century_are_asked_about(tmp_path: Path) -> None:
+    path = noisy(tmp_path, "a.npz", "ns", 5, zero=1_700_000_000 * 10**6)
+    error = refused(path)
+    assert error.code == "EV023"
+    assert "--time-unit ns" in error.fix
+    assert read_recording(path, time_unit="ns").events.t[0] // 10**6 == 1_700_000_000
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+@pytest.mark.parametrize("hz", [0.3, 10.0])
+def test_text_names_the_unit_that_its_numbers_speak_for(
+    tmp_path: Path, unit: str, hz: float
+) -> None:
+    path = noisy(tmp_path, "events.txt", unit, hz)
+    error = refused(path, size=(64, 48))
+    assert error.code == "EV003"
+    assert error.fix == f"Pass time_unit={unit!r} (--time-unit {unit})."
+    right = read_recording(path, size=(64, 48), time_unit=unit)
+    assert right.events.duration_us / 1e6 == pytest.approx(4, rel=0.01)
+
+
+def test_text_in_seconds_that_are_milliseconds(tmp_path: Path) -> None:
+    path = noisy(tmp_path, "events.txt", "s", 0.5)
+    assert "events.unit" not in {n.code for n in read_recording(path, size=(64, 48)).notes}
+    rows = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("".join(f"{float(t) * 1e3!r} {x} {y} {p}\n" for t, x, y, p in rows))
+    error = refused(path, size=(64, 48))  # read in s they lie on ticks of 1 ms, too
+    assert error.code == "EV023"
+    assert "ms where they were read in s" in error.fix
+
+
+def test_a_jump_of_the_clock_is_no_unit() -> None:
+    right = events(span_us=5_000_000)
+    t = np.where(np.arange(20_000) < 12_000, right.t, right.t + 10**11)
+    assert misread(Events(right.x, right.y, t, right.p, right.size), np.zeros(0, np.int64)) is None
