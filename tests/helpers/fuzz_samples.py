@@ -16,42 +16,19 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import h5py
 import numpy as np
-from helpers import bags, ecf, streams, tables
+from helpers import bags, streams, tables
 from helpers.fuzz_aedat4 import STREAM, XML, event_packet, frame_packet, header, packet
+from helpers.fuzz_formats import FORMATS
+from helpers.fuzz_sample import FRAMES, N, Sample, sample
 from helpers.recordings import SIZE, make, write_ijrr, zipped
 from helpers.videos import drifting
 
-from evflow.io import read_recording, write_events
+from evflow.io import write_events
 from evflow.io.source import open_frames
 from evflow.types import Events, Recording
 
-N, FRAMES = 300, 2
 REAL_AEDAT4 = "data/formats/dvxplorer320.aedat4"
-@dataclasses.dataclass(frozen=True)
-class Sample:
-    """path: what the reader gets; targets: the files of it that are damaged, most often the
-    first. read(path): what the reader returns.
-
-    sealed: every byte is under a checksum, so what is read is what was written or nothing.
-    counted: the file says how much it holds, so that a cut is seen.
-    text: of lines of words.
-    """
-
-    path: Path
-    targets: tuple[Path, ...]
-    read: Callable[..., Any]
-    sealed: bool = False
-    counted: bool = False
-    text: bool = False
-
-
-def sample(path: Path, *targets: Path, text: bool = False, sealed: bool = False,
-           counted: bool = False, **hints: Any) -> Sample:
-    """A recording."""
-    return Sample(path, targets or (path,), partial(read_recording, **hints), sealed,
-                  counted or sealed, text)
 
 
 # ------------------------------------------------------------------------------------ recordings
@@ -81,44 +58,6 @@ def table(folder: Path, kind: str) -> Sample:
 def dsec(folder: Path) -> Sample:
     write_events(folder / "a.h5", make(N, FRAMES))
     return sample(folder / "a.h5", sealed=True)
-
-
-def metavision(folder: Path, forms: tuple[int | None, ...]) -> Sample:
-    return sample(ecf.write(folder / "a.hdf5", streams.clustered(N), forms, geometry="240x180"),
-                  counted=True)
-
-
-def flat_hdf5(folder: Path, kind: str) -> Sample:
-    """Columns in a group of another name, or N x 4."""
-    ev = make(N).events
-    columns = {"x": ev.x, "y": ev.y, "t": ev.t, "p": ev.p.astype(np.uint8)}
-    with h5py.File(folder / "a.h5", "w") as f:
-        for name, column in columns.items() if kind == "columns" else ():
-            f[f"prophesee/left/{name}"] = column
-        if kind == "matrix":
-            f["all"] = np.stack([columns[name].astype(np.float64) for name in "xytp"], 1)
-        f.attrs["width"], f.attrs["height"] = SIZE
-    return sample(folder / "a.h5", counted=True)
-
-
-def npy(folder: Path, kind: str) -> Sample:
-    """N x 4, or records."""
-    ev = make(N).events
-    columns = {"x": ev.x, "y": ev.y, "t": ev.t, "p": ev.p}
-    if kind == "matrix":
-        np.save(folder / "a.npy", np.stack([columns[c].astype(np.int64) for c in "xytp"], 1))
-    else:
-        np.save(folder / "a.npy", np.rec.fromarrays(list(columns.values()), names="x,y,t,p"))
-    return sample(folder / "a.npy", counted=True, size=SIZE)
-
-
-def nmnist(folder: Path) -> Sample:
-    """Times within 23 bits; an overflow among the events."""
-    ev = streams.clustered(N)
-    rows = [bytes([x, y, p << 7 | t >> 16, t >> 8 & 255, t & 255])
-            for x, y, t, p in streams.listed(ev)]
-    (folder / "a.bin").write_bytes(b"".join([*rows[:50], bytes([0, 240, 0, 0, 0]), *rows[50:]]))
-    return sample(folder / "a.bin")
 
 
 def npz(folder: Path) -> Sample:
@@ -292,12 +231,7 @@ SAMPLES: dict[str, Callable[[Path], Sample]] = {
     **{kind: partial(stream, kind=kind) for kind in (
         "aedat2", "aedat3", "dat", "evt2", "evt2.1", "evt3")},
     **{kind: partial(table, kind=kind) for kind in tables.WRITERS},
-    "metavision": partial(metavision, forms=(0, 1, 2)),
-    "metavision-plain": partial(metavision, forms=()),
-    "hdf5-columns": partial(flat_hdf5, kind="columns"),
-    "hdf5-matrix": partial(flat_hdf5, kind="matrix"),
-    "nmnist": nmnist, "npy-matrix": partial(npy, kind="matrix"),
-    "npy-records": partial(npy, kind="records"),
+    **FORMATS,
     "dsec": dsec, "npz": npz, "ijrr": ijrr, "ijrr-zip": ijrr_zip, "e2vid-text": e2vid_text,
     "images-png": partial(images, suffix="png"), "images-jpg": partial(images, suffix="jpg"),
     "images-tif": partial(images, suffix="tif"), "images-bmp": partial(images, suffix="bmp"),
