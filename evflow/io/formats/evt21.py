@@ -27,6 +27,11 @@ EXTENSIONS: tuple[str, ...] = (".raw",)
 HALF = np.uint64(32)
 TRIED = 1 << 15  # words by which the order of halves is told
 
+# The places of the bits set in each byte, one after another, and where a byte's begin.
+_BITS = (np.arange(1 << 8)[:, None] >> np.arange(8)) & 1
+PLACES = np.nonzero(_BITS)[1].astype(np.uint16)
+PLACES_FROM = np.cumsum(_BITS.sum(1)) - _BITS.sum(1)
+
 
 def sniff(path: Path, head: bytes) -> bool:
     return prophesee.parse(head).encoding == "EVT2.1"
@@ -55,11 +60,21 @@ class Decoder(evt2.Decoder):
         rows, t, early = self.timed(upper, kind)
         self.timeless += int(np.bitwise_count(mask[early]).sum())
         x, y, p = evt2.fields(upper[rows])
-        bits = np.unpackbits(mask[rows].astype("<u4").view(np.uint8), bitorder="little")
-        places = np.flatnonzero(bits)
-        of = places >> 5
-        return Chunk(x[of] + (places & 31).astype(np.uint16), y[of], t[of], p[of],
-                     lambda i: byte + 8 * int(rows[of[i]]))
+        of, place = _bits_set(mask[rows])
+        return Chunk(x[of] + place, y[of], t[of], p[of], lambda i: byte + 8 * int(rows[of[i]]))
+
+
+def _bits_set(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each bit set in masks (n,) uint32, the lowest first: of which mask it is, and its place
+    (uint16). Byte by byte, as most are 0."""
+    parts = mask.astype("<u4").view(np.uint8)
+    some = np.flatnonzero(parts)
+    count = np.bitwise_count(parts[some])
+    ends = np.cumsum(count, dtype=np.int64)
+    first = PLACES_FROM[parts[some]] - (ends - count)
+    at = np.repeat(some, count)
+    place = PLACES[np.arange(len(at)) + np.repeat(first, count)]
+    return at >> 2, place + ((at & 3) << 3).astype(np.uint16)
 
 
 def _whole(
