@@ -92,7 +92,7 @@ def write(path: Path, events: Events, forms: tuple[int | None, ...] = (0, 1, 2),
     for name in "xytp":
         plain[name][: len(table)] = table[name]
     plain["t"][len(table):] = table["t"][-1] if len(table) else 0
-    with h5py.File(path, "w") as f:
+    with h5py.File(path, "w", libver=("v110", "v110")) as f:
         f.attrs.update(attributes)
         made = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         made.set_chunk((block,))

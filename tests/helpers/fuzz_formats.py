@@ -23,7 +23,7 @@ def flat_hdf5(folder: Path, kind: str) -> Sample:
     """Columns in a group of another name, or N x 4."""
     ev = make(N).events
     columns = {"x": ev.x, "y": ev.y, "t": ev.t, "p": ev.p.astype(np.uint8)}
-    with h5py.File(folder / "a.h5", "w") as f:
+    with h5py.File(folder / "a.h5", "w", libver=("v110", "v110")) as f:
         for name, column in columns.items() if kind == "columns" else ():
             f[f"prophesee/left/{name}"] = column
         if kind == "matrix":

@@ -133,7 +133,7 @@ class _Reading:
             raise Damage(packet.begin - HEADER.size, f"events of {packet.size} bytes; expected 8")
         if packet.kind == POLARITY and packet.number and self.source in (None, packet.source):
             self.source = packet.source
-            body = f.read(packet.number * packet.size)
+            body = f.read(min(packet.number * packet.size, os.path.getsize(path)))
             events = np.frombuffer(body, EVENT, len(body) // EVENT.itemsize)
             if len(events):
                 found.append(Part(events, packet.overflow, packet.begin))
@@ -172,7 +172,7 @@ class _Reading:
         if packet.size < FRAME.size:
             raise Damage(packet.begin - HEADER.size, f"frames of {packet.size} bytes")
         for k in range(packet.number):
-            body = f.read(packet.size)
+            body = f.read(min(packet.size, os.path.getsize(self.aside.path)))
             if len(body) < packet.size:
                 return
             info, *stamps, width, height, x, y = FRAME.unpack_from(body)

@@ -91,7 +91,8 @@ def _swap(table: np.ndarray) -> np.ndarray:
 
 
 def _halves_swapped(path: Path, header: prophesee.Header) -> tuple[bool, tuple[Note, ...]]:
-    """Does the upper half of each word come first? And a note, where the words alone tell it."""
+    """Does the upper half of each word come first? And a note, where the words tell it against
+    the header, of which OpenEB takes silence for no, or without one."""
     layout = header.fields.get("format", "").lower()
     if "endianness=" in layout:
         return "endianness=legacy" in layout, ()
@@ -100,6 +101,8 @@ def _halves_swapped(path: Path, header: prophesee.Header) -> tuple[bool, tuple[N
         data = f.read(8 * TRIED)
     table = np.frombuffer(data, f"{header.order}u8", len(data) // 8)
     swapped = _sense(_swap(table)) > _sense(table)
+    if layout and not swapped:
+        return False, ()
     order = "legacy (IMX636)" if swapped else "little"
     return swapped, (Note("events.layout", "the header does not tell which half of a word comes "
                           f"first: taken as {order} after the first words"),)

@@ -17,7 +17,8 @@ HEADERS = {  # name: text, whether upper halves come first, whether that is gues
     "imx636": (b"% format EVT21;height=180;width=240;endianness=legacy\n% end\n", True, False),
     "old": (b"% evt 2.1\n% geometry 240x180\n", False, True),
     "old imx636": (b"% evt 2.1\n% geometry 240x180\n", True, True),
-    "no endianness": (b"% format EVT21;height=180;width=240\n% evt 2.1\n% end\n", True, True)}
+    "no endianness": (b"% format EVT21;height=180;width=240\n% end\n", False, False),
+    "odd": (b"% format EVT21;height=180;width=240\n% evt 2.1\n% end\n", True, True)}
 
 
 @pytest.mark.parametrize("kind", HEADERS)
