@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import arrays, columns, tables
@@ -18,6 +20,7 @@ from evflow.io.decode.hdf5 import DAMAGE
 from evflow.io.decode.units import written_unit
 
 MOST = 2000  # groups and data sets looked at
+SCALES_MS = {1e3: "s", 1.0: "ms", 1e-3: "us", 1e-6: "ns"}  # eventcv's attribute, in ms
 
 
 def walk(f: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
@@ -76,11 +79,20 @@ def _in_group(
 
 
 def _unit(name: str, data: Any) -> str:
-    """Of times, by their attributes, else by their name."""
+    """Of times, by their attributes, else by their name, else by the file."""
     for key in ("unit", "units"):
         if isinstance(told := columns.text(data.attrs.get(key)), str) and told:
             return written_unit(f"[{told}]")
-    return written_unit(name)
+    unit = written_unit(name)
+    return told_unit(data.file) if unit == "auto" else unit
+
+
+def told_unit(f: Any) -> str:
+    """The unit of times that the file states for all of them, "auto" where it does not."""
+    stated = np.asarray(f.attrs.get("timestamp_scale_ms", 0)).ravel()
+    if len(stated) != 1 or stated.dtype.kind not in "iuf":
+        return "auto"
+    return next((unit for ms, unit in SCALES_MS.items() if abs(stated[0] / ms - 1) < 1e-6), "auto")
 
 
 def told_size(f: Any, group: Any) -> Size | None:

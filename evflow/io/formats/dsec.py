@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import MAGIC, Hdf5Writer, plausible
-from evflow.io.decode.hdf5_search import told_size
+from evflow.io.decode.hdf5_search import told_size, told_unit
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
 from evflow.notes import Note
@@ -66,6 +67,8 @@ def read(path: Path, hints: Hints) -> Recording:
     notes: tuple[Note, ...] = (RECTIFY,) if path.with_name("rectify_map.h5").is_file() else ()
     with tables.opened(path) as f:
         columns = _columns(path, f)
+        if hints.time_unit == "auto":
+            hints = dataclasses.replace(hints, time_unit=told_unit(f))
         size, assumed = _size(f)
         if assumed and hints.size is None:
             notes += (assumed,)

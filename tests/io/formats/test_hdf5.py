@@ -59,6 +59,16 @@ def milliseconds(f: Any) -> None:
     f["resolution"] = SIZE
 
 
+def eventcv(f: Any) -> None:
+    group(f, t=EVENTS.t * 1000)
+    f.attrs.update(width=SIZE[0], height=SIZE[1], timestamp_scale_ms=1e-6)
+
+
+def eventcv_group(f: Any) -> None:
+    group(f.create_group("events"), t=EVENTS.t * 1000)
+    f.attrs.update(width=SIZE[0], height=SIZE[1], timestamp_scale_ms=1e-6)
+
+
 def offset(f: Any) -> None:
     group(f.create_group("dvs"), t=(EVENTS.t - EVENTS.t[0]).astype(np.uint32))
     f["dvs/t_offset"] = EVENTS.t[0]
@@ -84,7 +94,8 @@ def across(f: Any) -> None:
 
 
 LAYOUTS: dict[str, Callable[[Any], None]] = {make.__name__: make for make in (
-    rvt, m3ed, flat, words, nanoseconds, milliseconds, offset, compound, matrix, across)}
+    rvt, m3ed, flat, words, nanoseconds, milliseconds, eventcv, eventcv_group, offset, compound,
+    matrix, across)}
 
 
 def write(folder: Path, kind: str) -> Path:
@@ -97,7 +108,7 @@ def write(folder: Path, kind: str) -> Path:
 def test_layouts(tmp_path: Path, kind: str) -> None:
     path = write(tmp_path, kind)
     name = find_format(path).NAME
-    assert name == ("dsec" if kind == "rvt" else "hdf5")
+    assert name == ("dsec" if kind in ("rvt", "eventcv_group") else "hdf5")
     found = read_recording(path)
     equal(found.events, EVENTS)
     first = int(EVENTS.t[0])
