@@ -5,7 +5,9 @@ Exit codes: 0 done, 1 something about the data, 2 usage, 3 disk or memory, 130 i
 
 from __future__ import annotations
 
+import difflib
 import sys
+from pathlib import Path
 from typing import Annotated, Any, NoReturn, Union
 
 import tyro
@@ -45,11 +47,25 @@ def offered() -> Any:
     return Union[named]  # noqa: UP007 - of types that are not known beforehand
 
 
+def understood(arguments: list[str]) -> list[str]:
+    """The command line as it is parsed. Raises EV020 where it begins with no command."""
+    first = arguments[0] if arguments else ""
+    if first == "--version":
+        return ["version", *arguments[1:]]
+    if first and not first.startswith("-") and first not in {*COMMANDS, "bench"}:
+        near = difflib.get_close_matches(first, COMMANDS, n=1)
+        fix = f"Did you mean: evflow {near[0]}?" if near else (
+            "A recording is measured by evflow estimate RECORDING -o cam/."
+            if Path(first).exists() else f"Commands: {', '.join(COMMANDS)}.")
+        raise EvflowDataError("EV020", f"evflow has no command {first!r}.", fix)
+    return forwarded(arguments)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the `evflow` command."""
     try:
         with stoppable():
-            arguments = forwarded(sys.argv[1:] if argv is None else argv)
+            arguments = understood(sys.argv[1:] if argv is None else argv)
             command = tyro.cli(
                 offered(), args=arguments, prog="evflow",
                 description="Measure an event camera from its recording; simulate any video as it "

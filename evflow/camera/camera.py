@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,16 @@ class Camera:
     def shape(self) -> tuple[int, ...]:
         """Shape of the maps, (..., H, W)."""
         return tuple(np.shape(self.theta_on))
+
+    def __repr__(self) -> str:
+        """One line: the size, and the median of each map; of traced maps their shape alone."""
+        size = "x".join(str(n) for n in self.shape)
+        if self._traced() or 0 in self.shape or any(
+                getattr(getattr(self, n), "dtype", np.dtype("O")).kind not in "fiu"
+                for n in PARAMETERS):
+            return f"Camera({size})"
+        middle = (f"{n} {np.median(np.asarray(getattr(self, n))):.4g}" for n in PARAMETERS)
+        return f"Camera({size}, medians: {', '.join(middle)})"
 
     @staticmethod
     def constant(
@@ -251,6 +262,15 @@ class Camera:
             std = Camera(*(jnp.asarray(data[n], jnp.float32) for n in errors))
             jax.tree.map(_check_std, maps, std)
             return maps, std
+
+
+def holds_camera(path: Path) -> bool:
+    """Whether a file is an .npz with a camera's maps."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in PARAMETERS} <= set(archive.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def _check_kind(path: Path) -> None:

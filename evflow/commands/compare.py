@@ -14,24 +14,28 @@ import tyro
 from evflow.commands.options import Reading, note_idle, own_first, tell, value, write_json
 from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_absent, need_folder
+from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
+    from evflow.camera import Camera
     from evflow.types import Events
 
 
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Compare(Reading):
-    """Compare a synthetic stream with a real one by rates, pixels, intervals and noise.
+    """Compare a synthetic stream with a real one by rates, pixels, intervals and noise, or two
+    measured cameras (camera.npz) parameter by parameter.
 
     Example: evflow compare flight.aedat4 synth.h5 -o comparison/
+    Example: evflow compare cam/camera.npz later/camera.npz
     """
 
     real: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REAL")]
     """The recorded events, of any known format. The reading options hold for both; --start and
     --stop count from its first event."""
     synthetic: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SYNTHETIC")]
-    """The events to hold against them, of a sensor of the same size."""
+    """The events to hold against them, of a sensor of the same size. Or both are cameras."""
     out: Annotated[Path | None, value("FOLDER", "-o")] = None
     """Folder for compare.json and compare.html (which needs matplotlib)."""
     plots: bool = True
@@ -52,6 +56,20 @@ class Compare(Reading):
             int(real.t[0]), int(real.t[-1]) + 1)
         return real, same if len(same) else self.read(self.synthetic, with_frames=False).events
 
+    def _cameras(self, *both: tuple[Camera, Camera | None]) -> None:
+        """Two cameras beside each other."""
+        from evflow.metrics.cameras import compare_cameras, describe_cameras
+
+        if self.out:
+            need_absent(self.out / "compare.json", self.overwrite)
+        (a, a_std), (b, b_std) = both
+        numbers = compare_cameras(a, b, a_std, b_std)
+        facts = {"a": str(self.real), "b": str(self.synthetic), **numbers}
+        if self.out:
+            write_json(self.out / "compare.json", facts)
+        print(json.dumps(facts, indent=2) if self.json else
+              describe_cameras(numbers, (_short(self.real), _short(self.synthetic))))
+
     def run(self) -> None:
         from evflow.metrics.streams import compare
         from evflow.process.provenance import sha256, told
@@ -60,6 +78,9 @@ class Compare(Reading):
 
         if self.out:
             need_folder(self.out)
+        if cameras := _cameras(self.real, self.synthetic):
+            self._cameras(*cameras)
+            return
         targets = [] if self.out is None else [self.out / "compare.json"] + (
             [self.out / "compare.html"] if self.plots else [])
         for target in targets:
@@ -84,3 +105,24 @@ class Compare(Reading):
         print(json.dumps(facts, indent=2) if self.json else words)
         if self.out:
             print(f"written to {self.out}/", file=sys.stderr)
+
+
+def _short(path: Path) -> str:
+    """What a camera is called beside another: cam/camera.npz is cam."""
+    return path.parent.name if path.stem == "camera" and path.parent.name else path.stem
+
+
+def _cameras(*paths: Path) -> list[tuple[Camera, Camera | None]]:
+    """The cameras, if both are; none if neither is. EV020 where one is and the other is not."""
+    from evflow.camera.camera import Camera, holds_camera
+
+    found = [holds_camera(path) for path in paths]
+    if all(found):
+        return [Camera.load_with_std(path) for path in paths]
+    if any(found):
+        camera, other = (paths[found.index(kind)] for kind in (True, False))
+        raise EvflowDataError(
+            "EV020", f"{camera} is a camera, {other} is none.",
+            "Compare two cameras or two event streams. To see whether the camera fits a recording: "
+            "evflow simulate RECORDING --camera camera.npz -o synth.h5, and compare the two.")
+    return []

@@ -301,3 +301,11 @@ def test_standard_deviations_come_with_an_estimate(tmp_path: Path) -> None:
     camera.save(broken, **errors | {"theta_on_std": np.full((4, 5), -1.0)})
     with pytest.raises(EvflowDataError, match="EV009"):
         Camera.load_with_std(broken)
+
+
+def test_it_is_shown_in_one_line() -> None:
+    assert repr(Camera.constant((4, 5), 0.25)) == (
+        "Camera(4x5, medians: theta_on 0.25, theta_off 0.2, eta_on 0, eta_off 0)")
+    shown = []
+    jax.jit(lambda c: shown.append(repr(c)) or c.theta_on)(Camera.constant((4, 5)))
+    assert shown == ["Camera(4x5)"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -160,3 +161,46 @@ def test_an_interrupted_process_ends_at_once(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("evflow.commands.version.Version.run", interrupted)
     with pytest.raises(SystemExit, match="at once: 130"):
         cli.run()
+
+
+@pytest.mark.parametrize(("line", "word"), [
+    ("estimat flight.h5", "evflow estimate"), ("simulte", "evflow simulate"),
+    ("whatever", "Commands: info")])
+def test_no_such_command(line: str, word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(line.split()) == 2
+    error = capsys.readouterr().err
+    assert "EV020" in error
+    assert word in error
+
+
+def test_a_recording_without_a_command(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(flight)]) == 2
+    assert "evflow estimate RECORDING" in capsys.readouterr().err
+
+
+def test_version_by_option(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("evflow ")
+
+
+def test_two_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str], flight: Path) -> None:
+    rng = np.random.default_rng(0)
+    even = Camera.constant((20, 30), 0.2, 0.3, 0.1, 0.1)
+    theta = (0.25 + 0.02 * rng.normal(size=(20, 30))).astype(np.float32)
+    uneven = dataclasses.replace(even, theta_on=theta)
+    flat = {f"{n}_std": np.full((20, 30), 0.005, np.float32)
+            for n in ("theta_on", "theta_off", "eta_on", "eta_off")}
+    a, b = tmp_path / "a" / "camera.npz", tmp_path / "b" / "camera.npz"
+    for path, camera in ((a, even), (b, uneven)):
+        path.parent.mkdir()
+        camera.save(path, **flat)
+    assert main(["compare", str(a), str(b)]) == 0
+    text = capsys.readouterr().out
+    assert "They differ in theta_on." in text
+    assert main(["compare", str(b), str(b), "--json"]) == 0
+    same = json.loads(capsys.readouterr().out)["theta_on"]
+    assert same["r"] == pytest.approx(1.0)
+    assert same["ratio"] == 1.0
+    assert same["apart"] == 0.0
+    assert main(["compare", str(a), str(flight)]) == 2
+    assert "is a camera" in capsys.readouterr().err
