@@ -3,6 +3,7 @@
     python -m benchmarks                          # everything, some minutes
     python -m benchmarks --only simulator train   # some subjects (limits are always measured)
     python -m benchmarks --quick                  # tiny inputs: does it run?
+    python -m benchmarks --device gpu             # a GPU, checked against the CPU
 
 Every case runs in a process of its own, and those of a task take turns, except with --quick. Exit
 code 1 if a case failed.
@@ -17,12 +18,11 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
@@ -39,6 +39,7 @@ from benchmarks import (
     limits,
 )
 from benchmarks.harness import Case, Record, Setting, compare, facts, measure
+from benchmarks.tables import table
 from benchmarks.turns import by_task, in_turn
 
 SUBJECTS: dict[str, tuple[Case, ...]] = {
@@ -71,12 +72,17 @@ class Options:
     """JSON lines (default: benchmarks/results/<date>.jsonl). An existing file is kept."""
     devices: Literal[1, 2] = 1
     """JAX CPU devices; the estimate splits its pixels over them."""
+    device: Literal["cpu", "gpu"] = "cpu"
+    """gpu: check that a GPU computes what the CPU does, and time it, in at most eight minutes; one
+    JSON document."""
 
 
 def main(options: Options) -> int:
-    out = options.out or default_out()
+    out = options.out or default_out("json" if options.device == "gpu" else "jsonl")
     if out.exists():
         raise EvflowDataError("EV013", f"{out} exists.", "Give another --out.")
+    if options.device == "gpu":
+        return on_gpu(options, out)
     cases, run_facts = select(options.only), facts() | {"quick": options.quick}
     console = Console(stderr=True)
     records, complete = run(cases, options, console)
@@ -87,6 +93,17 @@ def main(options: Options) -> int:
     Console(width=None if sys.stdout.isatty() else 150).print(table(records, run_facts))
     console.print(f"written to {out}")
     return int(any(r.failed for r in records)) if complete else 130
+
+
+def on_gpu(options: Options, out: Path) -> int:
+    """EV020 with options that belong to CPUs, or without a GPU."""
+    if options.only or options.devices > 1:
+        raise EvflowDataError("EV020", "--device gpu with --only or --devices.",
+                              "It runs all that it has, on one GPU.")
+    from benchmarks import accelerator
+
+    device = accelerator.device_of("gpu")
+    return accelerator.main(device, Setting(options.quick), out)
 
 
 def run(cases: list[Case], options: Options, console: Console) -> tuple[list[Record], bool]:
@@ -107,9 +124,9 @@ def run(cases: list[Case], options: Options, console: Console) -> tuple[list[Rec
     return records, True
 
 
-def default_out() -> Path:
+def default_out(extension: str) -> Path:
     now = datetime.datetime.now(datetime.UTC)
-    return Path(__file__).parent / "results" / f"{now:%Y-%m-%dT%H%M%S}.jsonl"
+    return Path(__file__).parent / "results" / f"{now:%Y-%m-%dT%H%M%S}.{extension}"
 
 
 def select(only: tuple[str, ...]) -> list[Case]:
@@ -119,44 +136,6 @@ def select(only: tuple[str, ...]) -> list[Case]:
         raise EvflowDataError("EV020", f"no benchmark {unknown}.", f"Choose from {list(SUBJECTS)}.")
     return [case for name, cases in SUBJECTS.items() if not only or name in {"limits", *only}
             for case in cases]
-
-
-def table(records: list[Record], run: dict[str, Any]) -> Table:
-    """One row per record; a line between subjects."""
-    title = f"{run['cpu']}, {run['cpus']} cores, load {run['load_before']} before; " + ", ".join(
-        f"{name} {version}" for name, version in run["versions"].items())
-    shown = Table(title=title, caption="x first: time against the first case of the same task, "
-                  "turn by turn, above 1 = slower. % of sgemm, copy: of the best measured in this "
-                  "run. others: cores busy with other processes meanwhile.")
-    for name in ("task", "implementation", "median s", "min s", "CPU s", "per second", "% sgemm",
-                 "% copy", "x first", "peak MB", "others"):
-        shown.add_column(name, justify="left" if name in ("task", "implementation") else "right")
-    for r, following in zip(records, [*records[1:], None], strict=True):
-        shown.add_row(*row(r), end_section=following is None or following.subject != r.subject)
-    return shown
-
-
-def row(r: Record) -> tuple[str, ...]:
-    split = f", {r.devices} devices" if r.devices > 1 else ""
-    start = (f"{r.subject}: {r.task}", r.implementation + split)
-    if r.seconds is None or r.fastest is None:
-        return (*start, r.skipped)
-    rates = "\n".join(f"{quantity(rate)} {unit}" for unit, rate in r.rates.items()
-                      if unit != "GB" or r.subject == "limits")
-    shares = (f"{100 * r.of_limit[k]:.1f}" if k in r.of_limit else "" for k in ("sgemm", "copy"))
-    return (*start, f"{r.seconds:.3g}", f"{r.fastest:.3g}",
-            "" if r.cpu is None else f"{r.cpu:.3g}", rates, *shares,
-            "" if r.relative is None else f"{r.relative:.2f}",
-            "" if r.peak_mb is None else f"{r.peak_mb:.0f}",
-            "" if r.others is None else f"{r.others:.2f}")
-
-
-def quantity(value: float) -> str:
-    """1234567.0 -> "1.23 M"."""
-    for scale, prefix in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
-        if value >= scale:
-            return f"{value / (1e3 if prefix == 'k' else scale):.3g} {prefix}"
-    return f"{value:.4g}"
 
 
 def command(arguments: Sequence[str], prog: str) -> None:
