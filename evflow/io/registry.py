@@ -104,7 +104,7 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
     """Read events and frames of a file or folder; its format is recognised by content.
 
     Args:
-        path: AEDAT2, AEDAT4, Prophesee RAW and DAT, DSEC, MVSEC, ROS bags, text and others: see
+        path: AEDAT, Prophesee RAW, DAT and HDF5, DSEC, MVSEC, ROS bags, text and others: see
             docs/formats.md.
         **hints: what the file does not tell. start_s, stop_s: the part to read, seconds from its
             first event; time_unit: "s", "ms", "us" or "ns"; polarity: "01", "pm1" or "invert";

@@ -34,9 +34,8 @@ def read(path: Path, hints: Hints) -> Recording:
             raise EvflowDataError(
                 "EV008", f"{path} is HDF5 without a layout that is known. It holds "
                 f"{hdf5_search.listing(f)}.",
-                "Name the events x, y, t, p in one group: with h5py, h5py.File(path, 'a') as f, "
-                "f['events/x'] = f['the/name/of/x'], and so for y, t (us) and p; no data is "
-                "copied.")
+                "Name the events x, y, t, p in one group, in Python: with h5py.File(path, 'a') as "
+                "f: f['events/x'] = f['its/name'], and so for y, t (us) and p. No data is copied.")
         group, table = found[0]
         size = hdf5_search.told_size(f, group)
         gathered = table.gather(path, hints, size, _offset(hints, group))

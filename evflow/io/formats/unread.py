@@ -23,8 +23,8 @@ VIDEO = Known(
     "Simulate its events (evflow simulate), or pass it beside a recording (--frames).")
 MAGICS: tuple[tuple[int, bytes, Known], ...] = (  # at a byte of the file
     (0, b"Event Stream", Known(
-        "an Event Stream (.es)", "Convert it with faery (pip install faery): faery input file a.es "
-        "output file a.csv.")),
+        "an Event Stream (.es)", "Convert it with faery (pip install faery): faery input file IN "
+        "output file OUT.csv.")),
     (0, b"MATLAB 5.0 MAT-file", Known(
         "a MATLAB file", f"In Python, scipy.io.loadmat(path) has its arrays: write {NPZ}.")),
     (0, b"MATLAB 7.3 MAT-file", Known(
@@ -60,7 +60,8 @@ def known(path: Path, head: bytes) -> Known | None:
     """What a file is that begins so and that no format claims; None where that is not known."""
     for at, magic, found in MAGICS:
         if head.startswith(magic, at):
-            return found
+            fix = found.fix.replace(" IN ", f" {path} ").replace("OUT", str(path.with_suffix("")))
+            return found._replace(fix=fix)
     if head.startswith(PICKLES):
         return next(found for _, magic, found in MAGICS if magic == b"\x80\x04")
     if head.startswith(b"\x93NUMPY"):
@@ -91,7 +92,7 @@ def _array(head: bytes) -> Known | None:
 def _archive(path: Path) -> Known | None:
     try:
         with zipfile.ZipFile(path) as archive:
-            names = sorted(archive.namelist())
+            names = [name[:60] for name in sorted(archive.namelist())]
     except DAMAGE:
         return Known("a damaged zip archive", "Copy it again.")
     return Known(f"a zip archive of {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}",

@@ -86,15 +86,15 @@ def test_unknown_chip_is_named(tmp_path: Path, chip: bytes) -> None:
 def aps(
     light: np.ndarray, begin: int, *, exposure: int, rolling: bool = False, right: bool = False
 ) -> list[tuple[int, int]]:
-    """Words of one frame (180, 240): column by column from the first or the last, each pixel at 900
-    after its reset and at 900 - light after its exposure; a column takes 10 us, a pause 5."""
+    """Words of one frame (36, 48): column by column from the first or the last, each pixel at 900
+    after its reset and at 900 - light after its exposure; a column takes 10 us."""
     words: list[tuple[int, int, int]] = []
-    columns = range(239, -1, -1) if right else range(240)
+    columns = range(47, -1, -1) if right else range(48)
     for k, x in enumerate(columns):
         for kind in (0, 1):
             start = begin + 10 * k + (exposure if kind else 0)
-            words += [(start, 1 << 31 | (179 - y) << 22 | x << 12 | kind << 10
-                       | 900 - kind * int(light[y, x]), kind) for y in range(180)]
+            words += [(start, 1 << 31 | (35 - y) << 22 | x << 12 | kind << 10
+                       | 900 - kind * int(light[y, x]), kind) for y in range(36)]
     words.sort(key=lambda word: (word[0], word[2]) if rolling else (word[2], word[0]))
     return [(address, t) for t, address, _ in words]
 
@@ -106,42 +106,44 @@ def davis(folder: Path, words: list[tuple[int, int]], chip: bytes = b"DAVIS240C"
     return path
 
 
-EVENT = 100 << 22 | 50 << 12 | 0x800
+EVENT, SMALL = 10 << 22 | 5 << 12 | 0x800, (48, 36)
 
 
 @pytest.mark.parametrize("right", [False, True])
 @pytest.mark.parametrize(("exposure", "rolling", "middle"), [
-    (10_000, False, (2_390 + 10_000) // 2),  # from the last reset to the first signal
-    (100, True, 1195 + 50)])  # the mean column is read at 1195 and, 100 later, again
+    (10_000, False, (470 + 10_000) // 2),  # from the last reset to the first signal
+    (100, True, 235 + 50)])  # the mean column is read at 235 and, 100 later, again
 def test_frames_of_a_davis(
     tmp_path: Path, exposure: int, rolling: bool, middle: int, right: bool
 ) -> None:
     """Two frames among events, whose x is turned where that of samples is not; a pixel that is
     darker than its reset is 0."""
     rng = np.random.default_rng(0)
-    light = rng.integers(0, 800, (2, 180, 240))
+    light = rng.integers(0, 800, (2, 36, 48))
     light[0, 3, 7] = -5
     words = [(EVENT, 1000)]
     for i, frame in enumerate(light):
         words += [*aps(frame, 2000 + 50_000 * i, exposure=exposure, rolling=rolling, right=right),
                   (EVENT, 40_000 + 50_000 * i)]
-    got = read_recording(davis(tmp_path, words))
-    assert listed(got.events) == [(189, 79, t, 1) for t in (1000, 40_000, 90_000)]
+    path = davis(tmp_path, words)
+    got = read_recording(path, size=SMALL)
+    assert listed(got.events) == [(42, 25, t, 1) for t in (1000, 40_000, 90_000)]
     assert got.frame_times.tolist() == [2000 + middle, 52_000 + middle]
     np.testing.assert_allclose(got.frames, np.maximum(light, 0) * 255 / 1023, rtol=1e-6)
     assert texts(got.notes) == ["frame times are mid-exposure",
                                 "1 values of frames that lay below their reset are 0"]
-    assert len(read_recording(davis(tmp_path, words), stop_s=0.02).frames) == 1
-    assert not read_recording(davis(tmp_path, words), no_frames=True).has_frames
+    assert len(read_recording(path, size=SMALL, stop_s=0.02).frames) == 1
+    assert not read_recording(path, size=SMALL, no_frames=True).has_frames
 
 
 def test_frames_across_the_turn_of_the_clock_and_cut_off(tmp_path: Path) -> None:
-    light = np.full((180, 240), 200)
+    light = np.full((36, 48), 200)
     turn = 2**32
     words = [(EVENT, turn - 3000), *aps(light, turn - 1000, exposure=5000), (EVENT, turn + 9000),
              *aps(light, turn + 20_000, exposure=5000)[:-7]]
-    got = read_recording(davis(tmp_path, [(address, t % turn) for address, t in words]))
-    assert got.frame_times.tolist() == [turn - 1000 + (2390 + 5000) // 2]
+    got = read_recording(
+        davis(tmp_path, [(address, t % turn) for address, t in words]), size=SMALL)
+    assert got.frame_times.tolist() == [turn - 1000 + (470 + 5000) // 2]
     assert got.events.t.tolist() == [turn - 3000, turn + 9000]
     assert texts(got.notes)[1] == "1 frames of which samples are missing were left out"
 

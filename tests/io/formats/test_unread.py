@@ -30,7 +30,7 @@ def zipped(*names: str) -> bytes:
 
 
 FILES = {  # name: bytes, and what the message says
-    "a.es": (b"Event Stream\2\0\0\1@\x000\0", "faery input file a.es output file a.csv"),
+    "a.es": (b"Event Stream\2\0\0\1@\x000\0", "a.es output file "),
     "a.mat": (b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(200), "scipy.io.loadmat"),
     "b.mat": (b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(600), "h5py.File(path)"),
     "a.csv.gz": (gzip.compress(b"0.1 3 4 1\n" * 9), "gunzip"),
