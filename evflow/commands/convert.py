@@ -29,7 +29,7 @@ class Convert(Reading):
     """File or folder of any known format."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
-    aedat4, none (a folder) evreal."""
+    aedat4, .aedat aedat2 (jAER), none (a folder) evreal."""
     format: Format = "auto"
     """Format of the output, where its extension leaves a choice (event_utils in .h5)."""
     overwrite: bool = False

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import sys
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,16 +13,19 @@ import numpy as np
 import tyro
 
 from evflow.commands.footage import Footage
-from evflow.commands.options import Compiling, own_first, refuse
+from evflow.commands.options import Compiling, own_first, refuse, value
 from evflow.commands.pixels import Pixels
 from evflow.commands.writing import Format, named, need_absent
-from evflow.notes import as_dicts
+from evflow.errors import EvflowDataError
+from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
     from evflow.io.images.frames import Frames, FrameSource
+    from evflow.io.writer import EventWriter
 
 
 Pair = tuple[np.ndarray, int]  # frame, time in us
+PREVIEW_S = 2.0  # a film is at least so long
 DEPTH = 8  # frames made ahead of the simulation, and blocks of events that wait to be written
 
 
@@ -45,11 +47,17 @@ class Simulate(Pixels, Footage, Compiling):
     their own times."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
-    aedat4, none (a folder) evreal."""
+    aedat4, .aedat aedat2 (jAER), none (a folder) evreal."""
     format: Format = "auto"
     """Format of the output, where its extension leaves a choice (event_utils in .h5)."""
     frames_too: bool = False
     """Write the video's frames beside the events: grey, at their own times."""
+    labels: bool = False
+    """Write which events are noise (.h5: events/noise, .npz: noise): those of the camera's η and
+    shot noise."""
+    preview: Annotated[Path | None, value("FILE")] = None
+    """Make a film of the events too (.mp4, .gif), slower than life where that is short; more by
+    evflow render."""
     interpolate: bool = True
     """Fill in frames where things move by more than --max-motion-px from frame to frame."""
     max_motion_px: Annotated[float, tyro.conf.arg(aliases=["--max-motion"])] = 1.0
@@ -70,8 +78,7 @@ class Simulate(Pixels, Footage, Compiling):
 
         format = named(self.format, self.out)
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
-        if not self.interpolate:
-            refuse(self, ("max_motion_px",), "nothing is filled in with --no-interpolate")
+        self._check(io.registry.writer_of(self.out, format))
         source = self.source(self.video)
         count = frames = 0
 
@@ -85,17 +92,39 @@ class Simulate(Pixels, Footage, Compiling):
             with io.open_writer(
                 self.out, source.size, format, overwrite=self.overwrite
             ) as writer, behind(DEPTH) as later:
-                pairs = _recorded(made, partial(later, writer.append_frames))
-                for events in simulate_stream(jax.random.key(self.seed), *unzip(pairs), camera,
-                                              model=sensor):
+                fits = _fitting(writer, source.notes)
+                pairs = _recorded(made, lambda *pair: later(writer.append_frames, *fits(*pair)))
+                for events, noise in simulate_stream(jax.random.key(self.seed), *unzip(pairs),
+                                                     camera, model=sensor, labels=True):
                     later(writer.append, events)
+                    if self.labels:
+                        later(writer.append_labels, noise)
                     count += len(events)
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": count, "frames": frames,
                  "sensor": self.sensor, "colour": self.colour, "notes": as_dicts(source.notes)}
-        print(json.dumps(facts) if self.json else
-              f"{count:,} events of {frames:,} frames -> {self.out}")
+        if self.preview:
+            facts["preview"] = _filmed(self.out, self.preview, self.overwrite)
+        print(json.dumps(facts) if self.json else "\n".join((
+            f"{count:,} events of {frames:,} frames -> {self.out}",
+            *([f"{facts['preview']} -> {self.preview}"] if self.preview else []))))
+
+    def _check(self, writer: type[EventWriter]) -> None:
+        """EV013, EV020 before any long work."""
+        from evflow.report.movie import Film
+
+        if not self.interpolate:
+            refuse(self, ("max_motion_px",), "nothing is filled in with --no-interpolate")
+        if self.labels and not writer.LABELS:
+            refuse(self, ("labels",), f"{writer.NAME} has no place for them; dsec (.h5) and npz do")
+        if self.preview is None:
+            return
+        if self.preview.suffix.lower() == ".png":
+            raise EvflowDataError("EV020", f"--preview {self.preview}.",
+                                  "It is a film: .mp4 or .gif.")
+        Film().check_target(self.preview, overwrite=self.overwrite)
+        need_absent(self.preview, self.overwrite, self.video, self.camera, self.timestamps)
 
     def _frames(
         self, source: FrameSource, shown: Callable[[int, int], None]
@@ -126,6 +155,38 @@ def _kept(video: Frames, colour: str, came: list[Pair]) -> Frames:
     for frame, time in video:
         came += as_seen(iter([(frame, time)]), colour)
         yield frame, time
+
+
+def _fitting(
+    writer: EventWriter, notes: list[Note]
+) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """What makes frames (T, H, W) such that the format holds them: where it has whole numbers
+    alone, those that are nearest, which a note says once."""
+    floats, whole = np.dtype(np.float32), np.dtype(np.uint8)
+    rounds = bool(writer.refuses(floats)) and not writer.refuses(whole)
+    said = Note("frames.depth", f"frames were rounded to 8 bits, which is what {writer.NAME} holds")
+
+    def fitting(frames: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not rounds or frames.dtype != floats:
+            return frames, times
+        if said not in notes:
+            notes.append(said)
+        return np.rint(frames).astype(whole), times
+
+    return fitting
+
+
+def _filmed(events: Path, film: Path, overwrite: bool) -> str:
+    """Make a film of a file of events; returns what was made, in words."""
+    from evflow import io
+    from evflow.report.movie import Film, write_film
+
+    recording = io.read_recording(events)
+    slow = max(1.0, PREVIEW_S * 1e6 / max(1, recording.events.duration_us))
+    rate = Film()
+    said = write_film(film, recording, dataclasses.replace(
+        rate, slow=slow, window_us=max(1, round(rate.window_us / slow))), overwrite=overwrite)
+    return f"{said}, {slow:.3g} times slower than life" if slow > 1 else said
 
 
 def _recorded(

@@ -8,11 +8,11 @@ from typing import Literal
 
 from evflow.errors import EvflowDataError
 
-Format = Literal["auto", "dsec", "e2vid", "event_utils", "evreal", "npz", "aedat4"]
+Format = Literal["auto", "dsec", "e2vid", "event_utils", "evreal", "npz", "aedat4", "aedat2"]
 
 FILES = frozenset((  # endings that nobody gives a folder
     ".npz", ".npy", ".json", ".html", ".htm", ".png", ".jpg", ".pdf", ".svg", ".txt", ".csv",
-    ".md", ".zip", ".h5", ".hdf5", ".aedat4", ".mp4", ".gif", ".py", ".yaml"))
+    ".md", ".zip", ".h5", ".hdf5", ".aedat4", ".aedat", ".mp4", ".gif", ".py", ".yaml"))
 
 
 def named(format: Format, out: Path) -> str | None:

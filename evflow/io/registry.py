@@ -44,6 +44,7 @@ from evflow.io.formats import (
     v2e_text,
 )
 from evflow.io.formats.ros import ros1, ros2
+from evflow.io.formats.write_aedat2 import Aedat2Writer
 from evflow.io.formats.write_aedat4 import Aedat4Writer
 from evflow.io.hints import Hints, Told
 from evflow.io.writer import EventWriter, copy
@@ -69,10 +70,10 @@ FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, t
     npz, npy, evimo2, evreal, e2vid, v2e_text, ijrr, plain_text, ros1, ros2, nmnist)
 WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
     dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
-    npz.NpzWriter, Aedat4Writer)}
+    npz.NpzWriter, Aedat4Writer, Aedat2Writer)}
 WRITTEN = {  # the format that an output's extension stands for, unless told otherwise
     ".h5": "dsec", ".hdf5": "dsec", ".zip": "e2vid", ".txt": "e2vid", ".npz": "npz",
-    ".aedat4": "aedat4", "": "evreal"}
+    ".aedat4": "aedat4", ".aedat": "aedat2", "": "evreal"}
 SEVERAL = {".h5": ("dsec", "event_utils"), ".hdf5": ("dsec", "event_utils")}  # else: the one format
 
 
@@ -180,7 +181,7 @@ def write_events(
         path: of the file, with an ending of the format.
         events: events or, with frames, a recording.
         format: one of `WRITERS`: "dsec" (HDF5: events/{x, y, t, p}, ms_to_idx, t_offset), "npz",
-            "aedat4", "e2vid", "event_utils", "evreal".
+            "aedat4", "aedat2", "e2vid", "event_utils", "evreal".
         overwrite: replace a file that exists.
 
     Raises:
@@ -207,7 +208,8 @@ def write_recording(
         path: of the file; a folder where it has no ending.
         recording: events and frames.
         format: as in `write_events`; None is what the ending of the path stands for (.h5: "dsec",
-            .npz: "npz", .aedat4: "aedat4", .zip and .txt: "e2vid", none: "evreal").
+            .npz: "npz", .aedat4: "aedat4", .aedat: "aedat2", .zip and .txt: "e2vid", none:
+            "evreal").
         overwrite: replace what exists.
 
     Raises:

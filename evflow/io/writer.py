@@ -41,13 +41,15 @@ class EventWriter(abc.ABC):
     ...         out.append(events)
 
     NAME: the format. DEPTHS: the dtypes of frames it can hold, () for none. MAX_SIDE: pixels of
-    its largest sensor. TIMES_US: its first and last time.
+    its largest sensor. TIMES_US: its first and last time. LABELS: whether it can tell noise from
+    signal.
     """
 
     NAME: ClassVar[str]
     DEPTHS: ClassVar[tuple[str, ...]] = DEPTHS
     MAX_SIDE: ClassVar[int] = 65536
     TIMES_US: ClassVar[tuple[int, int]] = (-(2**63), 2**63 - 1)
+    LABELS: ClassVar[bool] = False
 
     def __init__(self, path: str | os.PathLike, size: Size, *, overwrite: bool = False) -> None:
         self.path, self.size, self.overwrite = Path(path), check_size(size), overwrite
@@ -102,6 +104,16 @@ class EventWriter(abc.ABC):
         if sum(map(len, self._waiting)) >= FLUSH:
             self._flush()
 
+    def append_labels(self, noise: np.ndarray) -> None:
+        """Add which events are noise, bool (N,), one for each event in their order, in parts of any
+        length; EV020 where the format has no place for it."""
+        if not self.LABELS:
+            raise EvflowDataError("EV020", f"{self.NAME} does not tell noise from signal.",
+                                  "Write dsec (.h5) or npz.")
+        if len(noise):
+            with self._guard():
+                self._write_labels(noise)
+
     def append_frames(self, frames: np.ndarray, frame_times: np.ndarray) -> None:
         """Add frames (T, H, W) at frame_times (T,) int64 us.
 
@@ -151,6 +163,10 @@ class EventWriter(abc.ABC):
 
     def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
         """Store frames (T, H, W) of one dtype, T > 0, that follow those before."""
+        raise NotImplementedError
+
+    def _write_labels(self, noise: np.ndarray) -> None:
+        """Store labels (N,), N > 0, that follow those before."""
         raise NotImplementedError
 
     def _finish(self) -> None:  # noqa: B027 (most have nothing)

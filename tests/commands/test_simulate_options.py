@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
+import jax
 import numpy as np
 import pytest
 from helpers.videos import drifting
 
-from evflow import read_events
+from evflow import Camera, read_events, read_recording, simulate
 from evflow.camera.sensors import SENSORS
 from evflow.cli import main
 from evflow.commands.pixels import Pixels
+from evflow.io.source import open_frames
 from evflow.types import Events
 
 Run = tuple[Events, dict[str, Any]]
@@ -77,7 +80,52 @@ def test_a_picture_by_saccades(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert (rates[:, [0, 9]].max(1) < 0.2 * rates.max(1)).all()
 
 
+@pytest.mark.parametrize("suffix", [".h5", ".npz"])
+def test_noise_is_told_from_signal(video: Path, suffix: str) -> None:
+    """As `simulate(labels=True)` tells it, in the order of the events."""
+    out = video.with_name(f"out{suffix}")
+    assert main(["simulate", str(video), "-o", str(out), *BASE, "--theta-on", "0.3", "--theta-off",
+                 "0.3", "--eta-on", "20", "--labels"]) == 0
+    camera = Camera.constant((24, 32), 0.3, 0.3, 20.0, 0.0)
+    events, noise = simulate(
+        jax.random.key(0), np.load(video), 10_000 * np.arange(10), camera,
+        model=Pixels().model(), labels=True)
+    if suffix == ".npz":
+        labels = np.load(out)["noise"]
+    else:
+        with h5py.File(out) as f:
+            labels = f["events/noise"][:].astype(bool)
+    np.testing.assert_array_equal(labels, noise)
+    assert 0 < noise.sum() < len(noise)
+    again = read_events(out)
+    np.testing.assert_array_equal(again.t, events.t)
+
+
+def test_a_film_beside_the_events(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = video.with_name("out.mp4")
+    _, facts = run(video, *BASE, "--preview", str(film), capsys=capsys)
+    assert "times slower than life" in facts["preview"]
+    capture = cv2.VideoCapture(str(film))
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 60  # two seconds of it
+    capture.release()
+
+
+def test_frames_of_light_in_a_format_of_bytes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("aedat", reason="the package aedat reads AEDAT4")
+    for i, frame in enumerate(drifting(3, (24, 32))):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), frame)
+    out = tmp_path / "out.aedat4"
+    assert main(["simulate", str(tmp_path), "-o", str(out), *BASE, "--frames-too"]) == 0
+    assert "rounded to 8 bits" in capsys.readouterr().err
+    frames = read_recording(out).frames
+    light = np.stack([f for f, _ in open_frames(tmp_path, fps=100, response="srgb").open()])
+    np.testing.assert_array_equal(frames, np.rint(light))
+
+
 @pytest.mark.parametrize(("options", "code"), [
+    (["--labels", "--format", "event_utils"], "EV020"), (["--preview", "a.png"], "EV020"),
     (["--shot-hz", "-1"], "EV020"), (["--sensor", "esim", "--cutoff-hz", "30"], "EV020"),
     (["--mismatch", "-0.1"], "EV020"), (["--mismatch", "0.1", "--theta-on", "0"], "EV014"),
     (["--saccades", "5"], "EV020"), (["--crop", "99x9"], "EV020"),

@@ -20,7 +20,8 @@ from evflow.io.writer import EventWriter
 from evflow.types import Events, Recording
 
 EXTENSION = {name: suffix for suffix, name in reversed(WRITTEN.items())} | {"event_utils": ".h5"}
-each = pytest.mark.parametrize("kind", WRITERS)
+ANY = [name for name in WRITERS if name != "aedat2"]  # whose chips and times are few
+each = pytest.mark.parametrize("kind", ANY)
 LATEST = {"e2vid": 2**31 * 10**6, "evreal": 2**31 * 10**6, "event_utils": 2**31 * 10**6}
 
 
@@ -267,7 +268,7 @@ def test_the_extension_tells_the_format(tmp_path: Path) -> None:
     for suffix, kind in WRITTEN.items():
         assert kind == writer_of(f"a{suffix}").NAME
         assert kind == writer_of(f"a.b{suffix.upper()}" if suffix else "a").NAME
-        if kind != "aedat4":
+        if kind in ANY and kind != "aedat4":
             write_recording(tmp_path / f"{kind}{suffix}", Recording.of_events(events))
             equal(read_events(tmp_path / f"{kind}{suffix}"), events)
     assert set(WRITTEN.values()) | {"event_utils"} == set(WRITERS)

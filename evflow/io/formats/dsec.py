@@ -97,6 +97,7 @@ class DsecWriter(Hdf5Writer):
     """Write events (and frames) chunk by chunk; t is u32 and widens to i64 past 71 minutes."""
 
     NAME = NAME
+    LABELS = True
     offset_us: int | None = None
     n_events = 0  # in the file
 
@@ -126,6 +127,11 @@ class DsecWriter(Hdf5Writer):
             self._create("frame_times", (), "i8", self.CHUNK)
         self._extend("frames", frames)
         self._extend("frame_times", times)
+
+    def _write_labels(self, noise: np.ndarray) -> None:
+        if "noise" not in self._file["events"]:
+            self._create("events/noise", (), "u1", self.CHUNK)
+        self._extend("events/noise", noise)
 
     def _write(self, events: Events) -> None:
         t = events.t - self.offset_us

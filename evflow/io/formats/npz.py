@@ -152,6 +152,7 @@ class NpzWriter(EventWriter):
     end they are compressed one after the other, and no array is ever in memory."""
 
     NAME = NAME
+    LABELS = True
 
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
         self._archive = stack.enter_context(zipfile.ZipFile(
@@ -179,6 +180,11 @@ class NpzWriter(EventWriter):
                 self._columns[name] = self._column(name, dtype, self._stack, item)
         self._columns["frames"].append(frames)
         self._columns["frame_times"].append(times)
+
+    def _write_labels(self, noise: np.ndarray) -> None:
+        if "noise" not in self._columns:
+            self._columns["noise"] = self._column("noise", "?", self._stack)
+        self._columns["noise"].append(noise)
 
     def _finish(self) -> None:
         for name, column in self._columns.items():
