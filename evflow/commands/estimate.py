@@ -134,7 +134,7 @@ class Estimate(Compiling, Reading):
 
     def _estimated(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
         from evflow.estimation.pipeline import estimate_camera
-        from evflow.network.weights import load_weights, model_card, trained_steps
+        from evflow.network.weights import load_weights, model_card, trained_steps, weights_hash
         from evflow.process.terminal import bar
 
         params = load_weights(self.weights)
@@ -145,7 +145,7 @@ class Estimate(Compiling, Reading):
             from evflow.downstream.video import doubted
 
             found = doubted(found)
-        return found, {"weights": self.weights,
+        return found, {"weights": self.weights, "weights_sha256": weights_hash(self.weights),
                        "weights_steps": trained_steps(model_card(self.weights))}
 
     def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:

@@ -65,7 +65,8 @@ class Flow(Windowed):
         if truth is not None and result.get("aee") is None:
             notes.append(Note("truth.none", f"{self.truth} has no known flow at a pixel with "
                               "events: nothing was measured against it"))
-        facts = {"out": str(self.out), "weights": self.weights, "full_px": full_px,
+        facts = {"out": str(self.out), "weights": self.weights, "weights_sha256": trained.sha256,
+                 "full_px": full_px,
                  "scores": result, "notes": as_dicts(notes)}
         for note in notes:
             print(f"note: {note}", file=sys.stderr)

@@ -214,7 +214,6 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 def write_json(path: Path, facts: dict[str, Any]) -> None:
     """`facts` as an indented JSON file, replaced whole or not at all."""
-    from evflow.files.atomic import atomic_write
+    from evflow.files.atomic import atomic_text
 
-    with atomic_write(path, overwrite=True) as temporary:
-        temporary.write_text(json.dumps(facts, indent=2) + "\n")
+    atomic_text(path, json.dumps(facts, indent=2) + "\n", overwrite=True)

@@ -72,7 +72,8 @@ class Reconstruct(Windowed):
             said = (self._folder(images, times) if kind == "" else
                     self._film(images, times, recording))
         result = scores.result() if scores else None
-        facts = {"out": str(self.out), "weights": self.weights, "images": len(times),
+        facts = {"out": str(self.out), "weights": self.weights, "weights_sha256": trained.sha256,
+                 "images": len(times),
                  "scores": result, "notes": as_dicts(notes)}
         for note in notes:
             print(f"note: {note}", file=sys.stderr)

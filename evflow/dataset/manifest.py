@@ -18,7 +18,7 @@ from typing import Any
 from evflow.dataset.sequence import EventSequence, sequence_names
 from evflow.dataset.store import SUFFIXES, Format
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import atomic_text
 from evflow.files.regular import need_regular
 from evflow.process.provenance import sha256
 
@@ -75,8 +75,7 @@ class Part:
             self._path.unlink()
 
     def save(self) -> None:
-        with atomic_write(self._path, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(self._content, sort_keys=True) + "\n")
+        atomic_text(self._path, json.dumps(self._content, sort_keys=True) + "\n", overwrite=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,8 +129,7 @@ class Manifests:
                    "sequences": entries}
         # Drafts of its own: two hosts may share a process id.
         draft = self.folder / PARTS / f".{part}.{MERGED}"
-        with atomic_write(draft, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+        atomic_text(draft, json.dumps(content, indent=1, sort_keys=True) + "\n", overwrite=True)
         os.replace(draft, self.folder / MERGED)
 
     def truest(self, name: str) -> Record:

@@ -14,13 +14,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from evflow.downstream.network import Network, Params
 from evflow.downstream.presets import KINDS
-from evflow.downstream.published import SPLIT_BINS, join, read_published
+from evflow.downstream.published import SPLIT_BINS, read_published
 from evflow.errors import EvflowDataError
 from evflow.network.weights import load_weights, model_card, save_weights, weights_path
+from evflow.process.provenance import sha256
 
 PUBLISHED = (".pth", ".pt", ".tar")  # where there is no such file; else any but .safetensors
 RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: network
@@ -29,13 +29,14 @@ RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: net
 @dataclasses.dataclass(frozen=True)
 class Trained:
     """A network with its params. normalised, split: whether its event tensors are; card: who made
-    it of what, empty for a published checkpoint."""
+    it of what, empty for a published checkpoint; sha256: of the file, where there is one."""
 
     network: Network
     params: Params
     normalised: bool
     card: dict[str, Any]
     split: bool = False
+    sha256: str = ""
 
     @property
     def how(self) -> dict[str, bool]:
@@ -63,27 +64,25 @@ def load_network(name_or_path: str | os.PathLike) -> Trained:
     path = Path(name_or_path)
     if path.suffix in PUBLISHED or (path.is_file() and path.suffix != ".safetensors"):
         network, params, normalised = read_published(path)
-        return Trained(network, params, normalised, {}, split=network.bins == SPLIT_BINS)
+        return Trained(network, params, normalised, {},
+                       split=network.bins == SPLIT_BINS, sha256=sha256(path))
     file = _file(name_or_path)
     card = model_card(file)
     kind = KINDS.get(str(card.get("network")))
     if kind is None:
         raise EvflowDataError("EV018", f"{file} holds no event network.",
                               f"Its model card should name one of {list(KINDS)}.")
+    params = load_weights(file)
     try:
         network = kind(**card["structure"])
-    except (KeyError, TypeError) as e:
+        expected = jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16)))
+    except Exception as e:  # a card may say anything
         raise EvflowDataError("EV009", f"{file}: its model card does not describe a network "
-                              f"({e}).") from e
-    params = load_weights(file)
-    expected = jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16)))
+                              f"({type(e).__name__}: {e}).") from e
     if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
         raise EvflowDataError("EV018", f"{file}: the parameters are not those of {network}.")
-    for keys, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if not np.isfinite(np.asarray(leaf)).all():
-            raise EvflowDataError("EV007", f"{file}: {join(keys)} is not all finite.",
-                                  "A training that diverged? Take an earlier checkpoint.")
-    return Trained(network, params, bool(card.get("normalised")), card)
+    return Trained(network, params, bool(card.get("normalised")), card,
+                   sha256=sha256(file))
 
 
 def _file(name_or_path: str | os.PathLike) -> Path:

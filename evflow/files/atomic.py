@@ -13,6 +13,7 @@ from pathlib import Path
 
 from evflow.errors import EvflowDataError
 from evflow.files.moves import move_new, remove
+from evflow.files.whole import write_checked
 from evflow.process.alive import is_dead, mark
 from evflow.process.signals import uninterrupted
 
@@ -53,6 +54,12 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
     """
     with written_aside(path, _move, overwrite=overwrite) as temporary:
         yield temporary
+
+
+def atomic_text(path: str | os.PathLike, data: str | bytes, *, overwrite: bool = False) -> None:
+    """Write a text or bytes, which are read again before they get their name; as `atomic_write`."""
+    with atomic_write(path, overwrite=overwrite) as temporary:
+        write_checked(temporary, data)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,5 @@
 """Whether a file that was just written is whole, before it gets its name: errors that a library
-dropped on the way, and lost ends, show in sizes and tables of contents. Data are not read."""
+dropped on the way, and lost ends, show in sizes and tables of contents. Large data are not read."""
 
 from __future__ import annotations
 
@@ -21,6 +21,15 @@ def need_size(path: Path, size: int) -> None:
     """EV019 unless the file has as many bytes."""
     if (found := os.path.getsize(path)) != size:
         raise not_whole(path, f"it has {found:,} bytes of {size:,}")
+
+
+def write_checked(path: Path, data: str | bytes) -> None:
+    """Write a text (UTF-8; a file's name in it need not be) or bytes, and read them again; EV019
+    where something else is there."""
+    data = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
+    path.write_bytes(data)
+    if path.read_bytes() != data:
+        raise not_whole(path, "something else is there")
 
 
 def need_members(path: Path, sizes: Mapping[str, int | None]) -> None:

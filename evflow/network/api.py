@@ -23,6 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.network import architecture, coordinates, inference, pooling
 from evflow.network.architecture import Params, config_of
@@ -127,13 +128,19 @@ def summarize(
         >>> stats = sum(ef.summarize(params, v, d) for v, d in windows)
         >>> summary, std = ef.finish(params, stats)
     """
+    config, net = _pooling_parts(params)
+    inputs = prepare(config, voxels, dlogI, window_s, intensity)
+    return _pool(net["summary"], *inputs, config=config)
+
+
+def _pooling_parts(params: Params) -> tuple[ModelConfig, Params]:
+    """`parts` of a network that has a summary; EV018 for others."""
     config, net = parts(params)
-    if not config.pool:
+    if not config.pool or "summary" not in net:
         raise EvflowDataError(
             "EV018", "these weights estimate every pixel alone and have no summary.",
             'Use load_weights("default").')
-    inputs = prepare(config, voxels, dlogI, window_s, intensity)
-    return _pool(net["summary"], *inputs, config=config)
+    return config, net
 
 
 @partial(jax.jit, static_argnames="config")
@@ -156,9 +163,11 @@ def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
         the std falls with the amount of data.
 
     Raises:
-        EvflowDataError: EV018 (no weights).
+        EvflowDataError: EV018 (weights of the paper's network, which has no summary, or no
+            weights), EV020 (no statistics).
     """
-    config, net = parts(params)
+    config, net = _pooling_parts(params)
+    need(stats, Stats, "stats", "Give what summarize returns, one or a sum.")
     y, y_std = _finish(net["summary"], stats, config=config)
     result = squash_summary(y)
     return result, summary_std(result, y_std)

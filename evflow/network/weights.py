@@ -6,24 +6,30 @@ A file holds flat names "default/flow/level_0/actnorm/raw"; params is the nested
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from importlib import resources
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from evflow.checks import need
-from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
+from evflow.errors import EvflowDataError, naming
+from evflow.files.atomic import atomic_text
+from evflow.network import tensors
 from evflow.process.provenance import sha256
 
 Params = dict[str, Any]
+
+FOLDER = Path(str(resources.files("evflow") / "weights"))
+SUMS = "SHA256SUMS"  # of the released files
+DIGEST = "sha256"  # in a card: that of the arrays
+AGAIN = "Copy or make it again."
 
 
 def weights_path(name_or_path: str | os.PathLike = "default") -> Path:
@@ -31,10 +37,9 @@ def weights_path(name_or_path: str | os.PathLike = "default") -> Path:
     need(name_or_path, str | os.PathLike, "name_or_path", "Give a released name or a path.")
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
-        path = Path(str(resources.files("evflow") / "weights" / f"{name_or_path}.safetensors"))
+        path = FOLDER / f"{name_or_path}.safetensors"
     if not path.is_file():
-        folder = Path(str(resources.files("evflow") / "weights"))
-        known = sorted(p.stem for p in folder.glob("*.safetensors"))
+        known = sorted(p.stem for p in FOLDER.glob("*.safetensors"))
         raise EvflowDataError("EV016", f"no weights at {path}.",
                               f"Released names: {known}; or give a .safetensors path.")
     return path
@@ -55,36 +60,51 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
         A nested dict of float32 arrays under one key, the architecture's name.
 
     Raises:
-        EvflowDataError: EV009 (damaged), EV016 (no such file or name), EV018 (tensors that are not
-            float32, or nest badly), EV020 (neither a name nor a path).
+        EvflowDataError: EV007 (NaN), EV009 (damaged, or not what was saved), EV016 (no such file or
+            name), EV018 (tensors that are not float32, or nest badly), EV020 (neither a name nor a
+            path).
     """
     path = weights_path(name_or_path)
+    data = path.read_bytes()
+    with naming(path):
+        card = _card(data)
+        try:
+            arrays = tensors.parse(data)
+        except ValueError as e:
+            raise EvflowDataError("EV009", f"it is no sound safetensors file ({e}).", AGAIN) from e
+        _check_whole(path, data, arrays, card)
     params: Params = {}
-    try:
-        with safe_open(path, framework="numpy") as file:
-            _check_tensors(path, file)
-            for name in file.keys():  # noqa: SIM118 - safe_open is no mapping
-                *parents, leaf = name.split("/")
-                node = params
-                for part in parents:
-                    node = node.setdefault(part, {})
-                node[leaf] = jnp.asarray(file.get_tensor(name))
-    except SafetensorError as e:
-        raise EvflowDataError("EV009", f"{path} is not a readable safetensors file ({e}).") from e
+    for name, array in arrays.items():
+        *parents, leaf = name.split("/")
+        node = params
+        for part in parents:
+            node = node.setdefault(part, {})
+        node[leaf] = jnp.asarray(array)
     return params
 
 
-def _check_tensors(path: Path, file: Any) -> None:
-    """EV018 unless all are float32 and none has the name of a group of others."""
-    names = list(file.keys())
-    groups = {str(parent) for name in names for parent in PurePosixPath(name).parents}
-    for name in names:
-        kind = file.get_slice(name).get_dtype()
-        if kind != "F32" or str(PurePosixPath(name)) in groups:
-            raise EvflowDataError(
-                "EV018", f"{path}: {name} is of {kind}"
-                + (" and also a group of others." if kind == "F32" else "."),
-                "Expected float32 arrays, as save_weights writes them.")
+def _check_whole(path: Path, data: bytes, arrays: tensors.Arrays, card: dict[str, Any]) -> None:
+    """EV009 where the numbers are not those that were saved, or released; EV007 where some are not
+    finite; EV018 where there is none."""
+    if not arrays:
+        raise EvflowDataError("EV018", "it holds no array.", "Expected what save_weights writes.")
+    if DIGEST in card and tensors.digest(arrays) != card[DIGEST]:
+        raise EvflowDataError("EV009", "its numbers are not those that were saved (their SHA-256 "
+                              "differs from that of its model card).", AGAIN)
+    if path.parent == FOLDER and hashlib.sha256(data).hexdigest() != _released().get(path.name):
+        raise EvflowDataError(
+            "EV009", f"it is not the file that was released (its SHA-256 is not in {SUMS}).",
+            f"Install evflow again. Replaced on purpose? Then correct {SUMS} (sha256sum).")
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise EvflowDataError("EV007", f"{name} is not all finite.",
+                                  "A training that diverged? Take an earlier checkpoint.")
+
+
+def _released() -> dict[str, str]:
+    """SHA-256 of each released file, by name."""
+    lines = (FOLDER / SUMS).read_text().splitlines()
+    return {name: found for found, name in (line.split() for line in lines)}
 
 
 def save_weights(
@@ -102,32 +122,42 @@ def save_weights(
         The path.
 
     Raises:
-        EvflowDataError: EV013 (exists), EV019 (cannot be written), EV020 (another ending, by which
-            it could not be read again).
+        EvflowDataError: EV007 (NaN), EV013 (exists), EV019 (cannot be written), EV020 (another
+            ending, by which it could not be read again).
     """
     if Path(path).suffix != ".safetensors":
         raise EvflowDataError("EV020", f"{path} does not end in .safetensors.",
                               f"Name it {Path(path).with_suffix('.safetensors')}.")
     leaves = jax.tree_util.tree_leaves_with_path(params)
-    tensors = {"/".join(str(k.key) for k in keys): np.asarray(leaf, np.float32)
-               for keys, leaf in leaves}
-    data = save(tensors, metadata={"card": json.dumps(card, sort_keys=True)})
-    with atomic_write(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(data)
+    arrays = {"/".join(str(k.key) for k in keys): np.asarray(leaf, np.float32)
+              for keys, leaf in leaves}
+    if lost := [name for name, array in arrays.items() if not np.isfinite(array).all()]:
+        raise EvflowDataError("EV007", f"{lost[0]} is not all finite.",
+                              "A training that diverged? Save an earlier state.")
+    card = card | {DIGEST: tensors.digest(arrays)}
+    data = save(arrays, metadata={"card": json.dumps(card, sort_keys=True)})
+    atomic_text(path, data, overwrite=overwrite)
     return Path(path)
 
 
 def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
     """The card that was saved with the weights: command, seed, steps, data, figures."""
     path = weights_path(name_or_path)
+    with naming(path):
+        card = _card(path.read_bytes())
+    card.pop(DIGEST, None)  # of this file; a card goes on to others
+    return card
+
+
+def _card(data: bytes) -> dict[str, Any]:
+    """The model card as it is in the file; EV009."""
     try:
-        with safe_open(path, framework="numpy") as file:
-            card = json.loads((file.metadata() or {}).get("card", "{}"))
-    except (SafetensorError, ValueError, RecursionError) as e:
-        raise EvflowDataError("EV009", f"{path} has no readable model card ({e}).") from e
-    if not isinstance(card, dict):
-        raise EvflowDataError("EV009", f"the model card of {path} is no object but a "
-                              f"{type(card).__name__}.")
+        told = tensors.read_header(data)[0].get(tensors.CARD, {})
+        card = json.loads(told.get("card", "{}"))
+        if not isinstance(card, dict):
+            raise TypeError(f"it is no object but a {type(card).__name__}")
+    except (ValueError, TypeError, AttributeError, RecursionError) as e:
+        raise EvflowDataError("EV009", f"it has no readable model card ({e}).", AGAIN) from e
     return card
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import atomic_text
 
 WIDEST = 480  # pixels of a map: larger sensors are shown in blocks
 COLOURS = 256
@@ -104,9 +104,7 @@ def write_page(
             f'<body><header><h1>{text(title)}</h1><div class="sub">{text(subtitle)}</div>'
             f"</header>\n{sections}\n"
             f'<script type="application/json" id="numbers">{data}</script>\n</body></html>\n')
-    with atomic_write(path, overwrite=overwrite) as temporary:
-        # A file's name need not be UTF-8.
-        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")
+    atomic_text(path, page, overwrite=overwrite)
 
 
 def text(words: object) -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from evflow.camera import PARAMETERS, Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.result import CameraEstimate
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import atomic_text
 from evflow.types import Events
 
 TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON [Hz]", "eta_off": "η OFF [Hz]"}
@@ -45,8 +44,7 @@ def save_figure(figure: Any, path: str | os.PathLike) -> None:
     """Write it as PNG; an existing file is replaced."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    with atomic_write(path, overwrite=True) as temporary:
-        Path(temporary).write_bytes(buffer.getvalue())
+    atomic_text(path, buffer.getvalue(), overwrite=True)
 
 
 def event_image(events: Events, t0_us: int, t1_us: int) -> np.ndarray:

@@ -20,6 +20,7 @@ from evflow.errors import EvflowDataError
 from evflow.files.atomic import aside, atomic_write
 from evflow.files.folders import atomic_folder
 from evflow.files.moves import remove
+from evflow.files.whole import write_checked
 
 Codec = Literal["mpeg4", "vp9"]
 
@@ -85,7 +86,7 @@ def write_images(
             Image.fromarray(pixels).save(temporary / name)
         lines = (f"{time} {name}\n" for time, name in zip(times_us, names, strict=False))
         head = f"# {remark}\n" if remark else ""
-        (temporary / TIMES).write_text(f"{head}# timestamp_us image\n" + "".join(lines))
+        write_checked(temporary / TIMES, f"{head}# timestamp_us image\n" + "".join(lines))
     return f"{len(times_us)} images"
 
 

@@ -18,7 +18,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import aside, atomic_write
+from evflow.files.atomic import aside, atomic_text
 from evflow.files.regular import is_there
 from evflow.process import devices
 
@@ -176,9 +176,8 @@ class Checkpoints:
 
     def write_config(self, config: dict[str, Any]) -> None:
         """Save the configuration beside the steps."""
-        path = self.folder / "config.json"
-        with atomic_write(path, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(_as_json(config), indent=2) + "\n")
+        atomic_text(self.folder / "config.json", json.dumps(_as_json(config), indent=2) + "\n",
+                    overwrite=True)
 
 
 def _stored_shape(leaf: Any) -> tuple[int, ...]:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import jax
 
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import atomic_text
 from evflow.files.regular import is_there
 from evflow.process import devices
 from evflow.process.terminal import bar
@@ -41,8 +41,7 @@ class Log:
         self._progress(step, steps)
         if self._main:
             kept = list(lines_until(path, step))
-            with atomic_write(path, overwrite=True) as temporary:
-                temporary.write_text("".join(f"{line}\n" for line in kept))
+            atomic_text(path, "".join(f"{line}\n" for line in kept), overwrite=True)
             # By lines: a step is logged before its checkpoint is written.
             self._file = self._open.enter_context(path.open("a", buffering=1))
         self._started = time.monotonic()

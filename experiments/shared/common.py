@@ -15,7 +15,7 @@ from typing import Any, Literal, NoReturn
 import tyro
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import atomic_text
 from evflow.network.architecture import config_of
 from evflow.network.weights import load_weights, weights_hash
 from evflow.process.provenance import provenance
@@ -43,16 +43,13 @@ class StudyOptions:
 def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> None:
     """Save a result with its configuration, the hashes of the weights that this names, and
     provenance as JSON."""
-    with atomic_write(path, overwrite=True) as temporary:
-        record = {"result": result, "config": config, "weights_sha256": hashes(config),
-                  **provenance()}
-        temporary.write_text(json.dumps(record, indent=2, default=str) + "\n")
+    record = {"result": result, "config": config, "weights_sha256": hashes(config), **provenance()}
+    atomic_text(path, json.dumps(record, indent=2, default=str) + "\n", overwrite=True)
 
 
 def write_text(path: Path, text: str) -> None:
     """Save a table, whole or not at all."""
-    with atomic_write(path, overwrite=True) as temporary:
-        temporary.write_text(text + "\n")
+    atomic_text(path, text + "\n", overwrite=True)
 
 
 def conclude(options: Any, name: str, result: dict[str, Any], text: str) -> None:

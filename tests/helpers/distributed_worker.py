@@ -13,6 +13,7 @@ import sys
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 from helpers.networks import small_config
@@ -30,7 +31,7 @@ CONFIG = dataclasses.replace(
 
 def keep_gradients() -> optax.GradientTransformation:
     """Keeps the last gradients in the optimiser's state."""
-    return optax.GradientTransformation(lambda p: jax.tree.map(np.zeros_like, p),
+    return optax.GradientTransformation(lambda p: jax.tree.map(jnp.zeros_like, p),
                                         lambda grads, _, params=None: (grads, grads))
 
 

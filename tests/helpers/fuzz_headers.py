@@ -145,6 +145,14 @@ def tensor(dtype: str = "F32", shape: Any = (16,)) -> dict[str, Any]:
                "a": tensor("F32", (8,)) | {"data_offsets": [32, 64]}},
       brain={"a": tensor("BF16", (32,))}, quarter={"a": tensor("F8_E4M3", (64,))},
       claim={"a": tensor("F32", (1 << 40,))}, deep=b"[" * 100_000, none={},
+      zeros={"a": tensor("F32", (0, 1 << 62)) | {"data_offsets": [0, 0]}}, name={"": tensor()},
+      slashes={"//": tensor()}, long={"a/" * 9999 + "b": tensor()}, whole=b"[" + b"1," * 99 + b"1]",
+      overlap={name: tensor() for name in "ab"}, negative={"a": tensor() | {"shape": [-4, -4]}},
+      gap={"a": tensor("F32", (8,)) | {"data_offsets": [32, 64]}}, shape={"a": tensor() | {
+          "shape": {"0": 16}}}, fraction={"a": tensor() | {"shape": [16.0]}}, list={"a": [1]},
+      offsets={"a": tensor() | {"data_offsets": [0, 1 << 70]}}, card={
+          "a": tensor(), "__metadata__": {"card": "[" * 100_000}}, metadata={
+          "a": tensor(), "__metadata__": [1]}, twice=b'{"a":1,"a":2}', utf=b"\xff\xfe{}",
       words={"a": tensor("I64", (8,))}, booleans={"a": tensor("BOOL", (64,))})
 def weights(folder: Path, case: Any) -> Sample:
     from evflow.network.weights import load_weights

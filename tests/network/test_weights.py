@@ -11,6 +11,7 @@ from helpers.networks import small_params
 from safetensors.numpy import save
 
 from evflow.errors import EvflowDataError
+from evflow.network import weights
 from evflow.network.weights import (
     load_weights,
     model_card,
@@ -42,6 +43,48 @@ def test_refusals(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(EvflowDataError, match="EV009"):
         load_weights(path)
+
+
+def test_numbers_that_are_not_those_that_were_saved(tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "w.safetensors", small_params(), {"steps": 7})
+    data = bytearray(path.read_bytes())
+    start = 8 + int.from_bytes(data[:8], "little")
+    for place in (start, start + 4000, len(data) - 1):
+        changed = bytearray(data)
+        changed[place] ^= 1  # the last bit of a fraction
+        path.write_bytes(changed)
+        with pytest.raises(EvflowDataError, match=r"EV009.*SHA-256") as caught:
+            load_weights(path)
+        assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_weights_that_are_not_finite(tmp_path: Path, value: float) -> None:
+    bad = {"a": {"b": np.array([1.0, value], np.float32)}}
+    with pytest.raises(EvflowDataError, match=r"EV007.*a/b"):
+        save_weights(tmp_path / "w.safetensors", bad, {})
+    assert not [*tmp_path.iterdir()]
+    path = tmp_path / "other.safetensors"
+    path.write_bytes(save({"a/b": bad["a"]["b"]}))
+    with pytest.raises(EvflowDataError, match=r"EV007.*a/b"):
+        load_weights(path)
+
+
+def test_what_is_released_is_what_is_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that is replaced on purpose needs its line in SHA256SUMS."""
+    sums = (weights.FOLDER / weights.SUMS).read_text().split()
+    files = sorted(weights.FOLDER.glob("*.safetensors"))
+    assert sums[1::2] == [path.name for path in files]
+    assert sums[::2] == [weights.sha256(path) for path in files]
+    path = save_weights(tmp_path / "a.safetensors", small_params(), {})
+    (tmp_path / weights.SUMS).write_text(f"{weights.sha256(path)}  a.safetensors\n")
+    monkeypatch.setattr(weights, "FOLDER", tmp_path)
+    assert load_weights("a")
+    save_weights(path, {"a": np.ones(3)}, {}, overwrite=True)
+    with pytest.raises(EvflowDataError, match=r"EV009.*released"):
+        load_weights("a")
 
 
 def test_names_and_cards_by_which_weights_can_be_read_again(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from evflow.camera.exports.common import Export, Maps, Settings
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.folders import atomic_folder
-from evflow.files.whole import need_members
+from evflow.files.whole import need_members, write_checked
 
 TARGETS: Mapping[str, Callable[[Maps, Settings], Export]] = {
     "v2e": v2e.export, "esim": esim.export, "openeb": openeb.export, "iebcs": iebcs.export}
@@ -54,5 +54,5 @@ def write_export(
             with open(new / name, "wb") as f:
                 np.lib.format.write_array(f, array)
         for name, source in {"README.txt": export.text, **export.scripts}.items():
-            (new / name).write_text(source, "utf-8")
+            write_checked(new / name, source)
     return Path(folder)

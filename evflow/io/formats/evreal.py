@@ -18,6 +18,7 @@ from evflow.errors import EvflowDataError
 from evflow.files.arrays import GrowingArray, mapped
 from evflow.files.folders import atomic_folder
 from evflow.files.regular import is_there
+from evflow.files.whole import write_checked
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
@@ -148,5 +149,5 @@ class EvrealWriter(EventWriter):
             with GrowingArray(self._folder / "image_event_indices.npy", "i8", (1,)) as out:
                 out.append(np.searchsorted(ts, stamps)[:, None])
                 out.close()
-        (self._folder / "metadata.json").write_text(
-            json.dumps({"sensor_resolution": self.size[::-1]}) + "\n")
+        write_checked(self._folder / "metadata.json",
+                      json.dumps({"sensor_resolution": self.size[::-1]}) + "\n")
