@@ -9,6 +9,7 @@ from .camera.perturb import with_noise_histogram as with_noise_histogram
 from .camera.sensors import SENSORS as SENSORS
 from .camera.sensors import SensorModel as SensorModel
 from .errors import EvflowDataError as EvflowDataError
+from .estimation.estimator import CameraEstimator as CameraEstimator
 from .estimation.pipeline import estimate_camera as estimate_camera
 from .estimation.result import CameraEstimate as CameraEstimate
 from .io import open_writer as open_writer

@@ -18,7 +18,7 @@ import numpy as np
 
 from evflow import estimate_camera, finish
 from evflow.camera import CameraPrior
-from evflow.estimation.pipeline import pool_recording
+from evflow.estimation.pooled import pool_recording
 from evflow.report import plots
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, run_script

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from evflow import estimate_camera, finish
-from evflow.estimation.pipeline import pool_recording
+from evflow.estimation.pooled import pool_recording
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
 from experiments.shared.many import Setup, study

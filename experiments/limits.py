@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from evflow import estimate_camera, finish
-from evflow.estimation.pipeline import pool_recording
+from evflow.estimation.pooled import pool_recording
 from evflow.estimation.refine import pixel_posterior, refine_summary, refinement_chunks
 from evflow.recordings.windows import plan_windows
 from experiments.shared.cameras import Hidden, Protocol

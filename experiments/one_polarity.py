@@ -20,7 +20,7 @@ import numpy as np
 from evflow import estimate_camera, finish
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
-from evflow.estimation.pipeline import pool_recording
+from evflow.estimation.pooled import pool_recording
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
 from experiments.shared.many import Setup, study

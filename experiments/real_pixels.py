@@ -73,8 +73,9 @@ def halves(path: Path) -> list[str] | None:
     recording = read_recording(path)
     runs = plan_runs(recording, plan_windows(recording).pairs)
     cuts = [run[k:k + max(2, len(run) // 2)] for run in runs for k in (0, len(run) // 2)]
-    noise = frame_noise(recording, [i for run in runs for i in run])
-    first, second = (receptor_sample(recording, cuts[k::2], noise) for k in (0, 1))
+    noise = frame_noise([(recording, i) for run in runs for i in run])
+    first, second = (receptor_sample(
+        [(recording, cut) for cut in cuts[k::2]], noise) for k in (0, 1))
     if first is None or second is None:
         return None
     found = find(first)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shlex
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,6 +20,7 @@ from evflow.commands.options import (
     own_first,
     refuse,
     tell,
+    value,
     write_json,
 )
 from evflow.commands.packages import need_packages
@@ -26,10 +29,12 @@ from evflow.errors import EvflowDataError
 from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
+    from evflow.camera import Summary
     from evflow.estimation.result import CameraEstimate
     from evflow.types import Recording
 
 FILES = ("camera.npz", "camera.json", "maps.png", "histograms.png", "report.html")
+READ = ("effort", "budget_s", "on_interrupt")  # options of how much is read
 SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate notes these itself
 
 
@@ -51,6 +56,14 @@ class Estimate(Compiling, Reading):
     """How it was recorded. motion: of any kind; step: a screen that fills the view and steps
     between levels of light (thresholds are the change per event); static: a scene at rest, all of
     whose events are noise."""
+    effort: Literal["quick", "normal", "full"] = "normal"
+    """How much of a long recording is read. normal: parts spread over it, until the errors stop
+    shrinking or a minute's work is done (DAVIS346); quick: a third of that; full: everything."""
+    budget_s: Annotated[float | None, value("SECONDS")] = None
+    """Read no more after so many seconds of work; at least one part is read."""
+    on_interrupt: Literal["stop", "save"] = "stop"
+    """What Ctrl-C does while the recording is read. stop: end, and leave nothing; save: measure the
+    camera from what was read (a second Ctrl-C ends)."""
     weights: str = "default"
     """Name of released weights, or a .safetensors path."""
     window_ms: float = 40.0
@@ -81,8 +94,11 @@ class Estimate(Compiling, Reading):
         check_finite(self)
         moving = self.protocol == "motion"
         need_folder(self.out)
+        if self.budget_s is not None and self.budget_s < 0:
+            raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.",
+                                  "Give 0 or more; 0 reads one part.")
         if not moving:
-            refuse(self, ("weights", "window_ms", "reconstruct"),
+            refuse(self, ("weights", "window_ms", "reconstruct", *READ),
                    "of use with --protocol motion only")
         if not self.reconstruct:
             refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
@@ -138,15 +154,35 @@ class Estimate(Compiling, Reading):
         from evflow.process.terminal import bar
 
         params = load_weights(self.weights)
-        with bar("estimating", compiles=True) as progress:
+        began = time.monotonic()
+        with self._interrupted() as asked, bar("estimating", compiles=True) as progress:
+            done = (0, 1)
+
+            def advance(*counts: int) -> None:
+                nonlocal done
+                done = counts[0], counts[1]
+                progress(*done)
+
+            def enough(summary: Summary, std: Summary) -> bool:
+                progress(*done, f"estimating: {so_far(summary, std)}")
+                late = self.budget_s is not None and time.monotonic() - began >= self.budget_s
+                return late or bool(asked)
+
             found = estimate_camera(
-                recording, params, min_window_us=round(self.window_ms * 1000), progress=progress)
+                recording, params, effort=self.effort, progress=advance, until=enough,
+                min_window_us=round(self.window_ms * 1000))
         if recording.frames_were_made:
             from evflow.downstream.video import doubted
 
             found = doubted(found)
         return found, {"weights": self.weights, "weights_sha256": weights_hash(self.weights),
                        "weights_steps": trained_steps(model_card(self.weights))}
+
+    def _interrupted(self) -> contextlib.AbstractContextManager[list[int]]:
+        """A list that is no longer empty once the user wants what is known so far."""
+        from evflow.process.signals import stop_requests
+
+        return stop_requests() if self.on_interrupt == "save" else contextlib.nullcontext([])
 
     def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
         from evflow.estimation.bench.calibration import calibrate_step
@@ -163,3 +199,9 @@ class Estimate(Compiling, Reading):
                 out / "report.html", found, recording, weights=self.weights,
                 source=self.recording, command=shlex.join(["evflow", *sys.argv[1:]]),
                 min_window_us=round(self.window_ms * 1000), progress=progress)
+
+
+def so_far(summary: Summary, std: Summary) -> str:
+    """The thresholds while the recording is read."""
+    return ", ".join(f"θ {side.upper()} {float(getattr(summary, f'theta_{side}')):.3f} ± "
+                     f"{float(getattr(std, f'theta_{side}')):.3f}" for side in ("on", "off"))

@@ -13,6 +13,8 @@ import numpy as np
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.camera.optics import Optics, as_arrays
 from evflow.camera.sensors import SensorModel
+from evflow.estimation.drift import Third
+from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.notes import Note, as_dicts
 
 THRESHOLDS = ("theta_on", "theta_off")  # of whose measurement `undetermined` speaks
@@ -40,6 +42,9 @@ class CameraEstimate:
             is too fast to be seen; refractory_s, 0 where too few pixels change that fast.
         sensor_std: its standard deviations by field, NaN where nothing was measured.
         optics: what the frames show beside what the pixels saw.
+        extent: how much of the recording was read, and what more would bring.
+        thirds: thresholds of the three thirds of the recording, where it is long enough to tell:
+            whether the camera stayed the same.
     """
 
     camera: Camera
@@ -56,6 +61,8 @@ class CameraEstimate:
     sensor: SensorModel = SensorModel(noise_resets_memory=True)
     sensor_std: Mapping[str, float] = dataclasses.field(default_factory=dict)
     optics: Optics = Optics()
+    extent: Extent = EVERYTHING
+    thirds: tuple[Third, ...] = ()
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead, and the
@@ -91,4 +98,5 @@ class CameraEstimate:
                 "valid_fraction": float(self.valid.mean()), "events": int(self.n_events.sum()),
                 "hot_pixels": places(self.hot), "dead_pixels": places(self.dead),
                 "windows": self.windows, "undetermined": list(self.undetermined),
+                "extent": self.extent.as_dict(), "thirds": [t.as_dict() for t in self.thirds],
                 "notes": as_dicts(self.notes)}

@@ -151,7 +151,7 @@ def iter_windows(
         raise EvflowDataError(
             "EV017", f"no window of {min_us / 1e3:g} ms or more can be used ({why}).",
             "Record longer, or take shorter windows (min_us, --window-ms).")
-    return (_window(recording, pair, index) for index, pair in enumerate(plan.pairs))
+    return (window_at(recording, pair, index) for index, pair in enumerate(plan.pairs))
 
 
 def condensed(skipped: tuple[Skipped, ...]) -> tuple[Note, ...]:
@@ -165,7 +165,8 @@ def condensed(skipped: tuple[Skipped, ...]) -> tuple[Note, ...]:
         for why, frames in reasons.items())
 
 
-def _window(recording: Recording, pair: tuple[int, int], index: int) -> Window:
+def window_at(recording: Recording, pair: tuple[int, int], index: int) -> Window:
+    """The window between a pair of frames (first, last)."""
     t0, t1 = (int(recording.frame_times[i]) for i in pair)
     frame0, frame1 = (recording.frame_dn(i) for i in pair)
     return Window(recording.events.slice(t0, t1), frame0, frame1, t0, t1, index)

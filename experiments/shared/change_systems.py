@@ -23,7 +23,7 @@ from evflow.baselines.complementary import Complementary
 from evflow.baselines.integration import Integration
 from evflow.baselines.reconstruction import Reconstructor, dn_of
 from evflow.camera import Camera, Summary
-from evflow.estimation.pipeline import window_inputs
+from evflow.estimation.pooled import window_inputs
 from evflow.light.log_maps import lin_log
 from evflow.types import Window
 

@@ -23,7 +23,7 @@ from evflow.baselines import SYSTEMS
 from evflow.camera import THETA_MIN, Camera, Summary, sample_pixels
 from evflow.downstream.prior import WidePrior
 from evflow.errors import EvflowDataError
-from evflow.estimation.pipeline import pool_recording, window_inputs
+from evflow.estimation.pooled import pool_recording, window_inputs
 from evflow.estimation.result import CameraEstimate
 from evflow.network.api import Params, config_of, estimate_y, finish
 from evflow.network.coordinates import squash

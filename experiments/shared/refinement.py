@@ -6,7 +6,7 @@ from typing import Any
 
 from evflow import Recording, finish
 from evflow.camera import Summary
-from evflow.estimation.pipeline import pool_recording
+from evflow.estimation.pooled import pool_recording
 from evflow.estimation.refine import Chunk, refinement_chunks
 from evflow.recordings.windows import plan_windows
 

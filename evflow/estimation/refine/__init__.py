@@ -1,5 +1,6 @@
 """Refinement by simulation: the recording's own video, simulated with the estimated camera.
 
+    recording --> stretches, read one after the other    stretches.py
     frames --optical flow--> path (fine log frames)      path.py
     recorded events, simulated events --> Trace          trace.py
     Trace + path --> Moments, additive                   moments.py
@@ -20,23 +21,23 @@ from evflow.estimation.refine.denoise import frame_noise
 from evflow.estimation.refine.fit import Refined, fused, refine_summary
 from evflow.estimation.refine.path import (
     Chunk,
-    Survey,
     find_photoreceptor,
     make_chunk,
-    plan_runs,
     receptor_sample,
     refinement_chunks,
-    survey,
+    simulated_part,
 )
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
 from evflow.estimation.refine.receptor_search import Found
+from evflow.estimation.refine.stretches import Stretch, cut, plan_runs
 
 __all__ = [
     "Chunk",
     "Found",
     "PixelEvidence",
     "Refined",
-    "Survey",
+    "Stretch",
+    "cut",
     "find_photoreceptor",
     "foreseen",
     "frame_noise",
@@ -48,5 +49,5 @@ __all__ = [
     "refine_alone",
     "refine_summary",
     "refinement_chunks",
-    "survey",
+    "simulated_part",
 ]

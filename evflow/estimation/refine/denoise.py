@@ -6,6 +6,8 @@ and thresholds come out too high: by up to 40 % with 3 DN of noise.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -19,15 +21,16 @@ PAIRS = 8  # of frames that are looked at
 PATCH, SEARCH = 5, 15  # pixels: sides of what non-local means compares, and where it looks
 
 
-def frame_noise(recording: Recording, intervals: list[int]) -> float:
+def frame_noise(intervals: Sequence[tuple[Recording, int]]) -> float:
     """Standard deviation in DN of the frames' noise, 0 where too few places are quiet to tell it.
-    intervals: i, of frames i and i + 1. Noise is alike everywhere, what moves is not: the evenest
-    of the tiles without events tell it."""
+    intervals: of frames i and i + 1 of a recording. Noise is alike everywhere, what moves is not:
+    the evenest of the tiles without events tell it."""
     chosen = np.unique(np.linspace(0, len(intervals) - 1, min(PAIRS, len(intervals))).round())
     found = []
     for k in chosen.astype(int):
-        first, second = (recording.frame_dn(intervals[k] + j) for j in (0, 1))
-        t0, t1 = recording.frame_times[intervals[k]:intervals[k] + 2].tolist()
+        recording, i = intervals[k]
+        first, second = (recording.frame_dn(i + j) for j in (0, 1))
+        t0, t1 = recording.frame_times[i:i + 2].tolist()
         counts = recording.events.slice(t0, t1).count_map().sum(0)
         quiet = exposed(first, second) & (cv2.blur(counts.astype(np.float32), (3, 3)) == 0)
         found += _noise(first, second, quiet)

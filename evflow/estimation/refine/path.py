@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
 
+import cv2
 import jax
 import numpy as np
 
@@ -19,17 +20,26 @@ from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_search import Found, find
 from evflow.estimation.refine.sightings import Sightings, sight
+from evflow.estimation.refine.stretches import (
+    LARGE,
+    PART,
+    most_simulated,
+    plan_chunks,
+    plan_runs,
+    spread,
+)
 from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.light.log_maps import lin_log
 from evflow.recordings.glitches import SATURATED_DN, exposed
-from evflow.simulator.interpolate import MIN_SIDE, Interpolator
+from evflow.simulator.interpolate import Interpolator
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
-from evflow.types import Recording
+from evflow.types import Events, Recording
 
-INTERVALS = 8  # frame intervals per chunk: 200 ms at 40 Hz
 STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 px a step
-CHUNK_PIXELS = 8 * 346 * 260  # pixels of all chunks simulated, of a long recording
 STRETCHES = 3  # that tell the photoreceptor
+
+Box = tuple[slice, slice]
+Place = tuple[Recording, Sequence[int]]  # a recording and a run of its frame intervals
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,6 +52,7 @@ class Chunk:
     evidence: about each pixel's thresholds; quiet: (4, H, W) events in intervals in which the
     pixel's path stays within QUIET, the seconds and number of these, and how many had events.
     Intervals with a saturated or black frame are in none. sightings: the events beside the path.
+    box: rows and columns of the sensor.
     """
 
     path: np.ndarray
@@ -52,39 +63,11 @@ class Chunk:
     evidence: PixelEvidence
     quiet: np.ndarray
     sightings: Sightings
+    box: Box = (slice(None), slice(None))
 
 
 QUIET = 0.05  # log units: less than the smallest threshold of any use
 DARK_DN = 15.0  # below, half a DN of noise is .03 in log
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Survey:
-    """What the refinement reads of a recording. chunks: the stretches that it simulates, whole;
-    evidence and quiet, as in Chunk: sums over all stretches, those included."""
-
-    chunks: list[Chunk]
-    evidence: PixelEvidence
-    quiet: np.ndarray
-
-
-def survey(
-    recording: Recording, runs: list[list[int]], advance: Callable[[], None] = lambda: None,
-    seen_by: Photoreceptor = IDEAL, noise_dn: float = 0.0,
-) -> Survey:
-    """A recording's stretches, one after the other in the memory of one and of those kept.
-    runs: of `plan_runs`; advance() is called after each."""
-    width, height = recording.events.size
-    simulated = plan_chunks(recording, runs)
-    chunks, evidence = [], PixelEvidence.nothing((height, width))
-    quiet = np.zeros((4, height, width))
-    for run in runs:
-        chunk = make_chunk(recording, run, STEPS, seen_by, noise_dn)
-        evidence, quiet = evidence + chunk.evidence, quiet + chunk.quiet
-        if run in simulated:
-            chunks.append(chunk)
-        advance()
-    return Survey(chunks, evidence, quiet)
 
 
 def refinement_chunks(
@@ -96,40 +79,13 @@ def refinement_chunks(
     return [make_chunk(recording, run) for run in plan_chunks(recording, runs)]
 
 
-def plan_runs(recording: Recording, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
-    """Runs of up to INTERVALS consecutive frame intervals i (frame i to i + 1) in the windows
-    between the pairs of frames (first, last), ascending; none where frames are too small for
-    optical flow."""
-    if max(recording.frames.shape[1:]) < MIN_SIDE:
-        return []
-    runs: list[list[int]] = []
-    for i in itertools.chain.from_iterable(range(*pair) for pair in pairs):
-        if runs and runs[-1][-1] == i - 1 and len(runs[-1]) < INTERVALS:
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    return runs
-
-
-def plan_chunks(recording: Recording, runs: list[list[int]]) -> list[list[int]]:
-    """The runs that are simulated, again and again: the longest, evenly thinned to the budget.
-    The camera's parameters are alike everywhere, so some of a long recording tell them."""
-    longest = max((len(run) for run in runs), default=0)
-    runs = [run for run in runs if len(run) == longest]
-    width, height = recording.events.size
-    most = max(1, CHUNK_PIXELS // (width * height))
-    if len(runs) > most:
-        middles = (np.arange(most) + 0.5) * len(runs) / most  # of as many equal parts
-        runs = [runs[int(k)] for k in middles]
-    return runs
-
-
 def make_chunk(
-    recording: Recording, run: list[int], steps: int = STEPS, seen_by: Photoreceptor = IDEAL,
-    noise_dn: float = 0.0,
+    recording: Recording, run: Sequence[int], steps: int = STEPS, seen_by: Photoreceptor = IDEAL,
+    noise_dn: float = 0.0, *, first: bool | None = None,
 ) -> Chunk:
     """Interpolate the frames of a run of intervals, put them through what its pixels see them by,
-    and count its events."""
+    and count its events. first: whether the camera's recording begins there, if that is not with
+    the first frame."""
     film = interpolated(recording, run, steps, noise_dn)
     times = film.times_us + round(seen_by.delay_s * 1e6)
     fine = as_seen(film, seen_by)
@@ -139,8 +95,39 @@ def make_chunk(
     sightings = sight(recording.events, times, fine, steps, film.shown)
     return Chunk(
         fine, bright, film.dt_s, film.motion_px, trace,
-        evidence_of(sightings, first=run[0] == 0),
+        evidence_of(sightings, first=run[0] == 0 if first is None else first),
         _quiet(fine, trace, film.dt_s, film.shown[1:] & film.shown[:-1]), sightings)
+
+
+def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -> Chunk:
+    """What is simulated of a chunk: all of it, or of large sensors the busiest part, as large as a
+    DAVIS346. The camera's parameters are alike everywhere."""
+    height, width = chunk.bright.shape
+    if height * width <= LARGE:
+        return chunk
+    h, w = min(height, PART[0]), min(width, PART[1])
+    busy = cv2.integral(np.asarray(chunk.recorded.counts).sum((0, 1)))
+    inside = busy[h:, w:] - busy[:-h, w:] - busy[h:, :-w] + busy[:-h, :-w]
+    y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    box = slice(y, y + h), slice(x, x + w)
+    (recording, run), steps = place, (len(chunk.path) - 1) // len(chunk.dt_s)
+    times = recording.frame_times[run[0]:run[-1] + 2] + round(seen_by.delay_s * 1e6)
+    events = recording.events.slice(int(times[0]), int(times[-1]) + 1)
+    events = _inside(events, int(x), int(y), w, h)
+    path = np.ascontiguousarray(chunk.path[:, *box])
+    seen = chunk.sightings.seen.reshape(-1, height, width)[:, *box]
+    sums = chunk.evidence
+    evidence = PixelEvidence(*(a[:, *box] for a in (sums.equations, sums.bounds, sums.start)))
+    return Chunk(path, chunk.bright[box], chunk.dt_s, chunk.motion_px,
+                 trace_of_events(events, times, steps), evidence, chunk.quiet[:, *box],
+                 sight(events, times, path, steps, seen), box)
+
+
+def _inside(events: Events, x: int, y: int, width: int, height: int) -> Events:
+    """The events of a rectangle of pixels, counted from its first."""
+    kept = (events.x >= x) & (events.x < x + width) & (events.y >= y) & (events.y < y + height)
+    return Events.unchecked(events.x[kept] - np.uint16(x), events.y[kept] - np.uint16(y),
+                            events.t[kept], events.p[kept], (width, height))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -158,7 +145,7 @@ class Film:
 
 
 def interpolated(
-    recording: Recording, run: list[int], steps: int = STEPS, noise_dn: float = 0.0
+    recording: Recording, run: Sequence[int], steps: int = STEPS, noise_dn: float = 0.0
 ) -> Film:
     """The frames of a run of intervals, less their noise, filled up by optical flow."""
     frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
@@ -187,26 +174,27 @@ def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
 _seen = jax.jit(seen_path)
 
 
-def receptor_sample(
-    recording: Recording, runs: list[list[int]], noise_dn: float = 0.0
-) -> Sample | None:
-    """What a few of a recording's runs of intervals say of the photoreceptor; None where too
-    little happens."""
-    runs = plan_chunks(recording, runs)
-    chosen = np.unique(np.linspace(0, len(runs) - 1, min(STRETCHES, len(runs))).round())
+def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | None:
+    """What a few of the runs of intervals, each of a recording, say of the photoreceptor; None
+    where too little happens."""
+    if not places:
+        return None
+    size = places[0][0].events.size
+    told = spread([len(run) for _, run in places], most_simulated(size))
+    chosen = np.unique(np.linspace(0, len(told) - 1, min(STRETCHES, len(told))).round())
     parts = []
     for k in chosen.astype(int):
-        film = interpolated(recording, runs[k], STEPS, noise_dn)
+        recording, run = places[told[k]]
+        film = interpolated(recording, run, STEPS, noise_dn)
         s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
         parts.append((film.dn, np.repeat(film.dt_s / STEPS, STEPS), s))
     return sample(parts)
 
 
-def find_photoreceptor(
-    recording: Recording, runs: list[list[int]], noise_dn: float = 0.0
-) -> Found | None:
-    """What the pixels of a recording see its frames by; None where too little happens."""
-    data = receptor_sample(recording, runs, noise_dn)
+def find_photoreceptor(places: Sequence[Place], noise_dn: float = 0.0) -> Found | None:
+    """What the pixels of a camera see the frames by, from runs of intervals; None where too little
+    happens."""
+    data = receptor_sample(places, noise_dn)
     return find(data) if data is not None else None
 
 

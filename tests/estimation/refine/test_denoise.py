@@ -25,11 +25,15 @@ def scene(noise_dn: float, moves: int = 0) -> Recording:
                      1000 + 20_000 * np.arange(9))
 
 
+def noise(recording: Recording) -> float:
+    return frame_noise([(recording, i) for i in range(8)])
+
+
 @pytest.mark.parametrize("noise_dn", [1.0, 3.0, 6.0])
 @pytest.mark.parametrize("moves", [0, 1])
 def test_noise_is_measured(noise_dn: float, moves: int) -> None:
     """The quantile of the tiles lies a little below."""
-    assert frame_noise(scene(noise_dn, moves), list(range(8))) == pytest.approx(noise_dn, rel=0.25)
+    assert noise(scene(noise_dn, moves)) == pytest.approx(noise_dn, rel=0.25)
 
 
 def test_busy_frames_tell_nothing() -> None:
@@ -38,7 +42,7 @@ def test_busy_frames_tell_nothing() -> None:
     t = np.sort(rng.integers(0, 180_000, 60_000))
     events = Events(rng.integers(0, 96, 60_000), rng.integers(0, 72, 60_000), t,
                     rng.random(60_000) < 0.5, SHAPE[::-1])
-    assert frame_noise(Recording(events, calm.frames, calm.frame_times), list(range(8))) == 0.0
+    assert noise(Recording(events, calm.frames, calm.frame_times)) == 0.0
 
 
 def test_much_noise_is_taken_away_and_little_is_left() -> None:

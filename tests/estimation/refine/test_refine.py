@@ -4,6 +4,7 @@ the thresholds of a known path come back."""
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -14,24 +15,27 @@ from jax.scipy.stats import norm
 
 from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior, Summary
+from evflow.estimation.reading import ordered
 from evflow.estimation.refine import (
+    cut,
     fused,
-    path,
     pixel_posterior,
     plan_runs,
     refine_summary,
     refinement_chunks,
-    survey,
+    stretches,
 )
 from evflow.estimation.refine.bounds import ERROR, EXCESS, NOTHING, bounded
 from evflow.estimation.refine.fit import FusionNet
 from evflow.estimation.refine.moments import measure
-from evflow.estimation.refine.path import plan_chunks
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_evidence
+from evflow.estimation.refine.stretches import plan_chunks
 from evflow.estimation.refine.trace import FRESH, NEVER, trace_of_camera, trace_of_events
+from evflow.estimation.state import Eyes, State, add_path
 from evflow.light.log_maps import lin_log
 from evflow.recordings import plan_windows
 from evflow.recordings.faulty_pixels import hot_pixels
+from evflow.recordings.windows import WindowPlan
 from evflow.scenes import SceneConfig, make_bank
 from evflow.types import Events
 from experiments.shared.cameras import Protocol, hidden_recording
@@ -224,6 +228,16 @@ def test_chunks_are_runs_of_equal_length() -> None:
     assert plan_chunks(recording, plan_runs(recording, [])) == []
 
 
+def surveyed(recording: Recording, pairs: Sequence[tuple[int, int]]) -> State:
+    """All stretches of a recording, read in order."""
+    parts = cut(recording, WindowPlan(tuple(pairs), ()))
+    simulated = ordered(parts, "full").simulated
+    state = State({}, Eyes())
+    for i, stretch in enumerate(parts):
+        state = add_path(state, stretch, simulate=i in simulated)
+    return state
+
+
 def test_pixels_learn_from_every_stretch_and_few_are_simulated(
     monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -235,14 +249,15 @@ def test_pixels_learn_from_every_stretch_and_few_are_simulated(
     recording = Recording(events, frames, np.arange(18) * 40_000)
     pairs = [(0, 10), (10, 17)]
     runs = plan_runs(recording, pairs)
-    calls: list[None] = []
-    everything = survey(recording, runs, lambda: calls.append(None))
+    everything = surveyed(recording, pairs)
     assert [len(run) for run in runs] == [8, 8, 1]
-    assert (len(everything.chunks), len(calls)) == (2, 3)
-    monkeypatch.setattr(path, "CHUNK_PIXELS", 1)
-    little = survey(recording, runs)
+    assert len(everything.chunks) == 2
+    monkeypatch.setattr(stretches, "CHUNK_PIXELS", 1)
+    little = surveyed(recording, pairs)
     assert len(little.chunks) == 1
     assert plan_chunks(recording, runs) == [runs[1]]  # the middle: a recording's ends are its worst
+    assert everything.evidence is not None
+    assert little.evidence is not None
     np.testing.assert_array_equal(everything.evidence.equations, little.evidence.equations)
     np.testing.assert_array_equal(everything.evidence.bounds, little.evidence.bounds)
     np.testing.assert_array_equal(everything.quiet, little.quiet)
@@ -330,8 +345,8 @@ def test_fast_motion_makes_few_hot_pixels() -> None:
     bank = make_bank(jax.random.key(9), 8, photos=False)
     made = hidden_recording(jax.random.key(0), bank, fast)
     recording = made.recording
-    runs = plan_runs(recording, plan_windows(recording).pairs)
-    quiet = survey(recording, runs).quiet
+    quiet = surveyed(recording, plan_windows(recording).pairs).quiet
+    assert quiet is not None
     rate = float(made.nominal.eta_on + made.nominal.eta_off)
     always = np.stack([*quiet[:3], quiet[2]])  # as if they fired all the time
     assert hot_pixels(always, rate).sum() > 12

@@ -1,0 +1,135 @@
+"""A camera measured piece by piece, as beside a running one."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from evflow.errors import EvflowDataError
+from evflow.estimation.extent import Extent
+from evflow.estimation.pipeline import check_options
+from evflow.estimation.refine import Stretch, cut
+from evflow.estimation.refine.stretches import most_simulated, spread
+from evflow.estimation.result import CameraEstimate
+from evflow.estimation.state import State, add, estimate, looked_through, thinned
+from evflow.network import api
+from evflow.network.weights import load_weights
+from evflow.notes import Note
+from evflow.recordings.windows import condensed, plan_windows
+from evflow.types import Recording
+
+
+class CameraEstimator:
+    """Measure a camera while it records: add pieces of a recording, ask for the estimate so far.
+
+    Of what was added sums are kept, and a number of pieces that does not grow: memory is bounded
+    by the size of the sensor. The first pieces also tell what the pixels see the frames by. Given
+    one recording whole, the estimate is that of `estimate_camera(recording, effort="full")`.
+
+    Args:
+        params: of `load_weights`; None loads the released ones.
+        refine: as in `estimate_camera`.
+        pixel: as in `estimate_camera`.
+        min_window_us: as in `estimate_camera`.
+
+    Raises:
+        EvflowDataError: EV020 (an option that is not known).
+
+    Example:
+        >>> estimator = ef.CameraEstimator()
+        >>> for piece in pieces:  # `Recording`s of a second, say
+        ...     estimator.add(piece)
+        >>> estimator.estimate().save("camera.npz")
+    """
+
+    FIRST = 8  # stretches that are waited for before anything is measured
+    KEPT = 32  # stretches whose quiet time is counted
+    NOTES = 20  # on pieces, that are kept
+
+    def __init__(
+        self, params: api.Params | None = None, *, refine: Literal["auto", "off"] = "auto",
+        pixel: Literal["measured", "ideal"] = "measured", min_window_us: int = 40_000,
+    ) -> None:
+        check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")))
+        self._params = load_weights() if params is None else params
+        self._refine, self._pixel, self._min_us = refine, pixel, min_window_us
+        self._state: State | None = None
+        self._waiting: tuple[Stretch, ...] = ()
+        self._notes: tuple[Note, ...] = ()
+        self._size: tuple[int, int] | None = None
+        self._seconds, self._stretches, self._apart = 0.0, 0, 1
+
+    def add(self, piece: Recording) -> int:
+        """Read one more piece of the recording.
+
+        Args:
+            piece: events and the frames that they lie between, at least two; of the same camera.
+                Its last frame is the next piece's first.
+
+        Returns:
+            How many windows between frames it had that could be used; 0 of a piece in which
+            nothing happens, which is left out.
+
+        Raises:
+            EvflowDataError: EV011 (fewer than two frames), EV012 (frames and events do not
+                overlap), EV015 (another size), EV020 (no `Recording`). What was added before stays.
+        """
+        if isinstance(piece, Recording) and self._size not in (None, piece.events.size):
+            raise EvflowDataError("EV015", f"a piece of {piece.events.size} pixels after "
+                                  f"{self._size}.", "Add pieces of one camera only.")
+        if isinstance(piece, Recording) and piece.has_frames and not len(piece.events):
+            return 0
+        plan = plan_windows(piece, self._min_us)
+        self._notes = tuple(dict.fromkeys((*self._notes, *condensed(plan.skipped))))[:self.NOTES]
+        stretches = cut(piece, plan, path=self._refine == "auto", first=self._size is None)
+        self._size = piece.events.size
+        self._stretches += len(stretches)
+        self._seconds += sum((s.span_us[1] - s.span_us[0]) * 1e-6 for s in stretches)
+        if self._state is None:
+            self._waiting += stretches
+            if len(self._waiting) >= self.FIRST:
+                self._begin()
+        else:
+            for stretch in stretches:
+                self._state = self._next(self._state, stretch)
+        return len(plan.pairs)
+
+    def estimate(self) -> CameraEstimate:
+        """The camera, of all that was added.
+
+        Returns:
+            As of `estimate_camera`; more pieces can be added afterwards.
+
+        Raises:
+            EvflowDataError: EV017 (no window that could be used was added yet).
+        """
+        if self._state is None and self._waiting:
+            self._begin()
+        if self._state is None:
+            raise EvflowDataError(
+                "EV017", "nothing was added that could be used"
+                + "".join(f" ({note})" for note in self._notes[:3]) + ".",
+                "Add pieces with frames, in which something moves.")
+        extent = Extent(self._seconds, self._seconds, self._stretches, self._stretches)
+        return estimate(self._state, extent=extent, before=self._notes)
+
+    def _begin(self) -> None:
+        """Measure what waited."""
+        waited, self._waiting = self._waiting, ()
+        state = State(self._params, looked_through(waited, measured=self._pixel == "measured"))
+        most = most_simulated(waited[0].recording.events.size)
+        simulated = spread([len(s.run) for s in waited], most)
+        for i, stretch in enumerate(waited):
+            state = add(state, stretch, simulate=i in simulated)
+        self._state = state
+        self._apart = max(1, len(waited) // most)
+
+    def _next(self, state: State, stretch: Stretch) -> State:
+        """The state with a later stretch: of those that are simulated each second one makes room
+        where there are too many, so that they stay spread over the time."""
+        most = most_simulated(stretch.recording.events.size)
+        length = max((len(c.dt_s) for c in state.chunks), default=0)
+        wanted = len(stretch.run) >= length > 0 and len(state.parts) % self._apart == 0
+        if wanted and len(state.chunks) >= most:
+            self._apart *= 2
+        return add(thinned(state, most if wanted else most + 1, self.KEPT), stretch,
+                   simulate=wanted)

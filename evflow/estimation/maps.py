@@ -1,0 +1,99 @@
+"""From pooled evidence to the camera's summary and to maps of its pixels."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.estimation.pixel_noise import pixel_rates, threshold_law
+from evflow.estimation.pooled import window_inputs
+from evflow.estimation.refine import Chunk, Found, PixelEvidence, pixel_posterior, refine_summary
+from evflow.network import api, architecture
+from evflow.network.coordinates import SCALE, camera_std, per_channel, squash, unsquash_summary
+from evflow.recordings.glitches import exposed
+from evflow.types import Window
+
+
+def by_flow(
+    params: api.Params, windows: Iterable[Window], summary: Summary, summary_std: Summary
+) -> tuple[Camera, Camera]:
+    """Product of the windows' posteriors by the flow: each is N(y, s^2) and contains the prior (the
+    summary and the mismatch) once, so the prior's precision is taken off all but one. The
+    summary's own error, which all pixels share, is added to the std at the end."""
+    y6 = unsquash_summary(summary)[None, None]
+    prior, prior_precision = y6[..., :4], architecture.base_std(y6) ** -2.0
+    precision, weighted = jnp.zeros_like(prior), jnp.zeros_like(prior)
+    for window in windows:
+        voxels, dlogI, given = window_inputs(window)
+        y, s = api.estimate_y(params, voxels, dlogI, summary=summary, **given)
+        shown = exposed(window.frame0, window.frame1)
+        told = jnp.maximum(s**-2.0 - prior_precision, 0.0)
+        gained = jnp.where(jnp.asarray(shown)[..., None], told, 0.0)
+        # A posterior mean is shrunk towards the prior; (gained) (x - prior) = s^-2 (y - prior)
+        # is the window's own evidence x before shrinkage.
+        weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
+        precision += gained
+    total = prior_precision + precision
+    y = prior + weighted / total
+    relative = [getattr(summary_std, n) / getattr(summary, n) for n in PARAMETERS]
+    shared = jnp.stack(relative, -1)[None, None] / per_channel(SCALE, y6)
+    return squash(y), camera_std(y, jnp.sqrt(1.0 / total + shared**2))
+
+
+def by_regression(
+    evidence: PixelEvidence, summary: Summary, summary_std: Summary
+) -> tuple[Camera, Camera]:
+    """Each pixel's thresholds from its regression on the path, beside the summary's noise rates;
+    the summary's own error, which all pixels share, is added to the std."""
+    theta, error = pixel_posterior(evidence, summary)
+    shared = (float(summary_std.theta_on), float(summary_std.theta_off))
+    on, off = (jnp.sqrt(e**2 + s**2) for e, s in zip(jnp.asarray(error), shared, strict=True))
+    flat = jnp.ones(theta.shape[1:])
+    return (Camera(jnp.asarray(theta[0]), jnp.asarray(theta[1]), summary.eta_on * flat,
+                   summary.eta_off * flat),
+            Camera(on, off, summary_std.eta_on * flat, summary_std.eta_off * flat))
+
+
+def with_rates(
+    camera: Camera, std: Camera, quiet: np.ndarray, hot: np.ndarray, summary: Summary,
+    summary_std: Summary,
+) -> tuple[Camera, Camera]:
+    """The maps with each pixel's noise rates from its quiet time: a window holds too little noise
+    of a pixel for the network to say more than the camera's."""
+    rates, errors = {}, {}
+    law = threshold_law(quiet, np.stack([camera.theta_on, camera.theta_off]), hot)
+    for name, (events, seconds), relative in zip(("eta_on", "eta_off"), quiet, law, strict=True):
+        mean, error = (float(getattr(s, name)) for s in (summary, summary_std))
+        rate, own = pixel_rates(events, seconds, mean, hot, relative)
+        rates[name] = jnp.asarray(rate, jnp.float32)
+        errors[name] = jnp.asarray(np.hypot(own, rate * (error / mean)), jnp.float32)
+    return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)
+
+
+def refined(
+    params: api.Params, chunks: list[Chunk], summary: Summary, std: Summary
+) -> tuple[Summary, Summary]:
+    """The summary and its std after refinement."""
+    parts = next(iter(params.values()))
+    refined = refine_summary(chunks, summary, std, parts.get("fusion"), parts.get("signal"))
+    return refined.summary, refined.std
+
+
+def regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Summary]:
+    """The summary with the pooled regression's thresholds: the network knows few slow pixels."""
+    (on, off), error = found.thresholds()
+    on, off, error = jnp.float32(on), jnp.float32(off), jnp.float32(error)
+    return (dataclasses.replace(summary, theta_on=on, theta_off=off),
+            dataclasses.replace(std, theta_on=error * on, theta_off=error * off))
+
+
+def widened(summary: Summary, std: Summary, found: Found) -> Summary:
+    """The std with what not knowing the photoreceptor leaves open of the thresholds."""
+    on, off = found.theta_error
+    return dataclasses.replace(
+        std, theta_on=jnp.hypot(std.theta_on, jnp.float32(on) * summary.theta_on),
+        theta_off=jnp.hypot(std.theta_off, jnp.float32(off) * summary.theta_off))

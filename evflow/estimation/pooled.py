@@ -1,0 +1,107 @@
+"""What windows say: their statistics, which the network's summary is made of, and their quiet time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+
+from evflow.camera import Summary
+from evflow.errors import EvflowDataError
+from evflow.estimation.pixel_noise import quiet_time
+from evflow.light.log_maps import lin_log
+from evflow.network import api
+from evflow.recordings.glitches import exposed
+from evflow.recordings.windows import iter_windows
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
+from evflow.types import Recording, Window
+from evflow.voxel import voxelize
+
+Array = jax.Array
+
+
+def window_inputs(
+    window: Window, seen_by: Photoreceptor = IDEAL
+) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
+    """voxels (H, W, 32), dlogI (H, W) and conditions of one window of a recording."""
+    voxels = voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
+    before, after = (log_light(f, seen_by) for f in (window.frame0, window.frame1))
+    intensity, dlogI = 0.5 * (before + after), after - before
+    return voxels, dlogI, {"window_s": window.window_s, "intensity": intensity}
+
+
+def log_light(frame: np.ndarray, seen_by: Photoreceptor) -> Array:
+    """A frame (H, W) in log units, with the light that its pixels see beside it."""
+    if not seen_by.offset_dn:
+        return lin_log(frame)
+    return lin_log(np.maximum(frame.astype(np.float32) + seen_by.offset_dn, 0.0))
+
+
+def pool_recording(
+    params: api.Params, recording: Recording, min_window_us: int = 40_000
+) -> tuple[api.Stats, np.ndarray]:
+    """Summed Stats of all windows, and the events (H, W) in them."""
+    total: api.Stats | None = None
+    n_events = n_shown = np.zeros(())
+    for window in iter_windows(recording, min_window_us):
+        stats = window_stats(params, window)
+        counts, shown = window_counts(window)
+        total = stats if total is None else total + stats
+        n_events, n_shown = n_events + counts, n_shown + shown
+    assert total is not None  # iter_windows raises EV017 rather than yield nothing
+    need_shown(n_events, n_shown)
+    return total, n_events.astype(np.uint32)
+
+
+def need_shown(n_events: np.ndarray, n_shown: np.ndarray) -> None:
+    """EV017 where there are events (H, W) and the frames show none of them."""
+    if n_events.any() and not n_shown.any():
+        raise EvflowDataError(
+            "EV017", "no event happens where the frames are neither saturated nor black.",
+            "Expose the frames so that they show what moves.")
+
+
+def window_counts(window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """All events (H, W) of a window, and those that its frames show."""
+    counts = window.events.count_map().sum(0).astype(np.uint32)
+    return counts, counts * exposed(window.frame0, window.frame1)
+
+
+def window_stats(
+    params: api.Params, window: Window, seen_by: Photoreceptor = IDEAL
+) -> api.Stats:
+    """Stats of the pixels that a window's frames show. The others are replaced by random ones of
+    them and the sums scaled down to their number: arrays of one shape are compiled once."""
+    voxels, dlogI, given = window_inputs(window, seen_by)
+    shown = exposed(window.frame0, window.frame1)
+    share = float(shown.mean())
+    if 0 < share < 1:
+        rng = np.random.default_rng(window.index)
+        source = np.arange(shown.size)
+        source[~shown.ravel()] = rng.choice(np.flatnonzero(shown), int((~shown).sum()))
+
+        def filled(values: ArrayLike) -> np.ndarray:
+            pixels = np.asarray(values).reshape(shown.size, -1)
+            return pixels[source].reshape(np.shape(values))
+
+        voxels, dlogI = filled(voxels), filled(dlogI)
+        given["intensity"] = filled(given["intensity"])
+    stats = api.summarize(params, voxels, dlogI, **given)
+    return stats if share == 1 else jax.tree.map(lambda leaf: leaf * share, stats)
+
+
+def quiet_times(
+    windows: Iterable[Window], summary: Summary, hot: np.ndarray, seen_by: Photoreceptor
+) -> np.ndarray:
+    """The `quiet_time` of all windows: (2, 2, H, W), ON and OFF, events and seconds."""
+    noise = np.array([summary.eta_on, summary.eta_off])
+    total = np.zeros((2, 2, *hot.shape))
+    for window in windows:
+        frames = window.frame0, window.frame1
+        before, after = (log_light(f, seen_by) for f in frames)
+        total += quiet_time(window.events.count_map(), np.asarray(after - before),
+                            exposed(*frames), hot, window.window_s, noise)
+    return total

@@ -1,0 +1,73 @@
+"""What to know about an estimate: notes on its pixels, its thresholds and what its pixels see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.camera import Summary
+from evflow.estimation.refine import Found
+from evflow.network.pooling import Stats
+from evflow.notes import Note
+from evflow.recordings.check.contents import ACTIVE_SHARE, VALID_EVENTS
+from evflow.training.config import PRESETS
+
+FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
+
+
+def camera_notes(
+    stats: Stats, unknown: tuple[str, ...], n_events: np.ndarray, summary: Summary,
+    hot: np.ndarray, dead: np.ndarray,
+) -> list[Note]:
+    found = []
+    for name, mask, what in (
+        ("hot", hot, "they fire while nothing moves, and were left out of the refinement."),
+        ("dead", dead, "they never fire while all around them do; the maps show the camera's "
+         "summary there."),
+    ):
+        if mask.any():
+            y, x = np.argwhere(mask)[0]
+            found.append(Note(
+                f"pixels.{name}",
+                f"{name} pixels ({mask.sum()}, the first at x={x}, y={y}): {what}"))
+    low, high = PRESETS["default"].prior.theta
+    for name, events in (("on", stats.events_on), ("off", stats.events_off)):
+        theta = float(getattr(summary, f"theta_{name}"))
+        if name in unknown:
+            found.append(Note(
+                f"theta_{name}.undetermined", f"only {int(events)} {name.upper()} events, as noise "
+                f"sends: theta_{name} is undetermined, its value is the prior's, and the other "
+                "threshold was measured alone, less precisely."))
+        elif float(events) < FEW_EVENTS:
+            found.append(Note(
+                f"theta_{name}.uncertain",
+                f"only {int(events)} {name.upper()} events: theta_{name} is uncertain."))
+        elif not low <= theta <= high:
+            found.append(Note(
+                f"theta_{name}.extrapolated", f"theta_{name} = {theta:.3f} lies outside the "
+                f"{low}-{high} that the network was trained on: an extrapolation. Frames with a "
+                "gamma or an offset stretch the scale."))
+    active = float((n_events >= VALID_EVENTS).mean())
+    if active < ACTIVE_SHARE:
+        found.append(Note(
+            "pixels.unsure", f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
+            "elsewhere the maps show the camera's summary. Record more motion."))
+    return found
+
+
+def receptor_notes(found: Found | None) -> list[Note]:
+    if found is None:
+        return []
+    notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be seen: it is "
+                  f"above {found.least_cutoff_hz:.0f} Hz at 255 DN.")]
+    if found.sensor[0].cutoff_hz:
+        notes = [Note("pixels.slow", "the thresholds are those of the light behind the "
+                      "photoreceptor's low-pass; without it they come out otherwise where things "
+                      "move fast.")]
+    optics = found.optics
+    if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
+        more = "more" if optics.offset_dn > 0 else "less"
+        notes.append(Note(
+            "frames.light", f"pixels see {abs(optics.offset_dn):.0f} DN {more} light than the "
+            "frames show (dark current, black level): thresholds are those of that light. A gamma "
+            "of the frames cannot be told from one recording."))
+    return notes

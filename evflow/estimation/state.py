@@ -1,0 +1,216 @@
+"""What has been read of a camera so far, as a value, and the two things to do with it: `add` a
+stretch, and `estimate` the camera.
+
+Everything in a `State` is a sum over what was read, or bounded by the size of the sensor: maps of
+evidence, and the few stretches that are simulated. Only references to what was read grow, to
+count the quiet time at the end; `keep` says how many of these are kept.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from evflow.camera import Summary
+from evflow.camera.sensors import SensorModel
+from evflow.estimation import drift, maps
+from evflow.estimation.dead_time import DeadTime, dead_time
+from evflow.estimation.extent import EVERYTHING, Extent
+from evflow.estimation.one_polarity import untold, without
+from evflow.estimation.pooled import need_shown, quiet_times, window_counts, window_stats
+from evflow.estimation.refine import (
+    Chunk,
+    Found,
+    PixelEvidence,
+    Stretch,
+    find_photoreceptor,
+    frame_noise,
+    make_chunk,
+    simulated_part,
+)
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.remarks import camera_notes, receptor_notes
+from evflow.estimation.result import CameraEstimate
+from evflow.network import api
+from evflow.notes import Note
+from evflow.recordings.check.contents import VALID_EVENTS
+from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels
+from evflow.recordings.windows import window_at
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
+from evflow.types import Window
+
+Array = np.ndarray
+Advance = Callable[[], None]
+
+MOST_EVENTS = 16_000_000  # in which the dead time is looked for, the first
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Eyes:
+    """What the pixels see the frames by, how noisy these are, DN, and how long pixels rest: found
+    before anything else is read, as all evidence depends on it."""
+
+    seen_by: Photoreceptor = IDEAL
+    noise_dn: float = 0.0
+    found: Found | None = None
+    dead: DeadTime = dataclasses.field(default_factory=DeadTime)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class State:
+    """params: of the network. stats, n_events, n_shown (H, W), evidence, quiet (4, H, W): sums over
+    all that was read; chunks: the stretches that are simulated; read: the stretches whose quiet
+    time is counted at the end; windows: how many were read; parts: of each stretch, what drift.py
+    compares."""
+
+    params: api.Params
+    eyes: Eyes
+    stats: api.Stats | None = None
+    n_events: Array = dataclasses.field(default_factory=lambda: np.zeros(()))
+    n_shown: Array = dataclasses.field(default_factory=lambda: np.zeros(()))
+    evidence: PixelEvidence | None = None
+    quiet: Array | None = None
+    chunks: tuple[Chunk, ...] = ()
+    read: tuple[Stretch, ...] = ()
+    windows: int = 0
+    parts: tuple[drift.Part, ...] = ()
+
+
+def looked_through(stretches: Sequence[Stretch], *, measured: bool) -> Eyes:
+    """The eyes of a camera, from some of its stretches. measured: False takes pixels for ideal."""
+    events = max((s.recording.events for s in stretches), key=len)
+    if len(events) > MOST_EVENTS:
+        events = events.slice(int(events.t[0]), int(events.t[MOST_EVENTS]))
+    dead = dead_time(events)
+    runs = [(s.recording, s.run) for s in stretches if s.run]
+    if not runs:
+        return Eyes(dead=dead)
+    noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
+    found = find_photoreceptor(runs, noise_dn) if measured else None
+    return Eyes(found.seen if found is not None and found.needed else IDEAL, noise_dn, found,
+                dead)
+
+
+def add(
+    state: State, stretch: Stretch, *, simulate: bool, every: int = 1,
+    advance: Advance = lambda: None,
+) -> State:
+    """The state with one more stretch. simulate: whether it is one of those that the refinement
+    simulates; every: which of its windows are pooled, each one, or each second; advance() is called
+    after every window, and after the stretch."""
+    stats, n_events, n_shown = state.stats, state.n_events, state.n_shown
+    for number, window in enumerate(_windows([stretch])):
+        if number % every == 0 or stats is None:
+            said = window_stats(state.params, window, state.eyes.seen_by)
+            stats = said if stats is None else stats + said
+        counts, shown = window_counts(window)
+        n_events, n_shown = n_events + counts, n_shown + shown
+        advance()
+    state = dataclasses.replace(
+        state, stats=stats, n_events=n_events, n_shown=n_shown, read=(*state.read, stretch),
+        windows=state.windows + len(stretch.windows))
+    if not stretch.run:
+        return state
+    state = add_path(state, stretch, simulate=simulate)
+    advance()
+    return state
+
+
+def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
+    """The state with what the path between a stretch's frames tells, and no windows."""
+    place, seen_by = (stretch.recording, stretch.run), state.eyes.seen_by
+    chunk = make_chunk(*place, STEPS, seen_by, state.eyes.noise_dn, first=stretch.first)
+    shape = chunk.bright.shape
+    evidence = state.evidence if state.evidence is not None else PixelEvidence.nothing(shape)
+    quiet = state.quiet if state.quiet is not None else np.zeros((4, *shape))
+    kept = (simulated_part(chunk, place, seen_by),) if simulate else ()
+    return dataclasses.replace(
+        state, evidence=evidence + chunk.evidence, quiet=quiet + chunk.quiet,
+        chunks=(*state.chunks, *kept),
+        parts=(*state.parts, drift.part(stretch.span_us, chunk.evidence)))
+
+
+def glance(state: State) -> tuple[Summary, Summary]:
+    """The camera's summary so far and its std, before any refinement: of no cost."""
+    assert state.stats is not None
+    summary, std = api.finish(state.params, state.stats)
+    found = state.eyes.found
+    if found is not None and not state.eyes.seen_by.ideal and state.evidence is not None:
+        summary, std = maps.regressed(summary, std, found)
+    return summary, std
+
+
+def estimate(
+    state: State, *, extent: Extent | None = None, before: Sequence[Note] = (),
+    after: Sequence[Note] = (), advance: Advance = lambda: None,
+) -> CameraEstimate:
+    """The camera, of all that was read. extent: how much that is; before, after: notes on how it
+    was read, beside its own; advance() is called after every window that is read again."""
+    assert state.stats is not None
+    need_shown(state.n_events, state.n_shown)
+    eyes, stats = state.eyes, state.stats
+    n_events = state.n_events.astype(np.uint32)
+    summary, std = glance(state)
+    hot, chunks = np.zeros(n_events.shape, bool), list(state.chunks)
+    if state.evidence is not None and state.quiet is not None:
+        hot = hot_pixels(state.quiet, float(summary.eta_on + summary.eta_off))
+        chunks = [_without_hot(c, hot) for c in chunks]
+        summary, std = maps.refined(state.params, chunks, summary, std)
+        if eyes.found is not None and not eyes.seen_by.ideal:
+            std = maps.widened(summary, std, eyes.found)
+    unknown = untold(stats, summary)
+    if unknown:
+        summary, std = without(unknown, chunks, summary, std)
+    quiet = quiet_times(_told(_windows(state.read), advance), summary, hot, eyes.seen_by)
+    if state.evidence is not None:
+        camera, error = maps.by_regression(state.evidence, summary, std)
+    else:
+        again = _told(_windows(state.read), advance)
+        camera, error = maps.by_flow(state.params, again, summary, std)
+    camera, error = maps.with_rates(camera, error, quiet, hot, summary, std)
+    dead = dead_pixels(n_events)
+    extent = extent or EVERYTHING
+    thirds = drift.thirds(state.parts)
+    return CameraEstimate(
+        camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
+        state.windows,
+        (*before, *camera_notes(stats, unknown, n_events, summary, hot, dead),
+         *receptor_notes(eyes.found), *after, *extent.notes(), *drift.notes(thirds)),
+        tuple(f"theta_{name}" for name in unknown), **_measured(eyes),
+        extent=extent, thirds=thirds)
+
+
+def _measured(eyes: Eyes) -> dict[str, Any]:
+    """The fields of a CameraEstimate that are not per pixel."""
+    found, dead = eyes.found, eyes.dead
+    sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
+    fields = {"sensor": dataclasses.replace(sensor, refractory_s=dead.seconds),
+              "sensor_std": {**std, "refractory_s": dead.std_s}}
+    return {**fields, "optics": found.optics} if found else fields
+
+
+def _without_hot(chunk: Chunk, hot: Array) -> Chunk:
+    return dataclasses.replace(chunk, bright=chunk.bright & ~hot[chunk.box])
+
+
+def _windows(stretches: Sequence[Stretch]) -> Iterator[Window]:
+    for stretch in stretches:
+        for number, pair in stretch.windows:
+            yield window_at(stretch.recording, pair, number)
+
+
+def _told(windows: Iterator[Window], advance: Advance) -> Iterator[Window]:
+    for window in windows:
+        yield window
+        advance()
+
+
+def thinned(state: State, chunks: int, read: int) -> State:
+    """The state with each second of its simulated stretches where there are as many as `chunks`,
+    and likewise of those whose quiet time is counted, `read`."""
+    return dataclasses.replace(
+        state, chunks=state.chunks[::2] if 1 < chunks <= len(state.chunks) else state.chunks,
+        read=state.read[::2] if len(state.read) >= read else state.read)

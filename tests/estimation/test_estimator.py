@@ -1,0 +1,186 @@
+"""A camera measured piece by piece, and the part of a long recording that is read."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from helpers.networks import hidden
+
+from evflow import CameraEstimator, Recording, estimate_camera
+from evflow.errors import EvflowDataError
+from evflow.estimation import drift, reading
+from evflow.estimation.refine import cut
+from evflow.estimation.state import Eyes, State, thinned
+from evflow.recordings.windows import plan_windows
+from evflow.types import Events
+
+
+def piece(recording: Recording, first: int, last: int) -> Recording:
+    """Frames first to last and the events between."""
+    times = recording.frame_times[first:last + 1]
+    return Recording(recording.events.slice(int(times[0]), int(times[-1]) + 1),
+                     recording.frames[first:last + 1], times)
+
+
+def test_one_piece_is_the_whole_to_the_byte_and_pieces_come_near() -> None:
+    recording, _ = hidden(3)
+    whole = estimate_camera(recording)
+    estimator = CameraEstimator()
+    assert estimator.add(recording) == whole.windows == 6
+    again = estimator.estimate()
+    for a, b in zip(jax.tree.leaves((whole.camera, whole.std, whole.summary, whole.summary_std)),
+                    jax.tree.leaves((again.camera, again.std, again.summary, again.summary_std)),
+                    strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert whole.extent.whole
+    assert whole.extent.read_s == pytest.approx(0.24)
+
+
+def test_what_cannot_be_added_leaves_what_was() -> None:
+    recording, _ = hidden(3)
+    estimator = CameraEstimator(refine="off")
+    with pytest.raises(EvflowDataError, match="EV017"):
+        estimator.estimate()
+    assert estimator.add(piece(recording, 0, 3)) == 3
+    silent = dataclasses.replace(
+        recording, events=Events(*(np.zeros(0, int),) * 4, recording.events.size))
+    assert estimator.add(silent) == 0  # the camera stopped
+    bare = Recording.of_events(recording.events)
+    small = Events(*(np.zeros(1, int),) * 4, (16, 16))
+    other = Recording(small, np.zeros((2, 16, 16), np.uint8), np.array([0, 40_000]))
+    for code, wrong in (("EV011", bare), ("EV015", other), ("EV020", recording.events)):
+        with pytest.raises(EvflowDataError, match=code):
+            estimator.add(wrong)
+    before = estimator.estimate()
+    assert before.windows == 3
+    assert estimator.add(piece(recording, 3, 6)) == 3
+    found = estimator.estimate()
+    assert found.windows == 6
+    assert found.summary_std.eta_on < before.summary_std.eta_on  # it shrinks as it reads
+    assert found.n_events.sum() > before.n_events.sum()
+
+
+def test_what_is_kept_does_not_grow() -> None:
+    state = State({}, Eyes(), chunks=tuple(range(8)), read=tuple(range(32)))
+    less = thinned(state, 8, 32)
+    assert less.chunks == (0, 2, 4, 6)
+    assert less.read == tuple(range(0, 32, 2))
+    assert thinned(state, 9, 33).chunks == state.chunks
+
+
+def film(seconds: float, size: tuple[int, int] = (32, 24), hz: int = 25) -> Recording:
+    """Events everywhere, most in the last of every five stretches."""
+    rng, n = np.random.default_rng(0), round(seconds * 4000)
+    t = np.sort(rng.integers(0, round(seconds * 1e6), n))
+    busy = (t // 320_000) % 5 == 4
+    t = t[busy | (rng.random(n) < 0.3)]
+    x, y = (rng.integers(0, s, len(t)) for s in size)
+    frames = np.arange(round(seconds * hz) + 1)
+    moving = (100 + 50 * (frames % 2)).astype(np.uint8)
+    return Recording(Events(x, y, t, rng.random(len(t)) < 0.5, size),
+                     np.broadcast_to(moving[:, None, None], (len(frames), *size[::-1])),
+                     frames * (1_000_000 // hz))
+
+
+@pytest.fixture
+def stretches() -> tuple:
+    recording = film(16.0)
+    pairs = tuple((i, i + 1) for i in range(400))
+    return cut(recording, dataclasses.replace(plan_windows(film(1.0)), pairs=pairs, skipped=()))
+
+
+def test_a_short_recording_is_read_whole_in_order(stretches: tuple) -> None:
+    for effort in reading.EFFORTS:
+        order = reading.ordered(stretches, effort)
+        assert order.numbers == tuple(range(50))
+        assert order.every == 1
+
+
+@pytest.mark.parametrize(("effort", "number"), [("quick", 6), ("normal", 20), ("full", 50)])
+def test_of_a_long_one_a_spread_and_lively_part(
+    stretches: tuple, monkeypatch: pytest.MonkeyPatch, effort: reading.Effort, number: int
+) -> None:
+    monkeypatch.setattr(reading, "UNIT", 8 * 24 * 32)  # as if it were a DAVIS346
+    monkeypatch.setattr(reading, "PART", (24, 32))
+    order = reading.ordered(stretches, effort)
+    assert len(order.numbers) == len(set(order.numbers)) == number
+    assert order.simulated <= set(order.numbers)
+    first = np.sort(order.numbers[:4])
+    assert effort == "full" or first[0] < 15 < 30 < first[-1]  # any beginning is spread
+    if effort == "quick":  # each of 8 stretches, in which one or two lively ones lie
+        assert np.mean([i % 5 == 4 for i in order.numbers]) > 0.8
+
+
+def test_longer_and_larger_recordings_get_a_little_more(stretches: tuple) -> None:
+    lengths = [8] * len(stretches)
+    one = reading._affordable(stretches, lengths, "quick")
+    recording = stretches[0].recording
+    hours = dataclasses.replace(recording, frame_times=recording.frame_times * 100)
+    slow = [dataclasses.replace(s, recording=hours) for s in stretches]
+    assert reading._affordable(slow, lengths, "quick") == pytest.approx(2 * one, abs=1)
+
+
+def test_the_gain_of_reading_more() -> None:
+    def history(floor: float) -> list[tuple[int, float]]:
+        return [(n, floor + 1.0 / n) for n in (4, 8, 16)]
+
+    assert reading.gain(history(0.0)) == pytest.approx(1 - np.sqrt(0.5))
+    assert reading.gain(history(100.0)) < 0.001
+    assert np.isnan(reading.gain(history(0.0)[:1]))
+
+
+def parts(theta: np.ndarray, scatter: float = 0.02) -> list[drift.Part]:
+    """A stretch a second with thresholds theta (N, 2)."""
+    noise = np.random.default_rng(1).normal(0, scatter, theta.shape)
+    return [drift.Part(i * 1_000_000, t) for i, t in enumerate(theta * np.exp(noise))]
+
+
+def test_a_camera_that_stays_the_same_has_three_like_thirds() -> None:
+    found = drift.thirds(parts(np.full((18, 2), 0.2)))
+    assert [t.stretches for t in found] == [6, 6, 6]
+    assert drift.changed(found) == []
+    assert drift.notes(found) == []
+    assert found[1].theta_on == pytest.approx(0.2, abs=3 * found[1].std_on)
+    assert drift.thirds(parts(np.full((8, 2), 0.2))) == ()
+
+
+def test_a_threshold_that_changes_is_noted() -> None:
+    theta = np.full((18, 2), 0.2)
+    theta[12:, 1] *= 1.15
+    found = drift.thirds(parts(theta))
+    assert drift.changed(found) == ["off"]
+    note, = drift.notes(found)
+    assert note.code == "theta_off.drift"
+    gradual = theta.copy()
+    gradual[:, 0] *= np.linspace(1, 1.2, 18)
+    assert "on" in drift.changed(drift.thirds(parts(gradual)))
+    assert drift.changed(drift.thirds(parts(theta, scatter=0.2))) == []
+
+
+def test_a_stretch_s_regression_is_that_of_its_pixels_together() -> None:
+    on, off = np.random.default_rng(0).integers(1, 9, (2, 200)).astype(float)
+    value = 0.3 * on - 0.2 * off
+    sums = [on * on, on * -off, off * off, on * value, -off * value, value * value, 3 + 0 * on]
+    told = drift.part((0, 10), SimpleNamespace(equations=np.stack(sums).reshape(7, 10, 20)))
+    np.testing.assert_allclose(told.theta, [0.3, 0.2])
+    few = SimpleNamespace(equations=np.stack(sums).reshape(7, 10, 20) * 0.1)
+    assert np.isnan(drift.part((0, 10), few).theta).all()
+
+
+def test_until_ends_reading_and_nothing_is_lost() -> None:
+    recording, _ = hidden(14, 1200)
+    told = []
+
+    def enough(summary, std) -> bool:
+        told.append(float(std.eta_on))
+        return len(told) == 2
+
+    found = estimate_camera(recording, refine="off", until=enough)
+    assert len(told) == found.extent.stretches == 2
+    assert found.extent.of == 4
+    assert "reading.ended" in [note.code for note in found.notes]
+    assert found.windows == 16
