@@ -62,7 +62,8 @@ def test_every_code_in_the_table_is_used() -> None:
              for node in ast.walk(ast.parse(path.read_text()))
              if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     made = {f"theta_{side}.{end}" for side in ("on", "off")
-            for end in ("extrapolated", "uncertain", "undetermined") if f".{end}" in words}
+            for end in ("drift", "extrapolated", "uncertain", "undetermined")
+            if f".{end}" in words}
     made |= {f"pixels.{kind}" for kind in ("hot", "dead") if {"pixels.", kind} <= words}
     assert set(NOTES) <= words | made
 

@@ -25,6 +25,7 @@ MOST_LARGER = 2.0  # of larger sensors too: their pixels are known from fewer ev
 CELL, SAMPLE = 16, 16  # pixels; every 16th event is counted to choose
 SATURATED = 4.0  # events of a pixel, beyond which more say little
 BATCH = 4  # stretches between two looks at the errors
+SIMULATED = 5  # stretches, of many: what they leave of the camera's error is the model's own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Budget:
     enough: float
 
 
-BUDGETS = {"quick": Budget(6, 0.1), "normal": Budget(20, 0.05)}
+BUDGETS = {"quick": Budget(6, 0.1), "normal": Budget(18, 0.03)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +61,7 @@ def ordered(stretches: Sequence[Stretch], effort: Effort) -> Order:
         return Order(tuple(range(len(stretches))), frozenset(simulated))
     chosen = _chosen(stretches, number)
     longest = max(len(stretches[i].run) for i in chosen)
-    simulated = [i for i in chosen if len(stretches[i].run) == longest][:most]
+    simulated = [i for i in chosen if len(stretches[i].run) == longest][:min(most, SIMULATED)]
     return Order(tuple(chosen), frozenset(simulated), every=2)
 
 

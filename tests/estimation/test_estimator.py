@@ -100,7 +100,7 @@ def test_a_short_recording_is_read_whole_in_order(stretches: tuple) -> None:
         assert order.every == 1
 
 
-@pytest.mark.parametrize(("effort", "number"), [("quick", 6), ("normal", 20), ("full", 50)])
+@pytest.mark.parametrize(("effort", "number"), [("quick", 6), ("normal", 18), ("full", 50)])
 def test_of_a_long_one_a_spread_and_lively_part(
     stretches: tuple, monkeypatch: pytest.MonkeyPatch, effort: reading.Effort, number: int
 ) -> None:
