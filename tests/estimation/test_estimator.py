@@ -14,6 +14,7 @@ from evflow import CameraEstimator, Recording, estimate_camera
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
 from evflow.estimation.refine import cut
+from evflow.estimation.refine import stretches as cutting
 from evflow.estimation.state import Eyes, State, thinned
 from evflow.recordings.windows import plan_windows
 from evflow.types import Events
@@ -171,8 +172,9 @@ def test_a_stretch_s_regression_is_that_of_its_pixels_together() -> None:
     assert np.isnan(drift.part((0, 10), few).theta).all()
 
 
-def test_until_ends_reading_and_nothing_is_lost() -> None:
-    recording, _ = hidden(14, 1200)
+def test_until_ends_reading_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, _ = hidden(3)
+    monkeypatch.setattr(cutting, "INTERVALS", 2)
     told = []
 
     def enough(summary, std) -> bool:
@@ -181,6 +183,6 @@ def test_until_ends_reading_and_nothing_is_lost() -> None:
 
     found = estimate_camera(recording, refine="off", until=enough)
     assert len(told) == found.extent.stretches == 2
-    assert found.extent.of == 4
+    assert found.extent.of == 3
     assert "reading.ended" in [note.code for note in found.notes]
-    assert found.windows == 16
+    assert found.windows == 4
