@@ -31,6 +31,9 @@ class Render(Reading):
     """Pictures per second of the film (.mp4, .gif)."""
     window_ms: float = 33.0
     """How long a picture gathers events."""
+    window_events: Annotated[int | None, value("N")] = None
+    """Instead, how many events a picture gathers: a film shows so many after each other, --fps
+    times a second."""
     slow: float = 1.0
     """How many times slower than life (.mp4, .gif)."""
     over_frames: bool = False
@@ -52,7 +55,10 @@ class Render(Reading):
 
         check_finite(self)
         film = Film(fps=self.fps, window_us=round(1000 * self.window_ms), slow=self.slow,
-                    over_frames=self.over_frames, scale=self.scale, codec=self.codec)
+                    over_frames=self.over_frames, scale=self.scale, codec=self.codec,
+                    window_events=self.window_events)
+        if self.window_events is not None:
+            refuse(self, ("window_ms", "slow"), "the pictures go by --window-events")
         film.check_target(self.out, overwrite=self.overwrite)
         need_absent(self.out, self.overwrite, self.recording, self.frames,
                     self.timestamps)

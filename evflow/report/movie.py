@@ -6,6 +6,7 @@ Needs OpenCV and Pillow alone.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import os
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from evflow.files.atomic import atomic_write
 from evflow.report.plots import event_image
 from evflow.report.resimulate import busiest_instant
 from evflow.report.video import CODECS, FPS, SCALES, Codec, check_within, enlarged, write_video
-from evflow.types import Recording
+from evflow.types import Events, Recording
 
 SUFFIXES = (".mp4", ".gif", ".png")
 GAP = 8  # pixels between the pictures of a sheet
@@ -29,7 +30,8 @@ GAP = 8  # pixels between the pictures of a sheet
 @dataclasses.dataclass(frozen=True)
 class Film:
     """How events become pictures. fps: pictures per second; window_us: how long one gathers
-    events; slow: times slower than life; over_frames: on the frames nearest in time; scale:
+    events; window_events: instead, of how many events one is, the next of those that follow;
+    slow: times slower than life; over_frames: on the frames nearest in time; scale:
     screen pixels per pixel, None for as many as make it 640 wide;
     codec: of .mp4, "mpeg4" (players) or "vp9" (browsers too; some 50 times slower). Raises
     EV020."""
@@ -40,10 +42,11 @@ class Film:
     over_frames: bool = False
     scale: int | None = None
     codec: Codec = "mpeg4"
+    window_events: int | None = None
 
     def __post_init__(self) -> None:
         for name, bounds in (("fps", FPS), ("window_us", (1, 10**9)), ("slow", (1e-3, 1e6)),
-                             ("scale", SCALES)):
+                             ("scale", SCALES), ("window_events", (1, 10**9))):
             check_within(bounds, name, getattr(self, name))
         if self.codec not in CODECS:
             raise EvflowDataError("EV020", f"codec={self.codec!r}.", f"Choose {CODECS}.")
@@ -74,7 +77,7 @@ def write_film(
     path = Path(path)
     film.check_target(path, overwrite=overwrite)
     _check(recording, film)
-    count = max(1, math.ceil(recording.events.duration_us / film.step_us))
+    count = len(_windows(recording, film))
     return write_video(path, _pictures(recording, film, count, progress), count, fps=film.fps,
                        codec=film.codec, overwrite=overwrite)
 
@@ -98,8 +101,11 @@ def write_sheet(
             raise EvflowDataError("EV020", f"at={at_s} s.", "The recording covers 0 to "
                                   f"{events.duration_us / 1e6:.3f} s from its first event.")
         begin = span[0] + round(1e6 * at_s) - film.window_us // 2
-    middle = begin + film.window_us // 2
-    shown = event_image(events, begin, begin + film.window_us)
+    end = begin + film.window_us
+    if film.window_events is not None:
+        begin, end = _around(events, begin + film.window_us // 2, film.window_events)
+    middle = (begin + end) // 2
+    shown = event_image(events, begin, end)
     parts = [shown]
     if recording.has_frames:
         frame = _frame(recording, middle, _white(recording))
@@ -109,8 +115,8 @@ def write_sheet(
     sheet = np.concatenate([piece for part in parts for piece in (part, gap)][:-1], 1)
     with atomic_write(path, overwrite=overwrite) as temporary:
         Image.fromarray(sheet).save(temporary, "png", optimize=True)
-    inside = len(events.slice(begin, begin + film.window_us))
-    return (f"{inside:,} events of {film.window_us / 1e3:g} ms around "
+    inside = len(events.slice(begin, end))
+    return (f"{inside:,} events of {(end - begin) / 1e3:g} ms around "
             f"{(middle - span[0]) / 1e6:.3f} s")
 
 
@@ -125,17 +131,34 @@ def _pictures(
     recording: Recording, film: Film, count: int, progress: Progress | None
 ) -> Iterator[np.ndarray]:
     """(H, W, 3) uint8 RGB, one after the other."""
-    start = int(recording.events.t[0])
     white = _white(recording) if film.over_frames else 1.0
-    for i in range(count):
-        middle = start + round((i + 0.5) * film.step_us)
-        begin = middle - film.window_us // 2
-        shown = event_image(recording.events, begin, begin + film.window_us)
+    for i, (begin, end) in enumerate(_windows(recording, film)):
+        shown = event_image(recording.events, begin, end)
         if film.over_frames:
-            shown = _over(_frame(recording, middle, white), shown)
+            shown = _over(_frame(recording, (begin + end) // 2, white), shown)
         yield enlarged(shown, film.scale)
         if progress:
             progress(i + 1, count)
+
+
+def _windows(recording: Recording, film: Film) -> list[tuple[int, int]]:
+    """Begin and end in us of what each picture gathers: the time around evenly spaced instants, or
+    so many events after each other (and those at the same microsecond as the last)."""
+    t = recording.events.t
+    if film.window_events is None:
+        count = max(1, math.ceil(recording.events.duration_us / film.step_us))
+        middles = [int(t[0]) + round((i + 0.5) * film.step_us) for i in range(count)]
+        return [(m - film.window_us // 2, m - film.window_us // 2 + film.window_us)
+                for m in middles]
+    edges = [*t[:: film.window_events].tolist(), int(t[-1]) + 1]
+    return [(a, b) for a, b in itertools.pairwise(edges) if b > a]
+
+
+def _around(events: Events, at_us: int, count: int) -> tuple[int, int]:
+    """Begin and end in us of `count` events around an instant."""
+    middle = int(np.searchsorted(events.t, at_us))
+    first = max(0, min(middle - count // 2, len(events) - count))
+    return int(events.t[first]), int(events.t[min(first + count, len(events)) - 1]) + 1
 
 
 def _white(recording: Recording) -> float:

@@ -61,6 +61,23 @@ def test_a_film_shows_events_when_they_come(tmp_path: Path, name: str, codec: st
     assert last[top].min() > 235
 
 
+def test_pictures_of_so_many_events(tmp_path: Path) -> None:
+    """40 of 200 each: five pictures, of which the middle one turns from ON to OFF."""
+    film = Film(fps=5.0, scale=4, window_events=40)
+    assert "5 pictures, 1.0 s" in write_film(tmp_path / "a.mp4", two_corners(), film)
+    shown = [picture.astype(int) for picture in pictures(tmp_path / "a.mp4")]
+    on = [bool(picture[8:12, 12:16].min() < 200) for picture in shown]
+    off = [bool(picture[160:164, 240:244].min() < 200) for picture in shown]
+    assert on == [True, True, True, False, False]
+    assert off == [False, False, True, True, True]
+    for at_s, count in ((0.05, 40), (0.0, 40), (0.199, 40), (None, 1000)):
+        said = write_sheet(tmp_path / "a.png", two_corners(), Film(window_events=count),
+                           at_s=at_s, overwrite=True)
+        assert said.startswith(f"{min(count, 200)} events")
+    command = ["render", "x", "-o", str(tmp_path / "b.mp4"), "--window-events", "10"]
+    assert main([*command, "--slow", "2"]) == 2
+
+
 def test_events_over_frames(tmp_path: Path) -> None:
     path = tmp_path / "over.gif"
     write_film(path, two_corners(), Film(window_us=10_000, over_frames=True, scale=2))
