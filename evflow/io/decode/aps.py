@@ -8,7 +8,6 @@ frame begins where the resets go back to the first column.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -36,8 +35,7 @@ class Aps:
         self._clear()
 
     def _clear(self) -> None:
-        self.values = np.full((2, *self.size[::-1]), NONE, np.int16)
-        self.seen: list[_Reads] = [_Reads(), _Reads()]
+        self.reads: list[_Reads] = [_Reads(), _Reads()]
 
     def add(
         self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
@@ -74,23 +72,28 @@ class Aps:
     def _put(
         self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
     ) -> None:
-        for which in (RESET, SIGNAL):
+        for which, reads in enumerate(self.reads):
             of = np.flatnonzero(kind == which)
             if len(of):
-                self.values[which, y[of], x[of]] = value[of]
-                self.seen[which].add(t[of])
-        if min(reads.count for reads in self.seen) >= self.size[0] * self.size[1]:
+                reads.add(x[of], y[of], t[of], value[of])
+        counts = [reads.count for reads in self.reads]
+        pixels = self.size[0] * self.size[1]
+        if min(counts) >= pixels or max(counts) > 2 * pixels:  # complete, or without a beginning
             self.finish()
 
     def finish(self) -> None:
         """What was read since the last frame is one, if it is complete: at the end of the file."""
-        read = self.values >= 0
-        if read.all():
-            light = self.values[RESET].astype(np.int32) - self.values[SIGNAL]
+        counts = [reads.count for reads in self.reads]
+        complete = min(counts) >= self.size[0] * self.size[1]
+        if complete:
+            reset, signal = (reads.image(self.size) for reads in self.reads)
+            complete = min(int(reset.min()), int(signal.min())) > NONE
+        if complete:
+            light = reset - signal
             self.dark += int((light < 0).sum())
             frame = np.maximum(light, 0).astype(np.float32) * np.float32(255 / WHITE)
-            self.done(frame, _middle(*self.seen))
-        elif read.any():
+            self.done(frame, _middle(*self.reads))
+        elif max(counts):
             self.incomplete += 1
         self._clear()
 
@@ -108,20 +111,26 @@ class Aps:
         return tuple(said)
 
 
-@dataclasses.dataclass
 class _Reads:
-    """When the samples of one kind were read, us."""
+    """Samples of one kind, and when they were read, us."""
 
-    first: int = 0
-    last: int = 0
-    total: int = 0
-    count: int = 0
+    def __init__(self) -> None:
+        self.first = self.last = self.total = self.count = 0
+        self.parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def add(self, t: np.ndarray) -> None:
+    def add(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray) -> None:
         self.first = self.first if self.count else int(t[0])
         self.last = int(t[-1])
         self.total += int(t.sum())
         self.count += len(t)
+        self.parts.append((x, y, value))
+
+    def image(self, size: Size) -> np.ndarray:
+        """The values (H, W) int32, `NONE` where there is none."""
+        out = np.full(size[::-1], NONE, np.int32)
+        for x, y, value in self.parts:
+            out[y, x] = value
+        return out
 
 
 def _middle(resets: _Reads, signals: _Reads) -> int:

@@ -155,3 +155,18 @@ def test_aedat1_of_a_dvs128(tmp_path: Path) -> None:
     assert listed(read_events(path)) == [(117, 107, 5, 1), (116, 106, 9, 0)]
     path.write_bytes(b"#!AER-DAT1.0\r\n# AEChip: a.Cochlea\r\n")
     assert refused(path).code == "EV008"
+
+
+def test_samples_that_make_no_frame_cost_little(tmp_path: Path) -> None:
+    """Columns in any order, so that thousands of frames begin; and signals without a reset."""
+    rng = np.random.default_rng(0)
+    n = 8_000
+    address = (1 << 31 | rng.integers(0, 36, n) << 22 | rng.integers(0, 48, n) << 12
+               | rng.integers(0, 2, n) << 10)
+    words = [(EVENT, 0), *zip(address.tolist(), range(n), strict=True)]
+    found = read_recording(davis(tmp_path, words), size=SMALL)
+    assert not found.has_frames
+    signals = [(word | 1 << 10, t) for word, t in words[1:]]
+    found = read_recording(davis(tmp_path, [(EVENT, 0), *signals]), size=SMALL)
+    assert not found.has_frames
+    assert [note.code for note in found.notes] == ["frames.unused"]
