@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import codecs
 import itertools
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -34,6 +35,7 @@ EXTENSIONS: tuple[str, ...] = (".csv", ".txt", ".tsv", ".dat", ".log")
 
 COMMAS = str.maketrans(",;", "  ")
 MOST = 12  # columns of a header
+TOOL = re.compile(r"^geometry:|@\d", re.MULTILINE)  # by headers of OpenEB and faery: us
 
 
 class Layout(NamedTuple):
@@ -100,14 +102,16 @@ def layout(head: bytes) -> Layout | None:
         raise EvflowDataError(
             "EV008", f"its header is {told[:80]!r}: which columns are t, x, y and p?",
             "Name four columns t, x, y, p (timestamp, polarity, row, col are known too).")
-    return _laid_out(headers, rows, bool(told), begin, columns.written_size(said))
+    default = Layout("", "whole" if TOOL.search(said) else "auto", begin,
+                     columns.written_size(said))
+    return _laid_out(headers, rows, bool(told), default)
 
 
 def _laid_out(
-    headers: list[str], rows: list[list[float]], told: bool, begin: int, size: Size | None
+    headers: list[str], rows: list[list[float]], told: bool, default: Layout
 ) -> Layout | None:
     """The layout by the last header that fits the rows, else by the rows; told: no comment names
-    the columns, but a line of their own."""
+    the columns, but a line of their own; default: what the header says of the rest."""
     for words in reversed(headers):
         order = _order(words)
         if rows and len(rows[0]) == len(order) + 1 and _counts([row[0] for row in rows]):
@@ -118,17 +122,18 @@ def _laid_out(
         left = [name for name in _fields(words) if name not in named]
         notes = (Note("events.unread", f"columns {', '.join(left)} were not read"),) if left else ()
         unit = written_unit(words)
-        return Layout(order, unit if unit != "auto" else _whole(order, size), begin, size, notes)
+        return default._replace(order=order, notes=notes, unit=unit if unit != "auto" else
+                                _unit(order, default))
     order = columns.order_of(np.array(rows)) if rows and len(rows[0]) == 4 and not told else ""
     if not order:
         return None
-    notes = () if order == "txyp" or size else (columns.inferred(order),)
-    return Layout(order, _whole(order, size), begin, size, notes)
+    notes = () if order in columns.KNOWN else (columns.inferred(order),)
+    return default._replace(order=order, notes=notes, unit=_unit(order, default))
 
 
-def _whole(order: str, size: Size | None) -> str:
-    """How times without a unit are read: a tool that writes the size writes microseconds."""
-    return "whole" if order == columns.PROPHESEE or size else "auto"
+def _unit(order: str, default: Layout) -> str:
+    """How times without a unit are read."""
+    return "whole" if order == columns.PROPHESEE else default.unit
 
 
 def _decoded(line: bytes) -> str:

@@ -160,7 +160,8 @@ SIZED = {  # text that tells its size, in microseconds
         US, order="xypt", comma=","),
     "openeb-comment": "# geometry 64x48\n" + rows(US, order="xypt", comma=","),
     "faery": "t,x@64,y@48,on\n" + rows(US, comma=","),
-    "sides": "# width: 64, height: 48\nt,x,y,p\n" + rows(US, comma=","),
+    "sides": "# width: 64, height: 48\nt_us,x,y,p\n" + rows(US, comma=","),
+    "seconds": "%geometry:64,48\nx,y,p,t\n" + rows(SECONDS, order="xypt", comma=","),
     "fifth": "%geometry:64,48\nt,x,y,p,label\n" + rows(US, comma=",").replace("\n", ",7\n"),
     "true": "t,x@64,y@48,on\n" + rows(US, comma=",").replace(",0\n", ",false\n").replace(
         ",1\n", ",true\n"),
@@ -179,9 +180,17 @@ def test_text_that_tells_its_size(tmp_path: Path, kind: str) -> None:
     found = read_recording(path)
     equal(found.events, Events([3 + i for i in range(12)], [20 - i for i in range(12)], US[:12],
                                [i % 2 for i in range(12)], (64, 48)))
-    assert [note.text for note in found.notes] == (
-        ["columns label were not read"] if kind == "fifth" else [])
+    said = {"fifth": "events.unread", "xytp": "events.layout", "tpxy": "events.layout",
+            "pxyt": "events.layout"}
+    assert [note.code for note in found.notes] == ([said[kind]] if kind in said else [])
     assert refused(path, size=(9, 48)).code == "EV005"
+
+
+def test_a_size_alone_tells_no_unit(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("# resolution 64x48\n" + rows(US))
+    assert (refused(path).code, "--time-unit" in refused(path).fix) == ("EV003", True)
+    assert read_events(path, time_unit="us").size == (64, 48)
 
 
 @pytest.mark.parametrize("order", ["xytp", "tpxy", "pxyt"])

@@ -79,3 +79,23 @@ def test_truncated_blocks_never_pass() -> None:
         for end in range(len(data)):
             with pytest.raises(ValueError, match=r"bytes|runs|events"):
                 ecf.decode(data[:end])
+
+
+def test_filters_and_fields_that_are_not_known(tmp_path: Path) -> None:
+    """ECF on something else than events, and events without a time."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as f:
+        group = f.create_group("events")
+        for name in "ytp":
+            group[name] = np.arange(5)
+        made = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        made.set_chunk((5,))
+        made.set_filter(ecf.FILTER, h5py.h5z.FLAG_OPTIONAL)
+        h5py.h5d.create(group.id, b"x", h5py.h5t.NATIVE_UINT16, h5py.h5s.create_simple((5,)), made)
+    error = refused(path, size=(64, 48))
+    assert (error.code, "filter 36559" in error.seen, "h5repack" in error.fix) == (
+        "EV010", True, True)
+    with h5py.File(path, "w") as f:
+        f["CD/events"] = np.zeros(4, [("x", "u2"), ("y", "u2"), ("p", "i2")])
+    error = refused(path, size=(64, 48))
+    assert (error.code, "('x', 'y', 'p')" in error.seen) == ("EV008", True)
