@@ -11,7 +11,6 @@ fitted to all recordings.
 from __future__ import annotations
 
 import dataclasses
-import zipfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,19 +22,17 @@ import optax
 import tyro
 
 from evflow.commands.writing import need_absent, need_suffix
-from evflow.errors import EvflowDataError
 from evflow.estimation.refine import fused, refine_summary
 from evflow.estimation.refine.fit import FusionNet
-from evflow.files.atomic import atomic_write
 from evflow.network.coordinates import squash, unsquash_summary
 from evflow.network.weights import model_card, save_weights, weights_hash
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, estimator, run_script
-from experiments.shared.many import Setup, scores
+from experiments.shared.many import Setup
 from experiments.shared.refinement import COVERED, before_refinement
+from experiments.shared.rows import Rows, collected
 
 Array = jax.Array
-Rows = dict[str, np.ndarray]
 
 FOLDS = 5
 JITTER, DEGREES = 0.5, 30.0  # in standard deviations; of Student's t
@@ -69,47 +66,6 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarra
             "network": np.asarray(unsquash_summary(start[1])),
             "true": np.asarray(unsquash_summary(hidden.nominal)),
             "signal": hidden.signal_events()}
-
-
-def collect(options: Options) -> Rows:
-    """Rows of all recordings, stacked; saved now and then where asked for."""
-    found: list[dict[str, np.ndarray]] = []
-    begin, origin = 0, f"{options.seed} {weights_hash(options.weights)}"
-    if options.rows and options.rows.exists():
-        begin, found = saved_rows(options.rows, origin, options.recordings)
-    setup = Setup(str(options.weights), options.seed, photos=True)
-    jobs = [(i, draw_protocol(np.random.default_rng((options.seed, i))))
-            for i in range(begin, options.recordings)]
-    for i, made in enumerate(scores(row, setup, jobs, options.workers, "recordings"), begin + 1):
-        if made is not None:
-            found.append(made)
-        if options.rows and (i % 50 == 0 or i == options.recordings):
-            with atomic_write(options.rows, overwrite=True) as t, open(t, "wb") as f:
-                np.savez(f, allow_pickle=False, next=i, origin=origin, **stack(found))
-    return stack(found)
-
-
-def saved_rows(path: Path, origin: str, most: int) -> tuple[int, list[dict[str, np.ndarray]]]:
-    """How many recordings are done, and their rows. Raises EV009 where the file holds none, EV013
-    where they are of other weights or another seed, or of more recordings than `most`."""
-    try:
-        with open(path, "rb") as file, np.load(file) as saved:
-            kept = dict(saved)
-        begin, seen = int(kept.pop("next")), str(kept.pop("origin"))
-    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as e:
-        raise EvflowDataError("EV009", f"{path} holds no rows of this script ({e}).",
-                              "Choose another --rows.") from e
-    if seen != origin:
-        raise EvflowDataError("EV013", f"{path} holds rows of other weights or of another seed.",
-                              "Choose another --rows.")
-    if begin > most:
-        raise EvflowDataError("EV013", f"{path} holds rows of {begin} recordings, not {most}.",
-                              f"Pass --recordings {begin}, or choose another --rows.")
-    return begin, [dict(zip(kept, r, strict=True)) for r in zip(*kept.values(), strict=True)]
-
-
-def stack(rows: list[dict[str, np.ndarray]]) -> Rows:
-    return {k: np.stack([r[k] for r in rows]) for k in rows[0]}
 
 
 def fit(rows: Rows, options: Options) -> dict[str, Any]:
@@ -186,7 +142,11 @@ def main(options: Options) -> dict[str, Any]:
     need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights)
-    rows = collect(options)
+    protocols = [draw_protocol(np.random.default_rng((options.seed, i)))
+                 for i in range(options.recordings)]
+    setup = Setup(str(options.weights), options.seed, photos=True)
+    origin = f"{options.seed} {weights_hash(options.weights)}"
+    rows = collected(row, setup, protocols, options.workers, options.rows, origin)
     y, std = cross_validated(rows, options)
     widen = np.quantile(np.abs(y - rows["true"]) / std, COVERED, axis=0)
     figures = figures_of(rows, y, std * widen)

@@ -97,6 +97,18 @@ def estimate_camera(
     return found
 
 
+def read_whole(recording: Recording, params: api.Params) -> State:
+    """All of a recording with frames that can be used. Raises EV017 where there is none."""
+    plan = plan_windows(recording)
+    iter_windows(recording, plan=plan)
+    stretches = cut(recording, plan)
+    state = State(params, looked_through(stretches, measured=True))
+    simulated = ordered(stretches, "full").simulated
+    for i, stretch in enumerate(stretches):
+        state = add(state, stretch, simulate=i in simulated)
+    return state
+
+
 def check_options(**options: tuple[str, Sequence[str]]) -> None:
     """EV020 for a value that is none of those known."""
     for name, (value, known) in options.items():

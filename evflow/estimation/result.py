@@ -15,6 +15,7 @@ from evflow.camera.optics import Optics, as_arrays
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.drift import Third
 from evflow.estimation.extent import EVERYTHING, Extent
+from evflow.estimation.refine.receptor_search import Found
 from evflow.notes import Note, as_dicts
 
 THRESHOLDS = ("theta_on", "theta_off")  # of whose measurement `undetermined` speaks
@@ -42,6 +43,8 @@ class CameraEstimate:
             is too fast to be seen; refractory_s, 0 where too few pixels change that fast.
         sensor_std: its standard deviations by field, NaN where nothing was measured.
         optics: what the frames show beside what the pixels saw.
+        receptor: how both were found: the search for the photoreceptor and what it explains; None
+            where nothing was looked for.
         extent: how much of the recording was read, and what more would bring.
         thirds: thresholds of the three thirds of the recording, where it is long enough to tell:
             whether the camera stayed the same.
@@ -61,6 +64,7 @@ class CameraEstimate:
     sensor: SensorModel = SensorModel(noise_resets_memory=True)
     sensor_std: Mapping[str, float] = dataclasses.field(default_factory=dict)
     optics: Optics = Optics()
+    receptor: Found | None = None
     extent: Extent = EVERYTHING
     thirds: tuple[Third, ...] = ()
 

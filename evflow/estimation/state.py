@@ -31,6 +31,7 @@ from evflow.estimation.refine import (
     make_chunk,
     simulated_part,
 )
+from evflow.estimation.refine.correction import corrected, signs
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.remarks import camera_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
@@ -143,6 +144,35 @@ def glance(state: State) -> tuple[Summary, Summary]:
     return summary, std
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refined:
+    """hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera, before the last
+    correction; signs: what that goes by, None where the path tells nothing or was not asked."""
+
+    hot: Array
+    chunks: tuple[Chunk, ...]
+    summary: Summary
+    std: Summary
+    signs: Array | None = None
+
+
+def refine(state: State) -> Refined:
+    """The camera's summary by simulation and regression, where there is a path between frames."""
+    summary, std = glance(state)
+    hot = np.zeros(np.shape(state.n_events), bool)
+    if state.evidence is None or state.quiet is None:
+        return Refined(hot, state.chunks, summary, std)
+    found = state.eyes.found
+    hot = hot_pixels(state.quiet, float(summary.eta_on + summary.eta_off))
+    chunks = tuple(_without_hot(c, hot) for c in state.chunks)
+    summary, std = maps.refined(state.params, list(chunks), summary, std)
+    if found is None:
+        return Refined(hot, chunks, summary, std)
+    if not state.eyes.seen_by.ideal:
+        std = maps.widened(summary, std, found)
+    return Refined(hot, chunks, summary, std, signs(found, state.eyes.noise_dn, summary, std))
+
+
 def estimate(
     state: State, *, extent: Extent | None = None, before: Sequence[Note] = (),
     after: Sequence[Note] = (), advance: Advance = lambda: None,
@@ -153,17 +183,13 @@ def estimate(
     need_shown(state.n_events, state.n_shown)
     eyes, stats = state.eyes, state.stats
     n_events = state.n_events.astype(np.uint32)
-    summary, std = glance(state)
-    hot, chunks = np.zeros(n_events.shape, bool), list(state.chunks)
-    if state.evidence is not None and state.quiet is not None:
-        hot = hot_pixels(state.quiet, float(summary.eta_on + summary.eta_off))
-        chunks = [_without_hot(c, hot) for c in chunks]
-        summary, std = maps.refined(state.params, chunks, summary, std)
-        if eyes.found is not None and not eyes.seen_by.ideal:
-            std = maps.widened(summary, std, eyes.found)
-    unknown = untold(stats, summary)
-    if unknown:
-        summary, std = without(unknown, chunks, summary, std)
+    refined = refine(state)
+    hot, summary, std = refined.hot, refined.summary, refined.std
+    correction = next(iter(state.params.values())).get("correction")
+    if unknown := untold(stats, summary):
+        summary, std = without(unknown, list(refined.chunks), summary, std)
+    elif correction is not None and refined.signs is not None:
+        summary, std = corrected(correction, refined.signs, summary, std)
     quiet = quiet_times(_told(_windows(state.read), advance), summary, hot, eyes.seen_by)
     if state.evidence is not None:
         camera, error = maps.by_regression(state.evidence, summary, std)
@@ -189,7 +215,7 @@ def _measured(eyes: Eyes) -> dict[str, Any]:
     sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
     fields = {"sensor": dataclasses.replace(sensor, refractory_s=dead.seconds),
               "sensor_std": {**std, "refractory_s": dead.std_s}}
-    return {**fields, "optics": found.optics} if found else fields
+    return {**fields, "optics": found.optics, "receptor": found} if found else fields
 
 
 def _without_hot(chunk: Chunk, hot: Array) -> Chunk:

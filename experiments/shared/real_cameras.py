@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
+
+import numpy as np
 
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SENSORS, SensorModel
@@ -28,3 +31,28 @@ CHANGES: dict[str, dict[str, Any]] = {
     "v2e's noisy": {"model": SENSORS["noisy"].model},
     "as a real camera": {"model": REAL, "exposure_ms": 10, "frame_noise_dn": 2.0, "black_dn": 4.0},
 }
+
+
+def draw_real(rng: np.random.Generator) -> Protocol:
+    """A camera as it may be: a quarter are ideal, of the others each part is absent in some."""
+    mismatch = float(np.exp(rng.uniform(np.log(0.02), np.log(0.15))))
+    protocol = dataclasses.replace(
+        BASE, prior=CameraPrior(theta=(0.1, 0.5), mismatch=(mismatch, mismatch)),
+        frame_ms=int(rng.choice((20, 25, 33, 40))), intervals=int(rng.choice((8, 16, 24))),
+        shape=(96, 128), frame_noise_dn=0.5)
+    if rng.random() < 0.25:
+        return protocol
+
+    def some(share: float, low: float, high: float) -> float:
+        """0, or log-uniform."""
+        drawn = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        return drawn if rng.random() < share else 0.0
+
+    sensor = SensorModel(
+        cutoff_hz=some(0.7, 25.0, 600.0), refractory_s=some(0.5, 1e-4, 4e-3),
+        leak_hz=some(0.5, 0.02, 0.3), shot_hz=some(0.5, 0.1, 5.0), noise_resets_memory=True)
+    black, dark = float(rng.uniform(-8.0, 20.0)), some(0.4, 3.0, 40.0)
+    return dataclasses.replace(
+        protocol, model=sensor, exposure_ms=int(some(0.6, 3.0, 20.0)),
+        frame_noise_dn=0.5 + some(0.5, 0.3, 2.5), dark_dn=dark,
+        black_dn=black if rng.random() < 0.5 else 0.0)

@@ -6,11 +6,22 @@ from typing import Any
 
 from evflow import Recording, finish
 from evflow.camera import Summary
+from evflow.estimation.pipeline import read_whole
 from evflow.estimation.pooled import pool_recording
 from evflow.estimation.refine import Chunk, refinement_chunks
+from evflow.estimation.state import refine
 from evflow.recordings.windows import plan_windows
 
 COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier than a Gaussian's
+
+
+def uncorrected(params: Any, recording: Recording) -> tuple[Any, Summary, Summary] | None:
+    """The signs of the last correction, and the summary and its std without it; None where too
+    little happens."""
+    if len(recording.events) < 1000:
+        return None
+    refined = refine(read_whole(recording, params))
+    return None if refined.signs is None else (refined.signs, refined.summary, refined.std)
 
 
 def before_refinement(

@@ -19,6 +19,7 @@ from experiments import (
     changes,
     combine,
     compare_systems,
+    correct,
     coverage,
     curves,
     evaluate,
@@ -33,8 +34,9 @@ from experiments import (
     tell_apart,
 )
 from experiments.shared.common import begin, estimator, write_result
+from experiments.shared.rows import saved_rows
 
-FITS: list[Any] = [calibrate, fuse, tell_apart]
+FITS: list[Any] = [calibrate, correct, fuse, tell_apart]
 
 
 @pytest.mark.parametrize(("script", "option"), [
@@ -118,13 +120,13 @@ def test_rows_are_those_of_this_command(tmp_path: Path) -> None:
     for damaged in (b"no rows", b"PK\x03\x04 cut"):
         path.write_bytes(damaged)
         with pytest.raises(EvflowDataError, match="EV009"):
-            fuse.saved_rows(path, "0 a", 5)
+            saved_rows(path, "0 a", 5)
     np.savez(path, next=4, origin="0 a", y=np.arange(6.0).reshape(3, 2))
-    begun, rows = fuse.saved_rows(path, "0 a", 5)
+    begun, rows = saved_rows(path, "0 a", 5)
     assert (begun, [r["y"].tolist() for r in rows]) == (4, [[0, 1], [2, 3], [4, 5]])
     for origin, most in (("1 a", 5), ("0 a", 3)):
         with pytest.raises(EvflowDataError, match="EV013"):
-            fuse.saved_rows(path, origin, most)
+            saved_rows(path, origin, most)
 
 
 def test_real_recordings_that_are_not_there(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ NO_DEBUG = {
     "guessed_frames": "as many cameras as are asked for",
     "combine": "computes next to nothing",
     "calibrate": "as many steps as are asked for",
+    "correct": "as many recordings as are asked for",
     "fuse": "as many recordings as are asked for",
     "tell_apart": "as many recordings as are asked for"}
 

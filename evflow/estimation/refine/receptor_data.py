@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.estimation.refine.sightings import Sightings, counted, trusted
+from evflow.estimation.refine.smear import smeared
 
 Array = jax.Array
 
@@ -44,6 +45,17 @@ def sample(
     rng = np.random.default_rng(seed)
     rows = [_row(*part, rng, number) for number, part in enumerate(used)]
     return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
+
+
+def smeared_sample(data: Sample, seconds: float) -> Sample:
+    """The sample with each count replaced by its mean over that time (smear.py)."""
+    on, off = np.array(data.on), np.array(data.off)
+    for c, dt_s in enumerate(np.asarray(data.dt_s)):
+        used = np.flatnonzero(np.asarray(data.weight[c]) > 0)
+        place = np.asarray(data.pixel[c])[used], np.asarray(data.at[c])[used]
+        for counts in (on[c], off[c]):
+            counts[used] = smeared(*place, counts[used], seconds / float(dt_s.mean()))
+    return data._replace(on=jnp.asarray(on), off=jnp.asarray(off))
 
 
 def _row(

@@ -18,7 +18,7 @@ import numpy as np
 
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
-from evflow.estimation.refine.receptor_data import PIXELS, TILES, Sample
+from evflow.estimation.refine.receptor_data import PIXELS, TILES, Sample, smeared_sample
 from evflow.simulator.photoreceptor import FAST, Photoreceptor, seen_path
 
 Array = jax.Array
@@ -34,8 +34,9 @@ MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
 MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # The path is wrong in its own way everywhere. What it explains better by less than a few per cent
-# of what is left says nothing of the pixel, and so much is left open of what is found:
-BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
+# of what is left says nothing of the pixel, the less so the less it explains, and so much is left
+# open of what is found:
+BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel, of a path that explains all
 FLOOR = np.array([0.5, 1e-4, 5e-4])
 DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
 
@@ -45,6 +46,8 @@ DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera
 # rest, but for a few per cent and a part of what is lacking.
 LACKING, LEAST_KEPT = 1.5, 0.5
 KEPT_ERROR = (0.04, 0.8)
+SMEARS = (0.01, 0.02)  # s
+CUTOFFS = (np.inf, 1000.0, 500.0, 300.0, 200.0, 140.0, 100.0, 70.0, 50.0, 30.0, 20.0)  # Hz
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,7 +57,10 @@ class Found:
     (3, 3) of (offset, tau, delay); slope (2, 3): how log theta_on, log theta_off of the pooled
     regression change with the three; explained: shares of the variance that the regression
     explains, with an ideal pixel and as found; chance: probability that the ideal pixel is not
-    enough; size: how many independent events the sample is worth."""
+    enough; size: how many independent events the sample is worth; smear (2, 3): for each of SMEARS,
+    by how much the memory's mean over it is explained better (log of what is left), and how the
+    logs of theta_on and theta_off change with it; curve (K, 2): the share that is explained with
+    each of CUTOFFS, Hz, offset and delay as found."""
 
     seen: Photoreceptor
     theta: np.ndarray
@@ -64,6 +70,8 @@ class Found:
     explained: tuple[float, float]
     chance: float
     size: float
+    smear: np.ndarray
+    curve: np.ndarray
 
     @property
     def std(self) -> np.ndarray:
@@ -136,7 +144,7 @@ _slopes = jax.jit(jax.jacfwd(_sums))
 
 
 def _solved(sums: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """theta_on, -theta_off of the pooled regression, what it leaves and what there is."""
+    """theta_on, theta_off of the pooled regression, what it leaves and what there is."""
     aa, ab, bb, ay, by, yy = sums
     theta = np.linalg.solve(np.array([[aa, ab], [ab, bb]]), np.array([ay, by]))
     return theta, float(yy - theta @ np.array([ay, by])), float(yy)
@@ -183,12 +191,34 @@ def find(data: Sample) -> Found:
     information = bent @ np.linalg.inv(scatter + 1e-12 * np.eye(3)) @ bent
     information += np.diag((SCALE / PRIOR) ** 2)
     covariance = np.linalg.inv(information) * units + np.diag(FLOOR**2)
-    odds = 0.5 * min(size, BELIEVED) * (plain - value) - DOUBT - 0.5 * float(
+    fits, ideal_fits = (_solved(_totals(at, data))[0] for at in (phi, PLAIN))
+    believed = BELIEVED * (1 - np.exp(value)) ** 2
+    odds = 0.5 * min(size, believed) * (plain - value) - DOUBT - 0.5 * float(
         (((phi - PLAIN) / PRIOR) ** 2).sum())
+    if fits.min() <= 0:  # brightness that falls with ON events: there is no path
+        odds = -np.inf
     seen = Photoreceptor(float(phi[0]), float(phi[1]) if phi[1] > 2 * FAST else 0.0, float(phi[2]))
-    theta, ideal = (np.abs(_solved(_totals(at, data))[0]) for at in (phi, PLAIN))
-    return Found(seen, theta, ideal, covariance, of_theta, (1 - np.exp(plain), 1 - np.exp(value)),
-                 float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), size)
+    return Found(seen, np.abs(fits), np.abs(ideal_fits), covariance, of_theta,
+                 (float(1 - np.exp(plain)), float(1 - np.exp(value))),
+                 float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), size,
+                 _smear(phi if odds > 0 else PLAIN, data), _curve(phi, data))
+
+
+def _curve(phi: np.ndarray, data: Sample) -> np.ndarray:
+    """(K, 2), as in `Found`."""
+    taus = [max(1.0 / (2.0 * np.pi * cutoff), FAST) for cutoff in CUTOFFS]
+    return np.array([[cutoff, 1 - np.exp(_unexplained(np.array([phi[0], tau, phi[2]]), data))]
+                     for cutoff, tau in zip(CUTOFFS, taus, strict=True)])
+
+
+def _smear(phi: np.ndarray, data: Sample) -> np.ndarray:
+    """(2, 3), as in `Found`."""
+    theta, left, _ = _solved(_totals(phi, data))
+    rows = []
+    for seconds in SMEARS:
+        other, less, _ = _solved(_totals(phi, smeared_sample(data, seconds)))
+        rows.append([np.log(left / less), *np.log(np.abs(other / theta))])
+    return np.array(rows)
 
 
 def _size(phi: np.ndarray, data: Sample) -> float:

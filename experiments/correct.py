@@ -1,0 +1,87 @@
+"""Fit the last correction of the thresholds on simulated cameras as they are.
+
+    python -m experiments.correct evflow/weights/default.safetensors --out corrected.safetensors
+
+Each hidden camera (ideal, slow, blind for a while after an event, noisy, with exposed, offset and
+noisy frames) is measured without the correction; what is left of the error of log theta is
+regressed on what the estimate shows of itself (evflow/estimation/refine/correction.py).
+Cross-validation over recordings gives the figures of the model card and the factor of the std.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from evflow.commands.writing import need_absent, need_suffix
+from evflow.network.weights import model_card, save_weights, weights_hash
+from experiments.shared.cameras import Hidden, Protocol
+from experiments.shared.common import at_least, estimator, run_script
+from experiments.shared.correcting import FOLDS, cross_validated, figures_of, fit, flat
+from experiments.shared.many import Setup
+from experiments.shared.real_cameras import draw_real
+from experiments.shared.refinement import COVERED, uncorrected
+from experiments.shared.rows import collected
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Fit the last correction of the thresholds."""
+
+    weights: tyro.conf.Positional[Path]
+    out: Path
+    recordings: int = 400
+    workers: int = 1
+    """Processes that simulate side by side."""
+    seed: int = 5_000_011
+    """Apart from training's and the fusion's."""
+    rows: Path | None = None
+    """Where to keep the signs, to resume an interrupted run from."""
+    overwrite: bool = False
+
+
+def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
+    """Signs (2, F), and log theta and its std without the correction, beside the truth; None where
+    too little happens."""
+    made = uncorrected(params, hidden.recording)
+    if made is None:
+        return None
+    signs, summary, std = made
+    truth, found, error = (
+        np.array([float(getattr(s, f"theta_{p}")) for p in ("on", "off")])
+        for s in (hidden.nominal, summary, std))
+    return {"signs": signs, "left": np.log(truth / found), "before": error / found}
+
+
+def main(options: Options) -> dict[str, float]:
+    at_least(FOLDS, recordings=options.recordings)
+    at_least(1, workers=options.workers)
+    need_suffix(options.out, ".safetensors")
+    need_absent(options.out, options.overwrite)
+    name, net = estimator(options.weights)
+    origin = f"{options.seed} {weights_hash(options.weights)}"
+    protocols = [draw_real(np.random.default_rng((options.seed, i)))
+                 for i in range(options.recordings)]
+    setup = Setup(str(options.weights), options.seed, photos=True)
+    rows = collected(row, setup, protocols, options.workers, options.rows, origin)
+    both = flat(rows)
+    change, std = cross_validated(rows)
+    widen = float(np.quantile(np.abs(both["left"] - change) / std, COVERED))
+    figures = {"recordings": len(rows["left"]),
+               **figures_of(both["left"], both["before"], "before"),
+               **figures_of(both["left"] - change, std * widen, "after")}
+    made = {**fit(both["signs"], both["left"], both["before"]), "widen": np.array(widen)}
+    print("\n".join(f"{k:20s} {v:.4f}" for k, v in figures.items()))
+    card = model_card(options.weights) | {"correction": {
+        "recordings": options.recordings, "seed": options.seed, "figures": figures}}
+    save_weights(options.out, {name: {**net, "correction": made}}, card,
+                 overwrite=options.overwrite)
+    return figures
+
+
+if __name__ == "__main__":
+    run_script(main, Options, __doc__)
