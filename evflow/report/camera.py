@@ -27,6 +27,7 @@ from evflow.report import page
 from evflow.report.maps import fault_panel, map_panel, scatter_panel
 from evflow.report.page import Panel, bullets, number, paragraph, plural, spread, table
 from evflow.report.plots import require
+from evflow.report.receptor import receptor_panel
 from evflow.report.resimulate import (
     LEARNT_SECONDS,
     PIXELS,
@@ -66,13 +67,15 @@ STAGES = 4
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
     """trial: the estimate, re-simulated; half: the estimate from the first half; held: that one
-    on the second half. Where one is None, the reason stands in why_not or why_not_held."""
+    on the second half, and foretold what it explains there. Where one is None, the reason stands in
+    why_not or why_not_held."""
 
     trial: Trial | None
     half: CameraEstimate | None
     held: Trial | None
     why_not: str = ""
     why_not_held: str = ""
+    foretold: tuple[float, float] | None = None
 
 
 def write_report(
@@ -120,7 +123,8 @@ def write_report(
     evidence = gather(found, recording, weights, min_window_us, seed, step)
     judged = judge_estimate(found, evidence.trial, evidence.held)
     panels = [_verdict(found, evidence, judged), map_panel(found), scatter_panel(found),
-              *_trial_panels(recording, evidence), fault_panel(found), _held_panel(found, evidence),
+              *_trial_panels(recording, evidence), receptor_panel(found, evidence.foretold),
+              fault_panel(found), _held_panel(found, evidence),
               _assumptions(found, recording, weights, source, command)]
     step()
     numbers = {"grade": worst(judged), "trial": _numbers(evidence.trial),
@@ -137,7 +141,7 @@ def gather(
     seed: int, step: Callable[[], None],
 ) -> Evidence:
     """Put the estimate to the test; step() is called twice."""
-    trial = half = held = None
+    trial = half = held = shares = None
     why = why_held = ""
     try:
         if not (known(found, "on") and known(found, "off")):
@@ -151,11 +155,12 @@ def gather(
     step()
     if trial:
         try:
-            half, held = held_out(recording, load_weights(weights), runs, min_window_us, seed)
+            params = load_weights(weights)
+            half, held, shares = held_out(recording, params, runs, min_window_us, seed)
         except EvflowDataError as error:
             why_held = error.seen
     step()
-    return Evidence(trial, half, held, why, why_held)
+    return Evidence(trial, half, held, why, why_held, shares)
 
 
 def _numbers(trial: Trial | None) -> dict[str, Any] | None:

@@ -64,6 +64,27 @@ def histogram(values: np.ndarray, summary: float, colour: Any, unit: str) -> byt
     return svg(draw, 3.0, 1.5)
 
 
+def explained(curve: np.ndarray, ideal: float, found_hz: float) -> bytes:
+    """Share of the brightness that events explain, over the cutoff: curve (K, 2) of cutoff in Hz,
+    inf at the right edge, and share; ideal: of an ideal pixel and frames as they are, dashed;
+    found_hz: the cutoff that was found, 0 for none."""
+    def draw(axis: Any) -> None:
+        finite = curve[np.isfinite(curve[:, 0])]
+        edge = 3.0 * finite[:, 0].max()
+        at = np.where(np.isfinite(curve[:, 0]), curve[:, 0], edge)
+        axis.plot(at, curve[:, 1], color=INK, marker="o", ms=3, lw=1.3)
+        axis.axhline(ideal, color="#5d6673", lw=1.2, ls=(0, (3, 2)))
+        axis.axvline(found_hz or edge, color=ON_COLOUR, lw=1.2)
+        axis.set_xscale("log")
+        ticks = [20, 50, 100, 200, 500, edge]
+        axis.set_xticks(ticks, [*(str(t) for t in ticks[:-1]), "none"], minor=False)
+        axis.set_xticks([], minor=True)
+        axis.set_xlabel("cutoff of the photoreceptor [Hz at 255 DN]")
+        axis.set_ylabel("share explained")
+
+    return svg(draw, 3.6, 2.2)
+
+
 def on_against_off(on: np.ndarray, off: np.ndarray, symbol: str, unit: str) -> bytes:
     """Density of (ON, OFF) of the same pixels (N,), with the diagonal; where the two are far apart
     each axis has its own range."""

@@ -17,6 +17,9 @@ from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import estimate_camera
+from evflow.estimation.refine import frame_noise, receptor_sample
+from evflow.estimation.refine.receptor_search import explained
+from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.result import CameraEstimate
 from evflow.metrics.streams import compare
 from evflow.notes import Note
@@ -123,9 +126,10 @@ def busiest_instant(events: Events, span_us: tuple[int, int], length_us: int = I
 
 def held_out(
     recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int
-) -> tuple[CameraEstimate, Trial]:
+) -> tuple[CameraEstimate, Trial, tuple[float, float] | None]:
     """An estimate from the first half of the longest run (its last LEARNT_SECONDS), tried on the
-    second half. Raises EV017 where a half is too short to estimate from."""
+    second half, and what it foretells of that (`foretold`). Raises EV017 where a half is too short
+    to estimate from."""
     first, last = max(runs, key=lambda r: r[1] - r[0])
     times = recording.frame_times
     middle = int(np.searchsorted(times, (int(times[first]) + int(times[last])) // 2))
@@ -137,6 +141,23 @@ def held_out(
                      recording.frames[begin:middle + 1], times[begin:middle + 1])
     found = estimate_camera(half, params, min_window_us=min_window_us)
     seen_by = Photoreceptor.of(found.sensor, found.optics)
-    return found, resimulate(
-        recording, found.camera, busiest(recording, [(middle, last)]), seed, seen_by,
-        found.sensor.refractory_s)
+    trial = resimulate(recording, found.camera, busiest(recording, [(middle, last)]), seed,
+                       seen_by, found.sensor.refractory_s)
+    return found, trial, foretold(recording, found, (middle, last))
+
+
+def foretold(recording: Recording, found: CameraEstimate, run: Run) -> tuple[float, float] | None:
+    """Shares of the variance of brightness at the events of other frames (first, last) that an
+    estimate's thresholds explain: with an ideal pixel, and with the photoreceptor that was found.
+    None where one of the two says nothing."""
+    intervals = [(recording, i) for i in range(*run)]
+    places = [(recording, tuple(i for _, i in intervals[k:k + INTERVALS]))
+              for k in range(0, len(intervals), INTERVALS)]
+    if found.receptor is None:
+        return None
+    data = receptor_sample(places, frame_noise(intervals))
+    if data is None:
+        return None
+    receptor = found.receptor
+    ideal = explained(data, IDEAL, receptor.ideal_theta)
+    return ideal, explained(data, receptor.seen, receptor.theta) if receptor.needed else ideal

@@ -1,4 +1,4 @@
-"""The report on a camera: ten panels, nothing from outside, and words that follow the numbers."""
+"""The report on a camera: its panels, nothing from outside, and words that follow the numbers."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from evflow.report import camera, page
 from evflow.report.resimulate import busiest, usable_runs
 from evflow.report.verdict import judge_estimate, judge_stream, known, poorer, worst
 
-PANELS = ("verdict", "maps", "on-off", "rates", "images", "counts", "intervals", "faults",
-          "held-out", "assumptions")
+PANELS = ("verdict", "maps", "on-off", "rates", "images", "counts", "intervals", "receptor",
+          "faults", "held-out", "assumptions")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_every_picture_opens(report: tuple[Path, dict[str, Any]]) -> None:
             hrefs = re.findall(rb'href="([^"]*)"', raw)
             assert all(h.startswith((b"#", b"data:")) for h in hrefs)
     assert kinds["png"] == 8 + 3 + 1
-    assert kinds["svg+xml"] == 4 + 2 + 2 + 2 + 2
+    assert kinds["svg+xml"] == 4 + 2 + 2 + 2 + 2 + 1
 
 
 def test_the_numbers_lie_in_the_page(report: tuple[Path, dict[str, Any]]) -> None:

@@ -1,0 +1,43 @@
+"""Panel of what the pixels see the frames by: the photoreceptor, added light, the clocks."""
+
+from __future__ import annotations
+
+from evflow.estimation.result import CameraEstimate
+from evflow.report import figures, page
+from evflow.report.page import Panel, figure, grid, number, paragraph, spread, table
+
+TITLE = "What the pixels see the frames by"
+
+
+def receptor_panel(found: CameraEstimate, foretold: tuple[float, float] | None) -> Panel:
+    """Share explained over the cutoff, what was measured, and how it does on the other half.
+    foretold: shares of the second half that the first one's constants explain, as an ideal pixel
+    and as found; None where it was not tried."""
+    receptor = found.receptor
+    if receptor is None:
+        return Panel("receptor", TITLE, paragraph(
+            "Absent: nothing was looked for, or too little happens to tell.", "note"))
+    sensor, std, optics = found.sensor, found.sensor_std, found.optics
+    drawn = page.drawing(
+        figures.explained(receptor.curve, receptor.explained[0], sensor.cutoff_hz),
+        "share explained over the cutoff")
+    fast = f"above {receptor.least_cutoff_hz:.0f}"
+    rows = [["cutoff [Hz at 255 DN]", spread(sensor.cutoff_hz, std["cutoff_hz"])
+             if sensor.cutoff_hz else fast],
+            ["light added [DN]", spread(optics.offset_dn, optics.offset_dn_std)],
+            ["events after frames [ms]", spread(1e3 * optics.delay_s, 1e3 * optics.delay_s_std)],
+            ["dead time [ms]", spread(1e3 * sensor.refractory_s, 1e3 * std["refractory_s"])
+             if sensor.refractory_s else "not seen"]]
+    shares = [["all that was read", *(number(v, 3) for v in receptor.explained)]]
+    if foretold is not None:
+        shares.append(["second half, by the first", *(number(v, 3) for v in foretold)])
+    said = ("The estimate is of pixels with these constants." if receptor.needed else
+            "An ideal pixel is as probable: the estimate is of one.")
+    return Panel("receptor", TITLE, grid([
+        figure(drawn, "Line: offset and delay as found. Dashed: an ideal pixel, frames as they "
+               "are. Red: the cutoff that was found."),
+        table(["", "measured"], rows)
+        + table(["variance explained", "ideal pixel", "as found"], shares)], 22)
+        + paragraph("At an event a pixel remembers the brightness that it sees: the thresholds "
+                    "explain a share of that brightness along the frames, the more the truer the "
+                    f"photoreceptor is. {said}", "note"))
