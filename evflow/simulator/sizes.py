@@ -2,8 +2,8 @@
 
 The pixels that may fire in a block are padded to one of a few sizes, as XLA compiles a program for
 each. A short video gains nothing by many: a smaller size gets its program once the padding without
-it has taken about as long as compiling it. What the padding does is thrown away, so the events are
-the same.
+it has taken a good part of the time to compile it. What the padding does is thrown away, so the
+events are the same.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Hashable
 
 # A call hands work to another thread and back, which costs more than arrays that leave the cache.
 ACTIVE: tuple[int, ...] = (4096, 8192, 12288, 16384, 20480)
-PATIENCE = 1 << 21  # pixels of padding in a block: .2 to .3 s on one core
+PATIENCE = 1 << 19  # pixels of padding: some .1 s on one core, where a program takes .3 and more
 
 
 class Sizes:
@@ -29,7 +29,7 @@ class Sizes:
         fits = next(size for size in ACTIVE if size >= count)
         size = min(size for size in self.ready if size >= fits)
         self.padding[fits] += size - fits
-        if self.padding[fits] > PATIENCE:
+        if size > fits and self.padding[fits] > PATIENCE:
             self.ready.append(fits)
             return fits
         return size

@@ -21,6 +21,7 @@ def test_one_program_serves_until_its_padding_has_cost_another(pixels: int) -> N
         assert set(padded) == {fits, largest}
         assert sum(size - fits for size in padded) <= PATIENCE  # not more than it costs
         largest = max(found.ready)
+    assert len(found.ready) == len(set(found.ready)) <= len(ACTIVE)
 
 
 def test_each_program_has_its_own_sizes() -> None:
