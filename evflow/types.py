@@ -28,6 +28,7 @@ from evflow.checks import (
     need,
 )
 from evflow.errors import EvflowDataError
+from evflow.files.spool import forget
 from evflow.notes import Note
 
 BIT_DEPTHS = (8, 10, 12, 14, 16)  # of the converters in image sensors; 16-bit files hold any
@@ -121,7 +122,15 @@ class Events:
     def __repr__(self) -> str:
         width, height = self.size
         text = f"{len(self):,} events, {width}x{height}, {self.duration_us / 1e6:.3f} s"
-        return text + (f", {100 * self.p.mean():.0f} % ON" if len(self) else "")
+        return text + (f", {100 * self._share_on():.0f} % ON" if len(self) else "")
+
+    def _share_on(self) -> float:
+        """Of the events that are ON, counted in parts: they may lie on the disk."""
+        on = 0
+        for first in range(0, len(self), 1 << 24):
+            on += int(np.count_nonzero(self.p[first : first + (1 << 24)]))
+            forget(self.p)
+        return on / len(self)
 
     @property
     def duration_us(self) -> int:

@@ -150,6 +150,9 @@ class Camera:
         if len(self.shape) < 2 and not self._traced():
             raise EvflowDataError("EV002", f"the camera's maps have shape {self.shape}.",
                                   "Expected (..., H, W).")
+        if 0 in self.shape[-2:] and not self._traced():
+            raise EvflowDataError("EV002", f"the camera's maps have no pixel: {self.shape}.",
+                                  "Expected (..., H, W), as large as the sensor.")
         return self
 
     def check_values(self) -> None:

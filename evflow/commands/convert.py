@@ -39,13 +39,15 @@ class Convert(Reading):
 
     def run(self) -> None:
         from evflow import io
+        from evflow.files.spool import on_disk
         from evflow.io.registry import writer_of
         from evflow.types import Recording
 
         writer = writer_of(self.out, named(self.format, self.out))
         need_absent(self.out, self.overwrite, self.recording, self.frames,
                     self.timestamps)
-        recording = self.read(self.recording)
+        with on_disk():
+            recording = self.read(self.recording)
         notes = list(recording.notes)
         if recording.has_frames and (why := writer.refuses(recording.frames.dtype)):
             notes.append(Note(

@@ -7,8 +7,12 @@ with the last array that shows it, or with the process.
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import errno
+import mmap
 import tempfile
+from collections.abc import Iterator
 from typing import IO, Any
 
 import numpy as np
@@ -16,7 +20,34 @@ import numpy as np
 from evflow.errors import EvflowDataError
 
 LIMIT = 1 << 29  # bytes of a column in memory: 67 million int64 times
+LITTLE = 1 << 24  # the same, where columns are read once
 JOINED = 1 << 25  # bytes of parts; malloc gives smaller arrays memory that is warm
+
+
+_limit: contextvars.ContextVar[int | None] = contextvars.ContextVar("limit", default=None)
+
+
+@contextlib.contextmanager
+def on_disk(limit: int = LITTLE) -> Iterator[None]:
+    """Columns that are begun in this block keep `limit` bytes each in memory: where they are read
+    once, in order, as by a conversion."""
+    before = _limit.set(limit)
+    try:
+        yield
+    finally:
+        _limit.reset(before)
+
+
+def forget(array: np.ndarray) -> None:
+    """Give back the memory of what was read of a mapped array: it stays in its file, and is read
+    again where it is asked for. Others stay as they are."""
+    base: Any = array
+    while isinstance(base, np.ndarray):
+        mapped = getattr(base, "_mmap", None)
+        if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
+            mapped.madvise(mmap.MADV_DONTNEED)
+            return
+        base = base.base
 
 
 class Spool:
@@ -25,7 +56,7 @@ class Spool:
 
     def __init__(self, dtype: Any, limit: int | None = None) -> None:
         self.dtype, self.rows = np.dtype(dtype), 0
-        self.limit = LIMIT if limit is None else limit
+        self.limit = (_limit.get() or LIMIT) if limit is None else limit
         self._memory, self._filled = np.empty(0, self.dtype), 0
         self._parts: list[np.ndarray] = []  # rows behind those of _memory or _file
         self._file: IO[bytes] | None = None

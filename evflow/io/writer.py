@@ -22,6 +22,7 @@ import numpy as np
 from evflow.checks import COLUMNS, Size, check_frames, check_size, check_times
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
+from evflow.files.spool import forget
 from evflow.process.signals import uninterrupted
 from evflow.types import Events, Recording
 
@@ -200,11 +201,20 @@ def copy(recording: Recording, out: EventWriter) -> None:
     events, first = recording.events, 0
     cuts = np.searchsorted(events.t, recording.frame_times)
     for index, last in enumerate(cuts.tolist()):
-        out.append(_part(events, first, last))
+        _copy_events(events, first, last, out)
         out.append_frames(recording.frames[index : index + 1],
                           recording.frame_times[index : index + 1])
+        forget(recording.frames)
         first = last
-    out.append(_part(events, first, len(events)))
+    _copy_events(events, first, len(events), out)
+
+
+def _copy_events(events: Events, first: int, last: int, out: EventWriter) -> None:
+    """Part by part, each of which is forgotten where it lies on the disk."""
+    for begin in range(first, last, FLUSH):
+        out.append(_part(events, begin, min(begin + FLUSH, last)))
+        for name in COLUMNS:
+            forget(getattr(events, name))
 
 
 def _sound_frames(

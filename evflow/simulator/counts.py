@@ -74,7 +74,7 @@ def simulate_counts(
     timed = not isinstance(frame_dt_s, jax.core.Tracer)
     if timed and not 0 < float(frame_dt_s) < math.inf:
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}.", "A length in seconds, > 0.")
-    camera = jax.tree.map(lambda m: jnp.asarray(m, log_frames.dtype), camera.validate())
+    camera = jax.tree.map(lambda m: jnp.asarray(m, log_frames.dtype), sensor.simulable(camera))
     nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
     if nominal is not None and timed:
         noise.check_rate(noise.most_rate(model, camera, nominal), float(frame_dt_s))

@@ -24,6 +24,7 @@ from evflow.simulator import pack
 from evflow.simulator.active import BLOCK
 from evflow.simulator.circuits import circuit
 from evflow.simulator.frames import blocks
+from evflow.simulator.sensor import simulable
 from evflow.types import Events
 
 Array = jax.Array
@@ -66,9 +67,9 @@ def simulate(
 
     Raises:
         EvflowDataError: EV001 (fewer than two frames), EV002 (shapes), EV003 (dtype or range),
-            EV004 (times do not increase), EV007 (NaN), EV014 (camera out of range, or more noise
-            than an interval holds), EV015 (frames and camera of different size), EV020 (called
-            within jit, vmap or grad).
+            EV004 (times do not increase), EV007 (NaN), EV014 (camera out of range, or more events
+            or noise than an interval holds), EV015 (frames and camera of different size), EV020
+            (called within jit, vmap or grad).
 
     Example:
         >>> camera = ef.Camera.sample(jax.random.key(0), frames.shape[1:])
@@ -167,5 +168,4 @@ def _checked_camera(camera: Camera) -> Camera:
         raise EvflowDataError(
             "EV002", f"the camera's maps have shape {camera.shape}.",
             "Expected (H, W); simulate one camera at a time, or vmap simulate_voxels.")
-    camera.validate()
-    return jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), camera)
+    return jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), simulable(camera))

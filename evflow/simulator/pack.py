@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from evflow.camera.sensors import SensorModel
+from evflow.errors import EvflowDataError
 from evflow.light.log_maps import normalised_intensity
 from evflow.simulator import noise
 from evflow.simulator.active import TICKS, Block, Sent
@@ -21,6 +22,8 @@ from evflow.simulator.sensor import Sensor
 from evflow.types import Events
 
 Array = np.ndarray
+
+MOST_EVENTS = 1 << 27  # of a block of frames: 8 GB while they are sorted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,6 +99,13 @@ def _progressions(
         return np.concatenate([_of(getattr(out.spikes, name), at) for out, at, _ in sent])
 
     count = spikes("count")
+    if (total := float(np.abs(count).sum(dtype=np.float64))) > MOST_EVENTS:
+        most = float(np.abs(count).max())
+        raise EvflowDataError(
+            "EV014", f"{total:.3g} events between {len(dt_us) + 1} frames, up to {most:.3g} of one "
+            "pixel: the thresholds are too low for this video.",
+            "Raise them (those of real pixels are .05 to 1, natural log); or are the frames "
+            "logarithms, or of another scale?")
     row, k = _repeated(np.abs(count) - skip)
     step, pixel = (np.concatenate(parts).take(row) for parts in zip(
         *((at // out.first.shape[1], pixel) for out, at, pixel in sent), strict=True))

@@ -14,13 +14,33 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.camera import THETA_MIN
 from evflow.camera.sensors import SensorModel
+from evflow.errors import EvflowDataError
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity
 from evflow.simulator import noise, pixel
 from evflow.simulator.pixel import PixelState, Spikes
 
 Array = jax.Array
+LEAST_THETA = 1e-4  # log units; float32 holds the log of 255 DN to half a percent of that
 Clock = tuple[Array, Array]  # begin and end of an interval, see `SimState.time`
+
+
+def simulable(camera: Camera) -> Camera:
+    """The camera, unless it is none or its thresholds are within the rounding of brightness, where
+    events stand for nothing; EV002, EV014, EV015. Traced maps pass unchecked."""
+    camera.validate()
+    if any(isinstance(m, jax.core.Tracer) for m in jax.tree.leaves(camera)):
+        return camera
+    for name in ("theta_on", "theta_off"):
+        theta = np.asarray(getattr(camera, name))
+        if theta.size and theta.min() < LEAST_THETA:
+            where = tuple(int(i) for i in np.unravel_index(theta.argmin(), theta.shape))
+            raise EvflowDataError(
+                "EV014", f"{name} is {theta[where]:.3g} at index {where}: below {LEAST_THETA:g}, "
+                "brightness is rounded to the size of a threshold.",
+                f"Those of real pixels are .05 to 1, natural log; clamp them at {THETA_MIN}.")
+    return camera
 
 
 @jax.tree_util.register_dataclass

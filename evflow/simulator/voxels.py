@@ -147,8 +147,7 @@ def simulate_voxels(
         raise EvflowDataError(
             "EV015", f"the camera's leading axes are {camera.shape[:-2]}, the frames' {lead}.",
             "Give one camera (H, W) or one for each video.")
-    camera.validate()
-    camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), camera)
+    camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), sensor.simulable(camera))
     if timed and _by_blocks(key, model, log_frames, camera):
         return _in_blocks(key, np.asarray(log_frames), camera, float(frame_dt_s), model, bins)
     nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None

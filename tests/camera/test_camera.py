@@ -40,6 +40,14 @@ def same(a: Camera, b: Camera) -> bool:
     return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in PARAMETERS)
 
 
+@pytest.mark.parametrize("shape", [(0, 0), (0, 4), (3, 0)])
+def test_maps_without_pixels_are_no_camera(tmp_path: Path, shape: tuple[int, int]) -> None:
+    path = tmp_path / "camera.npz"
+    np.savez(path, **{name: np.ones(shape, np.float32) for name in PARAMETERS})
+    with pytest.raises(EvflowDataError, match=r"EV002.*no pixel"):
+        Camera.load(path)
+
+
 def test_constant_cameras() -> None:
     camera = Camera.constant((3, *SHAPE), 0.3, 0.15, 1.0, 0.5)
     assert camera.shape == (3, *SHAPE)

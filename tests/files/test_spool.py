@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from helpers.fuzz import flat, same
 from helpers.fuzz_samples import SAMPLES
+from helpers.recordings import equal, make
 
 from evflow import io
 from evflow.errors import EvflowDataError
 from evflow.files import spool
 from evflow.files.spool import Spool
-from evflow.types import Events
+from evflow.io import writer
+from evflow.types import Events, Recording
 
 EVENTS = 4_000_000
 
@@ -132,3 +134,33 @@ def test_windows_of_a_file_larger_than_memory(tmp_path: Path, kind: str) -> None
         else:  # a library may die of it instead of saying so
             assert done.returncode < 0 or "memory" in done.stderr.lower()
             assert not done.stdout
+
+
+def test_columns_that_are_read_once_lie_on_the_disk(tmp_path: Path) -> None:
+    events = make(1000).events
+    io.write_events(tmp_path / "a.npz", events, "npz")
+    with spool.on_disk(100):
+        found = io.read_events(tmp_path / "a.npz")
+    for name in "xytp":
+        column = getattr(found, name)
+        assert on_disk(column)
+        spool.forget(column)
+        np.testing.assert_array_equal(column, getattr(events, name))
+    assert not on_disk(io.read_events(tmp_path / "a.npz").t)
+    spool.forget(events.t)
+    assert repr(found) == repr(events)
+
+
+def test_a_copy_never_holds_all_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Out:
+        def __init__(self) -> None:
+            self.parts: list[Events] = []
+
+        def append(self, events: Events) -> None:
+            self.parts.append(events)
+
+    monkeypatch.setattr(writer, "FLUSH", 64)
+    out, recording = Out(), Recording.of_events(make(1000).events)
+    writer.copy(recording, out)  # type: ignore[arg-type]
+    assert max(map(len, out.parts)) == 64
+    equal(Events.concatenate(out.parts), recording.events)

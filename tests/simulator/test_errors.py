@@ -60,6 +60,8 @@ TIMES = np.array([0, 1000, 2000])
     ({"camera": dataclasses.replace(CAMERA, theta_on=CAMERA.theta_on.at[1, 1].set(0))}, "EV014",
      "theta_on is 0.0 at index (1, 1)"),
     ({"camera": dataclasses.replace(CAMERA, theta_off=-CAMERA.theta_off)}, "EV014", "theta_off"),
+    ({"camera": Camera.constant(SHAPE, theta_off=1e-6)}, "EV014", "theta_off is 1e-06 at index"),
+    ({"camera": Camera.constant(SHAPE, theta_on=1e-44)}, "EV014", "below 0.0001"),
     ({"camera": dataclasses.replace(CAMERA, eta_on=CAMERA.eta_on - 1)}, "EV014", ">= 0"),
     ({"camera": dataclasses.replace(CAMERA, eta_off=jnp.zeros((2, 2)))}, "EV015", "eta_off"),
     ({"camera": Camera.constant(SHAPE, eta_on=1e6)}, "EV014", "1e+03 events per pixel"),
@@ -73,6 +75,15 @@ def test_bad_input_says_what_was_seen(changed: dict[str, Any], code: str, seen: 
         simulate(KEY, **given)
     assert raised.value.code == code
     assert seen in str(raised.value)
+
+
+def test_more_events_than_memory_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    flash = np.stack([np.zeros(SHAPE), np.full(SHAPE, 255.0), np.zeros(SHAPE)]).astype(np.uint8)
+    camera = Camera.constant(SHAPE, theta_on=0.001, theta_off=0.001)
+    events = len(simulate(KEY, flash, TIMES, camera))
+    monkeypatch.setattr("evflow.simulator.pack.MOST_EVENTS", events - 1)
+    with pytest.raises(EvflowDataError, match=r"EV014.* events between 3 frames, up to 5\.54e\+03"):
+        simulate(KEY, flash, TIMES, camera)
 
 
 def test_simulate_cannot_be_traced() -> None:
