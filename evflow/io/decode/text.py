@@ -19,7 +19,7 @@ import numpy as np
 from evflow.io.decode.stream import Chunk, Damage
 from evflow.io.decode.units import check_text_seconds
 
-BLANKS = bytes.maketrans(b",;", b"  ")  # what else stands between numbers
+BLANKS = bytes.maketrans(b",;\"", b"   ")  # what else stands between numbers
 HEAD = 1 << 14  # bytes by which a file is recognised, and the order of its columns told
 BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
 MAX_LINE = 1000  # a longer one is not text
@@ -30,11 +30,14 @@ ON = (b"true", b"on")
 def events(
     f: IO[bytes], widths: tuple[int, ...], byte: int = 0, order: str = "txyp"
 ) -> Iterator[Chunk]:
-    """Chunks of lines of one of these numbers of columns, whose first are those of `order`; f is at
-    `byte`. What stands before a line that is none comes out before Damage is raised."""
+    """Chunks of lines of one of these numbers of columns, whose first are those of `order`, "-" for
+    one that is not looked at; f is at `byte`. What stands before a line that is none comes out
+    before Damage is raised."""
     line = 0
+    read = tuple(i for i, name in enumerate(order) if name != "-") if "-" in order else None
+    order = order.replace("-", "")
     for start, block in _blocks(f, byte):
-        table, widths, damage = _parse(start, plain(block, start), widths)
+        table, widths, damage = _parse(start, plain(block, start), widths, read)
         t, x, y, p = (table[:, order.index(name)] for name in "txyp")
         yield Chunk(x, y, t, p, lambda i, line=line: line + i, "event")  # type: ignore[misc]
         if damage:
@@ -81,40 +84,47 @@ def _blocks(f: IO[bytes], byte: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _parse(
-    byte: int, block: bytes, widths: tuple[int, ...]
+    byte: int, block: bytes, widths: tuple[int, ...], read: tuple[int, ...] | None
 ) -> tuple[np.ndarray, tuple[int, ...], Damage | None]:
     """(rows, columns) float64, the one width that later blocks must have, and what is wrong with
-    the line after those rows, if there is one."""
-    table = _table(block, widths)
-    if table is not None:
-        return table, (table.shape[1],) if len(table) else widths, None
-    sound, damage = _before_damage(byte, block, widths)
-    table = _table(sound, widths)
+    the line after those rows, if there is one. read: the columns to read; None: all."""
+    table = _table(block, widths, read)
+    damage = None
+    if table is None:
+        sound, damage = _before_damage(byte, block, widths, read)
+        table = _table(sound, widths, read)
     if table is None:  # what no line by itself shows
-        table, damage = np.zeros((0, widths[0])), Damage(
+        table, damage = np.zeros((0, len(read or range(widths[0])))), Damage(
             byte, "what stands here is not plain text")
-    return table, (table.shape[1],), damage
+    settled = read is None and (len(table) or damage)
+    return table, (table.shape[1],) if settled else widths, damage
 
 
-def _table(block: bytes, widths: tuple[int, ...]) -> np.ndarray | None:
+def _table(
+    block: bytes, widths: tuple[int, ...], read: tuple[int, ...] | None
+) -> np.ndarray | None:
     """The numbers of a block of lines; None where they are none, or not as many a line."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # a block of comments holds no data
-            table = np.loadtxt(io.StringIO(block.decode("ascii")), ndmin=2)
+            table = np.loadtxt(io.StringIO(block.decode("ascii", "replace")), ndmin=2, usecols=read)
     except ValueError:
         return None
     if table.size == 0:
-        return np.zeros((0, widths[0]))
-    return table if table.shape[1] in widths and np.isfinite(table).all() else None
+        return np.zeros((0, len(read or range(widths[0]))))
+    sound = table.shape[1] in (widths if read is None else (len(read),))
+    return table if sound and np.isfinite(table).all() else None
 
 
-def _before_damage(byte: int, block: bytes, widths: tuple[int, ...]) -> tuple[bytes, Damage]:
+def _before_damage(
+    byte: int, block: bytes, widths: tuple[int, ...], read: tuple[int, ...] | None
+) -> tuple[bytes, Damage]:
     """The lines before the first that is none, and what that one is."""
     at = 0
     for content in block.split(b"\n"):
         fields = content.partition(b"#")[0].split()
-        if fields and len(fields) in widths and all(map(is_number, fields)):
+        if fields and len(fields) in widths and all(
+                is_number(fields[i]) for i in read or range(len(fields))):
             widths = (len(fields),)
         elif fields:
             return block[:at], Damage(byte + at, f"the line {content[:60]!r} is not `t x y p` "

@@ -90,7 +90,8 @@ def layout(head: bytes) -> Layout | None:
         words, comment = _decoded(line), line.lstrip().startswith((b"#", b"%"))
         fields = text.plain(line, byte).partition(b"#")[0].split()
         byte += len(line)
-        if not rows and (comment or not any(map(text.is_float, _fields(words)))):
+        header = not told and not any(map(text.is_float, _fields(words.replace('"', " "))))
+        if not rows and (comment or header):
             told = words if words and not comment else told  # it must name what there is
             headers += [words] if _order(words) else []
             begin, said = byte, f"{said}\n{words}"

@@ -1,7 +1,8 @@
 """HDF5 as the simulator v2e writes it (v2ecore/emulator.py, --dvs_h5 and --ddd_output).
 
-/events uint32 (N, 4): t us, x, y, p in {0, 1}. With frames: /frame uint8 (T, H, W), /frame_ts
-uint32 us. Without them the file does not tell the sensor's size.
+/events uint32 (N, 4): t us, x, y, p in {0, 1}; of other tools in another order, which the values
+tell. With frames: /frame uint8 (T, H, W), /frame_ts uint32 us. Without them the file does not tell
+the sensor's size.
 """
 
 from __future__ import annotations
@@ -11,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from evflow.io.decode import tables
-from evflow.io.decode.stream import gather
+from evflow.io.decode import arrays, columns, tables
 from evflow.io.hints import Hints
 from evflow.types import Recording
 
@@ -36,8 +36,10 @@ def read(path: Path, hints: Hints) -> Recording:
             t, x, y, p = np.ascontiguousarray(data[part].T)
             return x, y, t, p
 
-        chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
-        found = gather(path, chunks, hints, size)
+        table = arrays.matrix("events", data)
+        if table is None or table.notes == (columns.inferred("txyp"),):
+            table = arrays.Table("events", len(data), rows, "us", tables.stored_rows(data))
+        found = table.gather(path, hints, size)
         if "frame" not in f:
             return Recording.of_events(found.events, found.notes)
         return tables.with_frames(

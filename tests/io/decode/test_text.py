@@ -163,6 +163,10 @@ SIZED = {  # text that tells its size, in microseconds
     "sides": "# width: 64, height: 48\nt_us,x,y,p\n" + rows(US, comma=","),
     "seconds": "%geometry:64,48\nx,y,p,t\n" + rows(SECONDS, order="xypt", comma=","),
     "fifth": "%geometry:64,48\nt,x,y,p,label\n" + rows(US, comma=",").replace("\n", ",7\n"),
+    "words": "%geometry:64,48\nt,x,y,p,label\n" + rows(US, comma=",").replace(
+        "\n", ",caf\u00e9 car\n"),
+    "quoted": "%geometry:64,48\n\"x\",\"y\",\"p\",\"t\"\n" + rows(
+        US, order="xypt", comma='","').replace("\n", '"\n"')[:-1],
     "true": "t,x@64,y@48,on\n" + rows(US, comma=",").replace(",0\n", ",false\n").replace(
         ",1\n", ",true\n"),
     "ON": "t,x@64,y@48,on\n" + rows(US, comma=",").replace(",0\n", ",OFF\n").replace(
@@ -180,8 +184,8 @@ def test_text_that_tells_its_size(tmp_path: Path, kind: str) -> None:
     found = read_recording(path)
     equal(found.events, Events([3 + i for i in range(12)], [20 - i for i in range(12)], US[:12],
                                [i % 2 for i in range(12)], (64, 48)))
-    said = {"fifth": "events.unread", "xytp": "events.layout", "tpxy": "events.layout",
-            "pxyt": "events.layout"}
+    said = {"fifth": "events.unread", "words": "events.unread", "xytp": "events.layout",
+            "tpxy": "events.layout", "pxyt": "events.layout"}
     assert [note.code for note in found.notes] == ([said[kind]] if kind in said else [])
     assert refused(path, size=(9, 48)).code == "EV005"
 

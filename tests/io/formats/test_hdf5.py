@@ -88,6 +88,13 @@ def matrix(f: Any) -> None:
     f.attrs["resolution"] = SIZE
 
 
+def xypt(f: Any) -> None:
+    """v2e's place and integers, in Prophesee's order."""
+    f["events"] = np.stack([EVENTS.x, EVENTS.y, EVENTS.p, EVENTS.t], 1).astype(np.int64)
+    f["frame"] = np.zeros((1, 48, 64), np.uint8)
+    f["frame_ts"] = EVENTS.t[:1]
+
+
 def across(f: Any) -> None:
     f["davis240/all"] = np.stack([EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p])
     f.attrs["resolution"] = SIZE
@@ -95,7 +102,7 @@ def across(f: Any) -> None:
 
 LAYOUTS: dict[str, Callable[[Any], None]] = {make.__name__: make for make in (
     rvt, m3ed, flat, words, nanoseconds, milliseconds, eventcv, eventcv_group, offset, compound,
-    matrix, across)}
+    matrix, xypt, across)}
 
 
 def write(folder: Path, kind: str) -> Path:
@@ -108,13 +115,15 @@ def write(folder: Path, kind: str) -> Path:
 def test_layouts(tmp_path: Path, kind: str) -> None:
     path = write(tmp_path, kind)
     name = find_format(path).NAME
-    assert name == ("dsec" if kind in ("rvt", "eventcv_group") else "hdf5")
+    other = {"rvt": "dsec", "eventcv_group": "dsec", "xypt": "v2e"}
+    assert name == other.get(kind, "hdf5")
     found = read_recording(path)
     equal(found.events, EVENTS)
     first = int(EVENTS.t[0])
     part = read_events(path, start_s=0.1, stop_s=0.2)
     equal(part, EVENTS.slice(first + 10**5, first + 2 * 10**5))
-    codes = {"m3ed": ["sensor.camera"], "matrix": ["events.layout"], "across": ["events.layout"]}
+    codes = {"m3ed": ["sensor.camera"], "matrix": ["events.layout"], "across": ["events.layout"],
+             "xypt": ["events.layout"]}
     assert [note.code for note in found.notes] == codes.get(kind, [])
 
 
