@@ -163,7 +163,9 @@ def refine(state: State) -> Refined:
     if state.evidence is None or state.quiet is None:
         return Refined(hot, state.chunks, summary, std)
     found = state.eyes.found
-    hot = hot_pixels(state.quiet, float(summary.eta_on + summary.eta_off))
+    seconds = sum(s.span_us[1] - s.span_us[0] for s in state.read) * 1e-6
+    hot = hot_pixels(
+        state.quiet, float(summary.eta_on + summary.eta_off), state.n_events, seconds)
     chunks = tuple(_without_hot(c, hot) for c in state.chunks)
     summary, std = maps.refined(state.params, list(chunks), summary, std)
     if found is None:

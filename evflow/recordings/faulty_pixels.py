@@ -9,6 +9,8 @@ NumPy and OpenCV only.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -18,6 +20,10 @@ PASSES = 10
 MOVING_FACTOR = 10.0  # edges and thresholds make neighbours differ more than noise rates do
 RESTLESS = 1.5  # times the noise that neighbours are expected to send: more, and edges went by
 LEAST_FIRED, LASTING = 2, 0.75  # times with events, and their share of those expected
+TWICE = 2.0  # as many events as the others there: thresholds alone do not make a pixel send them
+OWN_SHARE = 0.5  # of what its quiet rate makes a pixel send it must send beside the edges
+MANY_FIRED = 4  # quiet times with events: an edge is not missed so often
+QUIET_NEAR = 8.0  # times its own quiet time: that of the neighbourhood that tells of rest
 MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, itself included
 DEAD_EVENTS = 12  # median there: e^-12 by chance alone, and room for a high threshold
 
@@ -30,23 +36,41 @@ def fires_alone(
     return events > most + 5.0 * np.sqrt(most) + HOT_EVENTS
 
 
-def hot_pixels(quiet: np.ndarray, rate_hz: float) -> np.ndarray:
+def hot_pixels(
+    quiet: np.ndarray, rate_hz: float, counts: np.ndarray | None = None, seconds: float = 0.0
+) -> np.ndarray:
     """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
     happens in front of them; less than one in a million by chance. quiet (4, H, W): events,
-    seconds and number of such times, and how many of these had events.
+    seconds and number of such times, and how many of these had events. counts (H, W): events of
+    the whole recording, of so many seconds.
 
     Faults are scattered: where several pixels of a neighbourhood are busy, or the others there
     send more than noise too, something moved that the frames do not show, such as an edge that
-    went by between two of them. There only what fires at most times is a fault.
+    went by between two of them. There only what fires at most times is a fault. Where things move,
+    quiet times are few, and some are none: there it must fire at most of them while the others
+    rest, or send more events in all than any other there, by what its rate makes.
     """
-    events, seconds, times, fired = quiet
-    expected = rate_hz * seconds
+    events, seconds_quiet, times, fired = quiet
+    expected = rate_hz * seconds_quiet
     busy = fires_alone(events, expected)
     others, noise = _around(np.where(busy, 0.0, events)), _around(np.where(busy, 0.0, expected))
-    at_rest = others <= RESTLESS * noise + 2.0 * np.sqrt(RESTLESS * noise)
+    at_rest = others <= _restless(noise)
     steady = times * -np.expm1(-events / np.maximum(times, 1))  # times with events, at its own rate
     lasting = (fired >= LEAST_FIRED) & (fired >= LASTING * steady)
-    return busy & (_around(busy) <= MOST_HOT_NEAR) & (at_rest | lasting)
+    hot: np.ndarray = busy & (_around(busy) <= MOST_HOT_NEAR) & (at_rest | lasting)
+    if counts is None:
+        return hot
+    own = OWN_SHARE * seconds * events / np.maximum(seconds_quiet, 1e-9)
+    usual = _median_around(counts)
+    stands_out = (counts - _most_of_others(counts, hot) >= own) & (counts > TWICE * usual)
+    told = _around(seconds_quiet) >= QUIET_NEAR * seconds_quiet  # do others tell of rest?
+    return hot & ((usual <= _restless(rate_hz * seconds)) | stands_out
+                  | (lasting & told & (at_rest | (fired >= MANY_FIRED))))
+
+
+def _restless(noise: Any) -> Any:
+    """More events than so many, where `noise` are expected, come of edges that went by."""
+    return RESTLESS * noise + 2.0 * np.sqrt(RESTLESS * noise)
 
 
 def hot_at_rest(counts: np.ndarray) -> np.ndarray:
@@ -69,6 +93,14 @@ def hot_among_neighbours(counts: np.ndarray) -> np.ndarray:
 def dead_pixels(n_events: np.ndarray) -> np.ndarray:
     """(H, W) bool: pixels without a single event amid pixels with many; n_events (H, W)."""
     return (n_events == 0) & (_median_around(n_events) >= DEAD_EVENTS)
+
+
+def _most_of_others(counts: np.ndarray, hot: np.ndarray) -> np.ndarray:
+    """The most events (H, W) that a pixel in the neighbourhood of each has sent, itself and hot
+    ones left out."""
+    others = np.ones((AROUND, AROUND), np.uint8)
+    others[AROUND // 2, AROUND // 2] = 0
+    return cv2.dilate(np.where(hot, 0, counts).astype(np.float32), others)
 
 
 def _around(values: np.ndarray) -> np.ndarray:

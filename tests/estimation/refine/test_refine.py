@@ -338,6 +338,30 @@ def test_hot_pixels_come_alone() -> None:
     assert hot_pixels(quiet, 0.1)[5, 5]
 
 
+def test_hot_pixels_amid_motion_are_looked_at_twice() -> None:
+    """Ten frame intervals of 40 ms. A band of steady motion, 100 events a pixel, is quiet in one of
+    them; below it all but noise is rest."""
+    quiet, counts = np.zeros((4, 40, 40)), np.zeros((40, 40), int)
+    quiet[1:3, :20], counts[:20] = np.array([0.04, 1.0])[:, None, None], 100
+    quiet[1:3, 20:] = np.array([0.4, 10.0])[:, None, None]
+
+    def busy(y: int, x: int, events: float, fired: float, times: float, sent: int) -> None:
+        quiet[:, y, x] = events, 0.04 * times, times, fired
+        counts[y, x] = sent
+
+    busy(5, 5, 6, 1, 1, 104)  # an edge that the frames do not show
+    busy(5, 15, 6, 2, 2, 96)  # twice, while the neighbours fire, too
+    quiet[0, 3:8, 13:18] += 1
+    busy(5, 25, 9, 1, 1, 320)  # by its rate 90 events, and many more than others
+    quiet[1:3, 10:15, 3:8] = np.array([0.16, 4.0])[:, None, None]
+    busy(12, 5, 8, 6, 8, 130)  # fires at most quiet times, of which others there know
+    busy(30, 10, 12, 8, 10, 13)  # amid rest
+    busy(30, 20, 12, 2, 10, 12)  # in bursts
+    assert np.argwhere(hot_pixels(quiet, 0.2))[:, 0].tolist() == [5, 5, 5, 12, 30, 30]
+    found = hot_pixels(quiet, 0.2, counts, 0.4)
+    assert np.argwhere(found).tolist() == [[5, 25], [12, 5], [30, 10], [30, 20]]
+
+
 def test_fast_motion_makes_few_hot_pixels() -> None:
     """Edges that go by between two frames alike leave events where the frames say nothing moved."""
     fast = Protocol(scene=SceneConfig(speed_px_s=(250.0, 500.0), contrast=(0.5, 1.0)),
