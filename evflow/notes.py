@@ -29,6 +29,7 @@ NOTES: dict[str, str] = {
     "frames.depth": "16-bit frames that do not reach white",
     "frames.fast": "motion too fast to interpolate well",
     "frames.flipped": "frames were mirrored",
+    "frames.flow": "motion between frames was not found",
     "frames.laid": "frames were cropped or scaled",
     "frames.late": "frames whose time goes back were left out or sorted",
     "frames.light": "pixels see more or less light than the frames show",

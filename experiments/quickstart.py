@@ -71,7 +71,7 @@ def hidden_camera(options: Options) -> tuple[Recording, Camera, Summary]:
 
 
 def simulate_again(recording: Recording, found: CameraEstimate, seed: int) -> Events:
-    """The recording's frames, interpolated to <= 1 px of motion, seen by the estimated camera."""
+    """The recording's frames, interpolated to <= .5 px of motion, seen by the estimated camera."""
     pairs = ((recording.frame_dn(i), int(t)) for i, t in enumerate(recording.frame_times)
              if recording.events.t[0] - 1000 <= t <= recording.events.t[-1] + 1000)
     frames, times = unzip(upsample(pairs))

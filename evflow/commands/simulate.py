@@ -60,7 +60,7 @@ class Simulate(Pixels, Footage, Compiling):
     evflow render."""
     interpolate: bool = True
     """Fill in frames where things move by more than --max-motion-px from frame to frame."""
-    max_motion_px: Annotated[float, tyro.conf.arg(aliases=["--max-motion"])] = 1.0
+    max_motion_px: Annotated[float, tyro.conf.arg(aliases=["--max-motion"])] = 0.5
     """Longest motion in one step, in pixels; 0 = --no-interpolate."""
     overwrite: bool = False
     """Replace the output where it exists."""

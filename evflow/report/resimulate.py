@@ -96,7 +96,7 @@ def resimulate(
     recording: Recording, camera: Camera, run: Run, seed: int, seen_by: Photoreceptor = IDEAL,
     dead_s: float = 0.0,
 ) -> Trial:
-    """Simulate the frames of `run` twice, interpolated to 1 px of motion and put through what its
+    """Simulate the frames of `run` twice, interpolated by `upsample` and put through what its
     pixels see them by, and compare. dead_s: the pixels' dead time in seconds."""
     notes: list[Note] = []
     model = SensorModel(refractory_s=dead_s, noise_resets_memory=True)

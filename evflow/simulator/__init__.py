@@ -3,7 +3,8 @@
 pixel.py one interval of one pixel · noise.py Poisson noise and leak · sensor.py all pixels,
 vmapped · to events: frames.py what comes in, active.py the pixels that may fire, pack.py sorted
 lists, circuits.py block by block, events.py the stream · to voxels: bins.py, grids.py, voxels.py ·
-to counts: counts.py · voltmeter.py a Brownian pixel · interpolate.py slow videos to fast.
+to counts: counts.py · voltmeter.py a Brownian pixel · interpolate.py slow videos to fast
+(motion.py optical flow, between.py the pictures along its paths).
 """
 
 from evflow.simulator.counts import simulate_counts

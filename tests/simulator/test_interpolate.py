@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import pytest
 from helpers.videos import code_of
 
 from evflow.errors import EvflowDataError
 from evflow.notes import Note
-from evflow.simulator.interpolate import MAX_STEPS, Interpolator, unzip, upsample
+from evflow.simulator.between import intervals
+from evflow.simulator.interpolate import MAX_STEPS, unzip, upsample
 
 SIZE = 96
 
@@ -35,7 +39,7 @@ def between(a: np.ndarray, b: np.ndarray, dt: int = 40_000, **options: float) ->
 def test_linear_motion_is_followed_and_blending_is_much_worse(dx: float, dy: float) -> None:
     a, b = shifted(0, 0), shifted(dx, dy)
     filled = between(a, b)
-    assert np.hypot(dx, dy) - 1 <= len(filled) - 1 <= np.hypot(dx, dy) + 3
+    assert 2 * np.hypot(dx, dy) - 1 <= len(filled) - 1 <= 2 * np.hypot(dx, dy) + 4
     inner = np.s_[12:-12, 12:-12]  # what enters at the border cannot be known
     for frame, t in filled[1:-1]:
         s = t / 40_000
@@ -49,10 +53,11 @@ def test_linear_motion_is_followed_and_blending_is_much_worse(dx: float, dy: flo
 @pytest.mark.parametrize("shape", [(8, 64), (64, 8), (15, 64), (1, 40), (3, 48), (12, 12)])
 def test_narrow_frames_are_filled_too(shape: tuple[int, int]) -> None:
     frames = np.random.default_rng(0).uniform(0, 255, (2, *shape)).astype(np.float32)
-    made, motion = Interpolator().between(*frames, 4)
+    interval, = intervals(zip(frames, (0, 100), strict=True))
+    made = list(interval.at((0.25, 0.5, 0.75)))
     assert [f.shape for f in made] == [shape] * 3
     assert np.isfinite(made).all()
-    assert np.isfinite(motion)
+    assert np.isfinite(interval.speed_px)
 
 
 def test_steps_follow_the_wanted_motion() -> None:
@@ -92,32 +97,30 @@ def test_given_frames_come_out_unchanged_and_still_scenes_stay_short() -> None:
     assert all(f.min() >= 0 and f.max() <= 255 for f, _ in out)
 
 
-def test_warns_once_where_motion_is_too_fast() -> None:
+def test_tells_at_the_end_where_motion_is_too_fast() -> None:
     told: list[Note] = []
     pairs = [(shifted(6.0 * i), 40_000 * i) for i in range(3)]
-    out = list(upsample(pairs, max_motion_px=0.05, warn=told.append))
-    assert len(out) == 2 * MAX_STEPS + 1
-    assert len(told) == 1
-    assert "between the frames at 0 and 40000 us" in told[0].text
-    assert str(MAX_STEPS) in told[0].text
-    list(upsample(pairs, max_motion_px=1.0, warn=told.append))
+    out = list(upsample(pairs, max_motion_px=0.04, warn=told.append))
+    assert abs(len(out) - 2 * MAX_STEPS) <= 2
+    note, = told
+    assert note.code == "frames.fast"
+    assert str(MAX_STEPS) in note.text
+    assert "in 2 of 2 intervals" in note.text
+    list(upsample(pairs, warn=told.append))
     assert len(told) == 1
 
 
-def test_nothing_is_read_ahead() -> None:
-    """A video is a stream: each pair is filled before the next frame is asked for."""
+def test_one_frame_is_read_ahead() -> None:
+    """A video is a stream: what lies between two frames needs the one after them, and no other."""
     asked: list[int] = []
 
     def video() -> Iterator[tuple[np.ndarray, int]]:
-        for i in range(3):
+        for i in range(5):
             asked.append(i)
             yield shifted(3.0 * i), 1000 * i
 
-    stream = upsample(video())
-    next(stream)
-    assert asked == [0]
-    next(stream)
-    assert asked == [0, 1]
+    for _, t in upsample(video()):
+        assert asked[-1] == min(4, t // 1000 + 2)
 
 
 def test_empty_and_single() -> None:
@@ -136,6 +139,65 @@ def test_frames_too_small_for_motion_may_be_taken_as_they_are() -> None:
     tiny = [(np.zeros((8, 8), np.uint8), i) for i in range(2)]
     with pytest.raises(EvflowDataError, match=r"8x8 pixels are too small.*--no-interpolate"):
         list(upsample(tiny))
+
+
+def at_middle(frames: list[np.ndarray], number: int, times: tuple[int, ...]) -> np.ndarray:
+    interval = list(intervals(zip(frames, times, strict=True)))[number]
+    middle, = interval.at([0.5])
+    return middle
+
+
+INNER = np.s_[16:-16, 16:-16]
+
+
+@pytest.mark.parametrize(("places", "times", "wanted"), [
+    ((0, 1, 4, 9), (0, 10, 20, 30), 2.25),  # constant acceleration
+    ((0, 2, 6, 8), (0, 10, 30, 40), 4.0),  # constant velocity, one interval twice as long
+    ((0, 0, 0, 6), (0, 10, 20, 30), 0.0),  # what rests stays until it moves
+    ((0, 3, 6, 6), (0, 10, 900, 910), 4.5)])  # long after, velocities tell nothing
+def test_paths_are_smooth(
+    places: tuple[float, ...], times: tuple[int, ...], wanted: float
+) -> None:
+    made = at_middle([shifted(x) for x in places], 1, times)[INNER]
+    errors = [np.abs(made - shifted(x)[INNER]).mean() for x in (wanted - 0.2, wanted, wanted + 0.2)]
+    assert np.argmin(errors) == 1
+
+
+def test_paths_begin_and_end_at_the_frames() -> None:
+    frames = [shifted(x) for x in (0, 1, 4, 9)]
+    interval = list(intervals(zip(frames, range(4), strict=True)))[1]
+    begin, end = interval.at((0.0, 1.0))
+    np.testing.assert_allclose(begin, frames[1], atol=1e-3)
+    np.testing.assert_allclose(end, frames[2], atol=1e-3)
+
+
+def test_constant_velocity_changes_brightness_at_a_constant_rate() -> None:
+    """Cubic interpolation of the frames as they are would be unsteady by a tenth."""
+    out = list(upsample([(shifted(4.3 * i), 10_000 * i) for i in range(4)]))
+    changes = np.array([np.abs(np.log(b[INNER]) - np.log(a[INNER])).mean() / (t1 - t0)
+                        for (a, t0), (b, t1) in itertools.pairwise(out)])
+    assert changes.std() < 0.05 * changes.mean()
+
+
+@pytest.mark.parametrize("dx", [20, -30])
+def test_fast_pans_of_fine_textures_are_followed(dx: int) -> None:
+    noise = np.random.default_rng(0).uniform(0, 255, (120, 260)).astype(np.float32)
+    texture = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    first, middle, last = (texture[:, 50 + x:210 + x] for x in (0, dx // 2, dx))
+    made = at_middle([first, last], 0, (0, 1))
+    error, faded = (np.abs(m - middle)[:, 16:-16].mean() for m in (made, (first + last) / 2))
+    assert error < 0.1 * faded
+
+
+@pytest.mark.parametrize(("second", "failed"), [
+    (shifted(5.0), False), (0.7 * shifted(5.0), False), (shifted(0), False),
+    (shifted(0)[::-1].copy(), True), (shifted(0).T.copy(), True)])
+def test_flow_that_fails_is_told_with_its_share(second: np.ndarray, failed: bool) -> None:
+    """Unrelated pictures; not what moves, gets darker or stays."""
+    told: list[Note] = []
+    list(upsample([(shifted(0), 0), (second, 40_000)], max_motion_px=9.0, warn=told.append))
+    assert [note.code for note in told] == ["frames.flow"] * failed
+    assert all(re.search(r"in \d\d% of the pixels.*0 and 40000 us", note.text) for note in told)
 
 
 @pytest.mark.parametrize("step", [0.0, -1.0, float("nan")])

@@ -8,7 +8,6 @@ the refinement: its pixels start anew, so chunks are independent and memory stay
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Iterable, Sequence
 
 import cv2
@@ -31,7 +30,8 @@ from evflow.estimation.refine.stretches import (
 from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.light.log_maps import lin_log
 from evflow.recordings.glitches import SATURATED_DN, exposed
-from evflow.simulator.interpolate import Interpolator
+from evflow.simulator.between import intervals
+from evflow.simulator.motion import speed
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
 from evflow.types import Events, Recording
 
@@ -150,12 +150,12 @@ def interpolated(
     """The frames of a run of intervals, less their noise, filled up by optical flow."""
     frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
     times = recording.frame_times[run[0]:run[-1] + 2]
-    interpolator, clean = Interpolator(), [denoised(frame, noise_dn) for frame in frames]
+    clean = [denoised(frame, noise_dn) for frame in frames]
     dn, motion = [clean[0]], []
-    for a, b in itertools.pairwise(clean):
-        between, moved = interpolator.between(a, b, steps)
-        dn += [*between, b]
-        motion.append(moved)
+    for interval in intervals(zip(clean, times.tolist(), strict=True)):
+        # not sharp: the fusion network was trained on that contrast, another shifts its thresholds
+        dn += [*interval.at(np.arange(1, steps) / steps, sharp=False), interval.b.dn]
+        motion.append(speed(interval.motion.there))
     return Film(
         np.stack(frames), np.stack(dn), times, np.diff(times).astype(np.float32) * 1e-6,
         np.array(motion, np.float32), np.stack([exposed(frame) for frame in frames]))

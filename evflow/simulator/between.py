@@ -1,0 +1,168 @@
+"""What lies between the frames of a video: pictures warped along smooth paths.
+
+What a pixel shows moves along a cubic in time whose velocity at a frame is the mean of those before
+and after it (Catmull-Rom), so that neither place nor velocity jumps there. The picture at a time is
+warped from both frames, by cubic interpolation at double resolution. Bilinear interpolation blurs
+all but the given frames, so that events come at the frame rate, and OpenCV's cubic one alone moves
+by fits and starts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterable, Iterator
+
+import cv2
+import numpy as np
+
+from evflow.simulator.motion import Motion, MotionFinder, grid, inside, length, looked_up, speed
+
+UNEVEN = 2.0  # ratio of neighbouring intervals; beyond it the velocity of one tells little of both
+REACH = 33  # halved pixels: from how far away acceleration is taken where flow is not trusted
+COVERED = 5  # halved pixels around flow that is not trusted: parts of DIS' patches
+MIDDLE = np.array([9, -50, 225, 225, -50, 9], np.float32) / 368  # Lanczos' kernel of 3 pixels half
+# way between two
+BENT_PX = 0.05  # an acceleration that moves less is left out
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Frame:
+    """dn: (H, W) float32; time: us."""
+
+    dn: np.ndarray
+    time: int
+
+    @functools.cached_property
+    def doubled(self) -> np.ndarray:
+        """(2H, 2W): the frame, and between its pixels what lies there (Lanczos)."""
+        height, width = self.dn.shape
+        wide = np.empty((height, 2 * width), np.float32)
+        wide[:, ::2], wide[:, 1::2] = self.dn, _between_pixels(self.dn, 1)
+        both = np.empty((2 * height, 2 * width), np.float32)
+        both[::2], both[1::2] = wide, _between_pixels(wide, 0)
+        return both
+
+
+def _between_pixels(image: np.ndarray, axis: int) -> np.ndarray:
+    kernel = MIDDLE[None] if axis else MIDDLE[:, None]
+    anchor = (len(MIDDLE) // 2 - 1, 0) if axis else (0, len(MIDDLE) // 2 - 1)
+    return cv2.filter2D(image, -1, kernel, anchor=anchor, borderType=cv2.BORDER_REPLICATE)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Interval:
+    """Two frames and what moves between them.
+
+    bends: half the acceleration at a and at b, (H, W, 2) in pixels per squared interval; None
+    where nothing accelerates. speed_px: how far the fast pixels would move at their greatest
+    velocity. grid: of `motion.grid`.
+    """
+
+    a: Frame
+    b: Frame
+    motion: Motion
+    bends: tuple[np.ndarray, np.ndarray] | None
+    speed_px: float
+    grid: np.ndarray
+
+    def at(self, fractions: Iterable[float], *, sharp: bool = True) -> Iterator[np.ndarray]:
+        """The pictures (H, W) in DN, float32, at fractions of the interval; not sharp: warped
+        bilinearly from the frames as they are."""
+        a, b = (self.a.doubled, self.b.doubled) if sharp else (self.a.dn, self.b.dn)
+        how = cv2.INTER_CUBIC if sharp else cv2.INTER_LINEAR
+        scale = np.float32(2 if sharp else 1)
+        minus_there = -scale * self.motion.there
+        apart = scale * (self.motion.there + self.motion.back)
+        places, bends = scale * self.grid, [scale * bend for bend in self.bends or ()]
+        least = min(float(self.a.dn.min()), float(self.b.dn.min()))
+        most = max(float(self.a.dn.max()), float(self.b.dn.max()))
+        along, to_a, to_b = (np.empty_like(apart) for _ in range(3))  # new memory costs more
+        seen_a, seen_b = np.empty_like(self.a.dn), np.empty_like(self.a.dn)
+        for s in fractions:
+            # flow from the new picture: the quadratic blend of the two measured ones, which is
+            # exact for constant velocity, and what acceleration moves it by
+            cv2.scaleAdd(apart, s, minus_there, along)
+            cv2.scaleAdd(along, s, places, to_a)
+            for bend, share in zip(bends, (1 - s, s), strict=False):
+                cv2.scaleAdd(bend, share * s * (1 - s), to_a, to_a)
+            cv2.subtract(to_a, along, to_b)
+            looked_up(a, to_a, how, seen_a)
+            looked_up(b, to_b, how, seen_b)
+            in_a, in_b = inside(to_a, a.shape), inside(to_b, b.shape)
+            picture = cv2.addWeighted(seen_a, 1 - s, seen_b, s, 0)
+            cv2.copyTo(seen_a, cv2.compare(in_a, in_b, cv2.CMP_GT), picture)
+            cv2.copyTo(seen_b, cv2.compare(in_b, in_a, cv2.CMP_GT), picture)
+            yield np.clip(picture, least, most, out=picture)
+
+
+def intervals(pairs: Iterable[tuple[np.ndarray, int]]) -> Iterator[Interval]:
+    """The intervals of frames (H, W) in DN, float32, of one size, at rising times in us; none of
+    less than two. An interval comes when the frame after it was read, or there is none."""
+    find, places = MotionFinder(), None
+    last = held = before = None
+    for frame in itertools.starmap(Frame, pairs):
+        if last is not None:
+            places = grid(frame.dn.shape) if places is None else places
+            new = _Pair(last, frame, find(last.dn, frame.dn))
+            if held is not None:
+                after = _acceleration(held, new)
+                yield _interval(held, before, after, places)
+                before = after
+            held = new
+        last = frame
+    if held is not None and places is not None:
+        yield _interval(held, before, None, places)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Pair:
+    a: Frame
+    b: Frame
+    motion: Motion
+
+    @property
+    def length(self) -> int:
+        """In us."""
+        return self.b.time - self.a.time
+
+
+def _acceleration(first: _Pair, second: _Pair) -> np.ndarray | None:
+    """Half the acceleration at the frame that two intervals share, (h, w, 2) in pixels per us^2 at
+    half the resolution; None where one interval is much the longer. Where flow is not trusted, as
+    at the edges of what moves and of the picture, it is that of what lies around."""
+    before, after = first.length, second.length
+    if max(before, after) > UNEVEN * min(before, after):
+        return None
+    jump = second.motion.halves[0] / after + first.motion.halves[1] / before
+    trusted = first.motion.trusted[1] & second.motion.trusted[0]
+    weight = cv2.erode(trusted.astype(np.float32), np.ones((COVERED, COVERED), np.uint8))[..., None]
+    near = np.concatenate([jump * weight, weight], -1)
+    for _ in range(2):
+        near = cv2.blur(near, (REACH, REACH), borderType=cv2.BORDER_REPLICATE)
+    around = near[..., :2] / (near[..., 2:] + np.float32(1e-3))
+    return (around + weight * (jump - around)) / np.float32(before + after)
+
+
+def _interval(
+    pair: _Pair, before: np.ndarray | None, after: np.ndarray | None, places: np.ndarray
+) -> Interval:
+    """before, after: `_acceleration` at its frames; of one alone, it is constant."""
+    there, back = pair.motion.halves
+    fast, bends = speed(there), None
+    first, second = (after if before is None else before), (before if after is None else after)
+    if first is not None and second is not None:
+        square = np.float32(pair.length) ** 2
+        bent = _limited(first * square, there), _limited(second * square, back)
+        if max(map(speed, bent)) > BENT_PX:
+            fast = max(fast, speed(there - bent[0]), speed(back - bent[1]))
+            size = pair.a.dn.shape[::-1]
+            bends = cv2.resize(bent[0], size), cv2.resize(bent[1], size)
+    return Interval(pair.a, pair.b, pair.motion, bends, fast, places)
+
+
+def _limited(bend: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """No longer than the flow: what goes somewhere never turns back, and what rests stays."""
+    most, found = length(flow), length(bend)
+    return bend * (np.minimum(found, most) / np.maximum(found, np.float32(1e-9)))[..., None]

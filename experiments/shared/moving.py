@@ -1,0 +1,135 @@
+"""Pictures that move by known amounts, at any time: what lies between the frames of a video."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import skimage.data
+from scipy.ndimage import map_coordinates, spline_filter
+
+Matrix = np.ndarray  # (2, 3), of pixels (x, y, 1) to those of the picture
+SKIMAGE = ("camera", "coffee", "chelsea", "brick", "grass", "gravel", "rocket")
+SIDE = 768  # pixels of a texture
+
+
+@dataclasses.dataclass(frozen=True)
+class Moving:
+    """A picture (H, W) in DN seen under `view(u)`, u in frames, and perhaps an object before it:
+    another picture, seen through a disc of `radius` that itself moves by `across(u)` pixels."""
+
+    picture: np.ndarray
+    view: Callable[[float], Matrix]
+    object: np.ndarray | None = None
+    across: Callable[[float], np.ndarray] | None = None
+    radius: float = 0.0
+
+    def frame(self, u: float, size: tuple[int, int]) -> np.ndarray:
+        """The frame (H, W) at time u in DN, float32, of a size (width, height)."""
+        x, y = np.meshgrid(*map(np.arange, size))
+        seen = _seen(self.picture, self.view(u), x, y)
+        if self.object is None or self.across is None:
+            return seen
+        dx, dy = self.across(u)
+        away = np.hypot(x - dx - size[0] / 2, y - dy - size[1] / 2)
+        cover = np.clip(self.radius - away + 0.5, 0, 1).astype(np.float32)
+        shift = np.array([[1.0, 0, -dx], [0, 1, -dy]])
+        return seen + cover * (_seen(self.object, shift, x, y) - seen)
+
+
+def _seen(picture: np.ndarray, view: Matrix, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """By cubic splines: exact to a fraction of a DN, and alike at every sub-pixel shift."""
+    at_x, at_y = (r[0] * x + r[1] * y + r[2] for r in view)
+    seen = map_coordinates(_coefficients(picture), [at_y, at_x], np.float32, order=3,
+                           mode="mirror", prefilter=False)
+    return np.clip(seen, 0, 255)
+
+
+_KEPT: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+
+def _coefficients(picture: np.ndarray) -> np.ndarray:
+    if id(picture) not in _KEPT:
+        _KEPT[id(picture)] = picture, spline_filter(picture, 3, np.float32, "mirror")
+    return _KEPT[id(picture)][1]
+
+
+def photographs() -> dict[str, np.ndarray]:
+    """Grey photographs in DN, float32, by name: scikit-image's that need no download, and those
+    under EVFLOW_DATA where it is set."""
+    found = {}
+    for name in SKIMAGE:
+        image = getattr(skimage.data, name)()
+        found[name] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    folder = Path(os.environ.get("EVFLOW_DATA", "/nowhere")) / "data/images"
+    for path in sorted(folder.glob("*/*.jpg")) + sorted(folder.glob("*/images/*.jpg"))[:4]:
+        found[path.stem] = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    return {name: image.astype(np.float32) for name, image in found.items()}
+
+
+def textures() -> dict[str, np.ndarray]:
+    """Waves of 5 to 60 pixels; discs that cover each other, with edges of a pixel."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
+    waves = np.zeros((SIDE, SIDE), np.float32)
+    for _ in range(40):
+        angle, phase = rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi)
+        wave = 5 * 12 ** rng.uniform()
+        waves += np.sin(2 * np.pi * (np.cos(angle) * x + np.sin(angle) * y) / wave + phase)
+    discs = np.full((SIDE, SIDE), 120.0, np.float32)
+    for _ in range(900):
+        cx, cy = rng.uniform(0, SIDE, 2)
+        radius = 6 * 10 ** rng.uniform()
+        cover = np.clip(radius - np.hypot(x - cx, y - cy) + 0.5, 0, 1)
+        discs += cover * (np.float32(rng.uniform(15, 240)) - discs)
+    return {"waves": 127.5 + 110 * np.tanh(waves / 6), "discs": discs}
+
+
+def pan(speed: float) -> Callable[[float], Matrix]:
+    """A constant velocity in pixels per frame, a sixth of it downwards."""
+    step = speed * np.array([1, 1 / 6]) / np.hypot(1, 1 / 6)
+    return lambda u: np.array([[1, 0, u * step[0]], [0, 1, u * step[1]]])
+
+
+def hand(speed: float) -> Callable[[float], Matrix]:
+    """A camera held by hand: two sines and their velocity's root mean square."""
+    rates = 2 * np.pi * np.array([[1 / 13, 1 / 5.3], [1 / 9, 1 / 6.1]])  # of x and y, per frame
+    swing = speed / rates / np.sqrt([[1.0, 4.0], [2.0, 4.0]])
+
+    def view(u: float) -> Matrix:
+        shift = (swing * np.sin(rates * u + [[0.3, 1.1], [2.0, 0.7]])).sum(1)
+        return np.column_stack([np.eye(2), shift])
+
+    return view
+
+
+def turn(speed: float, size: tuple[int, int]) -> Callable[[float], Matrix]:
+    """Rotation and zoom about the middle; `speed` pixels per frame half way to the side."""
+    middle, rate = np.array(size) / 2, speed / (min(size) / 2)
+
+    def view(u: float) -> Matrix:
+        angle, zoom = rate * u, np.exp(-0.4 * rate * u)
+        c, s = zoom * np.cos(angle), zoom * np.sin(angle)
+        turned = np.array([[c, -s], [s, c]])
+        return np.column_stack([turned, middle - turned @ middle])
+
+    return view
+
+
+def video(moving: Moving, frames: int, size: tuple[int, int], dense: int) -> np.ndarray:
+    """Frames 0, 1 / dense, ... frames - 1 (N, H, W)."""
+    return np.stack([moving.frame(k / dense, size) for k in range((frames - 1) * dense + 1)])
+
+
+def blended(frames: np.ndarray, times: np.ndarray, steps: int) -> Iterator[tuple[np.ndarray, int]]:
+    """The video filled up by mixtures of neighbours."""
+    for (a, b), (t0, t1) in zip(itertools.pairwise(frames), itertools.pairwise(times), strict=True):
+        for k in range(steps):
+            s = k / steps
+            yield (1 - s) * a + s * b, int(t0 + round(s * (t1 - t0)))
+    yield frames[-1].astype(np.float32), int(times[-1])
