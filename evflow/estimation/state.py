@@ -64,8 +64,8 @@ class Eyes:
 class State:
     """params: of the network. stats, n_events, n_shown (H, W), evidence, quiet (4, H, W): sums over
     all that was read; chunks: the stretches that are simulated; read: the stretches whose quiet
-    time is counted at the end; windows: how many were read; parts: of each stretch, what drift.py
-    compares."""
+    time is counted at the end; windows, seconds: how many were read; parts: of each stretch, what
+    drift.py compares."""
 
     params: api.Params
     eyes: Eyes
@@ -77,6 +77,7 @@ class State:
     chunks: tuple[Chunk, ...] = ()
     read: tuple[Stretch, ...] = ()
     windows: int = 0
+    seconds: float = 0.0
     parts: tuple[drift.Part, ...] = ()
 
 
@@ -112,7 +113,8 @@ def add(
         advance()
     state = dataclasses.replace(
         state, stats=stats, n_events=n_events, n_shown=n_shown, read=(*state.read, stretch),
-        windows=state.windows + len(stretch.windows))
+        windows=state.windows + len(stretch.windows),
+        seconds=state.seconds + 1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
     if not stretch.run:
         return state
     state = add_path(state, stretch, simulate=simulate)
@@ -163,9 +165,8 @@ def refine(state: State) -> Refined:
     if state.evidence is None or state.quiet is None:
         return Refined(hot, state.chunks, summary, std)
     found = state.eyes.found
-    seconds = sum(s.span_us[1] - s.span_us[0] for s in state.read) * 1e-6
     hot = hot_pixels(
-        state.quiet, float(summary.eta_on + summary.eta_off), state.n_events, seconds)
+        state.quiet, float(summary.eta_on + summary.eta_off), state.n_events, state.seconds)
     chunks = tuple(_without_hot(c, hot) for c in state.chunks)
     summary, std = maps.refined(state.params, list(chunks), summary, std)
     if found is None:
