@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,6 +17,8 @@ from evflow.network import api, architecture
 from evflow.network.coordinates import SCALE, camera_std, per_channel, squash, unsquash_summary
 from evflow.recordings.glitches import exposed
 from evflow.types import Window
+
+Array = jax.Array
 
 
 def by_flow(
@@ -51,11 +54,15 @@ def by_regression(
     the summary's own error, which all pixels share, is added to the std."""
     theta, error = pixel_posterior(evidence, summary)
     shared = (float(summary_std.theta_on), float(summary_std.theta_off))
-    on, off = (jnp.sqrt(e**2 + s**2) for e, s in zip(jnp.asarray(error), shared, strict=True))
-    flat = jnp.ones(theta.shape[1:])
-    return (Camera(jnp.asarray(theta[0]), jnp.asarray(theta[1]), summary.eta_on * flat,
-                   summary.eta_off * flat),
-            Camera(on, off, summary_std.eta_on * flat, summary_std.eta_off * flat))
+    on, off = (np.sqrt(e**2 + np.float32(s**2)) for e, s in zip(error, shared, strict=True))
+
+    def flat(value: Array) -> Array:
+        return jnp.asarray(np.full(theta.shape[1:], value, np.float32))
+
+    return (Camera(jnp.asarray(theta[0]), jnp.asarray(theta[1]), flat(summary.eta_on),
+                   flat(summary.eta_off)),
+            Camera(jnp.asarray(on), jnp.asarray(off), flat(summary_std.eta_on),
+                   flat(summary_std.eta_off)))
 
 
 def with_rates(

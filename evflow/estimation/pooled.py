@@ -28,16 +28,23 @@ def window_inputs(
 ) -> tuple[ArrayLike, ArrayLike, dict[str, ArrayLike]]:
     """voxels (H, W, 32), dlogI (H, W) and conditions of one window of a recording."""
     voxels = voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
-    before, after = (log_light(f, seen_by) for f in (window.frame0, window.frame1))
-    intensity, dlogI = 0.5 * (before + after), after - before
+    intensity, dlogI = _mean_and_change(*(_light(f, seen_by) for f in (
+        window.frame0, window.frame1)))
     return voxels, dlogI, {"window_s": window.window_s, "intensity": intensity}
 
 
-def log_light(frame: np.ndarray, seen_by: Photoreceptor) -> Array:
-    """A frame (H, W) in log units, with the light that its pixels see beside it."""
+def _light(frame: np.ndarray, seen_by: Photoreceptor) -> np.ndarray:
+    """A frame (H, W) in DN, with the light that its pixels see beside it."""
     if not seen_by.offset_dn:
-        return lin_log(frame)
-    return lin_log(np.maximum(frame.astype(np.float32) + seen_by.offset_dn, 0.0))
+        return frame
+    return np.maximum(frame.astype(np.float32) + np.float32(seen_by.offset_dn), np.float32(0.0))
+
+
+@jax.jit
+def _mean_and_change(frame0: ArrayLike, frame1: ArrayLike) -> tuple[Array, Array]:
+    """Mean of the log intensity of two frames (H, W) in DN, and its change."""
+    before, after = lin_log(frame0), lin_log(frame1)
+    return 0.5 * (before + after), after - before
 
 
 def pool_recording(
@@ -90,7 +97,12 @@ def window_stats(
         voxels, dlogI = filled(voxels), filled(dlogI)
         given["intensity"] = filled(given["intensity"])
     stats = api.summarize(params, voxels, dlogI, **given)
-    return stats if share == 1 else jax.tree.map(lambda leaf: leaf * share, stats)
+    return stats if share == 1 else _scaled(stats, share)
+
+
+@jax.jit
+def _scaled(stats: api.Stats, share: ArrayLike) -> api.Stats:
+    return jax.tree.map(lambda leaf: leaf * share, stats)
 
 
 def quiet_times(
@@ -101,7 +113,7 @@ def quiet_times(
     total = np.zeros((2, 2, *hot.shape))
     for window in windows:
         frames = window.frame0, window.frame1
-        before, after = (log_light(f, seen_by) for f in frames)
-        total += quiet_time(window.events.count_map(), np.asarray(after - before),
+        _, change = _mean_and_change(*(_light(f, seen_by) for f in frames))
+        total += quiet_time(window.events.count_map(), np.asarray(change),
                             exposed(*frames), hot, window.window_s, noise)
     return total

@@ -43,7 +43,7 @@ from evflow.network.coordinates import (
     Output,
     camera_std,
     squash_summary,
-    summary_std,
+    squashed_summary,
     unsquash_summary,
 )
 from evflow.network.inputs import (
@@ -168,9 +168,7 @@ def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
     """
     config, net = _pooling_parts(params)
     need(stats, Stats, "stats", "Give what summarize returns, one or a sum.")
-    y, y_std = _finish(net["summary"], stats, config=config)
-    result = squash_summary(y)
-    return result, summary_std(result, y_std)
+    return squashed_summary(*_finish(net["summary"], stats, config=config))
 
 
 @partial(jax.jit, static_argnames="config")

@@ -66,6 +66,27 @@ def squash_summary(y: Array) -> Summary:
                    sigma[..., 0], sigma[..., 1])
 
 
+@jax.jit
+def _scaled(y: Array, y_std: Array) -> tuple[Array, Array]:
+    scale = per_channel(np.array([*SCALE, SIGMA_SCALE, SIGMA_SCALE]), y)
+    return y * scale, y_std * scale
+
+
+@jax.jit
+def _natural(log_y: Array, s: Array) -> tuple[Summary, Summary]:
+    medians = jnp.exp(log_y[..., :4] + per_channel(CENTRE, log_y))
+    sigma = jnp.maximum(jnp.exp(log_y[..., 4:] + SIGMA_CENTRE) - SIGMA_OFFSET, 0.0)
+    found = Summary(*jnp.moveaxis(jnp.concatenate([medians, sigma], -1), -1, 0))
+    added = jnp.concatenate([medians, sigma + SIGMA_OFFSET], -1)
+    return found, Summary(*jnp.moveaxis(added * s, -1, 0))
+
+
+def squashed_summary(y: Array, y_std: Array) -> tuple[Summary, Summary]:
+    """`squash_summary` and `summary_std`, as two programs: one would round otherwise than its
+    operations one by one."""
+    return _natural(*_scaled(y, y_std))
+
+
 def summary_std(summary: Summary, y_std: Array) -> Summary:
     """Standard deviation in natural units from that of y (..., 6), to first order."""
     s = y_std * per_channel(np.array([*SCALE, SIGMA_SCALE, SIGMA_SCALE]), y_std)

@@ -59,11 +59,16 @@ class Stats:
     events_off: Array
 
     def __add__(self, other: Stats) -> Stats:
-        return jax.tree.map(jnp.add, self, other)
+        return _added(self, other)
 
     def __radd__(self, other: int) -> Stats:
         """`sum(...)` begins with 0."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
+
+
+@jax.jit
+def _added(one: Stats, other: Stats) -> Stats:
+    return jax.tree.map(jnp.add, one, other)
 
 
 def window_features(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:

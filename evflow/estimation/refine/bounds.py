@@ -9,7 +9,6 @@ thresholds.
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.scipy import special
 
@@ -68,7 +67,7 @@ def bounded(
         scale = np.sqrt(along[i] + error**2)
         margin = (mean[i] - (bound - EXCESS)) / scale
         # phi / Phi, by logarithms: far below the bound both vanish
-        log_mills = -0.5 * margin**2 - np.asarray(log_ndtr(jnp.asarray(margin, jnp.float32)))
+        log_mills = -0.5 * margin**2 - np.asarray(log_ndtr(margin.astype(np.float32)))
         pull = np.where(bound == NOTHING, 0.0, np.exp(log_mills) / np.sqrt(2 * np.pi))
         mean = mean + along * (pull / scale)
         shrink = pull * (pull + margin) / scale**2

@@ -35,7 +35,7 @@ from evflow.estimation.refine.path import STEPS, Chunk
 from evflow.estimation.refine.signal import told_apart
 from evflow.estimation.refine.trace import FRESH, RUNNING, trace_of_camera
 from evflow.light.log_maps import lin_log_inverse, noise_factor, normalised_intensity
-from evflow.network.coordinates import squash_summary, summary_std, unsquash_summary
+from evflow.network.coordinates import squashed_summary, unsquash_summary
 
 Array = jax.Array
 Start = tuple[float, float]
@@ -228,9 +228,8 @@ class Fit:
 
 def _mean_factor(chunks: list[Chunk]) -> float:
     """Mean intensity factor of Eq. 12 over the frames."""
-    factors = [np.asarray(noise_factor(normalised_intensity(lin_log_inverse(
-        jnp.asarray(c.path[::STEPS]))))).mean() for c in chunks]
-    return float(np.mean(factors))
+    frames = (np.asarray(lin_log_inverse(jnp.asarray(c.path[::STEPS]))) for c in chunks)
+    return float(np.mean([noise_factor(normalised_intensity(dn)).mean() for dn in frames]))
 
 
 def refine_summary(
@@ -257,10 +256,17 @@ def refine_summary(
             "EV018", f"the weights' fusion sees {fusion['mean'].size} features of a recording, "
             f"this version has {features.size}.",
             'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
-    y, y_std = fused(fusion, jnp.asarray(features), unsquash_summary(stepped))
-    result = squash_summary(y)
-    result, result_std = _with_noise(chunks, result, summary_std(result, y_std), signal, fit.factor)
+    result, result_std = squashed_summary(*_corrected(fusion, features, stepped))
+    result, result_std = _with_noise(chunks, result, result_std, signal, fit.factor)
     return Refined(result, result_std, features, fit.start == FRESH)
+
+
+@jax.jit
+def _corrected(
+    fusion: dict[str, Any], features: Array, stepped: Summary
+) -> tuple[Array, Array]:
+    """y (6,) of the stepped summary as the fusion corrects it, and its std."""
+    return fused(fusion, features, unsquash_summary(stepped))
 
 
 def _with_noise(
@@ -276,8 +282,8 @@ def _with_noise(
     if signal is not None:
         log_eta, log_std = told_apart(chunks, theta, log_eta, log_std, signal)
     log_eta, log_std = with_tie(theta, both(std, "theta"), log_eta, log_std, factor)
-    rates = dict(zip(("eta_on", "eta_off"), jnp.float32(np.exp(log_eta)), strict=True))
-    errors = dict(zip(rates, jnp.float32(np.exp(log_eta) * log_std), strict=True))
+    rates = dict(zip(("eta_on", "eta_off"), map(jnp.float32, np.exp(log_eta)), strict=True))
+    errors = dict(zip(rates, map(jnp.float32, np.exp(log_eta) * log_std), strict=True))
     return dataclasses.replace(summary, **rates), dataclasses.replace(std, **errors)
 
 

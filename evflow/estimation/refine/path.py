@@ -164,14 +164,14 @@ def interpolated(
 def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
     """The path (K * steps + 1, H, W) in log units that a photoreceptor makes of a film."""
     if not seen_by.offset_dn and not seen_by.tau_s:
-        return np.asarray(lin_log(film.dn))
+        return np.asarray(_log(film.dn))
     steps = (len(film.dn) - 1) // len(film.dt_s)
     dt_s = np.repeat(film.dt_s / steps, steps).astype(np.float32)
     values = (np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST)))
     return np.asarray(_seen(film.dn, dt_s, *values))
 
 
-_seen = jax.jit(seen_path)
+_seen, _log = jax.jit(seen_path), jax.jit(lin_log)  # one program each, not one an operation
 
 
 def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | None:

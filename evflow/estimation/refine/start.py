@@ -110,7 +110,7 @@ def running_on(mean: Array, covariance: Array, span: Array, fired: Array) -> tup
     event, and whether there is one (H, W)."""
     along = covariance.sum(1)
     variance, centre = along.sum(0), mean.sum(0)
-    moments = _moments(*(jnp.asarray(v, jnp.float32)
+    moments = _moments(*(v.astype(np.float32)
                          for v in (centre, np.sqrt(variance), np.maximum(span, 0.0))), fired)
     moved, shrunk = (np.asarray(m, np.float64) for m in moments)
     covariance = covariance - along[:, None] * along[None] * ((1 - shrunk) / variance)
