@@ -76,7 +76,7 @@ class Estimate(Compiling, Reading):
     plots: bool = True
     """Write maps and histograms as PNG (needs matplotlib)."""
     report: bool = True
-    """Write report.html: the recording re-simulated, a held-out half, in ten panels (needs
+    """Write report.html: the recording re-simulated, a held-out half, in panels (needs
     matplotlib; takes about as long as the estimate; protocol motion only)."""
     checks: bool = True
     """Stop where `evflow check` finds errors."""

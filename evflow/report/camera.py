@@ -1,4 +1,4 @@
-"""The report on an estimated camera: ten panels in one HTML file, as evidence for the estimate.
+"""The report on an estimated camera: panels in one HTML file, as evidence for the estimate.
 
 The recording's own frames are simulated again with the estimate and laid beside what was
 recorded; an estimate from the first half is tried on the second. What cannot be shown says why.
@@ -24,6 +24,7 @@ from evflow.process.provenance import sha256, told
 from evflow.recordings.check import check
 from evflow.recordings.check.agreement import frame_steps
 from evflow.report import page
+from evflow.report.extent import extent_panel
 from evflow.report.maps import fault_panel, map_panel, scatter_panel
 from evflow.report.page import Panel, bullets, number, paragraph, plural, spread, table
 from evflow.report.plots import require
@@ -124,7 +125,7 @@ def write_report(
     judged = judge_estimate(found, evidence.trial, evidence.held)
     panels = [_verdict(found, evidence, judged), map_panel(found), scatter_panel(found),
               *_trial_panels(recording, evidence), receptor_panel(found, evidence.foretold),
-              fault_panel(found), _held_panel(found, evidence),
+              fault_panel(found), extent_panel(found), _held_panel(found, evidence),
               _assumptions(found, recording, weights, source, command)]
     step()
     numbers = {"grade": worst(judged), "trial": _numbers(evidence.trial),

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import builtins
 import json
+import signal
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.networks import hidden
 
-from evflow import write_events
+from evflow import EvflowDataError, Summary, write_events
 from evflow.cli import main
+from evflow.estimation import pipeline
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +89,36 @@ def test_help_has_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> N
         main([verb, "--help"])
     assert caught.value.code == 0
     assert f"Example: evflow {verb}" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("options", "effort", "ends"), [
+    ([], "normal", False),
+    (["--effort", "quick", "--budget-s", "1e9"], "quick", False),
+    (["--budget-s", "0"], "normal", True),
+    (["--on-interrupt", "save"], "normal", True),
+])
+def test_how_much_is_read(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], effort: str,
+    ends: bool,
+) -> None:
+    """A budget that is spent and Ctrl-C, where that is asked for, end reading and nothing else."""
+    asked: list[Any] = []
+
+    def estimated(*_: Any, **given: Any) -> None:
+        if "save" in options:
+            signal.raise_signal(signal.SIGINT)
+        so_far = Summary(*np.full(6, np.float32(0.2)))
+        asked.append((given["effort"], given["until"](so_far, so_far)))
+        raise EvflowDataError("EV017", "read.")
+
+    monkeypatch.setattr(pipeline, "estimate_camera", estimated)
+    assert main(["estimate", str(flight), "-o", str(tmp_path / "cam"), *options]) == 1
+    assert asked == [(effort, ends)]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_budget_below_nothing(flight: Path, tmp_path: Path) -> None:
+    command = ["estimate", str(flight), "-o", str(tmp_path / "cam")]
+    assert main([*command, "--budget-s", "-1"]) == 2
+    assert main([*command, "--budget-s", "nan"]) == 2
+    assert main([*command, "--protocol", "static", "--effort", "full"]) == 2

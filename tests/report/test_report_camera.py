@@ -21,13 +21,16 @@ from PIL import Image
 
 import evflow
 from evflow import CameraEstimate, EvflowDataError, Recording
+from evflow.estimation.drift import Third
+from evflow.estimation.extent import Extent
 from evflow.notes import Note
 from evflow.report import camera, page
+from evflow.report.extent import extent_panel
 from evflow.report.resimulate import busiest, usable_runs
 from evflow.report.verdict import judge_estimate, judge_stream, known, poorer, worst
 
 PANELS = ("verdict", "maps", "on-off", "rates", "images", "counts", "intervals", "receptor",
-          "faults", "held-out", "assumptions")
+          "faults", "extent", "held-out", "assumptions")
 
 
 @pytest.fixture(scope="module")
@@ -230,3 +233,21 @@ def test_large_maps_are_shown_in_blocks() -> None:
     np.testing.assert_array_equal(small, [[2.5, 4.5], [10.5, 12.5]])
     same, k = page.blocks(np.ones((3, 5)), 5)
     assert (same.shape, k) == ((3, 5), 1)
+
+
+def test_what_was_read_and_its_thirds_are_laid_side_by_side(
+    measured: tuple[CameraEstimate, Recording]
+) -> None:
+    thirds = tuple(Third(k * 10_000_000, (k + 1) * 10_000_000, 4, 0.2, theta, 0.004, 0.004)
+                   for k, theta in enumerate((0.2, 0.2, 0.25)))
+    found = dataclasses.replace(measured[0], thirds=thirds,
+                                extent=Extent(2.5, 30.0, 12, 94, 0.04))
+    body = extent_panel(found).body
+    assert "20.0 to 30.0 s" in body
+    assert "θ OFF changed" in body
+    assert "θ ON changed" not in body
+    assert "2.5 of 30.0 s were read" in body
+    assert "4% smaller" in body
+    same = dataclasses.replace(found, thirds=thirds[:1] * 3)
+    assert "agree within their errors" in extent_panel(same).body
+    assert "Too few stretches" in extent_panel(measured[0]).body
