@@ -62,11 +62,16 @@ LOG_MAPS = {"linlog": (lin_log, lin_log_inverse), "log_eps": (log_eps, log_eps_i
 def uint8_table(log_map: str) -> np.ndarray:
     """The log map of the 256 byte values, computed in float64 and rounded to 1e-8 as in v2e,
     then float32: exact threshold ties of 8-bit video fall as they do there."""
-    dn = np.arange(256, dtype=np.float64)
+    value = log64(np.arange(256), log_map)
+    return (np.round(value, 8) if log_map == "linlog" else value).astype(np.float32)
+
+
+def log64(dn: np.ndarray, log_map: str) -> np.ndarray:
+    """The log map of DN on 0..255 in float64 (host)."""
+    dn = dn.astype(np.float64)
     if log_map == "linlog":
-        value = np.where(dn <= LINLOG_KNEE, dn * LINLOG_SLOPE, np.log(np.maximum(dn, 1.0)))
-        return np.round(value, 8).astype(np.float32)
-    return np.log(dn / 255.0 + LOG_EPS).astype(np.float32)
+        return np.where(dn <= LINLOG_KNEE, dn * LINLOG_SLOPE, np.log(np.maximum(dn, 1.0)))
+    return np.log(dn / 255.0 + LOG_EPS)
 
 
 def to_log(frames: ArrayLike, log_map: str = "linlog") -> Array:

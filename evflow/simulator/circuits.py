@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any, Protocol
@@ -24,10 +23,11 @@ from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import to_log
 from evflow.simulator import active, noise, pack, sensor, voltmeter
 from evflow.simulator.active import BLOCK, Block, Exit
+from evflow.simulator.lapse import Lapse
 from evflow.simulator.pack import Keys
 from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor, SimState
-from evflow.simulator.sizes import ACTIVE, sizes
+from evflow.simulator.sizes import ACTIVE, aligned, picked, sizes
 
 Array = jax.Array
 Packed = tuple[Keys, list[np.ndarray]]  # events in no order, and how they are integers
@@ -72,14 +72,6 @@ def _start(
 @jax.jit
 def _salts(key: Array, first: int) -> Array:
     return noise.salts(key, first + jnp.arange(SALTED))
-
-
-def _aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
-    """An empty array that a CPU device takes over without a copy: at a multiple of 64 bytes."""
-    size = math.prod(shape) * dtype.itemsize
-    memory = np.empty(size + 64, np.uint8)
-    first = -memory.ctypes.data % 64
-    return memory[first : first + size].view(dtype).reshape(shape)
 
 
 class _Blocks:
@@ -171,10 +163,15 @@ class _Thresholds(_Blocks):
             yield some, padded.astype(np.int32), dataclasses.replace(block, frames=seen)
 
     def _packed(self, pieces: list[Piece], block: Block, dt_us: np.ndarray) -> Packed:
-        keys, sent = self.keys(dt_us), [(pixels, out) for pixels, _, out in pieces]
+        keys = self.keys(dt_us)
         struck = [(pixels, frames, out.struck) for pixels, frames, out in pieces]
-        return keys, [*pack.signal(self.model, keys, sent, dt_us),
+        return keys, [*self._signal(keys, pieces, dt_us),
                       *pack.noises(self.model, keys, self.here, struck, block, dt_us)]
+
+    def _signal(
+        self, keys: Keys, pieces: list[Piece], dt_us: np.ndarray
+    ) -> Iterator[np.ndarray]:
+        return pack.signal(self.model, keys, [(pixels, out) for pixels, _, out in pieces], dt_us)
 
 
 class Drifting(_Thresholds):
@@ -184,7 +181,7 @@ class Drifting(_Thresholds):
         super().__init__(*exit_and_sensor)
         # Fresh memory is dear. The device may read one block while another is filled.
         shape = (BLOCK + 1, self.before.size)
-        self.buffers = itertools.cycle([_aligned(shape, self.before.dtype) for _ in range(2)])
+        self.buffers = itertools.cycle([aligned(shape, self.before.dtype) for _ in range(2)])
 
     def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
         looked: tuple[Any, ...] = ()
@@ -223,6 +220,7 @@ class Still(_Thresholds):
         self.bright, self.dark = np.array(found)
         self.seen = np.full(self.before.size, self.begin)  # when each was stepped last
         self.stepped: list[tuple[np.ndarray, Array]] = []  # pixels, their limits from then on
+        self.lapse = Lapse(self.model)
 
     def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
         for frames, edges in video:
@@ -230,7 +228,7 @@ class Still(_Thresholds):
             struck = None
             if self.whole.rates is not None:
                 struck = active.look_for_noise(self.whole, block)
-            brightest, darkest = (_picked(pick, frames) for pick in (np.maximum, np.minimum))
+            brightest, darkest = (picked(pick, frames) for pick in (np.maximum, np.minimum))
             for pixels, limits in self.stepped:  # waits for the block before
                 self.bright[pixels], self.dark[pixels] = np.asarray(limits)[:, : len(pixels)]
             may_send = (brightest > self.bright) | (darkest < self.dark)
@@ -241,6 +239,7 @@ class Still(_Thresholds):
     def _step(self, block: Block, edges: np.ndarray, at: np.ndarray) -> Stepped:
         pieces: list[Piece] = []
         self.stepped = []
+        self.lapse.begin(block, np.diff(edges), self.pixels.base)
         for some, padded, seen in self.pieces(at, block):
             rested = self._rested(some, padded, edges) if active.waits(self.model) else None
             self.pixels, sent, limits = active.step_still(
@@ -249,19 +248,17 @@ class Still(_Thresholds):
             pieces.append((some, seen.frames, sent))
         return pieces, block, np.diff(edges)
 
+    def _signal(
+        self, keys: Keys, pieces: list[Piece], dt_us: np.ndarray
+    ) -> Iterator[np.ndarray]:
+        exact = self.lapse.signal(keys, self.here.camera, pieces, dt_us)
+        return super()._signal(keys, pieces, dt_us) if exact is None else exact
+
     def _rested(self, some: np.ndarray, padded: np.ndarray, edges: np.ndarray) -> np.ndarray:
         """Seconds since the last block of these pixels, for which this one is the last now."""
         since = edges[0] - self.seen.take(padded, mode="clip")
         self.seen[some] = edges[-1]
         return (since * self.tick_s).astype(np.float32)
-
-
-def _picked(pick: np.ufunc, frames: list[np.ndarray]) -> np.ndarray:
-    """The greatest or least of all frames, in place: fresh memory is dear."""
-    out = frames[0].copy()
-    for frame in frames[1:]:
-        pick(out, frame, out=out)
-    return out
 
 
 class Brownian(_Blocks):

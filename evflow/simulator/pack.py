@@ -99,14 +99,8 @@ def _progressions(
         return np.concatenate([_of(getattr(out.spikes, name), at) for out, at, _ in sent])
 
     count = spikes("count")
-    if (total := float(np.abs(count).sum(dtype=np.float64))) > MOST_EVENTS:
-        most = float(np.abs(count).max())
-        raise EvflowDataError(
-            "EV014", f"{total:.3g} events between {len(dt_us) + 1} frames, up to {most:.3g} of one "
-            "pixel: the thresholds are too low for this video.",
-            "Raise them (those of real pixels are .05 to 1, natural log); or are the frames "
-            "logarithms, or of another scale?")
-    row, k = _repeated(np.abs(count) - skip)
+    need_few(count, len(dt_us))
+    row, k = repeated(np.abs(count) - skip)
     step, pixel = (np.concatenate(parts).take(row) for parts in zip(
         *((at // out.first.shape[1], pixel) for out, at, pixel in sent), strict=True))
     k = (k + skip).astype(np.float32)
@@ -135,7 +129,7 @@ def noises(
     words, rates = jax.tree.map(lambda m: m.take(pixel), (whole.words, whole.rates))
     drawn = noise.draw(words, block.salts.take(step, axis=0).T)
     odds = noise.odds(rates, normalised_intensity(dn.astype(np.float32)), block.dt.take(step))
-    row, k = _repeated(_number(odds, noise.uniform(drawn)))
+    row, k = repeated(_number(odds, noise.uniform(drawn)))
     fraction, on = noise.event(
         model, words[row], drawn[row], k.astype(np.uint32), odds.share[row])
     yield from_fractions(keys, step[row], pixel[row], fraction, on, dt_us, noise=True)
@@ -168,7 +162,18 @@ def _of(values: jax.Array, at: Array) -> Array:
     return np.asarray(values).ravel().take(at)
 
 
-def _repeated(number: Array) -> tuple[Array, Array]:
+def need_few(count: Array, intervals: int) -> None:
+    """EV014 for more events, signed counts of pixels, than a video of sound thresholds has."""
+    if (total := float(np.abs(count).sum(dtype=np.float64))) > MOST_EVENTS:
+        most = float(np.abs(count).max())
+        raise EvflowDataError(
+            "EV014", f"{total:.3g} events between {intervals + 1} frames, up to {most:.3g} of one "
+            "pixel: the thresholds are too low for this video.",
+            "Raise them (those of real pixels are .05 to 1, natural log); or are the frames "
+            "logarithms, or of another scale?")
+
+
+def repeated(number: Array) -> tuple[Array, Array]:
     """Rows 0, 1, ... each `number` times, and which time it is: 0, 1, ..."""
     number = number.astype(np.int64)
     row = np.repeat(np.arange(len(number)), number)

@@ -1,4 +1,4 @@
-"""How many pixels a program steps at a time.
+"""How many pixels a program steps at a time, and the memory that it takes.
 
 The pixels that may fire in a block are padded to one of a few sizes, as XLA compiles a program for
 each. A short video gains nothing by many: a smaller size gets its program once the padding without
@@ -9,8 +9,11 @@ events are the same.
 from __future__ import annotations
 
 import functools
+import math
 from collections import Counter
 from collections.abc import Hashable
+
+import numpy as np
 
 # A call hands work to another thread and back, which costs more than arrays that leave the cache.
 ACTIVE: tuple[int, ...] = (4096, 8192, 12288, 16384, 20480)
@@ -39,3 +42,19 @@ class Sizes:
 def sizes(pixels: int, *program: Hashable) -> Sizes:
     """Those of a program, as long as the process runs. program: what else it is compiled for."""
     return Sizes(pixels)
+
+
+def aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
+    """An empty array that a CPU device takes over without a copy: at a multiple of 64 bytes."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    return memory[first : first + size].view(dtype).reshape(shape)
+
+
+def picked(pick: np.ufunc, frames: list[np.ndarray]) -> np.ndarray:
+    """The greatest or least of all frames, in place: fresh memory is dear."""
+    out = frames[0].copy()
+    for frame in frames[1:]:
+        pick(out, frame, out=out)
+    return out

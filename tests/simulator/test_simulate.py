@@ -300,3 +300,40 @@ def test_floor_division_is_exact_but_for_ties() -> None:
     tie = k.astype(np.float32) * theta
     at_tie = np.asarray(floor_divide(jnp.asarray(tie), jnp.asarray(theta)))
     assert ((at_tie == np.floor_divide(tie, theta)) | (at_tie == k)).all()
+
+
+@pytest.mark.parametrize("step_us", [60_000_000, 7_200_000_000])
+@pytest.mark.parametrize(("model", "dtype"), [
+    (SensorModel(), np.float32), (SensorModel(), np.uint8), (SensorModel(kind="esim"), np.float32),
+    (SensorModel(noise_resets_memory=True), np.uint8)])
+def test_frames_far_apart_have_times_exact_to_the_microsecond(
+    step_us: int, model: SensorModel, dtype: type
+) -> None:
+    """Against crossings worked out in float64, pixel by pixel; more than a block of frames, of
+    which a few in the middle are near each other."""
+    frames = drifting(20, speed=0.3).astype(dtype)
+    steps = np.full(19, step_us)
+    steps[9:12] = 1000
+    times = 5 + np.concatenate([[0], np.cumsum(steps)])
+    thresholds = [float(np.float32(v)) for v in (0.25, 0.1875)]  # exact in few bits: no ties
+    events = simulate(jax.random.key(0), frames, times, Camera.constant(SHAPE, *thresholds),
+                      model=model)
+    dn = frames.astype(np.float64)
+    logs = (np.log(dn / 255 + 1e-3) if model.kind == "esim" else
+            np.where(dn <= 20, dn * np.log(20) / 20, np.log(np.maximum(dn, 1))))
+    pixel, t, _ = by_pixel(events)
+    checked = 0
+    for at in range(0, SHAPE[0] * SHAPE[1], 7):
+        series, expected = logs.reshape(20, -1)[:, at], []
+        memory = series[0]
+        for i in range(19):
+            theta = thresholds[0] if series[i + 1] > memory else -thresholds[1]
+            for _ in range(int((series[i + 1] - memory) / theta)):
+                memory += theta
+                share = (memory - series[i]) / (series[i + 1] - series[i])
+                expected.append(times[i] + np.clip(np.ceil(share * steps[i]), 1, steps[i]))
+        ours = t[pixel == at]
+        assert len(ours) == len(expected)
+        assert np.abs(ours - np.array(expected)).max(initial=0) <= 1
+        checked += len(ours)
+    assert checked > 100
