@@ -45,8 +45,9 @@ def watched(pairs: Frames, drop: bool, count: Count) -> Frames:
     shown, last_change = 0, 0.0
     for frame, time in pairs:
         count.frames += 1
-        change = _change(run[0][0], frame) if run else np.inf
-        if run and change <= min(NOISE_DN, ALIKE * last_change):
+        most = min(NOISE_DN, ALIKE * last_change)  # of what compression leaves
+        change = _change(run[0][0], frame, most) if run else np.inf
+        if run and change <= most:
             shown += 1
             if not drop or shown > LONGEST:
                 if drop and shown == LONGEST + 1:
@@ -63,11 +64,11 @@ def watched(pairs: Frames, drop: bool, count: Count) -> Frames:
     count.repeats += shown - 1 if run and shown <= LONGEST else 0
 
 
-def _change(before: np.ndarray, after: np.ndarray) -> float:
-    """Mean absolute change in DN; of all pixels only where those compared first hardly change."""
+def _change(before: np.ndarray, after: np.ndarray, most: float) -> float:
+    """Mean absolute change in DN; of all pixels only where that may be at most `most`."""
     some = np.s_[::SAMPLED, ::SAMPLED]
     sampled = _mean(before[some], after[some])
-    return sampled if sampled > 2 * NOISE_DN else _mean(before, after)
+    return sampled if sampled > 2 * most else _mean(before, after)
 
 
 def _mean(before: np.ndarray, after: np.ndarray) -> float:
