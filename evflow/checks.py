@@ -19,6 +19,31 @@ COLUMNS = ("x", "y", "t", "p")
 RESET_US = 1_000_000  # a step back by more than this is another clock, not a late packet
 
 
+def plain(name: str, value: Any) -> Any:
+    """The value as an array of NumPy, or as it is where it is one of JAX. EV003 for masked values,
+    whose mask would be lost, for times with a unit, and for what is no array."""
+    if hasattr(value, "aval"):
+        return value
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise EvflowDataError(
+            "EV003", f"{name} has {np.ma.count_masked(value):,} masked values, which would count "
+            "as any others.", "Leave those out, or fill them: value.compressed(), value.filled(0).")
+    try:
+        array = np.asarray(value)
+    except EvflowDataError:
+        raise
+    except Exception as e:  # of tensors on other devices, with gradients: a kind a library
+        raise EvflowDataError(
+            "EV003", f"{name} is a {type(value).__name__} that is no array ({e}).",
+            "Of a PyTorch tensor: tensor.detach().cpu().numpy().") from e
+    if array.dtype.kind in "mM":
+        raise EvflowDataError(
+            "EV003", f"{name} has dtype {array.dtype}: times with a unit of their own.",
+            f"Times are integer us: {'t' if array.dtype.kind == 'm' else '(t - t[0])'}"
+            ".astype('timedelta64[us]').astype(np.int64).")
+    return array
+
+
 def need(value: Any, kind: Any, name: str, fix: str) -> None:
     """EV020 where a value of another kind, a class or a union of some, was given."""
     if not isinstance(value, kind):
@@ -96,8 +121,9 @@ def check_polarity(p: np.ndarray) -> np.ndarray:
 
 
 def check_columns(*given: Any) -> dict[str, np.ndarray]:
-    """x, y, t, p as 1-D arrays of one length without NaN; EV002, EV007."""
-    columns = {name: np.asarray(v) for name, v in zip(COLUMNS, given, strict=True)}
+    """x, y, t, p as 1-D arrays of one length without NaN; EV002, EV003, EV007."""
+    columns = {name: np.asarray(plain(name, v))
+               for name, v in zip(COLUMNS, given, strict=True)}
     for name, a in columns.items():
         if a.ndim != 1:
             fix = "Columns are 1-D arrays of one length."

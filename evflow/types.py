@@ -26,6 +26,7 @@ from evflow.checks import (
     check_size,
     check_times,
     need,
+    plain,
 )
 from evflow.errors import EvflowDataError
 from evflow.files.spool import forget
@@ -194,7 +195,8 @@ class Recording:
 
     def __post_init__(self) -> None:
         need(self.events, Events, "events", "Of a path: evflow.read_recording(path).")
-        frames, times = np.asarray(self.frames), np.asarray(self.frame_times)
+        frames, times = (np.asarray(plain(name, getattr(self, name)))
+                         for name in ("frames", "frame_times"))
         check_frames(frames, self.events.size)
         if times.shape != frames.shape[:1]:
             raise EvflowDataError(

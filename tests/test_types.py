@@ -45,6 +45,32 @@ def test_one_sided_polarities(p: list[int], on: int) -> None:
     assert events(p=np.array(p)).p.sum() == on
 
 
+class Graded:
+    """Like a tensor of PyTorch whose gradient is wanted."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values, self.shape, self.ndim = values, values.shape, values.ndim
+
+    def __array__(self, *_: object, **__: object) -> np.ndarray:
+        raise RuntimeError("use tensor.detach()")
+
+
+@pytest.mark.parametrize(("change", "seen"), [
+    (lambda a: np.ma.masked_equal(a, a[1]), "masked values"), (Graded, "Graded that is no array"),
+    (lambda a: a.astype("m8[us]"), "timedelta64"), (lambda a: a.astype("M8[us]"), "datetime64")])
+@pytest.mark.parametrize("column", ["x", "y", "t", "p"])
+def test_what_is_no_plain_array_is_refused(change: Any, seen: str, column: str) -> None:
+    values = {"x": [0, 5, 2], "y": [0, 3, 1], "t": [10, 11, 12], "p": [0, 1, 1]}
+    with pytest.raises(EvflowDataError, match="EV003") as caught:
+        events(**{column: change(np.array(values[column]))})
+    assert seen in str(caught.value)
+    assert caught.value.seen.startswith(f"{column} ")
+
+
+def test_a_mask_that_hides_nothing_is_none() -> None:
+    assert len(events(x=np.ma.masked_array([0, 5, 2]))) == 3
+
+
 def test_canonical_dtypes_and_no_copy() -> None:
     made = events(x=np.array([0, 5, 2], np.uint8), y=np.array([0, 3, 1], np.int64),
                   t=np.array([10, 10, 12], np.uint32))

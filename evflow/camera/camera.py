@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evflow.camera.prior import CameraPrior, Summary, sample_nominal
+from evflow.checks import plain
 from evflow.errors import EvflowDataError, naming
 from evflow.files.archives import load_npz
 from evflow.files.atomic import atomic_write
@@ -171,7 +172,7 @@ class Camera:
                 "All four maps must be (..., H, W) of one sensor.",
             )
         for name, value in leaves.items():
-            array = np.asarray(value)
+            array = np.asarray(plain(name, value))
             bad = ~np.isfinite(array) | (array <= 0 if name.startswith("theta") else array < 0)
             if bad.any():
                 where = tuple(int(i) for i in np.argwhere(bad)[0])

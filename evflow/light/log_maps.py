@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from evflow.checks import plain
 from evflow.errors import EvflowDataError
 
 DEPTHS = (np.dtype(np.uint8), np.dtype(np.uint16))  # whose whole range is an image's
@@ -76,7 +77,7 @@ def log64(dn: np.ndarray, log_map: str) -> np.ndarray:
 
 def to_log(frames: ArrayLike, log_map: str = "linlog") -> Array:
     """Log intensity (float32) of uint8 or float DN frames 0..255, or uint16 on 0..65535."""
-    frames = jnp.asarray(frames)
+    frames = jnp.asarray(plain("frames", frames))
     if frames.dtype == jnp.uint8:
         return jnp.take(jnp.asarray(uint8_table(log_map)), frames, axis=0, mode="clip")
     if frames.dtype == jnp.uint16:
@@ -169,7 +170,7 @@ def _native(frame: ArrayLike) -> Any:
     """An array in this machine's byte order."""
     if isinstance(frame, jax.Array):
         return frame
-    frame = np.asarray(frame)
+    frame = np.asarray(plain("frame", frame))
     return frame.astype(frame.dtype.newbyteorder("="), copy=False)
 
 

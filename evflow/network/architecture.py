@@ -14,6 +14,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.network import encoder, flow, pooling
 from evflow.network.config import MODELS, ModelConfig
@@ -38,6 +39,7 @@ class SpreadNet(nn.Module):
 
 def config_of(params: Params) -> ModelConfig:
     """The static structure behind params: its name, and the sizes of its leaves."""
+    need(params, dict, "params", "Pass what load_weights() returns.")
     if len(params) != 1 or next(iter(params)) not in MODELS:
         raise EvflowDataError(
             "EV018", f"params have the top-level keys {sorted(params)}.",
@@ -48,6 +50,16 @@ def config_of(params: Params) -> ModelConfig:
         raise EvflowDataError("EV018", f"params[{name!r}] has no {', '.join(sorted(missing))}.",
                               "Pass what load_weights() returns, whole.")
     base = MODELS[name]
+    try:
+        return _sized(base, net)
+    except (KeyError, TypeError, AttributeError, IndexError) as e:
+        raise EvflowDataError("EV018", f"params[{name!r}] are not those of the network: {e} is "
+                              "missing or no array.", "Pass what load_weights() returns, whole."
+                              ) from e
+
+
+def _sized(base: ModelConfig, net: Params) -> ModelConfig:
+    """The structure with the sizes of the leaves."""
     steps = net["flow"]["level_0"]["actnorm"]["raw"].shape[0]
     hidden = net["flow"]["level_0"]["coupling"]["w_2"].shape[-1]
     return dataclasses.replace(

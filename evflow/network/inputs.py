@@ -14,6 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
+from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.network.config import ModelConfig
@@ -45,7 +46,7 @@ def check_finite(name: str, values: ArrayLike) -> None:
     """EV003 where values are no real numbers, EV007 where they are not finite."""
     if isinstance(values, jax.core.Tracer):
         return
-    given = np.asarray(values)
+    given = np.asarray(plain(name, values))
     if not is_real(given.dtype):
         raise EvflowDataError("EV003", f"{name} has dtype {given.dtype}.",
                               "Expected real numbers.")
@@ -78,7 +79,7 @@ def prepare(
         raise EvflowDataError(
             "EV002", f"dlogI has shape {np.shape(dlogI)}, voxels {np.shape(voxels)}.",
             "dlogI must be voxels' shape without the channels: (..., H, W).")
-    if np.size(dlogI) == 0:
+    if 0 in np.shape(dlogI):
         raise EvflowDataError("EV001", f"voxels of shape {np.shape(voxels)} hold no pixel.")
     for name, value in (("voxels", voxels), ("dlogI", dlogI), ("window_s", window_s)):
         check_finite(name, value)

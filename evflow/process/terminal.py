@@ -61,31 +61,34 @@ def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[R
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
     """SIGTERM, as schedulers send it, ends the block as Ctrl-C does: through every `finally`, so
-    that nothing half-written is left. A signal that comes while Python collects garbage, where
+    that nothing half-written is left. One of either that comes while Python collects garbage, where
     exceptions are ignored, or imports a module, which compiled ones do not survive or swallow,
     comes again."""
     if threading.current_thread() is not threading.main_thread():
         yield  # handlers belong to the main thread
         return
 
-    def later() -> None:
-        again.append(threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)))
+    def later(number: int) -> None:
+        again.append(threading.Timer(0.05, os.kill, (os.getpid(), number)))
         again[-1].start()
 
-    def stop(_: int, frame: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         if _imports(frame) > outside:
-            return later()
+            return later(number)
         raise KeyboardInterrupt
 
     def ignored(lost: Any) -> None:
         if isinstance(lost.exc_value, KeyboardInterrupt):
-            later()
+            later(signal.SIGTERM)
         else:
             hook(lost)
 
     again: list[threading.Timer] = []
     outside = _imports(sys._getframe())  # of the module that the block itself is run by
     before, hook = signal.signal(signal.SIGTERM, stop), sys.unraisablehook
+    keyboard = signal.getsignal(signal.SIGINT)
+    if keyboard is signal.default_int_handler:  # not where a shell has it ignored
+        signal.signal(signal.SIGINT, stop)
     sys.unraisablehook = ignored
     try:
         yield
@@ -94,6 +97,7 @@ def stoppable() -> Iterator[None]:
             timer.cancel()
         sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGINT, keyboard)
 
 
 def _imports(frame: FrameType | None) -> int:
@@ -103,6 +107,21 @@ def _imports(frame: FrameType | None) -> int:
         count += frame.f_code.co_filename.startswith("<frozen importlib")
         frame = frame.f_back
     return count
+
+
+def open_closed() -> None:
+    """Standard streams that were closed (`evflow ... >&-`) lead nowhere: Python has none then, and
+    the next file that is opened would be taken for them."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        if getattr(sys, name) is not None:
+            continue
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        with contextlib.suppress(OSError):
+            os.fstat(number)  # somebody's by now, or this very one
+            setattr(sys, name, open(nowhere, mode, closefd=False))  # noqa: SIM115 (to the end)
+            continue
+        os.dup2(nowhere, number)
+        setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
 
 
 def unread() -> None:

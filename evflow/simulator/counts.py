@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
+from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.simulator import noise, pixel, sensor
@@ -55,7 +56,7 @@ def simulate_counts(
             size), EV020 (options, or a model that has no such counts).
     """
     model = model or SensorModel()
-    log_frames = as_log(model, jnp.asarray(log_frames))
+    log_frames = as_log(model, jnp.asarray(plain("log_frames", log_frames)))
     if log_frames.dtype != jnp.float64:
         log_frames = log_frames.astype(jnp.float32)
     if log_frames.ndim != 3 or len(log_frames) < 2:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
-from evflow.checks import COLUMNS
+from evflow.checks import COLUMNS, plain
 from evflow.errors import EvflowDataError
 from evflow.simulator import pack
 from evflow.simulator.active import BLOCK
@@ -79,7 +79,8 @@ def simulate(
            for leaf in jax.tree.leaves((key, frames, times_us, camera))):
         raise EvflowDataError("EV020", "simulate was called within jit, vmap or grad.",
                               "There take simulate_voxels, or simulate_counts.")
-    frames, times_us = np.asarray(frames), np.asarray(times_us)
+    frames = np.asarray(plain("frames", frames))
+    times_us = np.asarray(plain("times_us", times_us))
     if frames.ndim != 3 or times_us.shape != frames.shape[:1]:
         raise EvflowDataError(
             "EV002", f"frames {frames.shape} with times {times_us.shape}.",

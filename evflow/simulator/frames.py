@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.ranges import DARKEST_DN, meaning
 
@@ -53,7 +54,8 @@ def _single_frames(
             raise EvflowDataError(
                 "EV002", f"the {'frames' if block is None else 'times'} end after {index} frames.",
                 "Give one time per frame, in blocks of the same lengths.")
-        block, times = np.asarray(block), np.atleast_1d(np.asarray(times))
+        block = np.asarray(plain("frames", block))
+        times = np.atleast_1d(np.asarray(plain("times", times)))
         block = block[None] if block.ndim == 2 else block
         _check_block(block, times, shape, dtype, index)
         if block.dtype.kind == "f" and not bright:

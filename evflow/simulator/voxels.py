@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
+from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.simulator import circuits, noise, sensor
@@ -125,7 +126,7 @@ def simulate_voxels(
         >>> voxels = ef.simulate_voxels(key, log_frames, camera, frame_dt_s=1e-3)
     """
     model = model or SensorModel()
-    log_frames = jnp.asarray(log_frames)
+    log_frames = jnp.asarray(plain("log_frames", log_frames))
     if log_frames.dtype != jnp.uint8:
         log_frames = log_frames.astype(jnp.float32)
     if log_frames.ndim < 3 or log_frames.shape[-3] < 2:

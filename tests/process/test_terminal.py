@@ -15,6 +15,8 @@ from evflow.errors import EvflowDataError
 from evflow.process.terminal import INTERRUPTED, stoppable
 from experiments.shared import common
 
+TREE = Path(common.__file__).parents[2]
+
 
 def test_a_signal_ends_the_block_through_its_cleaning_up() -> None:
     cleaned = []
@@ -48,11 +50,14 @@ def test_a_signal_where_exceptions_are_ignored_comes_again() -> None:
     assert (sys.unraisablehook, signal.getsignal(signal.SIGTERM)) == (hook, handler)
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_amid_an_import_waits_for_its_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
+    for name in ("interrupted_import", "running_import"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
     (tmp_path / "interrupted_import.py").write_text(
-        "import signal\nsignal.raise_signal(signal.SIGTERM)\nwhole = True\n")
+        f"import signal\nsignal.raise_signal({int(number)})\nwhole = True\n")
     monkeypatch.syspath_prepend(tmp_path)
 
     def work() -> None:
@@ -66,9 +71,35 @@ def test_a_signal_amid_an_import_waits_for_its_end(
     # Of a block that is itself run by an import, no end of that import is waited for.
     (tmp_path / "running_import.py").write_text(
         "import signal, time\nfrom evflow.process.terminal import stoppable\n"
-        "with stoppable():\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(10)\n")
+        f"with stoppable():\n    signal.raise_signal({int(number)})\n    time.sleep(10)\n")
     with pytest.raises(KeyboardInterrupt):
         import running_import  # noqa: F401
+
+
+LOADING = """
+import builtins, signal
+import evflow.__main__
+
+def loading(name, *rest, load=builtins.__import__):
+    if name == "evflow.cli":
+        signal.raise_signal(signal.SIGINT)
+    return load(name, *rest)
+
+builtins.__import__ = loading
+evflow.__main__.run()
+"""
+
+
+def test_ctrl_c_while_modules_are_loaded_ends_quietly() -> None:
+    run = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True,
+                         timeout=60, env=os.environ | {"PYTHONPATH": str(TREE)})
+    assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", "")
+
+
+def test_closed_standard_streams_lead_nowhere() -> None:
+    run = subprocess.run(f"{sys.executable} -m evflow version >&- <&-", shell=True, timeout=60,
+                         capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(TREE)})
+    assert (run.returncode, run.stderr) == (0, "")
 
 
 def test_scripts_whose_output_nobody_reads_end_quietly(tmp_path: Path) -> None:

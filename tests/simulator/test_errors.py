@@ -41,6 +41,9 @@ TIMES = np.array([0, 1000, 2000])
     ({"times_us": 5}, "EV002", "()"),
     ({"frames": frames(0), "times_us": TIMES[:0]}, "EV001", "no frames"),
     ({"frames": frames(1), "times_us": TIMES[:1]}, "EV001", "one frame"),
+    ({"frames": np.ma.masked_equal(frames(), frames()[1, 1, 1])}, "EV003", "masked"),
+    ({"times_us": np.ma.masked_equal(TIMES, TIMES[1])}, "EV003", "times_us has 1 masked"),
+    ({"times_us": TIMES.astype("m8[us]")}, "EV003", "astype('timedelta64[us]').astype(np.int64)"),
     ({"frames": with_value(np.nan)}, "EV007", "1 values of the frames are not finite, first in "
                                               "frame 1 at y=2, x=3"),
     ({"frames": with_value(-np.inf)}, "EV007", "frame 1"),
