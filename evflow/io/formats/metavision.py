@@ -23,6 +23,7 @@ NAME = "metavision"
 EXTENSIONS: tuple[str, ...] = (".hdf5", ".h5")
 
 EVENTS = "CD/events"
+TOLD = ("format", "geometry", "sensor_name", "plugin_name", "generation", "sensor_generation")
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -33,8 +34,8 @@ def read(path: Path, hints: Hints) -> Recording:
     """Raises EV008 (other fields), EV009 (damaged), EV010 (h5py or a filter) and what
     `stream.collect` raises."""
     with tables.opened(path) as f:
-        fields = {key.lower(): value for key in f.attrs
-                  if (value := columns.text(f.attrs[key])) is not None}
+        fields = {key: value for key in TOLD
+                  if (value := columns.text(f.attrs.get(key))) is not None}
         size, notes = prophesee.Header(fields, 0).size()
         data = tables.dataset(path, f, EVENTS, (None,), ecf.FILTER)
         table = arrays.structured(EVENTS, data)
