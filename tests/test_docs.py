@@ -2,8 +2,8 @@
 
 Every fenced block of bash or python runs, in order, in a folder with a small recording, a video and
 a folder of frames; the README's Python also runs in an empty one. On the line above a block may
-stand `<!-- not run: reason -->`, `<!-- slow -->` or `<!-- needs PACKAGE -->`; installation is not
-run. The quick test leaves out what `SLOW` names and lays a camera ready in its place; the slow one
+stand `<!-- not run: reason -->`, `<!-- slow -->`, `<!-- [slow, ]needs PACKAGE -->`; installation is
+not run. The quick test leaves out what `SLOW` names and lays a camera ready in its place; the slow one
 runs it all, with a small preset for a large one.
 """
 
@@ -51,7 +51,7 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PAGES = [*DOCUMENTS, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
 BLOCK = re.compile(r"(?:<!-- (?P<mark>[^>]+) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)^```$",
                    re.DOTALL | re.MULTILINE)
-MARK = re.compile(r"slow|needs \w+|not run: .+")
+MARK = re.compile(r"slow|(slow, )?needs \w+|not run: .+")
 SLOW = re.compile(r"evflow (estimate|train|bench)|python -m|estimate_camera")
 SMALLER = {"--preset full": "--preset debug", "--preset small": "--preset debug"}
 SHAPE = (48, 64)
@@ -111,8 +111,8 @@ def run_document(document: Path, *, quick: bool) -> int:
     names: dict[str, Any] = {}
     ran = 0
     for block in blocks(document):
-        needed = block.mark.removeprefix("needs ") if block.mark.startswith("needs ") else ""
-        if (block.mark.startswith("not run") or (quick and block.mark == "slow")
+        slow, needed = block.mark.startswith("slow"), block.mark.partition("needs ")[2]
+        if (block.mark.startswith("not run") or (quick and slow)
                 or (needed and not importlib.util.find_spec(needed))):
             continue
         if block.kind == "bash":

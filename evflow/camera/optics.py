@@ -45,6 +45,13 @@ def as_arrays(
     return {name: np.asarray(value, np.float64) for name, value in named.items()}
 
 
+def read_undetermined(path: str | os.PathLike) -> tuple[str, ...]:
+    """Thresholds in a camera.npz whose values, and widths, are a prior's: the recording that it
+    was estimated from did not tell. None in files that do not say. Raises EV009, EV016."""
+    named = load_npz(Path(path)).get("undetermined")
+    return () if named is None or named.dtype.kind != "U" else tuple(str(n) for n in named.ravel())
+
+
 def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
     """The circuit and the optics in a camera.npz; those of an ideal pixel where it holds none.
     Raises EV009 where a value is no number, EV016 where there is no file."""

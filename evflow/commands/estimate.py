@@ -64,6 +64,9 @@ class Estimate(Compiling, Reading):
     on_interrupt: Literal["stop", "save"] = "stop"
     """What Ctrl-C does while the recording is read. stop: end, and leave nothing; save: measure the
     camera from what was read (a second Ctrl-C ends)."""
+    thresholds: Annotated[Path | None, value("FILE")] = None
+    """Of --protocol static: take the thresholds, which a scene at rest does not tell, from this
+    camera.npz: noise and thresholds joined in one camera."""
     weights: str = "default"
     """Name of released weights, or a .safetensors path."""
     window_ms: float = 40.0
@@ -102,6 +105,8 @@ class Estimate(Compiling, Reading):
                    "of use with --protocol motion only")
         if not self.reconstruct:
             refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
+        if self.protocol != "static":
+            refuse(self, ("thresholds",), "of use with --protocol static only")
         need_packages(self.recording, pictures=self.plots or (self.report and moving))
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording = tell(self.read(self.recording))
@@ -114,13 +119,15 @@ class Estimate(Compiling, Reading):
             facts = {**found.as_dict(), "recording": str(self.recording),
                      "protocol": self.protocol,
                      "recording_notes": as_dicts(recording.notes), **facts}
-            write_json(out / "camera.json", facts)
             if self.plots:
                 plots.camera_maps(found, out / "maps.png")
                 plots.camera_histograms(found, out / "histograms.png")
-            if self.report and moving:
-                self._report(out, found, recording)
-        print(json.dumps(facts, indent=2) if self.json else describe(found))
+            tested = self._report(out, found, recording) if self.report and moving else {}
+            facts |= {key: tested[key] for key in ("grade", "verdict") if key in tested}
+            write_json(out / "camera.json", facts)
+        said = [f"verdict: {tested['grade']}", *tested["verdict"]] if tested else []
+        print(json.dumps(facts, indent=2) if self.json else
+              "\n".join([describe(found), *said]))
         print(f"written to {self.out}/", file=sys.stderr)
 
     def _checked(self, recording: Recording) -> list[Note]:
@@ -186,16 +193,21 @@ class Estimate(Compiling, Reading):
 
     def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
         from evflow.estimation.bench.calibration import calibrate_step
+        from evflow.estimation.joined import with_thresholds
         from evflow.estimation.static import estimate_noise
 
-        return (calibrate_step if self.protocol == "step" else estimate_noise)(recording), {}
+        found = (calibrate_step if self.protocol == "step" else estimate_noise)(recording)
+        return with_thresholds(found, self.thresholds) if self.thresholds else found, {}
 
-    def _report(self, out: Path, found: CameraEstimate, recording: Recording) -> None:
+    def _report(
+        self, out: Path, found: CameraEstimate, recording: Recording
+    ) -> dict[str, Any]:
+        """report.html, and its numbers."""
         from evflow.process.terminal import bar
         from evflow.report.camera import write_report
 
         with bar("reporting", compiles=True) as progress:
-            write_report(
+            return write_report(
                 out / "report.html", found, recording, weights=self.weights,
                 source=self.recording, command=shlex.join(["evflow", *sys.argv[1:]]),
                 min_window_us=round(self.window_ms * 1000), progress=progress)

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from evflow.commands.options import warn_of_prior
 from evflow.commands.writing import need_absent, need_folder
 
 
@@ -34,13 +35,14 @@ class Export:
     def run(self) -> None:
         from evflow.camera import Camera
         from evflow.camera.exports import export_camera, write_export
-        from evflow.camera.optics import read_sensor
+        from evflow.camera.optics import read_sensor, read_undetermined
 
         need_folder(self.out)
         need_absent(self.out, self.overwrite, self.camera)
         camera, std = Camera.load_with_std(self.camera)
         export, maps = export_camera(camera, self.to, std, read_sensor(self.camera)[0])
         write_export(self.out, export, maps, overwrite=self.overwrite)
+        warn_of_prior(read_undetermined(self.camera), "exported")
         files = [*sorted([*export.scripts, *export.arrays]), "maps.npz", "README.txt"]
         facts = {"out": str(self.out), "to": self.to, "files": files, "text": export.text}
         print(json.dumps(facts) if self.json else

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -217,3 +217,13 @@ def write_json(path: Path, facts: dict[str, Any]) -> None:
     from evflow.files.atomic import atomic_text
 
     atomic_text(path, json.dumps(facts, indent=2) + "\n", overwrite=True)
+
+
+def warn_of_prior(undetermined: Sequence[str], done: str) -> None:
+    """A word on stderr where a camera's thresholds were never measured. done: what happens to them
+    all the same."""
+    if undetermined:
+        print(f"warning: {' and '.join(undetermined)} of this camera were not measured: they are "
+              f"{done} with the value of the prior. Estimate them from a recording with frames in "
+              "which something moves, or join two estimates: evflow estimate --thresholds.",
+              file=sys.stderr)

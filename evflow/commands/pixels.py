@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from evflow.commands.options import refuse, value
+from evflow.commands.options import refuse, value, warn_of_prior
 from evflow.errors import EvflowDataError
 
 if TYPE_CHECKING:
@@ -114,12 +114,14 @@ class Pixels:
         import jax
 
         from evflow.camera import Camera
+        from evflow.camera.optics import read_undetermined
 
         refuse(self, THRESHOLDS, "the camera's own are those of --camera")
         if self.sensor != "clean":
             print(f"note: --sensor {self.sensor} adds its own noise and limits to the camera's "
                   "measured noise.", file=sys.stderr)
         camera, std = Camera.load_with_std(path)
+        warn_of_prior(read_undetermined(path), "simulated")
         if self.draw:
             if std is None:
                 raise EvflowDataError("EV020", f"{path} holds no standard deviations.",

@@ -84,6 +84,7 @@ class CameraEstimate:
         """
         extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
         extra |= as_arrays(self.sensor, self.sensor_std, self.optics)
+        extra["undetermined"] = np.array(self.undetermined, "U9")
         return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
                                 n_events=self.n_events, hot=self.hot, dead=self.dead)
 

@@ -56,6 +56,7 @@ from evflow.report.verdict import (
     judge_estimate,
     known,
     poorer,
+    sentences,
     worst,
 )
 from evflow.simulator.photoreceptor import Photoreceptor
@@ -104,7 +105,8 @@ def write_report(
         progress: progress(done, total) is called after each stage.
 
     Returns:
-        JSON-ready numbers, which also lie in the page: "grade" ("good", "fair", "poor"), "trial"
+        JSON-ready numbers, which also lie in the page: "grade" ("good", "fair", "poor"),
+        "verdict" (what was seen and what to do, a sentence each), "trial"
         and "held_out" (each None, or what `compare` says, with the "ceiling" of the counts' r).
 
     Raises:
@@ -112,10 +114,10 @@ def write_report(
             another size than the estimate), EV016 (no such weights), EV019 (cannot be written).
     """
     require()
-    if recording.events.size != found.n_events.shape[::-1]:
+    if (size := found.n_events.shape[::-1]) != recording.events.size:
         raise EvflowDataError(
-            "EV015", f"the estimate is of {found.n_events.shape[::-1]} pixels, the recording of "
-            f"{recording.events.size}.", "Pass the recording that the camera was estimated from.")
+            "EV015", f"the estimate is of {size} pixels, the recording of {recording.events.size}.",
+            "Pass the recording that the camera was estimated from.")
     done = itertools.count(1)
 
     def step() -> None:
@@ -128,8 +130,8 @@ def write_report(
               fault_panel(found), extent_panel(found), _held_panel(found, evidence),
               _assumptions(found, recording, weights, source, command)]
     step()
-    numbers = {"grade": worst(judged), "trial": _numbers(evidence.trial),
-               "held_out": _numbers(evidence.held)}
+    numbers = {"grade": worst(judged), "verdict": sentences(judged),
+               "trial": _numbers(evidence.trial), "held_out": _numbers(evidence.held)}
     name = Path(source).name if source else "an event camera"
     page.write_page(path, f"Camera report: {name}", repr(recording), panels, numbers,
                     overwrite=overwrite)

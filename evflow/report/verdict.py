@@ -201,8 +201,12 @@ def _timing(numbers: dict[str, Any], kind: str) -> str:
 def describe_streams(numbers: dict[str, Any]) -> str:
     """A comparison in words: the verdict, what was seen, what to do; a sentence a line."""
     judged = judge_streams(numbers)
-    seen = [j.seen[0].upper() + j.seen[1:] for j in judged]
-    return "\n".join([ALIKE[worst(judged)], how_compared(numbers), *seen, *advice(judged)])
+    return "\n".join([ALIKE[worst(judged)], how_compared(numbers), *sentences(judged)])
+
+
+def sentences(judged: list[Judged]) -> list[str]:
+    """What was seen, and what to do."""
+    return [*(j.seen[0].upper() + j.seen[1:] for j in judged), *advice(judged)]
 
 
 def how_compared(numbers: dict[str, Any]) -> str:

@@ -258,3 +258,33 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(out)["summary"]["eta_on"] == pytest.approx(1.0, rel=0.1)
     assert run(source, "static")[0] == 1  # a screen that steps is no scene at rest
     assert run(source, "step", "--overwrite", "--window-ms", "30")[0] == 2
+
+
+def test_noise_and_thresholds_join_in_one_camera(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from evflow.camera.optics import read_undetermined
+    from evflow.cli import main
+
+    camera = Camera.constant(SHAPE, 0.2, 0.25, 1.0, 0.5)
+    still, steps = tmp_path / "still.npz", tmp_path / "steps" / "camera.npz"
+    write_recording(still, Recording(
+        bench(camera, [100] * 20).events, np.zeros((0, *SHAPE), np.uint8), np.zeros(0)))
+    steps.parent.mkdir()
+    calibrate_step(bench(camera, CYCLES)).save(steps)
+    base = ["estimate", str(still), "--protocol", "static", "--no-plots", "-o"]
+    assert main([*base, str(tmp_path / "alone")]) == 0
+    alone = tmp_path / "alone" / "camera.npz"
+    assert read_undetermined(alone) == ("theta_on", "theta_off")
+    capsys.readouterr()
+    assert main(["export", str(alone), "--to", "v2e", "-o", str(tmp_path / "v2e")]) == 0
+    assert "theta_on and theta_off of this camera were not measured" in capsys.readouterr().err
+
+    assert main([*base, str(tmp_path / "both"), "--thresholds", str(steps)]) == 0
+    both = Camera.load(tmp_path / "both" / "camera.npz")
+    assert read_undetermined(tmp_path / "both" / "camera.npz") == ()
+    np.testing.assert_array_equal(both.theta_on, Camera.load(steps).theta_on)
+    np.testing.assert_array_equal(both.eta_on, Camera.load(alone).eta_on)
+    capsys.readouterr()
+    assert main([*base, str(tmp_path / "no"), "--thresholds", str(alone)]) == 2
+    assert "EV020" in capsys.readouterr().err

@@ -1,0 +1,63 @@
+"""One camera of two estimates: thresholds of a moving scene or of steps, noise of one at rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Camera
+from evflow.camera.optics import read_sensor, read_undetermined
+from evflow.errors import EvflowDataError
+from evflow.estimation.result import THRESHOLDS, CameraEstimate
+from evflow.files.archives import load_npz
+from evflow.notes import Note
+
+
+def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEstimate:
+    """The estimate with the thresholds, circuit and optics of the camera.npz at `path`.
+
+    Raises EV015 (another size), EV020 (no standard deviations, or thresholds that were not
+    measured there either), and what reading a camera raises.
+    """
+    camera, std = Camera.load_with_std(path)
+    undetermined = read_undetermined(path)
+    if std is None or undetermined:
+        raise EvflowDataError(
+            "EV020", f"{path} holds no {'standard deviations' if std is None else 'measured '}"
+            f"{'' if std is None else ' and '.join(undetermined)}.",
+            "Pass the camera.npz of a recording in which something moves, or of steps of light.")
+    if camera.shape != found.camera.shape:
+        raise EvflowDataError(
+            "EV015", f"{path} is a camera of {camera.shape} pixels, the recording of "
+            f"{found.camera.shape}.", "Join two estimates of one camera.")
+    sensor, optics = read_sensor(path)
+    valid = load_npz(Path(path)).get("valid", np.ones(camera.shape, bool)).astype(bool)
+    maps = {name: getattr(camera, name) for name in THRESHOLDS}
+    errors = {name: getattr(std, name) for name in THRESHOLDS}
+    used = valid if valid.any() else np.ones_like(valid)
+    values: dict[str, float] = {}
+    value_errors: dict[str, float] = {}
+    for name in THRESHOLDS:
+        theta, error = (np.asarray(m[name])[used] for m in (maps, errors))
+        side = name.removeprefix("theta_")
+        middle = float(np.median(theta))
+        spread = 1.4826 * float(np.median(np.abs(theta - middle)))
+        values |= {name: middle, f"sigma_{side}": spread}
+        value_errors |= {name: float(np.median(error)),
+                         f"sigma_{side}": spread / np.sqrt(2.0 * theta.size)}
+
+    def scalars(numbers: dict[str, float]) -> dict[str, jnp.ndarray]:
+        return {name: jnp.float32(number) for name, number in numbers.items()}
+
+    said = Note("theta.joined", f"the thresholds are those of {path}.")
+    return dataclasses.replace(
+        found, camera=dataclasses.replace(found.camera, **maps),
+        std=dataclasses.replace(found.std, **errors),
+        summary=dataclasses.replace(found.summary, **scalars(values)),
+        summary_std=dataclasses.replace(found.summary_std, **scalars(value_errors)),
+        valid=valid & ~found.hot, undetermined=(), sensor=sensor, optics=optics,
+        notes=(*(n for n in found.notes if n.code not in ("scene.static", "frames.none")), said))
