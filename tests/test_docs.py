@@ -3,8 +3,8 @@
 Every fenced block of bash or python runs, in order, in a folder with a small recording, a video and
 a folder of frames; the README's Python also runs in an empty one. On the line above a block may
 stand `<!-- not run: reason -->`, `<!-- slow -->`, `<!-- [slow, ]needs PACKAGE -->`; installation is
-not run. The quick test leaves out what `SLOW` names and lays a camera ready in its place; the slow one
-runs it all, with a small preset for a large one.
+not run. The quick test leaves out what `SLOW` names and lays a camera ready in its place; the slow
+one runs it all, with a small preset for a large one.
 """
 
 from __future__ import annotations
@@ -258,7 +258,8 @@ def test_what_is_said_of_the_experiments_presets_is_so() -> None:
     options = {name: importlib.import_module(f"experiments.{name}").Options for name in scripts}
     without = {name for name, kind in options.items()
                if "preset" not in {field.name for field in dataclasses.fields(kind)}}
-    making = {"calibrate", "combine", "fuse", "tell_apart"}
-    assert without == {"quickstart", "evaluate_network", "guessed_frames", *making}
+    making = {"calibrate", "combine", "correct", "fuse", "tell_apart"}
+    assert without == {
+        "quickstart", "evaluate_network", "guessed_frames", "long_recordings", *making}
     text = (ROOT / "docs/experiments.md").read_text("utf-8")
     assert all(f"`{name}`" in text.partition("| script")[0] for name in without - making)

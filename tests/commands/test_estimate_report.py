@@ -30,7 +30,7 @@ def test_estimate_writes_the_report(flight: Path, tmp_path: Path) -> None:
     command = ["estimate", str(flight), "-o", str(out), "--no-plots"]
     assert main(command) == 0
     text = (out / "report.html").read_text()
-    assert text.count("<section") == 10
+    assert text.count("<section") == 12
     assert "flight.npz" in text
     assert text.count("sha256 ") == 2  # of the weights and of the recording
     assert sorted(p.name for p in out.iterdir()) == ["camera.json", "camera.npz", "report.html"]

@@ -21,6 +21,7 @@ SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem != "__init__")
 LINES = 120
 # Whose measure, drawing or fit is their own, and reads best beside its use.
 LONG = {"ablate", "changes", "compare_systems", "coverage", "curves", "evaluate_network", "fuse",
+        "long_recordings",
         "generate", "integrate", "limits", "models", "noise", "noise_rates", "quickstart",
         "see_better", "tell_apart", "train_eventgan", "train_network"}
 NO_DEBUG = {
@@ -29,6 +30,7 @@ NO_DEBUG = {
     "guessed_frames": "as many cameras as are asked for",
     "combine": "computes next to nothing",
     "calibrate": "as many steps as are asked for",
+    "long_recordings": "as long as is asked for",
     "correct": "as many recordings as are asked for",
     "fuse": "as many recordings as are asked for",
     "tell_apart": "as many recordings as are asked for"}
