@@ -25,6 +25,7 @@ from evflow import Camera, CameraEstimate, Events, Recording, estimate_camera, s
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
+from evflow.network.weights import load_weights
 from experiments.shared.common import begin, conclude, markdown, run_script
 
 SPEED = 90.0  # pixels per second
@@ -132,10 +133,11 @@ def main(options: Options) -> dict[str, Any]:
     begin(options, "long_recordings")
     recording, camera = make(options)
     before, wall = time.process_time(), time.monotonic()
-    found = estimate_camera(recording)
+    found = estimate_camera(recording, load_weights(options.weights), effort=options.effort)
     result = {"cpu_s": time.process_time() - before, "wall_s": time.monotonic() - wall,
               "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-              "events": len(recording.events), **score(found, camera)}
+              "events": len(recording.events), "read_s": found.extent.read_s,
+              **score(found, camera)}
     conclude(options, "long_recordings", result, markdown(
         ("what", "value"), ((k, f"{v:.4g}") for k, v in result.items())))
     return result
