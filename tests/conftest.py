@@ -17,7 +17,8 @@ from helpers.compilation import compile_quickly, remember
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 compile_quickly(os.environ)
 remember(os.environ)
-MOST_MB = 2500  # of memory, that compiled programs may fill before they are forgotten
+# Of memory, that compiled programs may fill before they are forgotten: a fifth for each of two.
+MOST_MB = max(2500, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 5_000_000)
 
 
 # A shell lets what it starts in the background ignore Ctrl-C, and so would every child.
@@ -35,7 +36,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.fixture(scope="module", autouse=True)
 def _bounded_memory() -> Iterator[None]:
-    """Hundreds of compiled programs take gigabytes a process, on a machine that runs two."""
+    """Thousands of compiled programs take gigabytes a process, on a machine that runs two."""
     yield
     status = Path("/proc/self/status")
     resident = status.read_text().split("VmRSS:")[1].split()[0] if status.exists() else 0

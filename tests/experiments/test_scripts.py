@@ -97,7 +97,9 @@ def nothing(_params: object, _hidden: object, protocol: Protocol) -> int | None:
 
 
 def test_a_study_leaves_out_what_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("experiments.shared.many.hidden_recording", lambda *_: None)
+    for name in ("hidden_recording", "load_weights", "make_bank"):
+        monkeypatch.setattr(f"experiments.shared.many.{name}", lambda *_, **__: None)
+    monkeypatch.setattr("experiments.shared.many._SHARED", {})
     protocols = [Protocol(intervals=n) for n in (2, 4, 3)]
     assert study(nothing, Setup("default", 0), protocols, 1, "recordings") == [4, 3]
 

@@ -1,7 +1,8 @@
 """How the tests compile: quickly and remembered, or as in use.
 
 Compilation is most of the suite's time, and most programs run once on few pixels. They are
-compiled in a third of the time: without optimisation, by XLA's older emitters.
+compiled in a third of the time: without optimisation, by XLA's older emitters. Where conftest's
+`optimised` switches optimisation on, LLVM's first level does, in half the time of the highest.
 EVFLOW_TESTS_OPTIMISED=1 lets the whole suite run as users compile; `as_in_use` and `precise` are
 for the tests that always do.
 """
@@ -18,7 +19,8 @@ OPTIMISED = "EVFLOW_TESTS_OPTIMISED"
 UNOPTIMISED = "JAX_DISABLE_MOST_OPTIMIZATIONS"
 # Other versions of XLA may not know these flags, and end a process that is given an unknown one.
 FLAGS_OF = "0.10."
-FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+FLAGS = ("--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
+         "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true")
 
 
 def compile_quickly(environment: MutableMapping[str, str]) -> None:

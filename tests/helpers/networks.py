@@ -13,11 +13,14 @@ import numpy as np
 from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior
 from evflow.network import architecture
+from evflow.network.config import ModelConfig
+from evflow.network.encoder import LOGIT_BIAS, NORMS
 from evflow.scenes import SceneConfig, make_bank, sample_scene, watch
 from evflow.simulator import simulate_voxels
 from evflow.training.config import PRESETS, TrainConfig
 
 SHAPE = (48, 64)  # of hidden recordings
+Params = dict[str, Any]
 
 
 def small_config(**changes: Any) -> TrainConfig:
@@ -27,19 +30,34 @@ def small_config(**changes: Any) -> TrainConfig:
 
 
 @cache
-def small_params() -> dict[str, Any]:
+def small_params() -> Params:
     """A small network whose flow is far from the identity (couplings drawn at random)."""
-    init = jax.jit(architecture.init, static_argnums=1)
-    return jax.jit(jiggle)(init(jax.random.key(0), PRESETS["debug"].model), 0.1)
+    return random_params(PRESETS["debug"].model)
 
 
-def jiggle(params: Any, scale: float) -> Any:
-    """Every leaf moved by scale N(0, 1) / sqrt(fan-in), so that no layer is zero."""
-    leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    moved = [leaf + scale * jax.random.normal(k, leaf.shape) for leaf, k in
-             zip(leaves, keys, strict=True)]
-    return jax.tree.unflatten(tree, moved)
+def random_params(config: ModelConfig, name: str = "default") -> Params:
+    """As `architecture.init` makes them, but for zeros: no layer is zero."""
+    shapes = jax.eval_shape(lambda key: architecture.init(key, config, name), jax.random.key(0))
+    params = drawn(shapes, 0.1)
+    last = params[name]["encoder"][f"Dense_{NORMS}"]
+    last["bias"] = last["bias"] + LOGIT_BIAS
+    return params
+
+
+def drawn(shapes: Any, scale: float) -> Any:
+    """Arrays of these shapes, by NumPy: to compile a draw for each takes ten seconds. Weights
+    N(0, 1 / fan-in) but for last layers of the flow, which like all else lie `scale` N(0, 1)
+    about 0, and norms about 1."""
+    rng = np.random.default_rng(1)
+
+    def one(path: Any, leaf: Any) -> jax.Array:
+        names, noise = [p.key for p in path], rng.standard_normal(leaf.shape)
+        last = names[-2:] in (["coupling", "w_3"], ["injector", "w_2"])
+        weight = names[-1] == "kernel" or (names[-1][0] == "w" and not last)
+        noise *= leaf.shape[-2] ** -0.5 if weight else scale
+        return jnp.asarray(noise + (names[-1] == "scale"), leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(one, shapes)
 
 
 @cache
@@ -52,6 +70,7 @@ def seen(shape: tuple[int, int] = (12, 10), frames: int = 17) -> tuple[Any, Any,
     return voxels, jnp.moveaxis(jnp.diff(log_frames, axis=0), 0, -1), camera
 
 
+@cache
 def hidden(seed: int, ms: int = 280) -> tuple[Recording, Camera]:
     """A camera with thresholds .15-.4 watches a lively scene; frames every 40 ms, the
     first at 20 ms: events cover all six windows."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.networks import jiggle
+from helpers.networks import drawn
 
 from evflow.network import encoder
 from evflow.network.config import ModelConfig
@@ -17,13 +17,19 @@ from evflow.network.config import ModelConfig
 CONFIG = ModelConfig(changes=4, piece=6, encoder_hidden=24)
 
 
+def made(module: encoder.IntensityEncoder) -> Any:
+    """Params whose norms and biases lie .3 N(0, 1) about theirs."""
+    shapes = jax.eval_shape(module.init, jax.random.key(1), jnp.ones((1, 10)))
+    return drawn(shapes["params"], 0.3)
+
+
 @pytest.mark.parametrize("outputs", [1, 2])
 @pytest.mark.parametrize("changes", [4, 1])
 def test_columns_are_the_module(outputs: int, changes: int) -> None:
     config = dataclasses.replace(CONFIG, changes=changes)
     module = encoder.IntensityEncoder(config, outputs)
-    x = 3.0 * jax.random.normal(jax.random.key(0), (50, 10)) + 1.0
-    params = jiggle(module.init(jax.random.key(1), x)["params"], 0.3)
+    x = jnp.asarray(3.0 * np.random.default_rng(0).standard_normal((50, 10)) + 1.0, jnp.float32)
+    params = made(module)
     expected: Any = module.apply({"params": params}, x)
     logits, feature = expected
     folded = encoder.fold(params)
@@ -36,7 +42,7 @@ def test_columns_are_the_module(outputs: int, changes: int) -> None:
 
 def test_folded_layers_have_no_mean_to_take_off() -> None:
     module = encoder.IntensityEncoder(CONFIG, 2)
-    params = jiggle(module.init(jax.random.key(1), jnp.ones((1, 10)))["params"], 0.3)
+    params = made(module)
     folded = encoder.fold(params)
     for index in range(encoder.NORMS):
         layer = folded[f"Dense_{index}"]

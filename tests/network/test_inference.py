@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.networks import jiggle, seen, small_params
+from helpers.networks import random_params, seen, small_params
 
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
-from evflow.network import api, architecture, inference
+from evflow.network import api, inference
 from evflow.network.config import MODELS
 from evflow.process import chunks
 
@@ -71,9 +71,7 @@ def test_it_is_encode_and_forward(name: str) -> None:
     if name == "paper":
         paper = MODELS["paper"]
         small = dataclasses.replace(paper.flow, steps=2, hidden=16)
-        init = jax.jit(architecture.init, static_argnums=(1, 2))
-        params = jax.jit(jiggle)(init(
-            jax.random.key(0), dataclasses.replace(paper, flow=small), "paper"), 0.1)
+        params = random_params(dataclasses.replace(paper, flow=small), "paper")
     known = Summary(*(jnp.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
     given = {"summary": known, "intensity": 3.0 + dL[..., 0]}
     code = api.encode(params, voxels, dL.sum(-1), **given)
