@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.compilation import compile_quickly, remember
+from helpers.compilation import compile_quickly, optimise_often_run, remember
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 compile_quickly(os.environ)
@@ -32,6 +32,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     from xdist.scheduler import LoadFileScheduling
 
     return LoadFileScheduling(config, log)
+
+
+def pytest_collection_finish() -> None:
+    if "jax" in sys.modules:
+        optimise_often_run()
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from helpers.compilation import as_in_use, compile_quickly, quickly
+from helpers.compilation import as_in_use, compile_quickly, optimise_often_run, quickly
 from helpers.networks import hidden, small_config
 
 import evflow as ef
@@ -128,6 +128,7 @@ def test_programs_compiled_as_in_use_give_the_same_bytes(name: str) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--print"]:
+        optimise_often_run()
         print(json.dumps({name: MADE[name]() for name in sys.argv[2:]}))
     else:
         quick = as_in_use()

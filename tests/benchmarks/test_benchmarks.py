@@ -41,7 +41,8 @@ UNITS = {"simulator": {"frames", "events", "GB"}, "voxels": {"events", "GB"},
          "networks": {"steps", "pixels"}}
 
 
-@pytest.mark.parametrize("subject", ["simulator", "voxels", "io", "estimate",
+@pytest.mark.parametrize("subject", ["simulator", "voxels", "io",
+                                     pytest.param("estimate", marks=pytest.mark.slow),
                                      pytest.param("train", marks=pytest.mark.slow),
                                      pytest.param("networks", marks=pytest.mark.slow)])
 def test_subject_yields_complete_records(subject: str, tmp_path: Path) -> None:

@@ -31,7 +31,8 @@ PUBLISHED = {"esim": 1_005_123, "dvs346": 625_344, "dvs240": 557_458}
 WITHIN = {"esim": 1e-3, "dvs346": 1e-2, "dvs240": 1e-2}
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize("name", [
+    "esim", "dvs240", pytest.param("dvs346", marks=pytest.mark.slow)])
 def test_counts_are_those_of_the_published_programs(
     name: str, data_file: Callable[[str], Path]
 ) -> None:

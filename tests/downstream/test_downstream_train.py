@@ -28,7 +28,7 @@ from evflow.errors import EvflowDataError
 from evflow.scenes import TextureBank, make_bank
 from evflow.types import Events, Recording
 
-DATA = SequenceConfig(sequences=4, windows=4, steps_per_window=4, crop=16, noise=0.0,
+DATA = SequenceConfig(sequences=4, windows=4, steps_per_window=4, crop=16, noise=0.1,
                       hot_pixels=0.0, model=SensorModel())
 SMALL = E2VID(base=4, encoders=1, blocks=0)
 sample = jax.jit(sample_sequences, static_argnames="config")
@@ -96,13 +96,13 @@ def test_noise_spares_the_first_window_and_hot_pixels_stay() -> None:
 
 def test_noise_is_not_taken_for_events() -> None:
     """Normalised tensors have deviation 1 where there are events, as they will have in use."""
-    s = sample(jax.random.key(3), bank(), dataclasses.replace(DATA, noise=0.1))
+    s = sequences()
     np.testing.assert_array_equal(s.given(False), s.tensors + s.noise)
     assert float(jnp.std(s.noise[1:])) == pytest.approx(0.1, rel=0.05)
     clean = np.asarray(s.given(True) - s.noise)
     np.testing.assert_allclose(clean, normalise(s.tensors), atol=1e-6)
     assert not clean[s.tensors == 0].any()
-    np.testing.assert_array_equal(s.tensors, sequences().tensors)
+    assert 0.2 < np.mean(s.tensors == 0) < 1
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ import pytest
 import evflow as ef
 from evflow.errors import EvflowDataError
 from evflow.network.weights import load_weights, model_card
+from evflow.scenes import make_bank
 from evflow.training.options import TrainOptions
 from evflow.training.run import train_network
 from experiments import (
@@ -34,8 +35,10 @@ from experiments.shared.common import slug
 
 
 def test_quickstart_draws_truth_beside_estimate(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    bank = make_bank(jax.random.key(0), 8, photos=False)
+    monkeypatch.setattr(quickstart, "make_bank", lambda *_: bank)
     options = quickstart.Options(out=tmp_path, width=64, height=48, milliseconds=150)
     result = quickstart.main(options)
     text = capsys.readouterr().out

@@ -95,6 +95,7 @@ def small(monkeypatch: pytest.MonkeyPatch, scenes: tuple[str, ...]) -> None:
     monkeypatch.delenv("EVFLOW_DATA", raising=False)
 
 
+@pytest.mark.slow
 def test_table_has_all_cells_and_follows_from_the_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:

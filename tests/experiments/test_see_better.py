@@ -69,6 +69,7 @@ def test_event_tensors_and_frames_are_those_of_their_windows() -> None:
     assert clip.tensors[0, 0, 1:4].sum() == clip.tensors[0].sum()
 
 
+@pytest.mark.slow
 def test_clips_are_scenes_that_events_follow_and_repeat_themselves() -> None:
     bank = make_bank(jax.random.key(0), procedural=4, photos=False, size=64, cutout_size=24)
     data = SequenceConfig(scene=targets.SCENES)

@@ -9,6 +9,7 @@ for the tests that always do.
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import os
 from collections.abc import Mapping, MutableMapping
@@ -21,6 +22,9 @@ UNOPTIMISED = "JAX_DISABLE_MOST_OPTIMIZATIONS"
 FLAGS_OF = "0.10."
 FLAGS = ("--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
          "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true")
+
+# Programs, by module, that one estimate runs dozens of times: longer than they compile.
+OFTEN = {"evflow.estimation.refine.receptor_search": ("_sums", "_slopes")}
 
 
 def compile_quickly(environment: MutableMapping[str, str]) -> None:
@@ -50,6 +54,19 @@ def precise() -> dict[str, bool]:
     """Compiler options for programs whose rounding is what is tested: the older emitters round
     double precision to some 4e-7."""
     return {"xla_cpu_use_fusion_emitters": True} if quickly(os.environ) else {}
+
+
+def optimise_often_run() -> None:
+    """Compile the programs of OFTEN with optimisation after all."""
+    if quickly(os.environ):
+        import jax
+
+        options = {"xla_backend_optimization_level": 1}
+        for where, names in OFTEN.items():
+            module = importlib.import_module(where)
+            for name in names:
+                plain = getattr(module, name).__wrapped__
+                setattr(module, name, jax.jit(plain, compiler_options=options))
 
 
 def remember(environment: MutableMapping[str, str]) -> None:
