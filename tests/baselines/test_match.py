@@ -22,7 +22,8 @@ def scene() -> np.ndarray:
     return np.asarray(render(drawn, jnp.arange(-0.15, 0.1501, 1e-3), (32, 48)), np.float32)
 
 
-@pytest.mark.parametrize("mismatch", [0.03, 0.15])
+@pytest.mark.parametrize("mismatch", [
+    0.03, pytest.param(0.15, marks=pytest.mark.slow)])
 def test_match_on_the_true_video(scene: np.ndarray, mismatch: float) -> None:
     """The floor of 1500 pixels in .3 s: about .01; the mismatch is found as well."""
     shape, times = scene.shape[1:], np.arange(len(scene)) * 1000

@@ -14,8 +14,6 @@ from helpers.scenery import SHAPE, TIMES, bank, draw, pair, path, plain_scene, s
 from evflow.errors import EvflowDataError
 from evflow.scenes import Layer, SceneConfig, render, sample_scene
 
-pytestmark = pytest.mark.usefixtures("optimised")  # they render thousands of frames
-
 
 def test_at_rest_the_texture_itself_is_seen() -> None:
     texture = bank().backgrounds[0]

@@ -54,10 +54,10 @@ def agree(a: np.ndarray, b: np.ndarray, events: Events, window_us: int, bins: in
     np.testing.assert_allclose(counts, events.count_map(), atol=1e-3)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
-@pytest.mark.parametrize(("camera", "model"), [
-    (QUIET, SensorModel()), (NOISY, SensorModel()), (NOISY, SensorModel(timestamps="v2e")),
-    (NOISY, ALL_ON)])
+@pytest.mark.parametrize(("camera", "model", "dtype"), [
+    (QUIET, SensorModel(), np.float32), (NOISY, SensorModel(), np.uint8),
+    (NOISY, SensorModel(timestamps="v2e"), np.float32), (NOISY, ALL_ON, np.float32),
+    (NOISY, ALL_ON, np.uint8)])
 def test_voxels_are_those_of_the_events(
     camera: Camera, model: SensorModel, dtype: type
 ) -> None:
@@ -67,9 +67,9 @@ def test_voxels_are_those_of_the_events(
     agree(ours, direct, events, 32_000)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
-@pytest.mark.parametrize(("count", "dt_us", "bins", "refractory_s"), [
-    (65, 500, 16, 4e-4), (11, 3000, 16, 4e-4), (2, 30_000, 2, 2.5e-3)])
+@pytest.mark.parametrize(("count", "dt_us", "bins", "refractory_s", "dtype"), [
+    (65, 500, 16, 4e-4, np.float32), (11, 3000, 16, 4e-4, np.uint8),
+    (2, 30_000, 2, 2.5e-3, np.float32), (2, 30_000, 2, 2.5e-3, np.uint8)])
 def test_any_number_of_frames_and_bins_and_dead_times(
     count: int, dt_us: int, bins: int, refractory_s: float, dtype: type
 ) -> None:
@@ -103,11 +103,10 @@ def test_windows_one_after_another_keep_the_time() -> None:
     np.testing.assert_allclose(np.asarray(far, np.float64).sum(-1), exact, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
-def test_noise_with_several_events_an_interval(dtype: type) -> None:
+def test_noise_with_several_events_an_interval() -> None:
     """Mean 2 per interval and polarity, where the loop over further events runs."""
     camera = Camera.constant(SHAPE, 0.2, 0.2, 2000.0, 2000.0)
-    ours, direct, events = both(camera, SensorModel(), FRAMES.astype(dtype), 1000)
+    ours, direct, events = both(camera, SensorModel(), FRAMES, 1000)
     assert len(events) > 2 * 32 * 1.9 * np.prod(SHAPE)
     agree(ours, direct, events, 32_000)
 
