@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
+import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -13,9 +15,16 @@ import numpy as np
 import skimage.data
 from scipy.ndimage import map_coordinates, spline_filter
 
+from evflow.simulator.between import intervals
+from evflow.simulator.motion import speed as speed_of
+from evflow.types import Events
+
+Pairs = Iterator[tuple[np.ndarray, int]]
 Matrix = np.ndarray  # (2, 3), of pixels (x, y, 1) to those of the picture
 SKIMAGE = ("camera", "coffee", "chelsea", "brick", "grass", "gravel", "rocket")
 SIDE = 768  # pixels of a texture
+FADES = 16  # mixtures per frame
+PERIOD_US, PHASES = 33_333, 16  # of a frame
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +99,23 @@ def textures() -> dict[str, np.ndarray]:
     return {"waves": 127.5 + 110 * np.tanh(waves / 6), "discs": discs}
 
 
+@functools.cache
+def pictures() -> dict[str, np.ndarray]:
+    """`photographs` and `textures`."""
+    return photographs() | textures()
+
+
+def moving(motion: str, picture: str, speed: float, size: tuple[int, int]) -> Moving:
+    """A scene by the name of its motion: pan, hand, turn or object, at pixels per frame."""
+    shown = pictures()[picture]
+    if motion == "object":
+        other = pictures()["chelsea" if picture == "camera" else "camera"]
+        step = speed * np.array([1, 1 / 6])
+        return Moving(shown, lambda u: np.eye(2, 3), other, lambda u: (u - 4) * step, size[1] / 4)
+    views = {"pan": pan(speed), "hand": hand(speed), "turn": turn(speed, size)}
+    return Moving(shown, views[motion])
+
+
 def pan(speed: float) -> Callable[[float], Matrix]:
     """A constant velocity in pixels per frame, a sixth of it downwards."""
     step = speed * np.array([1, 1 / 6]) / np.hypot(1, 1 / 6)
@@ -126,10 +152,43 @@ def video(moving: Moving, frames: int, size: tuple[int, int], dense: int) -> np.
     return np.stack([moving.frame(k / dense, size) for k in range((frames - 1) * dense + 1)])
 
 
-def blended(frames: np.ndarray, times: np.ndarray, steps: int) -> Iterator[tuple[np.ndarray, int]]:
-    """The video filled up by mixtures of neighbours."""
-    for (a, b), (t0, t1) in zip(itertools.pairwise(frames), itertools.pairwise(times), strict=True):
-        for k in range(steps):
-            s = k / steps
-            yield (1 - s) * a + s * b, int(t0 + round(s * (t1 - t0)))
-    yield frames[-1].astype(np.float32), int(times[-1])
+def faded(pairs: Iterable[tuple[np.ndarray, int]]) -> Pairs:
+    """A video (frame, us) filled up by mixtures of neighbours."""
+    for (a, t0), (b, t1) in itertools.pairwise(pairs):
+        for k in range(FADES):
+            s = k / FADES
+            yield ((1 - s) * a + s * b).astype(np.float32), round(t0 + s * (t1 - t0))
+    yield b.astype(np.float32), t1
+
+
+def bilinear(pairs: Iterable[tuple[np.ndarray, int]]) -> Pairs:
+    """A video (frame, us) filled up in steps of a pixel along straight paths, warped bilinearly."""
+    for i in intervals((frame.astype(np.float32), t) for frame, t in pairs):
+        steps = max(1, math.ceil(speed_of(i.motion.there)))
+        shares = np.arange(1, steps) / steps
+        straight = dataclasses.replace(i, bends=None).at(shares, sharp=False)
+        times = np.round(i.a.time + shares * (i.b.time - i.a.time)).astype(int)
+        yield i.a.dn, i.a.time
+        yield from zip(straight, times.tolist(), strict=True)
+    yield i.b.dn, i.b.time
+
+
+WAYS = {"fade": faded, "bilinear": bilinear}
+
+
+def scores(made: Events, truth: Events) -> dict[str, float]:
+    """Share of events; rate by phase; combs in per cent; correlation of counts."""
+    (rate, waves), (true_rate, true_waves) = _folded(made), _folded(truth)
+    ratio, comb = rate / true_rate, 100 * np.abs(waves - true_waves)
+    r = np.corrcoef(made.count_map().ravel(), truth.count_map().ravel())[0, 1]
+    return {"share": len(made) / len(truth), "least": float(ratio.min()),
+            "most": float(ratio.max()), "at_rate": float(comb[0]), "at_double": float(comb[1]),
+            "r": float(r)}
+
+
+def _folded(events: Events) -> tuple[np.ndarray, np.ndarray]:
+    """Rate by phase over its mean, after the first frame; amplitudes at the frame rate and its
+    double."""
+    phase = events.t[events.t >= PERIOD_US] % PERIOD_US / PERIOD_US
+    rate = np.histogram(phase, PHASES, (0, 1))[0]
+    return rate / rate.mean(), np.array([2 * np.exp(2j * np.pi * k * phase).mean() for k in (1, 2)])
