@@ -137,6 +137,13 @@ def forgiving(folder: Path, kind: str) -> Sample:
         made, read=partial(made.read, partial=True), sealed=False, counted=False)
 
 
+def mended(folder: Path, kind: str, late: str) -> Sample:
+    """The same, with times that go back left out, sorted or joined."""
+    made = SAMPLES[kind](folder)
+    return dataclasses.replace(made, read=partial(made.read, late=late), sealed=False,
+                               counted=False)
+
+
 # --------------------------------------------------------------------------- what else is read
 
 
@@ -258,3 +265,5 @@ if importlib.util.find_spec("rosbags") is not None:
 SAMPLES |= {f"{kind}-partial": partial(forgiving, kind=kind)
             for kind in ("evt2", "evt3", "v2e-text", "e2vid", "ijrr", "v2e", "aedat4", "rosbag")
             if kind in SAMPLES}
+SAMPLES |= {f"{kind}-{late}": partial(mended, kind=kind, late=late) for kind, late in (
+    ("evt3", "drop"), ("evt2", "sort"), ("e2vid", "join"), ("rosbag", "drop")) if kind in SAMPLES}

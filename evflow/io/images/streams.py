@@ -87,9 +87,10 @@ def events_alone() -> Iterator[None]:
     try:
         yield
     except EvflowDataError as e:
+        late = " Late frames: --late drop, or sort." if e.code == "EV004" else ""
         raise EvflowDataError(
-            e.code, e.seen, f"{e.fix} The events alone: --no-frames (no_frames=True).".lstrip()
-        ) from e
+            e.code, e.seen,
+            f"{e.fix}{late} The events alone: --no-frames (no_frames=True).".lstrip()) from e
 
 
 def _named(

@@ -200,7 +200,7 @@ def test_frames_whose_time_goes_back(tmp_path: Path) -> None:
     path = npz(tmp_path, columns)
     error = refused(path)
     assert error.code == "EV004"
-    assert "--no-frames" in error.fix
+    assert "--late drop, or sort. The events alone: --no-frames" in error.fix
     got = read_recording(path, late="sort")
     assert got.frame_times.tolist() == [0, 50_000, 100_000, 200_000, 300_000]
     np.testing.assert_array_equal(got.frames, frames[[0, 2, 1, 3, 4]])
