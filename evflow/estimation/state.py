@@ -31,7 +31,7 @@ from evflow.estimation.refine import (
     make_chunk,
     simulated_part,
 )
-from evflow.estimation.refine.correction import corrected, signs
+from evflow.estimation.refine.doubt import doubted, signs
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.remarks import camera_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
@@ -148,8 +148,8 @@ def glance(state: State) -> tuple[Summary, Summary]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Refined:
-    """hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera, before the last
-    correction; signs: what that goes by, None where the path tells nothing or was not asked."""
+    """hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera, before
+    refine/doubt.py; signs: what that goes by, None where nothing was looked for on the path."""
 
     hot: Array
     chunks: tuple[Chunk, ...]
@@ -188,11 +188,11 @@ def estimate(
     n_events = state.n_events.astype(np.uint32)
     refined = refine(state)
     hot, summary, std = refined.hot, refined.summary, refined.std
-    correction = next(iter(state.params.values())).get("correction")
+    doubt = next(iter(state.params.values())).get("doubt")
     if unknown := untold(stats, summary):
         summary, std = without(unknown, list(refined.chunks), summary, std)
-    elif correction is not None and refined.signs is not None:
-        summary, std = corrected(correction, refined.signs, summary, std)
+    elif doubt is not None and refined.signs is not None:
+        std = doubted(doubt, refined.signs, summary, std)
     quiet = quiet_times(_told(_windows(state.read), advance), summary, hot, eyes.seen_by)
     if state.evidence is not None:
         camera, error = maps.by_regression(state.evidence, summary, std)

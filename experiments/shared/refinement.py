@@ -15,9 +15,9 @@ from evflow.recordings.windows import plan_windows
 COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier than a Gaussian's
 
 
-def uncorrected(params: Any, recording: Recording) -> tuple[Any, Summary, Summary] | None:
-    """The signs of the last correction, and the summary and its std without it; None where too
-    little happens."""
+def undoubted(params: Any, recording: Recording) -> tuple[Any, Summary, Summary] | None:
+    """What refine/doubt.py goes by, and the summary and its std without it; None where too little
+    happens."""
     if len(recording.events) < 1000:
         return None
     refined = refine(read_whole(recording, params))

@@ -19,9 +19,9 @@ from experiments import (
     changes,
     combine,
     compare_systems,
-    correct,
     coverage,
     curves,
+    doubt,
     evaluate,
     fuse,
     generate,
@@ -36,7 +36,7 @@ from experiments import (
 from experiments.shared.common import begin, estimator, write_result
 from experiments.shared.rows import saved_rows
 
-FITS: list[Any] = [calibrate, correct, fuse, tell_apart]
+FITS: list[Any] = [calibrate, doubt, fuse, tell_apart]
 
 
 @pytest.mark.parametrize(("script", "option"), [

@@ -31,7 +31,7 @@ NO_DEBUG = {
     "combine": "computes next to nothing",
     "calibrate": "as many steps as are asked for",
     "long_recordings": "as long as is asked for",
-    "correct": "as many recordings as are asked for",
+    "doubt": "as many recordings as are asked for",
     "fuse": "as many recordings as are asked for",
     "tell_apart": "as many recordings as are asked for"}
 

@@ -1,11 +1,11 @@
-"""Fit the last correction of the thresholds on simulated cameras as they are.
+"""Fit how far the thresholds may be off, on simulated cameras as they are.
 
-    python -m experiments.correct evflow/weights/default.safetensors --out corrected.safetensors
+    python -m experiments.doubt evflow/weights/default.safetensors --out doubted.safetensors
 
 Each hidden camera (ideal, slow, blind for a while after an event, noisy, with exposed, offset and
-noisy frames) is measured without the correction; what is left of the error of log theta is
-regressed on what the estimate shows of itself (evflow/estimation/refine/correction.py).
-Cross-validation over recordings gives the figures of the model card and the factor of the std.
+noisy frames) is measured; the size of its error is regressed on what the estimate shows of itself
+(evflow/estimation/refine/doubt.py). Cross-validation over recordings gives the figures of the
+model card and the factor of the std.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from evflow.commands.writing import need_absent, need_suffix
 from evflow.network.weights import model_card, save_weights, weights_hash
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import at_least, estimator, run_script
-from experiments.shared.correcting import FOLDS, cross_validated, figures_of, fit, flat
+from experiments.shared.doubting import FOLDS, cross_validated, figures_of, fit, flat
 from experiments.shared.many import Setup
 from experiments.shared.real_cameras import draw_real
-from experiments.shared.refinement import COVERED, uncorrected
+from experiments.shared.refinement import COVERED, undoubted
 from experiments.shared.rows import collected
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Fit the last correction of the thresholds."""
+    """Fit how far the thresholds may be off."""
 
     weights: tyro.conf.Positional[Path]
     out: Path
@@ -45,9 +45,8 @@ class Options:
 
 
 def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
-    """Signs (2, F), and log theta and its std without the correction, beside the truth; None where
-    too little happens."""
-    made = uncorrected(params, hidden.recording)
+    """Signs (2, F), error of log theta (2,) and its std so far; None where too little happens."""
+    made = undoubted(params, hidden.recording)
     if made is None:
         return None
     signs, summary, std = made
@@ -69,17 +68,17 @@ def main(options: Options) -> dict[str, float]:
     setup = Setup(str(options.weights), options.seed, photos=True)
     rows = collected(row, setup, protocols, options.workers, options.rows, origin)
     both = flat(rows)
-    change, std = cross_validated(rows)
-    widen = float(np.quantile(np.abs(both["left"] - change) / std, COVERED))
+    std = cross_validated(rows)
+    widen = float(np.quantile(np.abs(both["left"]) / std, COVERED))
     figures = {"recordings": len(rows["left"]),
+               "median": float(np.median(np.abs(both["left"]))),
                **figures_of(both["left"], both["before"], "before"),
-               **figures_of(both["left"] - change, std * widen, "after")}
+               **figures_of(both["left"], std * widen, "after")}
     made = {**fit(both["signs"], both["left"], both["before"]), "widen": np.array(widen)}
     print("\n".join(f"{k:20s} {v:.4f}" for k, v in figures.items()))
-    card = model_card(options.weights) | {"correction": {
+    card = model_card(options.weights) | {"doubt": {
         "recordings": options.recordings, "seed": options.seed, "figures": figures}}
-    save_weights(options.out, {name: {**net, "correction": made}}, card,
-                 overwrite=options.overwrite)
+    save_weights(options.out, {name: {**net, "doubt": made}}, card, overwrite=options.overwrite)
     return figures
 
 

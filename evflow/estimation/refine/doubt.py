@@ -1,0 +1,75 @@
+"""How far the thresholds may be off, for cameras as they are.
+
+The fusion (fit.py) learned its errors on pixels without a low-pass and on frames that show light.
+What an exposure, noise, an offset that stays undetected or a slow photoreceptor adds shows in how
+the pooled regression, the fusion and the path disagree, and above all in how little the path
+explains; a linear map of these signs to the log of the standard deviation, fitted on simulated
+cameras of all these kinds beside ideal ones, says how much.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Summary
+from evflow.errors import EvflowDataError
+from evflow.estimation.refine.receptor_search import Found
+
+Array = np.ndarray
+
+NAMES = (
+    "regression", "other_regression", "unexplained", "explained_more", "smear_10", "smear_20",
+    "theta_10", "theta_20", "frame_noise", "needed", "offset", "offset_std", "tau", "tau_std",
+    "open", "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal")
+BEYOND = 2.0  # standard deviations outside of what it learned on, beyond which a sign is held
+POOR = 0.3  # share that a path leaves unexplained, from which on an offset is easily missed
+
+
+def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Array:
+    """(2, F) float64: NAMES of theta_on and theta_off."""
+    theta, error = (np.array([float(getattr(s, f"theta_{p}")) for p in ("on", "off")])
+                    for s in (summary, std))
+    needed = float(found.needed)
+    pooled = np.log((found.theta if found.needed else found.ideal_theta) / theta)
+    ideal, seen = found.explained
+    left = 1.0 - (seen if found.needed else ideal)
+    offset_std, tau_std, _ = found.std
+    shared = [np.log(left + 1e-3), np.log((1 - ideal + 1e-3) / (1 - seen + 1e-3)),
+              *found.smear[:, 0]]
+    camera = [noise_dn / 3.0, needed, needed * found.seen.offset_dn / 20.0, np.log(offset_std),
+              needed * found.seen.tau_s * 1e3, np.log(tau_std * 1e3)]
+    rows = []
+    for p in (0, 1):
+        own = [np.log(needed * found.theta_error[p] + 0.01), np.log(error[p] / theta[p]),
+               np.log(theta[p]), np.log(theta[1 - p]), np.log(found.size), 1.0 - p,
+               (1 - needed) * left, (1 - needed) * float(left > POOR)]
+        rows.append([pooled[p], pooled[1 - p], *shared, *found.smear[:, 1 + p], *camera, *own])
+    return np.array(rows, np.float64)
+
+
+def doubted(net: dict[str, Any], rows: Array, summary: Summary, std: Summary) -> Summary:
+    """The std of a summary with those of its thresholds replaced.
+
+    net: "mean", "scale" (F,) of the signs that it was fitted to, "map" (F + 1,) to the log of the
+    relative standard deviation, and "widen" (), its calibration; rows: of `signs`. Raises EV018
+    for weights that go by other signs.
+    """
+    if np.shape(net["mean"]) != (len(NAMES),):
+        raise EvflowDataError(
+            "EV018", f"the weights' doubt goes by {np.size(net['mean'])} signs, this version by "
+            f"{len(NAMES)}.", "They are of another version; refit: python -m experiments.doubt.")
+    error = relative_error(net, rows) * float(net["widen"])
+    return dataclasses.replace(std, **{
+        name: jnp.float32(float(getattr(summary, name)) * error[p])
+        for p, name in enumerate(("theta_on", "theta_off"))})
+
+
+def relative_error(net: dict[str, Any], rows: Array) -> Array:
+    """Standard deviation (N,) of log theta, before "widen", of rows (N, F)."""
+    x = (rows - np.asarray(net["mean"])) / np.asarray(net["scale"])
+    x = np.concatenate([np.clip(x, -BEYOND, BEYOND), np.ones((len(x), 1))], -1)
+    return np.asarray(np.exp(x @ np.asarray(net["map"])))
