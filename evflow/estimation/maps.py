@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.camera import PARAMETERS, THETA_MIN, Camera, Summary
 from evflow.estimation.pixel_noise import pixel_rates, threshold_law
 from evflow.estimation.pooled import window_inputs
 from evflow.estimation.refine import Chunk, Found, PixelEvidence, pixel_posterior, refine_summary
@@ -19,6 +19,8 @@ from evflow.recordings.glitches import exposed
 from evflow.types import Window
 
 Array = jax.Array
+
+SLOW_ERROR = 0.15  # of the network's thresholds, relative, where pixels are not ideal
 
 
 def by_flow(
@@ -91,11 +93,17 @@ def refined(
 
 
 def regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Summary]:
-    """The summary with the pooled regression's thresholds: the network knows few slow pixels."""
-    (on, off), error = found.thresholds()
-    on, off, error = jnp.float32(on), jnp.float32(off), jnp.float32(error)
-    return (dataclasses.replace(summary, theta_on=on, theta_off=off),
-            dataclasses.replace(std, theta_on=error * on, theta_off=error * off))
+    """The summary with the mean of its own and the pooled regression's thresholds, weighted by what
+    is known of each: the network knows few slow pixels, and a poor path says little."""
+    theta, error = found.thresholds()
+    values, errors = {}, {}
+    for name, other in zip(("theta_on", "theta_off"), theta, strict=True):
+        own = float(getattr(summary, name))
+        known = max(float(getattr(std, name)) / own, SLOW_ERROR) ** -2.0, error**-2.0
+        middle = np.exp(np.average(np.log([own, max(float(other), THETA_MIN)]), weights=known))
+        values[name] = jnp.float32(middle)
+        errors[name] = jnp.float32(middle * sum(known) ** -0.5)
+    return dataclasses.replace(summary, **values), dataclasses.replace(std, **errors)
 
 
 def widened(summary: Summary, std: Summary, found: Found) -> Summary:

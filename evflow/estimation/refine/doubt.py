@@ -26,6 +26,7 @@ NAMES = (
     "theta_10", "theta_20", "frame_noise", "needed", "offset", "offset_std", "tau", "tau_std",
     "open", "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal")
 BEYOND = 2.0  # standard deviations outside of what it learned on, beyond which a sign is held
+NARROWER = 0.5  # of the std before: what a recording leaves open is not learned away
 POOR = 0.3  # share that a path leaves unexplained, from which on an offset is easily missed
 
 
@@ -64,7 +65,8 @@ def doubted(net: dict[str, Any], rows: Array, summary: Summary, std: Summary) ->
             f"{len(NAMES)}.", "They are of another version; refit: python -m experiments.doubt.")
     error = relative_error(net, rows) * float(net["widen"])
     return dataclasses.replace(std, **{
-        name: jnp.float32(float(getattr(summary, name)) * error[p])
+        name: jnp.float32(max(float(getattr(summary, name)) * error[p],
+                              NARROWER * float(getattr(std, name))))
         for p, name in enumerate(("theta_on", "theta_off"))})
 
 

@@ -34,9 +34,8 @@ MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
 MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # The path is wrong in its own way everywhere. What it explains better by less than a few per cent
-# of what is left says nothing of the pixel, the less so the less it explains, and so much is left
-# open of what is found:
-BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel, of a path that explains all
+# of what is left says nothing of the pixel, and so much is left open of what is found:
+BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
 FLOOR = np.array([0.5, 1e-4, 5e-4])
 DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
 
@@ -192,8 +191,7 @@ def find(data: Sample) -> Found:
     information += np.diag((SCALE / PRIOR) ** 2)
     covariance = np.linalg.inv(information) * units + np.diag(FLOOR**2)
     fits, ideal_fits = (_solved(_totals(at, data))[0] for at in (phi, PLAIN))
-    believed = BELIEVED * (1 - np.exp(value)) ** 2
-    odds = 0.5 * min(size, believed) * (plain - value) - DOUBT - 0.5 * float(
+    odds = 0.5 * min(size, BELIEVED) * (plain - value) - DOUBT - 0.5 * float(
         (((phi - PLAIN) / PRIOR) ** 2).sum())
     if fits.min() <= 0:  # brightness that falls with ON events: there is no path
         odds = -np.inf
