@@ -119,6 +119,8 @@ TYPES = {
     'found.save("camera.npz", overwrite=True)': "Path",
     'ef.estimate_camera("flight.h5").windows': "int",
     "isinstance(found, ef.CameraEstimate)": "bool",
+    "ef.CameraEstimator().add(recording)": "int",
+    "ef.CameraEstimator(params).estimate()": "CameraEstimate",
     'ef.write_report("report.html", found, recording)': "dict[str, Any]",
     "ef.__version__": "str",
 }

@@ -93,6 +93,7 @@ def many_links_to_one_image(folder: Path) -> Sample:
     path = tables.write(folder, "event_utils", 50)
     with h5py.File(path, "a") as f:
         del f["images"]
+        f.attrs["sensor_resolution"] = (1024, 1024)  # that of the images, or they are left out
         f.create_dataset("images/0", (1024, 1024), "u1", chunks=(1024, 1024), compression="gzip")
         f["images/0"][:] = 0
         f["images/0"].attrs["timestamp"] = 0.1

@@ -20,7 +20,8 @@ FIX = ("Only what is in the file itself is read. Copy it in: with h5py, values =
 
 class _Contained(h5py.Group):  # type: ignore[misc]
     """A group whose members, and theirs, lie in its own file; EV009 where one is asked for that
-    does not, KeyError where there is none, ValueError where a link leads nowhere."""
+    does not, KeyError where there is none, ValueError where a link leads nowhere, or to what is
+    damaged."""
 
     def __getitem__(self, name: Any) -> Any:
         found = _opened(self.id, self._e(name))
@@ -68,11 +69,20 @@ def _opened(at: Any, path: bytes, links: int = MOST_LINKS) -> Any:
         if kind == h5py.h5l.TYPE_SOFT:
             at = _followed(at, part, links)
         elif kind == h5py.h5l.TYPE_HARD:
-            at = h5py.h5o.open(at, part)
+            at = _linked(at, part)
             _check_own(at)
         else:
             raise _elsewhere(at, part, "is a link to another file")
     return at
+
+
+def _linked(at: Any, part: bytes) -> Any:
+    """The object that the group `at` holds as `part`; ValueError where it cannot be opened, which
+    h5py tells by the same KeyError as that it is not there."""
+    try:
+        return h5py.h5o.open(at, part)
+    except KeyError as e:
+        raise ValueError(f"{part.decode(errors='replace')} cannot be opened ({e})") from e
 
 
 def _followed(at: Any, part: bytes, links: int) -> Any:
