@@ -9,7 +9,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import Camera
+from evflow.camera import PARAMETERS, Camera
+from evflow.camera.exports.common import Settings
 from evflow.camera.optics import read_sensor, read_undetermined
 from evflow.errors import EvflowDataError
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
@@ -39,16 +40,13 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
     maps = {name: getattr(camera, name) for name in THRESHOLDS}
     errors = {name: getattr(std, name) for name in THRESHOLDS}
     used = valid if valid.any() else np.ones_like(valid)
-    values: dict[str, float] = {}
-    value_errors: dict[str, float] = {}
-    for name in THRESHOLDS:
-        theta, error = (np.asarray(m[name])[used] for m in (maps, errors))
-        side = name.removeprefix("theta_")
-        middle = float(np.median(theta))
-        spread = 1.4826 * float(np.median(np.abs(theta - middle)))
-        values |= {name: middle, f"sigma_{side}": spread}
-        value_errors |= {name: float(np.median(error)),
-                         f"sigma_{side}": spread / np.sqrt(2.0 * theta.size)}
+    seen, seen_std = ({name: np.asarray(getattr(c, name))[used][None] for name in PARAMETERS}
+                      for c in (camera, std))
+    nearest = vars(Settings.of(seen, seen_std))
+    sigmas = tuple(name.replace("theta", "sigma") for name in THRESHOLDS)
+    values = {name: nearest[name] for name in (*THRESHOLDS, *sigmas)}
+    value_errors = {name: float(np.median(np.asarray(errors[name])[used])) for name in THRESHOLDS}
+    value_errors |= {name: values[name] / np.sqrt(2.0 * used.sum()) for name in sigmas}
 
     def scalars(numbers: dict[str, float]) -> dict[str, jnp.ndarray]:
         return {name: jnp.float32(number) for name, number in numbers.items()}

@@ -3,7 +3,7 @@ stretch, and `estimate` the camera.
 
 Everything in a `State` is a sum over what was read, or bounded by the size of the sensor: maps of
 evidence, and the few stretches that are simulated. Only references to what was read grow, to
-count the quiet time at the end; `keep` says how many of these are kept.
+count the quiet time at the end; `thinned` bounds these.
 """
 
 from __future__ import annotations
