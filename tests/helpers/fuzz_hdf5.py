@@ -3,14 +3,15 @@ data set."""
 
 from __future__ import annotations
 
+import struct
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-from helpers import tables
-from helpers.fuzz_registry import HOSTILE, hostile
+from helpers import ecf, streams, tables
+from helpers.fuzz_registry import HOSTILE, each, hostile
 from helpers.fuzz_samples import SAMPLES, Sample, sample
 from helpers.recordings import make
 
@@ -99,4 +100,16 @@ def many_links_to_one_image(folder: Path) -> Sample:
         f["images/0"].attrs["timestamp"] = 0.1
         for i in range(1, 1000):
             f[f"images/{i:09d}"] = f["images/0"]
+    return sample(path)
+
+
+@each(stays=(1, 0), back=(1, 2**64 - 24), back_to_itself=(1, 2**64 - 16), leaves=(1, 1 << 40),
+      first=(0, 0), small=(0, 8))
+def heap(folder: Path, case: tuple[int, int]) -> Sample:
+    """Text of variable length, in whose heap an object is free space of such a size."""
+    which, size = case
+    path = ecf.write(folder / "a.hdf5", streams.clustered(9), (), geometry="240x180")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<HHIQ", data, data.index(b"GCOL") + 16 + 24 * which, 0, 1, 0, size)
+    path.write_bytes(data)
     return sample(path)

@@ -1,17 +1,20 @@
 """HDF5 read as far as one file goes. Links, virtual data sets and external storage lead into other
 files: a missing one reads as zeros, a pipe has no end, and the file itself ends the process.
 
-`File` is h5py's, but every part of a path is looked at before HDF5 follows it.
+`File` is h5py's, but every part of a path is looked at before HDF5 follows it, and the heap that
+holds text of variable length before HDF5 walks it (`hdf5_heaps`).
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import h5py
 
 from evflow.errors import EvflowDataError
+from evflow.io.decode.hdf5_heaps import Heaps
 
 MOST_LINKS = 16  # soft links followed in one path, as HDF5 itself does
 FIX = ("Only what is in the file itself is read. Copy it in: with h5py, values = f[name][:]; "
@@ -28,7 +31,7 @@ class _Contained(h5py.Group):  # type: ignore[misc]
         if isinstance(found, h5py.h5g.GroupID):
             return Group(found)
         if isinstance(found, h5py.h5d.DatasetID):
-            return h5py.Dataset(found, readonly=True)
+            return Dataset(found, readonly=True)
         return h5py.Datatype(found)
 
     def __contains__(self, name: Any) -> bool:
@@ -44,9 +47,38 @@ class _Contained(h5py.Group):  # type: ignore[misc]
         except KeyError:
             return default
 
+    @property
+    def attrs(self) -> Attributes:
+        return Attributes(self)
+
 
 class Group(_Contained):
     """A group of a `File`."""
+
+
+class Dataset(h5py.Dataset):  # type: ignore[misc]
+    """A data set of a `File`; ValueError where values are asked for that lie in its heap, as those
+    of variable length do: no format has such."""
+
+    def __getitem__(self, args: Any, new_dtype: Any = None) -> Any:
+        if self.dtype.hasobject:
+            raise ValueError(f"{self.name} has values of variable length, or references")
+        return super().__getitem__(args, new_dtype)
+
+    @property
+    def attrs(self) -> Attributes:
+        return Attributes(self)
+
+
+class Attributes(h5py.AttributeManager):  # type: ignore[misc]
+    """The attributes of a group or data set; ValueError where one lies in a heap of which HDF5
+    would not find the end."""
+
+    def __getitem__(self, name: Any) -> Any:
+        kind = h5py.h5a.open(self._id, self._e(name)).get_type()
+        plain = isinstance(kind, (h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID)) or (
+            isinstance(kind, h5py.h5t.TypeStringID) and not kind.is_variable_str())
+        return super().__getitem__(name) if plain else _of_heap(self._id, name)
 
 
 class File(_Contained, h5py.File):  # type: ignore[misc]
@@ -54,6 +86,17 @@ class File(_Contained, h5py.File):  # type: ignore[misc]
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "r")
+
+
+def _of_heap(at: Any, name: Any) -> Any:
+    """An attribute of the object `at`, read with an eye on every heap; ValueError."""
+    whole = h5py.h5i.get_file_id(at)
+    if whole.get_create_plist().get_sizes()[1] != 8:
+        raise ValueError(f"attribute {name} has lengths of other than 8 bytes")
+    with Heaps(Path(os.fsdecode(h5py.h5f.get_name(whole)))) as file, h5py.File(file, "r") as again:
+        found = _opened(again.id, h5py.h5i.get_name(at))
+        kind = h5py.Dataset if isinstance(found, h5py.h5d.DatasetID) else h5py.Group
+        return h5py.AttributeManager(kind(found))[name]
 
 
 def _opened(at: Any, path: bytes, links: int = MOST_LINKS) -> Any:

@@ -50,7 +50,7 @@ def tables_of(path: Path, f: Any) -> list[tuple[Any, arrays.Table]]:
     before matrices, the outer before the inner, a left camera before others."""
     ranked: list[tuple[tuple[int, int, bool, str], Any, arrays.Table]] = []
     for group, found in walk(f):
-        for kind, table in _in_group(path, group, found):
+        for kind, table in _in_group(path, f, group, found):
             name = table.name
             rank = (kind, name.count("/"), "left" not in name.lower(), name)
             ranked.append((rank, group, table))
@@ -60,7 +60,7 @@ def tables_of(path: Path, f: Any) -> list[tuple[Any, arrays.Table]]:
 
 
 def _in_group(
-    path: Path, group: Any, found: dict[str, Any]
+    path: Path, f: Any, group: Any, found: dict[str, Any]
 ) -> Iterator[tuple[int, arrays.Table]]:
     flat = [name for name, data in found.items()
             if len(data.shape) == 1 and data.dtype.kind in "biuf"]
@@ -68,7 +68,8 @@ def _in_group(
         of = {c: found[name] for c, name in chosen.items()}
         if len({len(data) for data in of.values()}) == 1:
             of = {c: tables.dataset(path, group, name, (None,)) for c, name in chosen.items()}
-            yield 0, arrays.named(group.name, of, len(of["t"]), _unit(chosen["t"], of["t"]))
+            yield 0, arrays.named(group.name, of, len(of["t"]), _unit(
+                f, chosen["t"], of["t"]))
     for name, data in found.items():
         if len(data.shape) == 1 and data.dtype.fields and (table := arrays.structured(
                 data.name, tables.dataset(path, group, name, (None,)))):
@@ -78,13 +79,13 @@ def _in_group(
             yield 2, table
 
 
-def _unit(name: str, data: Any) -> str:
+def _unit(f: Any, name: str, data: Any) -> str:
     """Of times, by their attributes, else by their name, else by the file."""
     for key in ("unit", "units"):
         if isinstance(told := columns.text(data.attrs.get(key)), str) and told:
             return written_unit(f"[{told}]")
     unit = written_unit(name)
-    return told_unit(data.file) if unit == "auto" else unit
+    return told_unit(f) if unit == "auto" else unit
 
 
 def told_unit(f: Any) -> str:
@@ -111,7 +112,8 @@ def _small(group: Any, name: str) -> Any:
     if name not in group:
         return None
     data = group[name]
-    return data[()] if getattr(data, "size", None) and data.size <= 4 and not data.chunks else None
+    few = getattr(data, "size", None) and data.size <= 4 and not data.chunks
+    return data[()] if few and data.dtype.kind in "iuf" else None
 
 
 def listing(f: Any) -> str:
