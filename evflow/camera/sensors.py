@@ -75,8 +75,9 @@ class SensorModel:
             crosses the threshold; "v2e" = v2e's slots, shared by the k-th event of every pixel.
         log_map: "linlog" (v2e: linear below 20 DN) or "log_eps" (ESIM: log(I/255 + 1e-3));
             "auto" becomes the kind's own.
-        cutoff_hz: corner frequency of the intensity-dependent first-order low-pass at 255 DN;
-            0 = off.
+        cutoff_hz: corner frequency of the first-order low-pass at 255 DN; 0 = off.
+        cutoff_by_light: let the corner go with intensity, as in v2e; False: the same everywhere,
+            as where not the photoreceptor but what follows it is slow.
         refractory_s: dead time after an event in seconds; with "v2e" the contrast is kept and
             fires later.
         leak_hz: ON leak events per second.
@@ -101,6 +102,7 @@ class SensorModel:
     timestamps: Literal["crossing", "v2e"] = "crossing"
     log_map: LogMap = "auto"
     cutoff_hz: float = 0.0
+    cutoff_by_light: bool = True
     refractory_s: float = 0.0
     leak_hz: float = 0.0
     leak_jitter: float = 0.0

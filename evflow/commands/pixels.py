@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 THRESHOLDS = ("theta_on", "theta_off", "mismatch", "eta_on", "eta_off")
 CIRCUIT = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz")
+CHOICES = ("cutoff_by_light", "noise_resets_memory")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,6 +48,8 @@ class Pixels:
     """The same, OFF."""
     cutoff_hz: Annotated[float | None, value("HZ", "--cutoff")] = None
     """Corner of the photoreceptor's low-pass at white; 0: none."""
+    cutoff_by_light: bool = True
+    """The corner goes with intensity, as in v2e; else it is the same everywhere."""
     refractory_s: Annotated[float | None, value("SECONDS", "--refractory")] = None
     """Time after an event in which a pixel sends no other (v2e: .0005)."""
     leak_hz: Annotated[float | None, value("HZ", "--leak")] = None
@@ -72,9 +75,9 @@ class Pixels:
         told: dict[str, Any] = {name: number for name in CIRCUIT
                                 if (number := getattr(self, name)) is not None}
         if model.kind == "v2e":
-            told["noise_resets_memory"] = self.noise_resets_memory
+            told |= {name: getattr(self, name) for name in CHOICES}
         else:
-            refuse(self, ("noise_resets_memory",), f"--sensor {self.sensor} has no such choice")
+            refuse(self, CHOICES, f"--sensor {self.sensor} has no such choice")
         return dataclasses.replace(model, **told)
 
     def seen_by(self, recorded: bool) -> Photoreceptor:

@@ -104,7 +104,7 @@ def look(
         (lp, base, active), (frame, dt, salt) = carry, inputs
         log_i = to_log(frame, model.log_map)
         if model.cutoff_hz > 0:
-            log_i = pixel.low_pass(lp, log_i, _i01(frame), dt, model.cutoff_hz)
+            log_i = pixel.low_pass(model, lp, log_i, _i01(frame), dt)
         if sensor.leaking is not None:
             drawn = noise.draw(sensor.words, salt)
             base = base - noise.leak(model, sensor.leaking, sensor.words, drawn, dt)

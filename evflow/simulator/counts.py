@@ -164,7 +164,7 @@ def _scan_smooth(
         i01 = sensor.i01_of(model, log_i)
         lp, base = log_i, pixels.base
         if model.cutoff_hz > 0:
-            lp = pixel.low_pass(pixels.lp, log_i, i01, dt, model.cutoff_hz)
+            lp = pixel.low_pass(model, pixels.lp, log_i, i01, dt)
         if whole.leaking is not None:
             base = base - whole.leaking * dt
         contrast = lp - base

@@ -6,7 +6,8 @@ frames, what the pixel sees is s in
 
     ds/dt = r(t) (u(t) - s),    u = lin-log(L + offset),    r = (L + offset + 20) / 275 / tau
 
-(first order, its rate proportional to light as in v2e), `delay` after the frames' clock. Between
+(first order, its rate proportional to light as in v2e, or r = 1 / tau whatever the light, where
+not the photoreceptor but what follows it is slow), `delay` after the frames' clock. Between
 instants u moves linearly, which is solved exactly, however long the step: `SensorModel.cutoff_hz`
 is v2e's own form of it, true for steps far below tau. tau = 1 / (2 pi cutoff).
 """
@@ -36,20 +37,21 @@ LEAST_LIGHT = 0.02  # of v2e's full rate
 class Photoreceptor:
     """offset_dn: light added to the frames' DN before the log; tau_s: time constant of the
     low-pass at 255 DN, 0 where it is too fast to be seen; delay_s: of the events after the
-    frames."""
+    frames; by_light: whether the low-pass is the slower the darker it is."""
 
     offset_dn: float = 0.0
     tau_s: float = 0.0
     delay_s: float = 0.0
+    by_light: bool = True
 
     @staticmethod
     def of(sensor: SensorModel, optics: Optics) -> Photoreceptor:
         tau_s = 1.0 / (2.0 * np.pi * sensor.cutoff_hz) if sensor.cutoff_hz > 0 else 0.0
-        return Photoreceptor(optics.offset_dn, tau_s, optics.delay_s)
+        return Photoreceptor(optics.offset_dn, tau_s, optics.delay_s, sensor.cutoff_by_light)
 
     @property
     def ideal(self) -> bool:
-        return self == Photoreceptor()
+        return not (self.offset_dn or self.tau_s or self.delay_s)
 
     @property
     def cutoff_hz(self) -> float:
@@ -66,9 +68,11 @@ def lin_log_dn(dn: ArrayLike) -> Array:
     return jnp.where(dn <= 20.0, dn * (np.log(20.0) / 20.0), jnp.log(jnp.maximum(dn, 1.0)))
 
 
-def seen_path(dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> Array:
+def seen_path(
+    dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike, by_light: ArrayLike = True
+) -> Array:
     """s (T + 1, ...) of light (T + 1, ...) in DN at instants dt_s (T,) apart, begun at rest."""
-    u, rate = _light(dn, offset, tau_s)
+    u, rate = _light(dn, offset, tau_s, by_light)
 
     def step(s: Array, x: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
         s = _followed(s, *x)
@@ -92,7 +96,8 @@ def seen_frames(
     darker = np.float32(np.log1p(max(seen_by.offset_dn, 0.0) / 255.0))
     before: tuple[Array, Array, Array, int] | None = None
     for frame, t_us in pairs:
-        now, rate = _light_of_frame(np.asarray(frame, np.float32), offset, tau_s)
+        now, rate = _light_of_frame(
+            np.asarray(frame, np.float32), offset, tau_s, seen_by.by_light)
         s = now
         if before is not None and seen_by.tau_s:
             old, u, pace, last_us = before
@@ -101,11 +106,13 @@ def seen_frames(
         yield np.minimum(np.asarray(_as_dn(s - darker)), 255), t_us + round(seen_by.delay_s * 1e6)
 
 
-def _light(dn: ArrayLike, offset: ArrayLike, tau_s: ArrayLike) -> tuple[Array, Array]:
+def _light(
+    dn: ArrayLike, offset: ArrayLike, tau_s: ArrayLike, by_light: ArrayLike
+) -> tuple[Array, Array]:
     """u and r at light in DN."""
     light = jnp.maximum(jnp.asarray(dn) + offset, LEAST_DN)
-    rate = jnp.maximum((light + 20.0) / 275.0, LEAST_LIGHT) / jnp.maximum(tau_s, FAST)
-    return lin_log_dn(light), rate
+    share = jnp.where(by_light, jnp.maximum((light + 20.0) / 275.0, LEAST_LIGHT), 1.0)
+    return lin_log_dn(light), share / jnp.maximum(tau_s, FAST)
 
 
 def _followed(s: Array, before: Array, now: Array, rate: Array, dt_s: Array) -> Array:

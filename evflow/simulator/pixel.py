@@ -81,9 +81,11 @@ def floor_divide(a: Array, theta: Array) -> Array:
     return quotient + jnp.where(remainder >= theta, 1.0, 0.0) - jnp.where(remainder < 0, 1.0, 0.0)
 
 
-def low_pass(lp: Array, log_i: Array, i01: Array, dt: Array, cutoff_hz: float) -> Array:
-    """First-order low-pass whose corner scales with intensity (v2e): eps = i01 dt 2 pi fc."""
-    eps = jnp.minimum(i01 * (dt * (2 * jnp.pi * cutoff_hz)), 1.0)
+def low_pass(model: SensorModel, lp: Array, log_i: Array, i01: Array, dt: Array) -> Array:
+    """First-order low-pass, eps = dt 2 pi fc, whose corner scales with intensity i01 (v2e) if the
+    model's does."""
+    eps = dt * (2 * jnp.pi * model.cutoff_hz)
+    eps = jnp.minimum(i01 * eps if model.cutoff_by_light else eps, 1.0)
     return lp + eps * (log_i - lp)
 
 
@@ -208,7 +210,7 @@ def contrast(
     during the interval. Returns the state with its memory leaked; the threshold it moves
     towards, negative for OFF; the contrast towards it when the interval begins and ends.
     """
-    lp = log_i if model.cutoff_hz <= 0 else low_pass(state.lp, log_i, i01, dt, model.cutoff_hz)
+    lp = log_i if model.cutoff_hz <= 0 else low_pass(model, state.lp, log_i, i01, dt)
     base = state.base if leaked is None else state.base - leaked
     start, end = state.lp - state.base, lp - base
     rising = end > 0

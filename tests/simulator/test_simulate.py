@@ -272,20 +272,26 @@ def test_refractory_ramps_fire_as_soon_as_they_may() -> None:
     np.testing.assert_allclose(t_late, expected, atol=1)  # us; chains of up to 34 events
 
 
-def test_low_pass_follows_its_difference_equation() -> None:
-    """A step 20 -> 255 DN through the filter (I01 = 1, fc = 40 Hz) against the recursion."""
+@pytest.mark.parametrize(("by_light", "low", "high", "share"), [
+    (True, 20.0, 255.0, 1.0), (True, 25.0, 62.0, 82 / 275), (False, 25.0, 62.0, 1.0)])
+def test_low_pass_follows_its_difference_equation(
+    by_light: bool, low: float, high: float, share: float
+) -> None:
+    """A step through the filter (fc = 40 Hz at 255 DN, or at all) against the recursion."""
     dt, count = 1e-3, 40
-    frames = np.full((count, *SHAPE), 255.0, np.float32)
-    frames[0] = 20.0
+    frames = np.full((count, *SHAPE), high, np.float32)
+    frames[0] = low
     theta = 0.01  # a coarse one would hide a corner that is off by a twentieth
     camera = Camera.constant(SHAPE, theta, theta)
-    events = simulate(KEY, frames, milliseconds(count), camera, model=SensorModel(cutoff_hz=40.0))
-    lp = np.log(20.0) + np.log(255 / 20) * (1 - (1 - 2 * np.pi * 40 * dt) ** np.arange(count))
+    model = SensorModel(cutoff_hz=40.0, cutoff_by_light=by_light)
+    events = simulate(KEY, frames, milliseconds(count), camera, model=model)
+    eps, step = share * 2 * np.pi * 40 * dt, np.log(high / low)
+    lp = np.log(low) + step * (1 - (1 - eps) ** np.arange(count))
     level = np.floor((lp - lp[0]) / theta)
     seen = np.histogram(events.t, milliseconds(count) + 1)[0] / np.prod(SHAPE)
     assert np.abs(np.cumsum(seen) - level[1:]).max() <= 1
-    assert seen.sum() == pytest.approx(np.log(255 / 20) / theta, abs=1.01)
-    assert seen[0] == pytest.approx(2 * np.pi * 0.04 * np.log(255 / 20) / theta, abs=1.01)
+    assert seen.sum() == pytest.approx((lp[-1] - lp[0]) / theta, abs=1.01)
+    assert seen[0] == pytest.approx(eps * step / theta, abs=1.01)
 
 
 def test_floor_division_is_exact_but_for_ties() -> None:
