@@ -50,6 +50,7 @@ NOTES: dict[str, str] = {
     "frames.unit": "the unit of the frame times was inferred",
     "frames.unused": "frames were left out",
     "frames.white": "what radiance is white",
+    "levels.few": "all steps of light are of one size",
     "theta.joined": "the thresholds are of another estimate of this camera",
     "scene.static": "nothing moves: the noise alone was measured",
     "scene.restless": "the light moves while it should rest",

@@ -1,7 +1,8 @@
-"""What of a measured camera is not per pixel: its circuit, and what its frames show beside it.
+"""What of a measured camera is not per pixel: its summary, its circuit, and what its frames show
+beside it.
 
-camera.npz holds both as scalars, `sensor_cutoff_hz`, `optics_offset_dn`, ... and their standard
-deviations `..._std`, NaN where nothing was measured.
+camera.npz holds them as scalars, `summary_theta_on`, `sensor_cutoff_hz`, `optics_offset_dn`, ...
+and their standard deviations `..._std`, NaN where nothing was measured.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evflow.camera.prior import Summary
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.archives import load_npz
@@ -43,6 +45,28 @@ def as_arrays(
     named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
     named |= {f"optics_{name}": value for name, value in dataclasses.asdict(optics).items()}
     return {name: np.asarray(value, np.float64) for name, value in named.items()}
+
+
+def summary_arrays(summary: Summary, std: Summary) -> dict[str, np.ndarray]:
+    """A summary as scalars by the names that they have in camera.npz."""
+    return {f"summary_{name}{end}": np.asarray(value, np.float64)
+            for end, kind in (("", summary), ("_std", std))
+            for name, value in dataclasses.asdict(kind).items()}
+
+
+def read_summary(path: str | os.PathLike) -> tuple[dict[str, float], dict[str, float]] | None:
+    """The summary in a camera.npz and its standard deviations, by name; None in files without one.
+    Raises EV009, EV016."""
+    held = load_npz(Path(path))
+    names = [field.name for field in dataclasses.fields(Summary)]
+    if any(f"summary_{name}{end}" not in held for name in names for end in ("", "_std")):
+        return None
+    of, std = ({n: held[f"summary_{n}{end}"] for n in names} for end in ("", "_std"))
+    if any(np.shape(v) != () or v.dtype.kind not in "fiu" or not np.isfinite(v)
+           for values in (of, std) for v in values.values()):
+        raise EvflowDataError("EV009", f"{path}: its summary holds what is no finite number.",
+                              "Make the file again: evflow estimate.")
+    return {n: float(v) for n, v in of.items()}, {n: float(v) for n, v in std.items()}
 
 
 def read_undetermined(path: str | os.PathLike) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import shlex
 import sys
 import time
@@ -46,10 +47,15 @@ class Estimate(Compiling, Reading):
     Example: evflow estimate flight.aedat4 -o cam/
 
     Example: evflow estimate screen.aedat4 -o bench/ --protocol step
+
+    Example: evflow estimate dim.aedat4 bright.aedat4 -o noise/ --protocol static --lux 5 200
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """A recording with frames; of a static scene without frames the noise alone is measured."""
+    more: Annotated[tuple[Path, ...], tyro.conf.Positional,
+                    tyro.conf.arg(metavar="[MORE ...]")] = ()
+    """Of --protocol static: the same camera at rest in other light, a --lux for each."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for camera.npz, camera.json, the pictures and report.html."""
     protocol: Literal["motion", "step", "static"] = "motion"
@@ -64,6 +70,9 @@ class Estimate(Compiling, Reading):
     on_interrupt: Literal["stop", "save"] = "stop"
     """What Ctrl-C does while the recording is read. stop: end, and leave nothing; save: measure the
     camera from what was read (a second Ctrl-C ends)."""
+    lux: Annotated[tuple[float, ...], value("LUX ...")] = ()
+    """What a light meter read. static: of each recording, in their order, for noise against
+    illuminance; step: of each level, the darkest first, in place of the frames' own ratios."""
     thresholds: Annotated[Path | None, value("FILE")] = None
     """Of --protocol static: take the thresholds, which a scene at rest does not tell, from this
     camera.npz: noise and thresholds joined in one camera."""
@@ -80,7 +89,7 @@ class Estimate(Compiling, Reading):
     """Write maps and histograms as PNG (needs matplotlib)."""
     report: bool = True
     """Write report.html: the recording re-simulated, a held-out half, in panels (needs
-    matplotlib; takes about as long as the estimate; protocol motion only)."""
+    matplotlib; takes about as long as the estimate), or what a bench shows, level by level."""
     checks: bool = True
     """Stop where `evflow check` finds errors."""
     overwrite: bool = False
@@ -100,6 +109,7 @@ class Estimate(Compiling, Reading):
         if self.budget_s is not None and self.budget_s < 0:
             raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.",
                                   "Give 0 or more; 0 reads one part.")
+        self._check_light()
         if not moving:
             refuse(self, ("weights", "window_ms", "reconstruct", *READ),
                    "of use with --protocol motion only")
@@ -107,13 +117,14 @@ class Estimate(Compiling, Reading):
             refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
         if self.protocol != "static":
             refuse(self, ("thresholds",), "of use with --protocol static only")
-        need_packages(self.recording, pictures=self.plots or (self.report and moving))
+        need_packages(self.recording, *self.more, pictures=self.plots or self.report)
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording = tell(self.read(self.recording))
             doubts = self._checked(recording)
-            recording = without_repeats(recording)
+            recording = without_repeats(recording) if moving else recording
             recording = self._reconstructed(recording) if self.reconstruct else recording
             found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
+            words = describe(found)  # the doubts are on the terminal already
             found = dataclasses.replace(found, notes=(*doubts, *found.notes))
             found.save(out / "camera.npz")
             facts = {**found.as_dict(), "recording": str(self.recording),
@@ -122,13 +133,31 @@ class Estimate(Compiling, Reading):
             if self.plots:
                 plots.camera_maps(found, out / "maps.png")
                 plots.camera_histograms(found, out / "histograms.png")
-            tested = self._report(out, found, recording) if self.report and moving else {}
+            tested = self._report(out, found, recording) if self.report else {}
             facts |= {key: tested[key] for key in ("grade", "verdict") if key in tested}
             write_json(out / "camera.json", facts)
         said = [f"verdict: {tested['grade']}", *tested["verdict"]] if tested else []
         print(json.dumps(facts, indent=2) if self.json else
-              "\n".join([describe(found), *said]))
+              "\n".join([words, *said]))
         print(f"written to {self.out}/", file=sys.stderr)
+
+    def _check_light(self) -> None:
+        """EV020 where --lux, or a second recording, goes with nothing else, or not with it."""
+        count = 1 + len(self.more)
+        if (self.more and self.protocol != "static") or (self.lux and self.protocol == "motion"):
+            what = f"{count} recordings" if self.more else "--lux"
+            raise EvflowDataError(
+                "EV020", f"{what} with --protocol {self.protocol}.",
+                "Noise against illuminance, of one recording at rest for each --lux, is "
+                f"--protocol static{' or, of one screen, step' if not self.more else ''}.")
+        if not all(0 < v < math.inf for v in self.lux):
+            raise EvflowDataError("EV020", f"--lux {' '.join(f'{v:g}' for v in self.lux)}.",
+                                  "Give numbers > 0.")
+        if self.protocol == "static" and (self.more or self.lux) and len(self.lux) != count:
+            raise EvflowDataError(
+                "EV020", f"{len(self.lux)} values of --lux for {count} recording"
+                f"{'s' if self.more else ''}.", "Give one of each, in the same order: evflow "
+                "estimate A B --protocol static --lux 5 200.")
 
     def _checked(self, recording: Recording) -> list[Note]:
         """What `evflow check` doubts; raises its errors, unless told not to."""
@@ -138,7 +167,8 @@ class Estimate(Compiling, Reading):
         if self.checks:
             report.raise_if_failed()
         doubts = [finding.note() for finding in (*report.errors, *report.warnings)
-                  if finding.code not in SAID_BELOW]
+                  if finding.code not in (SAID_BELOW if self.protocol == "motion" else
+                                          (*SAID_BELOW, "EV028"))]
         for doubt in doubts:
             print(f"warning: {doubt}", file=sys.stderr)
         return doubts
@@ -194,22 +224,37 @@ class Estimate(Compiling, Reading):
     def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
         from evflow.estimation.bench.calibration import calibrate_step
         from evflow.estimation.joined import with_thresholds
-        from evflow.estimation.static import estimate_noise
+        from evflow.estimation.static import estimate_noise, noise_over_light
 
-        found = (calibrate_step if self.protocol == "step" else estimate_noise)(recording)
-        return with_thresholds(found, self.thresholds) if self.thresholds else found, {}
+        if self.protocol == "step":
+            return calibrate_step(recording, lux=self.lux), {}
+        found = estimate_noise(recording, lux=self.lux[0] if self.lux else None)
+        if self.more:
+            others = []
+            for path, lux in zip(self.more, self.lux[1:], strict=True):
+                other = tell(self.read(path))
+                self._checked(other)
+                others.append(estimate_noise(other, lux=lux))
+            found = noise_over_light([found, *others])
+        facts = {"recordings": [str(p) for p in (self.recording, *self.more)]} if self.more else {}
+        return with_thresholds(found, self.thresholds) if self.thresholds else found, facts
 
     def _report(
         self, out: Path, found: CameraEstimate, recording: Recording
     ) -> dict[str, Any]:
         """report.html, and its numbers."""
         from evflow.process.terminal import bar
+        from evflow.report.bench import Source, write_bench_report
         from evflow.report.camera import write_report
 
+        command = shlex.join(["evflow", *sys.argv[1:]])
+        if self.protocol != "motion":
+            return write_bench_report(out / "report.html", found, recording, source=Source(
+                (self.recording, *self.more), command))
         with bar("reporting", compiles=True) as progress:
             return write_report(
                 out / "report.html", found, recording, weights=self.weights,
-                source=self.recording, command=shlex.join(["evflow", *sys.argv[1:]]),
+                source=self.recording, command=command,
                 min_window_us=round(self.window_ms * 1000), progress=progress)
 
 

@@ -35,12 +35,14 @@ class Export:
     def run(self) -> None:
         from evflow.camera import Camera
         from evflow.camera.exports import export_camera, write_export
-        from evflow.camera.optics import read_sensor, read_undetermined
+        from evflow.camera.optics import read_sensor, read_summary, read_undetermined
 
         need_folder(self.out)
         need_absent(self.out, self.overwrite, self.camera)
         camera, std = Camera.load_with_std(self.camera)
-        export, maps = export_camera(camera, self.to, std, read_sensor(self.camera)[0])
+        known = read_summary(self.camera)
+        export, maps = export_camera(
+            camera, self.to, std, read_sensor(self.camera)[0], known[0] if known else None)
         write_export(self.out, export, maps, overwrite=self.overwrite)
         warn_of_prior(read_undetermined(self.camera), "exported")
         files = [*sorted([*export.scripts, *export.arrays]), "maps.npz", "README.txt"]

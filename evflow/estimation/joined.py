@@ -11,7 +11,7 @@ import numpy as np
 
 from evflow.camera import PARAMETERS, Camera
 from evflow.camera.exports.common import Settings
-from evflow.camera.optics import read_sensor, read_undetermined
+from evflow.camera.optics import read_sensor, read_summary, read_undetermined
 from evflow.errors import EvflowDataError
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.files.archives import load_npz
@@ -47,6 +47,9 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
     values = {name: nearest[name] for name in (*THRESHOLDS, *sigmas)}
     value_errors = {name: float(np.median(np.asarray(errors[name])[used])) for name in THRESHOLDS}
     value_errors |= {name: values[name] / np.sqrt(2.0 * used.sum()) for name in sigmas}
+    if known := read_summary(path):  # what it says of itself, rather than what maps tell of it
+        values, value_errors = ({name: of[name] for name in (*THRESHOLDS, *sigmas)}
+                                for of in known)
 
     def scalars(numbers: dict[str, float]) -> dict[str, jnp.ndarray]:
         return {name: jnp.float32(number) for name, number in numbers.items()}

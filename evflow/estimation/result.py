@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from evflow.camera import PARAMETERS, Camera, Summary
-from evflow.camera.optics import Optics, as_arrays
+from evflow.camera.optics import Optics, as_arrays, summary_arrays
 from evflow.camera.sensors import SensorModel
+from evflow.estimation.bench.levels import Bench
 from evflow.estimation.drift import Third
 from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.refine.receptor_search import Found
@@ -48,6 +49,7 @@ class CameraEstimate:
         extent: how much of the recording was read, and what more would bring.
         thirds: thresholds of the three thirds of the recording, where it is long enough to tell:
             whether the camera stayed the same.
+        bench: of a bench, its levels of light: noise and speed at each; None of other recordings.
     """
 
     camera: Camera
@@ -67,10 +69,11 @@ class CameraEstimate:
     receptor: Found | None = None
     extent: Extent = EVERYTHING
     thirds: tuple[Third, ...] = ()
+    bench: Bench | None = None
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead, and the
-        scalars of `camera.optics`.
+        scalars of `camera.optics`: summary, circuit, frames.
 
         Args:
             path: of the file; `Camera.load` reads it.
@@ -84,6 +87,7 @@ class CameraEstimate:
         """
         extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
         extra |= as_arrays(self.sensor, self.sensor_std, self.optics)
+        extra |= summary_arrays(self.summary, self.summary_std)
         extra["undetermined"] = np.array(self.undetermined, "U9")
         return self.camera.save(path, overwrite=overwrite, **extra, valid=self.valid,
                                 n_events=self.n_events, hot=self.hot, dead=self.dead)
@@ -104,4 +108,5 @@ class CameraEstimate:
                 "hot_pixels": places(self.hot), "dead_pixels": places(self.dead),
                 "windows": self.windows, "undetermined": list(self.undetermined),
                 "extent": self.extent.as_dict(), "thirds": [t.as_dict() for t in self.thirds],
+                **({"bench": self.bench.as_dict()} if self.bench else {}),
                 "notes": as_dicts(self.notes)}

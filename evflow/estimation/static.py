@@ -5,11 +5,15 @@ Whether it is static the events themselves tell (recordings/stillness.py).
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera, Summary
 from evflow.errors import EvflowDataError
+from evflow.estimation.bench.levels import Bench, Level
 from evflow.estimation.pixel_noise import pixel_rates
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.notes import Note
@@ -19,12 +23,13 @@ from evflow.training.config import PRESETS
 from evflow.types import Recording
 
 
-def estimate_noise(recording: Recording) -> CameraEstimate:
+def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraEstimate:
     """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
 
     A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
     over pixels that are not hot. Thresholds are those of the prior that the
-    network was trained on, with its width; `valid` is False everywhere.
+    network was trained on, with its width; `valid` is False everywhere. lux: the illuminance, for
+    `.bench`, which `noise_over_light` joins.
     Raises EV011 (with frames: EV017) where the scene moves, or is too short to tell.
     """
     events = recording.events
@@ -45,10 +50,25 @@ def estimate_noise(recording: Recording) -> CameraEstimate:
         return Summary(*(jnp.float32(v) for v in (theta, theta, *eta, sigma, sigma)))
 
     total = counts.sum(0, dtype=np.uint32)
+    level = () if lux is None else (Level(
+        lux, 1, seconds, means[0], mean_errors[0], means[1], mean_errors[1]),)
     return CameraEstimate(
         camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
-        dead_pixels(total), 0, _notes(hot, total, recording.has_frames), THRESHOLDS)
+        dead_pixels(total), 0, _notes(hot, total, recording.has_frames), THRESHOLDS,
+        bench=Bench("lux", level) if level else None)
+
+
+def noise_over_light(found: Sequence[CameraEstimate]) -> CameraEstimate:
+    """The first of several estimates of one camera's noise, each with its lux, whose `.bench` has
+    the levels of all; EV015 where they are of different sizes."""
+    sizes = {f.camera.shape for f in found}
+    if len(sizes) > 1:
+        raise EvflowDataError("EV015", f"recordings of cameras of different sizes: {sizes}.",
+                              "Noise against illuminance is that of one camera.")
+    levels = [level for f in found if f.bench for level in f.bench.levels]
+    return dataclasses.replace(
+        found[0], bench=Bench("lux", tuple(sorted(levels, key=lambda v: v.light))))
 
 
 def uniform(bounds: tuple[float, float]) -> tuple[float, float]:

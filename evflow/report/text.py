@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from evflow.estimation.result import CameraEstimate
+from evflow.report.page import plural, spread
 
 LABELS = {
     "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON (Hz/pixel)",
@@ -16,24 +17,33 @@ LABELS = {
 def describe(found: CameraEstimate) -> str:
     """The summary as a table, then what to know before trusting it."""
     std = dataclasses.asdict(found.summary_std)
-    lines = [f"{LABELS[name]:22} {float(value):7.3f} ± {float(std[name]):.3f}"
+    lines = [_line(found, name, float(value), float(std[name]))
              for name, value in dataclasses.asdict(found.summary).items()]
     lines += measured(found)
     events = f"from {int(found.n_events.sum()):,} events"
-    windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
-    lines.append(f"{events} in {windows}; {found.valid.mean():.0%} of the pixels have events of "
+    parts = plural(found.windows, "step" if found.bench else "window")
+    lines.append(f"{events} in {parts}; {found.valid.mean():.0%} of the pixels have events of "
                  "their own" if found.windows else f"{events} of a static scene")
     lines += [f"note: {note}" for note in found.notes]
     return "\n".join(lines)
 
 
+def _line(found: CameraEstimate, name: str, value: float, std: float) -> str:
+    """One quantity of the summary; of a threshold also in percent of contrast."""
+    kind, _, side = name.partition("_")
+    if kind != "eta" and f"theta_{side}" in found.undetermined:
+        return f"{LABELS[name]:22}   not measured"
+    percent = 100 * math.exp(value)
+    shown = f"   {spread(percent - 100, percent * std)} % of contrast" if kind == "theta" else ""
+    return f"{LABELS[name]:22} {spread(value, std):>15}{shown}"
+
+
 def measured(found: CameraEstimate) -> list[str]:
     """Of the circuit and the frames, a line for what was measured."""
     optics, sensor, std = found.optics, found.sensor, found.sensor_std
-    rows = [("cutoff (Hz at 255 DN)", sensor.cutoff_hz, std.get("cutoff_hz", math.nan), 0),
-            ("dead time (ms)", 1e3 * sensor.refractory_s,
-             1e3 * std.get("refractory_s", math.nan), 2),
-            ("light added (DN)", optics.offset_dn, optics.offset_dn_std, 1),
-            ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std, 2)]
-    return [f"{name:24} {value:5.{digits}f} ± {std:.{digits}f}"
-            for name, value, std, digits in rows if value and math.isfinite(std)]
+    rows = [("cutoff (Hz at 255 DN)", sensor.cutoff_hz, std.get("cutoff_hz", math.nan)),
+            ("dead time (ms)", 1e3 * sensor.refractory_s, 1e3 * std.get("refractory_s", math.nan)),
+            ("light added (DN)", optics.offset_dn, optics.offset_dn_std),
+            ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std)]
+    return [f"{name:22} {spread(value, std):>15}"
+            for name, value, std in rows if value and math.isfinite(std)]

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from evflow.estimation.result import CameraEstimate
+from evflow.report.page import spread
 from evflow.report.resimulate import Trial
 
 Grade = Literal["good", "fair", "poor"]
@@ -92,13 +93,13 @@ def _threshold(found: CameraEstimate, key: str) -> Judged:
                       "frames: without it thresholds cannot be told.")
     if any(note.code == f"theta_{key}.extrapolated" for note in found.notes):
         return Judged("fair", name, 1.5, f"θ {name} lies outside what the network was trained on.",
-                      THRESHOLD, f"{theta:.3f} ± {std:.3f}", "A threshold outside the trained "
+                      THRESHOLD, spread(theta, std), "A threshold outside the trained "
                       "range is an extrapolation: are the frames linear in light (--response), "
                       "and dark ones without an offset?")
     error = std / theta
     grade = graded(error, ERROR)
     return Judged(grade, name, error / ERROR[0], f"θ {name} is known to {error:.0%}.",
-                  THRESHOLD, f"{theta:.3f} ± {std:.3f}", "" if grade == "good" else
+                  THRESHOLD, spread(theta, std), "" if grade == "good" else
                   "Record longer, with more motion and texture, to know the thresholds better.")
 
 

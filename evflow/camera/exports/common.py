@@ -57,9 +57,13 @@ class Settings:
     dead_s: float = 0.0
 
     @staticmethod
-    def of(maps: Maps, std: Maps | None = None, sensor: SensorModel = SensorModel()) -> Settings:
+    def of(
+        maps: Maps, std: Maps | None = None, sensor: SensorModel = SensorModel(),
+        summary: Mapping[str, float] | None = None,
+    ) -> Settings:
         """From maps (H, W), their standard deviations and the circuit; hot and dead pixels move
-        neither median nor spread, which is that of the estimates and that within each, together."""
+        neither median nor spread, which is that of the estimates and that within each, together.
+        summary: what an estimate says of the whole camera itself, in place of these."""
         middle = {name: float(np.median(values)) for name, values in maps.items()}
         sigma = {}
         for name in ("theta_on", "theta_off"):
@@ -67,7 +71,8 @@ class Settings:
             within = float(np.median(std[name])) if std else 0.0
             sigma[name.replace("theta", "sigma")] = float(np.hypot(spread, within))
         height, width = maps["theta_on"].shape
-        return Settings(width, height, **middle, **sigma, cutoff_hz=sensor.cutoff_hz,
+        values = {**middle, **sigma, **(summary or {})}
+        return Settings(width, height, **values, cutoff_hz=sensor.cutoff_hz,
                         dead_s=sensor.refractory_s)
 
     @property

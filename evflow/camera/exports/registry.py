@@ -21,10 +21,12 @@ TARGETS: Mapping[str, Callable[[Maps, Settings], Export]] = {
 
 
 def export_camera(
-    camera: Camera, to: str, std: Camera | None = None, sensor: SensorModel = SensorModel()
+    camera: Camera, to: str, std: Camera | None = None, sensor: SensorModel = SensorModel(),
+    summary: Mapping[str, float] | None = None,
 ) -> tuple[Export, Maps]:
     """A camera of maps (H, W) in the words of a simulator, and the maps as float32. std: of an
-    estimate's maps, which are more even than the camera; sensor: its circuit, as measured.
+    estimate's maps, which are more even than the camera; sensor: its circuit, as measured; summary:
+    what the estimate says of the whole camera (`read_summary`), without which maps tell it.
 
     Raises EV020 (no such simulator), EV002 (several cameras at once).
     """
@@ -36,7 +38,7 @@ def export_camera(
     maps, errors = ({name: np.asarray(getattr(c, name), np.float32) for name in PARAMETERS}
                     if c is not None else None for c in (camera, std))
     assert maps is not None
-    return TARGETS[to](maps, Settings.of(maps, errors, sensor)), maps
+    return TARGETS[to](maps, Settings.of(maps, errors, sensor, summary)), maps
 
 
 def write_export(

@@ -17,6 +17,7 @@ import numpy as np
 
 from evflow.camera import THETA_MIN, Camera, Summary
 from evflow.errors import EvflowDataError
+from evflow.estimation.bench.levels import Unit, few_sizes, light_of_rests, measured_bench
 from evflow.estimation.bench.rests import check_steps, find_rests
 from evflow.estimation.bench.steps import (
     camera_rate,
@@ -26,7 +27,7 @@ from evflow.estimation.bench.steps import (
     shrunk_rates,
 )
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
-from evflow.light.log_maps import lin_log
+from evflow.light.log_maps import lin_log, lin_log_inverse
 from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
 from evflow.recordings.stillness import LEAST_EVENTS, MOVING, company
@@ -42,34 +43,56 @@ MOST = 0.5  # of the pixels: with fewer measured, the result warns
 @dataclasses.dataclass(frozen=True, eq=False)
 class Steps:
     """levels: (K+1, H, W) log intensity at each rest; counts: (K, 2, H, W) ON and OFF events of
-    each step; seconds: (K,) over which they were counted; rest: (2, H, W) events while nothing
-    changed, and rest_s how long that was; notes: what is odd about these."""
+    each step; seconds: (K,) over which they were counted; rests: (K+1, 2, H, W) events while
+    nothing changed; spans: the rests, and quiet their parts in which those were counted; light:
+    (K+1,) of each, in unit; notes: what is odd about these."""
 
     levels: np.ndarray
     counts: np.ndarray
     seconds: np.ndarray
-    rest: np.ndarray
-    rest_s: float
+    rests: np.ndarray
+    spans: list[Span]
+    quiet: list[Span]
+    light: np.ndarray
+    unit: Unit
     notes: tuple[Note, ...]
+
+    @property
+    def rest(self) -> np.ndarray:
+        """(2, H, W) events of all rests."""
+        return self.rests.sum(0, dtype=np.float64)
+
+    @property
+    def rest_s(self) -> float:
+        """How long they were, in seconds."""
+        return sum(b - a for a, b in self.quiet) * 1e-6
+
+    @property
+    def changes(self) -> np.ndarray:
+        """(K,) log units, of the median pixel."""
+        return np.median(np.diff(self.levels, axis=0), (1, 2))
 
 
 def calibrate_step(
     recording: Recording, *, rests_us: Sequence[Span] | None = None,
-    light: Sequence[float] | None = None, fresh: bool = False, literal: bool = False,
+    light: Sequence[float] | None = None, lux: Sequence[float] | None = None,
+    fresh: bool = False, literal: bool = False,
 ) -> CameraEstimate:
     """Thresholds, and the noise of the rests, from a screen whose light steps between rests.
 
     rests_us: (begin, end) of each rest in us; found in the frames if left out. light: its light
-    (any linear unit: lux, cd/m2) at each rest; the mean of the frames there if left out. fresh: the
-    memory is at the light of the first rest, as in a simulation; a running camera's may be
+    (any linear unit: lux, cd/m2) at each rest; the mean of the frames there if left out. lux:
+    instead, that of each level which the frames rest at, darkest first. fresh: the memory is at the
+    light of the first rest, as in a simulation; a running camera's may be
     anywhere. literal: theta = dlogI / events, the paper's own words; the std then counts a whole
     event. A polarity's map is measured where a pixel has 2 of its events; else it is the camera's
     median. Raises EV001 (no events), EV011 (no frames and no light), EV017 (frames that show no two
     rests, or no screen that steps), EV020.
     """
-    steps = _steps(recording, rests_us, light)
+    steps = _steps(recording, rests_us, light, tuple(lux or ()))
     _check_polarity(steps)
-    hz, kept = camera_rate(steps.rest, steps.rest_s)
+    rest = steps.rest
+    hz, kept = camera_rate(rest, steps.rest_s)
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
     theta, error = (ratio if literal else regression)(steps.levels, clean, strays, fresh)
@@ -86,18 +109,22 @@ def calibrate_step(
         spreads.append(spread)
         maps.append(np.where(sound[i], theta[i], median))
         stds.append(np.where(sound[i], error[i], np.hypot(spread, own)))
-    eta, eta_std = shrunk_rates(steps.rest, steps.rest_s)
+    eta, eta_std = shrunk_rates(rest, steps.rest_s)
     n_events = steps.counts.sum((0, 1)).astype(np.uint32)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
-    return _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
-                     n_events, ~kept, len(steps.counts), _notes(steps, untold, valid, ~kept),
-                     tuple(untold))
+    found = _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
+                      n_events, ~kept, len(steps.counts), _notes(steps, untold, valid, ~kept),
+                      tuple(untold))
+    return dataclasses.replace(found, bench=measured_bench(
+        steps.unit, recording.events, steps.spans, steps.quiet, steps.light,
+        np.median(steps.levels, (1, 2)), steps.rests, clean, kept,
+        np.where(sound, theta, np.nan)))
 
 
 def _notes(
     steps: Steps, untold: Sequence[str], valid: np.ndarray, hot: np.ndarray
 ) -> tuple[Note, ...]:
-    notes = [*steps.notes, *(Note(
+    notes = [*steps.notes, *few_sizes(steps.changes), *(Note(
         f"{name}.undetermined", f"no step sends {side} events: {name} is the prior's.")
         for name, side in zip(THRESHOLDS, ("ON", "OFF"), strict=True) if name in untold)]
     if valid.mean() < MOST:
@@ -111,16 +138,16 @@ def _notes(
 
 def _check_polarity(steps: Steps) -> None:
     """EV021 where OFF events come with steps up."""
-    change = np.median(np.diff(steps.levels, axis=0), (1, 2))
     net = (steps.counts[:, 0] - steps.counts[:, 1]).sum((1, 2))
-    if (change * net).sum() < 0:
+    if (steps.changes * net).sum() < 0:
         raise EvflowDataError(
             "EV021", "ON events come where the light falls, OFF events where it rises.",
             "Pass --polarity invert (polarity='invert'), or are frames and events not aligned?")
 
 
 def _steps(
-    recording: Recording, rests_us: Sequence[Span] | None, light: Sequence[float] | None
+    recording: Recording, rests_us: Sequence[Span] | None, light: Sequence[float] | None,
+    lux: tuple[float, ...],
 ) -> Steps:
     events, times = recording.events, recording.frame_times
     if len(events) == 0:
@@ -132,19 +159,27 @@ def _steps(
     if len(spans) < 2 or any(b < a for a, b in itertools.pairwise(flat)):
         raise EvflowDataError("EV020", f"rests_us={spans}.",
                               "Give two or more (begin, end) in us, in order of time.")
+    if lux and light is not None:
+        raise EvflowDataError("EV020", "both light and lux.", "Give one of them.")
     levels = _levels(recording, spans, light)
     if light is None:
         check_steps(levels)
+    unit: Unit = "DN" if light is None else "light"
+    if lux:
+        unit, light = "lux", light_of_rests(np.median(levels, (1, 2)), lux)
+        levels = _levels(recording, spans, light)
     settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
     counts = [events.slice(before[1], after).count_map()
               for before, after in zip(spans, settled[1:], strict=False)]
     seconds = [(after - before[1]) * 1e-6
                for before, after in zip(spans, settled[1:], strict=False)]
     quiet = [(a, b) for a, (_, b) in zip(settled, spans, strict=True)]
-    rest = np.asarray(np.sum([events.slice(a, b).count_map() for a, b in quiet], 0, np.float64))
+    rests = np.stack([events.slice(a, b).count_map() for a, b in quiet])
     busiest = max((events.slice(a, b) for a, b in quiet), key=len)
-    return Steps(levels, np.array(counts, np.float64), np.array(seconds), rest,
-                 sum(b - a for a, b in quiet) * 1e-6, tuple(_restless(busiest)))
+    shown = (np.asarray(light, np.float64) if light is not None else
+             np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))
+    return Steps(levels, np.array(counts, np.float64), np.array(seconds), rests, spans, quiet,
+                 shown, unit, tuple(_restless(busiest)))
 
 
 def _restless(rest: Events) -> list[Note]:

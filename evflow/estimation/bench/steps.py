@@ -96,7 +96,7 @@ def shrunk_rates(
     counts: np.ndarray, seconds: float
 ) -> tuple[np.ndarray, tuple[np.ndarray, list[tuple[float, float]]]]:
     """Rates (2, H, W), a gamma posterior whose prior has the mean and the spread of the camera;
-    their std, and per polarity the median pixel's rate and its std."""
+    their std, and per polarity the mean rate over pixels that are not hot and its std."""
     hz, kept = camera_rate(counts, seconds)
     if seconds <= 0:
         flat = np.zeros(counts.shape)
@@ -107,7 +107,6 @@ def shrunk_rates(
     rate, shape = (v[:, None, None] for v in (mean / variance, mean**2 / variance))
     eta = (counts + shape) / (seconds + rate)
     pixels = max(int(kept.sum()), 1)
-    median = mean / np.sqrt(1.0 + variance / mean**2)  # of a log-normal of that mean and spread
     error = np.sqrt((mean / seconds + variance) / pixels + 1.0 / (seconds * pixels) ** 2)
     return eta, (np.sqrt(counts + shape) / (seconds + rate),
-                 [(float(m), float(e)) for m, e in zip(median, error, strict=True)])
+                 [(float(m), float(e)) for m, e in zip(hz, error, strict=True)])

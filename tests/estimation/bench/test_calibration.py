@@ -17,6 +17,7 @@ from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
+from evflow.estimation.bench.levels import few_sizes
 from evflow.estimation.bench.rests import find_rests
 from evflow.io import write_recording
 from evflow.notes import texts
@@ -248,16 +249,86 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         return code, capsys.readouterr().out
 
     code, out = run(source, "step")
-    assert (code, json.loads(out)["protocol"]) == (0, "step")
-    assert not (tmp_path / "step" / "report.html").exists()
+    said = json.loads(out)
+    assert (code, said["protocol"], said["grade"]) == (0, "step", "fair")  # of two levels alone
+    assert [level["light"] for level in said["bench"]["levels"]] == pytest.approx([25, 225])
+    page = (tmp_path / "step" / "report.html").read_text()
+    assert page.count("<section") == 9
+    assert "% of contrast" not in page  # the terminal's word
+    for word in ("2 levels of light", "one size", "S-curves", "light [DN]"):
+        assert word in page
     found = Camera.load(tmp_path / "step" / "camera.npz")
     assert abs(float(jnp.median(found.theta_on)) - 0.2) < 0.01
     assert abs(float(jnp.median(found.theta_off)) - 0.25) < 0.01
-    code, out = run(still, "static")
+    code, out = run(still, "static", str(still), "--lux", "40", "5")
+    said = json.loads(out)
     assert code == 0
-    assert json.loads(out)["summary"]["eta_on"] == pytest.approx(1.0, rel=0.1)
+    assert said["summary"]["eta_on"] == pytest.approx(1.0, rel=0.1)
+    assert [level["light"] for level in said["bench"]["levels"]] == [5, 40]  # darkest first
+    assert said["bench"]["levels"][0]["eta_off"] == pytest.approx(said["summary"]["eta_off"])
+    assert "light [lux]" in (tmp_path / "static" / "report.html").read_text()
     assert run(source, "static")[0] == 1  # a screen that steps is no scene at rest
     assert run(source, "step", "--overwrite", "--window-ms", "30")[0] == 2
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["two.npz", "--lux", "1", "2"], "2 recordings with --protocol motion"),
+    (["--lux", "1", "2"], "--lux with --protocol motion"),
+    (["two.npz", "--protocol", "step"], "2 recordings with --protocol step"),
+    (["two.npz", "--protocol", "static"], "0 values of --lux for 2 recordings"),
+    (["--protocol", "static", "--lux", "1", "2"], "2 values of --lux for 1 recording"),
+    (["--protocol", "static", "--lux", "-1"], "--lux -1"),
+])
+def test_illuminances_go_with_recordings(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from evflow.cli import main
+
+    assert main(["estimate", "one.npz", "-o", str(tmp_path / "out"), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_levels_of_light_are_told_apart() -> None:
+    """Noise and duration of the steps at each, with a light meter's values as with the frames'."""
+    camera = cameras(0.03, "eq12")
+    recording = bench(camera, STAIRS)
+    found = calibrate_step(recording, fresh=True)
+    assert "levels.few" not in [note.code for note in found.notes]
+    assert found.bench is not None
+    levels = found.bench.levels
+    np.testing.assert_allclose([v.light for v in levels], sorted(set(STAIRS)), rtol=1e-3)
+    assert [v.rests for v in levels] == [2, 2, 2, 2, 2, 1]
+    for name in ("eta_on", "eta_off"):
+        true = float(np.mean(getattr(camera, name)))
+        off = [(getattr(v, name) - true) / getattr(v, f"{name}_std") for v in levels]
+        assert np.abs(off).max() < 3.5
+    assert all(v.up_s is None is v.down_s for v in levels)  # steps of two thresholds
+    assert len(found.bench.steps) == len(STAIRS) - 1
+    metered = calibrate_step(recording, lux=[0.3 * v for v in sorted(set(STAIRS))], fresh=True)
+    assert metered.bench is not None
+    assert metered.bench.unit == "lux"
+    np.testing.assert_allclose(metered.camera.theta_on, found.camera.theta_on, atol=1e-4)
+    for lux in ([1, 2], [6, 5, 4, 3, 2, 1], [0, 1, 2, 3, 4, 5]):
+        with pytest.raises(EvflowDataError, match=r"EV020.*the frames rest at 6 levels"):
+            calibrate_step(recording, lux=lux)
+
+
+def test_how_long_steps_last() -> None:
+    """Ramps of 20 ms, even in log: from half to nine tenths they take 8 ms, turned or not."""
+    found = calibrate_step(bench(cameras(0.1), [25, 75, 225, 60, 225, 80, 25, 120, 25]))
+    assert found.bench is not None
+    lasting = [step.seconds for step in found.bench.steps]
+    assert None not in lasting
+    np.testing.assert_allclose(lasting, 0.008, rtol=0.2)
+    assert np.median(lasting) == pytest.approx(0.008, rel=0.06)
+    assert found.bench.levels[0].up_s is None
+
+
+@pytest.mark.parametrize(("levels", "few"), [
+    (CYCLES, True), ([25, 75, 225, 75, 25], True), ([25, 60, 225, 60, 25], False)])
+def test_steps_of_one_size_are_told(levels: list[float], few: bool) -> None:
+    changes = np.diff(np.log(levels))
+    assert [note.code for note in few_sizes(changes)] == ["levels.few"] * few
 
 
 def test_noise_and_thresholds_join_in_one_camera(
