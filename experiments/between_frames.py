@@ -1,21 +1,25 @@
 """Events of a video of 30 frames/s against those of what it shows, seen at 32 times the rate.
 
     python -m experiments.between_frames --preset debug
-    python -m experiments.between_frames --preset full --workers 2
+    python -m experiments.between_frames --preset full --workers 2 --rows rows.jsonl
 
 Photographs and textures move by known amounts; their frames, 8 bit, are faded into each other,
 warped bilinearly along straight paths in steps of a pixel, or filled up by `upsample`, and
-simulated by the camera that sees the dense video. Columns: share of the dense events; rate by the
-phase of a frame over the dense one, least and most of 16 (1 is no comb); amplitude at the frame
-rate and its double, in per cent of the mean rate, that the dense events lack; correlation of
-counts per pixel. Writes between_frames.json, .md and .png.
+simulated by the camera that sees the dense video. Columns: share of the dense events, mean and
+range over pictures, and where an object's edge goes; rate by the phase of a frame over the dense
+one, least and most of 16 (1 is no comb); amplitude at the frame rate and its double, in per cent of
+the mean rate, that the dense events lack; correlation of counts per pixel; share of the intervals
+whose flow a note tells of. Writes between_frames.json, .md and .png.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import operator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,19 +28,26 @@ import numpy as np
 
 from evflow import Camera, Events
 from evflow.camera import CameraPrior
+from evflow.files.atomic import atomic_text
 from evflow.process.terminal import bar
 from evflow.process.workers import worker_pool
 from evflow.report import plots
 from evflow.simulator import simulate_stream
-from evflow.simulator.interpolate import unzip, upsample
+from evflow.simulator.between import intervals
+from evflow.simulator.interpolate import FAILED, unzip, upsample
 from experiments.shared.common import begin, conclude, markdown, run_script
-from experiments.shared.moving import PERIOD_US, WAYS, Pairs, moving, pictures, scores, video
+from experiments.shared.moving import WAYS, Pairs, Seen, moving, pictures, scores, seen, video
 
-FRAMES = {"debug": 4, "full": 10}
-SIZES = {"debug": ((346, 260),), "full": ((346, 260), (640, 480))}
-SPEEDS = {"debug": (10.0,), "full": (5.0, 10.0, 20.0, 30.0)}  # pixels per frame
-PICTURES = {"debug": ("camera",), "full": ("camera", "coffee", "000000000785", "waves", "discs")}
-MOTIONS = {"debug": ("pan", "hand"), "full": ("pan", "hand", "turn", "object")}
+Scene = tuple[str, str, float, tuple[int, int]]  # motion, picture, speed, size
+
+FRAMES = {"debug": 4, "full": 8}
+SMALL, LARGE = (346, 260), (640, 480)
+PICTURES = ("coffee", "000000000785", "discs", "camera", "waves")
+FEWER = 3  # pictures, in large frames and what is hard
+SPEEDS = (5.0, 10.0, 20.0, 30.0)  # pixels per frame
+HARD = {"crossing": SPEEDS, "rotation": (5.0, 10.0, 15.0, 20.0), "zoom": (2.0, 5.0, 10.0, 15.0)}
+UNITS = {"rotation": "°", "zoom": " %"}
+DENSE, STEP_PX = 32, 0.6  # of the dense video: times the frame rate, and what moves in a step
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,26 +59,46 @@ class Options:
     seed: int = 0
     workers: int = 1
     """Processes side by side."""
+    rows: Path | None = None
+    """Where to keep the rows, to resume an interrupted run from."""
 
 
-def measured(job: tuple[Any, ...]) -> dict[str, Any]:
-    """Scores of each way on one scene. job: motion, picture, speed, size, frames, seed."""
-    motion, picture, speed, size, count, seed = job
+def scenes(preset: str) -> Iterator[Scene]:
+    """What moves how; only pictures that are there."""
+    if preset == "debug":
+        yield from itertools.product(("pan", "hand"), ("camera",), (10.0,), (SMALL,))
+        return
+    there = [name for name in PICTURES if name in pictures()]
+    for motion, size, speed, picture in itertools.product(
+            ("pan", "hand", "turn", "object"), (SMALL, LARGE), SPEEDS, there):
+        if size == SMALL or picture in there[:FEWER]:
+            yield motion, picture, speed, size
+    for motion, speeds in HARD.items():
+        for speed, picture in itertools.product(speeds, there[:FEWER]):
+            yield motion, picture, speed, SMALL
+
+
+def measured(scene: Scene, frames: int, seed: int) -> dict[str, Any]:
+    """Scores of each way on one scene."""
+    motion, picture, speed, size = scene
     prior = CameraPrior((0.2, 0.2), (0.03, 0.03), noise="none")
     camera = Camera.sample(jax.random.key(seed), size[::-1], prior)
-    dense = max(32, round(speed / 0.6))
-    film = video(moving(motion, picture, speed, size), count, size, dense)
-    times = np.round(np.arange(len(film)) * PERIOD_US / dense).astype(int).tolist()
-    frames = np.clip(np.rint(film[::dense]), 0, 255).astype(np.uint8)
+    shown = moving(motion, picture, speed, size)
+    dense = max(DENSE, round(speed / STEP_PX))
 
-    def seen(pairs: Pairs) -> Events:
+    def simulated(pairs: Pairs) -> Seen:
         made = simulate_stream(jax.random.key(seed), *unzip(iter(pairs)), camera)
-        return Events.concatenate(list(made))
+        return seen(Events.concatenate(list(made)))
 
-    truth = seen(zip(film, times, strict=True))
-    ways, given = {**WAYS, "evflow": upsample}, list(zip(frames, times[::dense], strict=True))
+    film = list(video(shown, frames, size, dense))
+    truth, swept = simulated(iter(film)), shown.swept(frames, size)
+    given = [(np.clip(np.rint(frame), 0, 255).astype(np.uint8), t) for frame, t in film[::dense]]
+    whole = [(frame.astype(np.float32), t) for frame, t in given]
+    told = [interval.motion.failed > FAILED for interval in intervals(whole)]
+    ways = {**WAYS, "evflow": upsample}
     return {"motion": motion, "picture": picture, "speed": speed, "size": f"{size[0]}x{size[1]}",
-            **{name: scores(seen(way(given)), truth) for name, way in ways.items()}}
+            "told": float(np.mean(told)),
+            **{name: scores(simulated(way(given)), truth, swept) for name, way in ways.items()}}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -78,40 +109,73 @@ def table(rows: list[dict[str, Any]]) -> str:
         same = list(group)
         for way in (*WAYS, "evflow"):
             m = {k: np.mean([row[way][k] for row in same]) for k in same[0][way]}
-            lines.append((motion, size, f"{speed:g}", way, f"{m['share']:.3f}",
+            shares = [row[way]["share"] for row in same]
+            lines.append((motion, size, f"{speed:g}{UNITS.get(motion, ' px')}", way,
+                          f"{m['share']:.3f} ({min(shares):.2f}–{max(shares):.2f})",
+                          f"{m['swept']:.2f}" if "swept" in m else "",
                           f"{m['least']:.2f}–{m['most']:.2f}",
-                          f"{m['at_rate']:.1f} / {m['at_double']:.1f}", f"{m['r']:.3f}"))
-    return markdown(("motion", "size", "px/frame", "between", "events", "rate by phase",
-                     "comb, % at 1x / 2x", "r of counts"), lines)
+                          f"{m['at_rate']:.1f} / {m['at_double']:.1f}", f"{m['r']:.3f}",
+                          f"{np.mean([row['told'] for row in same]):.0%}" * (way == "evflow")))
+    return markdown(("motion", "size", "per frame", "between", "events", "at the edge",
+                     "rate by phase", "comb, % at 1x / 2x", "r of counts", "told"), lines)
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Shares of events over speed, a line for each way, of pans and of the other motions."""
-    figure = plots.new_figure(8.0, 3.2)
+    """Of each motion, over speed: shares of events, and the range of the rate by phase; a colour
+    for each way, a point for each picture."""
     motions = list(dict.fromkeys(row["motion"] for row in rows))
+    figure = plots.new_figure(2.4 * len(motions) + 1, 5.0)
     for k, motion in enumerate(motions, 1):
-        axis = figure.add_subplot(1, len(motions), k)
-        for way in (*WAYS, "evflow"):
-            points = [(row["speed"], row[way]["share"]) for row in rows if row["motion"] == motion]
-            axis.plot(*np.array(sorted(points)).T, ".", label=way)
-        axis.set(title=motion, xlabel="pixels per frame", ylim=(0, 1.3))
-    axis.legend()
+        share, rate = (figure.add_subplot(2, len(motions), at) for at in (k, k + len(motions)))
+        same = [row for row in rows if row["motion"] == motion]
+        speeds = sorted({row["speed"] for row in same})
+        for j, way in enumerate((*WAYS, "evflow")):
+            at = np.array([speeds.index(row["speed"]) + 0.22 * (j - 1) for row in same])
+            of = {name: np.array([row[way][name] for row in same])
+                  for name in ("share", "least", "most")}
+            share.plot(at, of["share"], ".", label=way)
+            rate.vlines(at, of["least"], of["most"], colors=f"C{j}", alpha=0.4)
+        for axis, asked in ((share, (0.9, 0.8)), (rate, (0.93, 1.07))):
+            axis.hlines(asked, -0.5, len(speeds) - 0.5, colors="0.6", linewidth=0.6)
+            axis.set_xticks(range(len(speeds)), [f"{s:g}{UNITS.get(motion, '')}" for s in speeds])
+        share.set(title=motion, ylim=(0, 1.3))
+        rate.set(ylim=(0.4, 2.0), xlabel="a frame" if motion in UNITS else "pixels a frame")
+        if k == 1:
+            share.set(ylabel="events, share of the dense")
+            rate.set(ylabel="rate by phase of a frame")
+            share.legend(fontsize=7)
     plots.save_figure(figure, path)
 
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "between_frames")
-    known, rows = pictures(), list[dict[str, Any]]()
-    scenes = itertools.product(*(of[options.preset] for of in (MOTIONS, SIZES, SPEEDS, PICTURES)))
-    jobs = [(motion, picture, speed, size, FRAMES[options.preset], options.seed)
-            for motion, size, speed, picture in scenes if picture in known]
+    frames, wanted = FRAMES[options.preset], list(scenes(options.preset))
+    done = _kept(options.rows, frames, options.seed)
+    left = [scene for scene in wanted if repr(scene) not in done]
+    measure = partial(measured, frames=frames, seed=options.seed)
     with bar("scenes") as progress, worker_pool(options.workers) as pool:
-        for row in (map if options.workers == 1 else pool.map)(measured, jobs):
-            rows.append(row)
-            progress(len(rows), len(jobs))
+        found = map(measure, left) if options.workers == 1 else pool.map(measure, left)
+        for scene, row in zip(left, found, strict=True):
+            done[repr(scene)] = row
+            _keep(options.rows, frames, options.seed, done)
+            progress(len(done), len(wanted))
+    rows = [done[repr(scene)] for scene in wanted]
     conclude(options, "between_frames", {"rows": rows}, table(rows))
     draw(rows, options.out / "between_frames.png")
     return {"rows": rows}
+
+
+def _kept(path: Path | None, frames: int, seed: int) -> dict[str, dict[str, Any]]:
+    """Rows by scene that an interrupted run with the same options left."""
+    if path is None or not path.exists():
+        return {}
+    kept = json.loads(path.read_text())
+    return dict(kept["rows"]) if kept["of"] == [frames, seed] else {}
+
+
+def _keep(path: Path | None, frames: int, seed: int, rows: dict[str, dict[str, Any]]) -> None:
+    if path is not None:
+        atomic_text(path, json.dumps({"of": [frames, seed], "rows": rows}), overwrite=True)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ SKIMAGE = ("camera", "coffee", "chelsea", "brick", "grass", "gravel", "rocket")
 SIDE = 768  # pixels of a texture
 FADES = 16  # mixtures per frame
 PERIOD_US, PHASES = 33_333, 16  # of a frame
+FINER = 16  # bins of a phase, of which the amplitudes are taken
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,23 +41,60 @@ class Moving:
 
     def frame(self, u: float, size: tuple[int, int]) -> np.ndarray:
         """The frame (H, W) at time u in DN, float32, of a size (width, height)."""
-        x, y = np.meshgrid(*map(np.arange, size))
-        seen = _seen(self.picture, self.view(u), x, y)
+        seen = _seen(self.picture, self.view(u), size)
         if self.object is None or self.across is None:
             return seen
-        dx, dy = self.across(u)
-        away = np.hypot(x - dx - size[0] / 2, y - dy - size[1] / 2)
-        cover = np.clip(self.radius - away + 0.5, 0, 1).astype(np.float32)
+        (dx, dy), away = self.across(u), self.beyond(u, size)
+        cover = np.clip(0.5 - away, 0, 1).astype(np.float32)
         shift = np.array([[1.0, 0, -dx], [0, 1, -dy]])
-        return seen + cover * (_seen(self.object, shift, x, y) - seen)
+        return seen + cover * (_seen(self.object, shift, size) - seen)
+
+    def swept(self, frames: int, size: tuple[int, int]) -> np.ndarray | None:
+        """Pixels (H, W) over which the object's edge goes in so many frames; None without one."""
+        if self.across is None:
+            return None
+        beyond = np.stack([self.beyond(u, size) for u in np.arange(0, frames - 0.9, 0.1)])
+        return (beyond.min(0) <= 1) & (beyond.max(0) >= -1)
+
+    def beyond(self, u: float, size: tuple[int, int]) -> np.ndarray:
+        """How far each pixel lies outside of the object's edge (H, W); negative inside."""
+        assert self.across is not None
+        x, y = np.meshgrid(*map(np.arange, size))
+        dx, dy = self.across(u)
+        away: np.ndarray = np.hypot(x - dx - size[0] / 2, y - dy - size[1] / 2) - self.radius
+        return away
 
 
-def _seen(picture: np.ndarray, view: Matrix, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _seen(picture: np.ndarray, view: Matrix, size: tuple[int, int]) -> np.ndarray:
     """By cubic splines: exact to a fraction of a DN, and alike at every sub-pixel shift."""
+    known = _coefficients(picture)
+    if np.array_equal(view[:, :2], np.eye(2)):
+        return np.clip(_shifted(known, float(view[0, 2]), float(view[1, 2]), size), 0, 255)
+    x, y = np.meshgrid(*map(np.arange, size))
     at_x, at_y = (r[0] * x + r[1] * y + r[2] for r in view)
-    seen = map_coordinates(_coefficients(picture), [at_y, at_x], np.float32, order=3,
-                           mode="mirror", prefilter=False)
+    seen = map_coordinates(known, [at_y, at_x], np.float32, order=3, mode="mirror", prefilter=False)
     return np.clip(seen, 0, 255)
+
+
+def _shifted(known: np.ndarray, dx: float, dy: float, size: tuple[int, int]) -> np.ndarray:
+    """What `map_coordinates` gives of a mere shift, whose weights are the same everywhere."""
+    (i, fx), (j, fy) = ((math.floor(d), d - math.floor(d)) for d in (dx, dy))
+    rows, columns = (_mirrored(np.arange(at - 1, at + n + 2), whole) for at, n, whole in zip(
+        (j, i), size[::-1], known.shape, strict=True))
+    part = known[np.ix_(rows, columns)]
+    filtered = cv2.sepFilter2D(part, -1, _weights(fx), _weights(fy), anchor=(0, 0))
+    return filtered[: size[1], : size[0]]
+
+
+def _weights(f: float) -> np.ndarray:
+    """Of four neighbours, a cubic B-spline's at the fraction f between the middle ones."""
+    g = 1 - f
+    return np.array([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], np.float32) / 6
+
+
+def _mirrored(at: np.ndarray, whole: int) -> np.ndarray:
+    at = np.abs(at) % (2 * whole - 2)
+    return np.minimum(at, 2 * whole - 2 - at)
 
 
 _KEPT: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -106,13 +144,19 @@ def pictures() -> dict[str, np.ndarray]:
 
 
 def moving(motion: str, picture: str, speed: float, size: tuple[int, int]) -> Moving:
-    """A scene by the name of its motion: pan, hand, turn or object, at pixels per frame."""
+    """A scene by the name of its motion. pan, hand, turn, object, crossing: at pixels per frame;
+    rotation: at degrees, zoom: at per cent per frame. crossing: the object's background goes the
+    other way, half as fast."""
     shown = pictures()[picture]
-    if motion == "object":
+    if motion in ("object", "crossing"):
         other = pictures()["chelsea" if picture == "camera" else "camera"]
         step = speed * np.array([1, 1 / 6])
-        return Moving(shown, lambda u: np.eye(2, 3), other, lambda u: (u - 4) * step, size[1] / 4)
-    views = {"pan": pan(speed), "hand": hand(speed), "turn": turn(speed, size)}
+        view = pan(speed / 2) if motion == "crossing" else pan(0.0)
+        return Moving(shown, view, other, lambda u: (u - 4) * step, size[1] / 4)
+    rate = speed / (min(size) / 2)
+    views = {"pan": pan(speed), "hand": hand(speed), "turn": turn(rate, -0.4 * rate, size),
+             "rotation": turn(math.radians(speed), 0.0, size),
+             "zoom": turn(0.0, -math.log1p(speed / 100), size)}
     return Moving(shown, views[motion])
 
 
@@ -134,22 +178,24 @@ def hand(speed: float) -> Callable[[float], Matrix]:
     return view
 
 
-def turn(speed: float, size: tuple[int, int]) -> Callable[[float], Matrix]:
-    """Rotation and zoom about the middle; `speed` pixels per frame half way to the side."""
-    middle, rate = np.array(size) / 2, speed / (min(size) / 2)
+def turn(angle: float, growth: float, size: tuple[int, int]) -> Callable[[float], Matrix]:
+    """Rotation about the middle by radians per frame, and the logarithm by which steps across the
+    picture grow."""
+    middle = np.array(size) / 2
 
     def view(u: float) -> Matrix:
-        angle, zoom = rate * u, np.exp(-0.4 * rate * u)
-        c, s = zoom * np.cos(angle), zoom * np.sin(angle)
+        grown = np.exp(growth * u)
+        c, s = grown * np.cos(angle * u), grown * np.sin(angle * u)
         turned = np.array([[c, -s], [s, c]])
         return np.column_stack([turned, middle - turned @ middle])
 
     return view
 
 
-def video(moving: Moving, frames: int, size: tuple[int, int], dense: int) -> np.ndarray:
-    """Frames 0, 1 / dense, ... frames - 1 (N, H, W)."""
-    return np.stack([moving.frame(k / dense, size) for k in range((frames - 1) * dense + 1)])
+def video(moving: Moving, frames: int, size: tuple[int, int], dense: int) -> Pairs:
+    """Frames 0, 1 / dense, ... frames - 1 (H, W) and their times in us."""
+    for k in range((frames - 1) * dense + 1):
+        yield moving.frame(k / dense, size), round(k * PERIOD_US / dense)
 
 
 def faded(pairs: Iterable[tuple[np.ndarray, int]]) -> Pairs:
@@ -176,19 +222,32 @@ def bilinear(pairs: Iterable[tuple[np.ndarray, int]]) -> Pairs:
 WAYS = {"fade": faded, "bilinear": bilinear}
 
 
-def scores(made: Events, truth: Events) -> dict[str, float]:
-    """Share of events; rate by phase; combs in per cent; correlation of counts."""
-    (rate, waves), (true_rate, true_waves) = _folded(made), _folded(truth)
-    ratio, comb = rate / true_rate, 100 * np.abs(waves - true_waves)
-    r = np.corrcoef(made.count_map().ravel(), truth.count_map().ravel())[0, 1]
-    return {"share": len(made) / len(truth), "least": float(ratio.min()),
-            "most": float(ratio.max()), "at_rate": float(comb[0]), "at_double": float(comb[1]),
-            "r": float(r)}
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seen:
+    """What `scores` asks of events. counts (H, W); rate by phase over its mean, after the first
+    frame; waves: amplitudes at the frame rate and its double."""
+
+    number: int
+    counts: np.ndarray
+    rate: np.ndarray
+    waves: np.ndarray
 
 
-def _folded(events: Events) -> tuple[np.ndarray, np.ndarray]:
-    """Rate by phase over its mean, after the first frame; amplitudes at the frame rate and its
-    double."""
+def seen(events: Events) -> Seen:
     phase = events.t[events.t >= PERIOD_US] % PERIOD_US / PERIOD_US
-    rate = np.histogram(phase, PHASES, (0, 1))[0]
-    return rate / rate.mean(), np.array([2 * np.exp(2j * np.pi * k * phase).mean() for k in (1, 2)])
+    rate, edges = np.histogram(phase, PHASES * FINER, (0, 1))
+    middles = (edges[1:] + edges[:-1]) / 2
+    waves = [2 * (np.exp(2j * np.pi * k * middles) * rate).sum() / rate.sum() for k in (1, 2)]
+    rate = rate.reshape(PHASES, FINER).sum(1)
+    return Seen(len(events), events.count_map(), rate / rate.mean(), np.array(waves))
+
+
+def scores(made: Seen, truth: Seen, swept: np.ndarray | None = None) -> dict[str, float]:
+    """Share of events, also of those where `swept` (H, W); rate by phase; combs in per cent;
+    correlation of counts."""
+    ratio, comb = made.rate / truth.rate, 100 * np.abs(made.waves - truth.waves)
+    found = {"share": made.number / truth.number, "least": float(ratio.min()),
+             "most": float(ratio.max()), "at_rate": float(comb[0]), "at_double": float(comb[1]),
+             "r": float(np.corrcoef(made.counts.ravel(), truth.counts.ravel())[0, 1])}
+    return found if swept is None else {
+        **found, "swept": float(made.counts[swept].sum() / truth.counts[swept].sum())}
