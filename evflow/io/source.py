@@ -154,11 +154,16 @@ def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:
 
 def _source(size: tuple[int, int], count: int, images: Any, told: FrameHints,
             notes: list[Note]) -> FrameSource:
+    def shown() -> Frames:
+        return converted(_between(images(), told), told, notes)
+
     def frames() -> Frames:
-        seen = repeats.Count()
-        shown = converted(_between(images(), told), told, notes)
-        yield from repeats.watched(shown, told.repeated == "drop", seen)
-        if note := seen.note(dropped=told.repeated == "drop"):
+        if told.repeated == "drop":
+            yield from repeats.dropped(shown, notes)
+            return
+        runs = repeats.Runs()
+        yield from runs.watched(shown())
+        if note := runs.note():
             notes.append(note)
 
     return FrameSource(size, count, frames, notes)

@@ -12,6 +12,7 @@ import dataclasses
 
 import numpy as np
 
+from evflow.io.images.cadence import evened
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -20,8 +21,6 @@ Array = np.ndarray
 LONGEST = 4  # showings of a frame; more often, and the scene stands still
 FIRING_SHARE = 0.01  # of the pixels have events where a frame should have changed
 STRIDE = 4  # every 4th pixel of every 4th row is compared first
-LEAST_CYCLES, REGULAR = 3, 0.8  # repeats, and the share of them that are equally far apart
-EVEN = 1.5  # times the usual change after a repeat: less, and the frames were evenly spaced
 
 
 def repeated_frames(recording: Recording) -> Array:
@@ -41,7 +40,7 @@ def without_repeats(recording: Recording) -> Recording:
         return recording
     kept = np.delete(np.arange(len(recording.frames)), at)
     times = recording.frame_times[kept]
-    even = _evenly(recording, at, kept)
+    even = _evenly(recording, kept)
     note = Note("frames.repeated", f"{len(at)} of {len(recording.frames)} frames repeat the one "
                 "before while pixels fire, and are left out"
                 + ("" if even is None else "; the others are evenly spaced again") + ".")
@@ -50,27 +49,13 @@ def without_repeats(recording: Recording) -> Recording:
         notes=(*recording.notes, note))
 
 
-def _evenly(recording: Recording, at: Array, kept: Array) -> Array | None:
-    """Times (K,) of the kept frames where a converter repeated frames at regular places, None
-    where a camera had no new one: there as much happens in twice the time."""
-    gaps = np.diff(at)
-    if len(at) < LEAST_CYCLES or len(kept) < 4 or np.median(gaps) < 3 or (
-            (gaps == np.median(gaps)).mean() < REGULAR):
-        return None
+def _evenly(recording: Recording, kept: Array) -> Array | None:
+    """Times (K,) of the kept frames where a converter repeated frames at regular places, else
+    None (`cadence`)."""
     some = recording.frames[:, ::STRIDE, ::STRIDE].astype(np.float32)[kept]
-    change = np.abs(np.diff(some, axis=0)).mean((1, 2))
-    long = np.diff(kept) > 1
-    if np.median(change[long]) > EVEN * np.median(change[~long]):
-        return None
-    anchors = np.searchsorted(kept, at - 1)  # among the kept: what is shown again right after
-    times = recording.frame_times[at - 1]
-    step = np.median(np.diff(times) / np.diff(anchors))
-    ends = np.array([0, len(kept) - 1])
-    outside = times[[0, -1]] + (ends - anchors[[0, -1]]) * step
-    places = np.concatenate([ends[:1] - 1, anchors, ends[1:] + 1])
-    known = np.concatenate([outside[:1] - step, times, outside[1:] + step])
-    even: Array = np.rint(np.interp(np.arange(len(kept)), places, known)).astype(np.int64)
-    return even if (np.diff(even) > 0).all() else None
+    changes = np.abs(np.diff(some, axis=0)).mean((1, 2))
+    return evened(recording.frame_times[kept], changes,
+                  float(np.median(np.diff(recording.frame_times))))
 
 
 def _equal(a: Array, b: Array) -> bool:

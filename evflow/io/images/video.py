@@ -65,7 +65,7 @@ class Video:
             raise cut_off(self.path, count, self.claimed, REST)
         if self.times_us is not None and count < len(self.times_us) and not self.hints.partial:
             raise self._miscounted(f"{count:,}")
-        self.notes.extend(clock.notes())
+        self.notes.extend(note for note in clock.notes() if note not in self.notes)
 
     def _name(self, index: int) -> str:
         return f"frame {index} of {self.path}"

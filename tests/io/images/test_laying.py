@@ -1,23 +1,18 @@
-"""Frames laid on a sensor, slow motion, saccades over one picture, and repeated frames."""
+"""Frames laid on a sensor, slow motion, and saccades over one picture."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from helpers.videos import code_of, drifting
+from helpers.videos import code_of
 
 from evflow.io.images.frames import FrameSource
 from evflow.io.images.laying import laid, lay_of, slowed
-from evflow.io.images.repeats import Count, watched
 from evflow.io.images.saccades import saccades, swept
 from evflow.io.source import open_frames
-
-Pairs = Iterator[tuple[np.ndarray, int]]
 
 
 def source(frames: np.ndarray, step_us: int = 10_000) -> FrameSource:
@@ -119,36 +114,3 @@ def test_one_picture_is_a_source_only_where_a_sensor_moves_over_it(tmp_path: Pat
     fine = swept(one, 2.0, sensor_size="5x3")
     assert fine.size == (5, 3)
     assert all_of(fine).shape[1:] == (3, 5)
-
-
-MOVING = drifting(24, (24, 32), 1.0).astype(np.uint8)
-PULLDOWN = np.array([i * 4 // 5 for i in range(30)])  # 24 -> 30 frames/s: frame 0 0 1 2 3 4 4 5
-STILL = np.concatenate([np.zeros(20, int), np.arange(10)])  # stands still, then moves
-
-
-@pytest.mark.parametrize(("order", "repeats"), [
-    (PULLDOWN, 6), (np.repeat(np.arange(8), 2), 8), (np.repeat(np.arange(8), 3), 16),
-    (np.arange(24), 0), (STILL, 0), (STILL[::-1], 0), (np.zeros(9, int), 0),
-    (np.array([0, 1, 2, 2, 3, 4, 5, 6, 6, 7]), 2)])
-@pytest.mark.parametrize("noise", [0, 1])
-def test_repeated_frames_are_counted_and_dropped(
-    order: np.ndarray, repeats: int, noise: int
-) -> None:
-    """Also where a codec leaves a little of them; a scene that stands still is none of a
-    converter's."""
-    rng = np.random.default_rng(1)
-    frames = MOVING[order]
-    spots = rng.random(frames.shape) < 0.1 * noise
-    frames = np.where(spots & (frames < 255), frames + 1, frames).astype(np.uint8)
-    kept: dict[bool, Any] = {}
-    for drop in (False, True):
-        count = Count()
-        pairs: Pairs = ((frame, 1000 * i) for i, frame in enumerate(frames))
-        kept[drop] = [t // 1000 for _, t in watched(pairs, drop, count)]
-        assert (count.frames, count.repeats) == (len(order), repeats)
-        note = count.note(dropped=drop)
-        assert (note is not None) == (repeats > 1)
-        assert note is None or f"{repeats} of {len(order)} frames" in note.text
-    assert kept[False] == list(range(len(order)))
-    first = [i for i in range(len(order)) if i == 0 or order[i] != order[i - 1]]
-    assert kept[True] == (first if repeats else kept[False])
