@@ -40,10 +40,10 @@ from experiments.shared.moving import WAYS, Pairs, Seen, moving, pictures, score
 
 Scene = tuple[str, str, float, tuple[int, int]]  # motion, picture, speed, size
 
-FRAMES = {"debug": 4, "full": 8}
+FRAMES = {"debug": 4, "full": 7}
 SMALL, LARGE = (346, 260), (640, 480)
-PICTURES = ("coffee", "000000000785", "discs", "camera", "waves")
-FEWER = 3  # pictures, in large frames and what is hard
+PICTURES = ("coffee", "discs", "000000000785", "waves")
+FEWER = 2  # pictures, in large frames and of what is hard
 SPEEDS = (5.0, 10.0, 20.0, 30.0)  # pixels per frame
 HARD = {"crossing": SPEEDS, "rotation": (5.0, 10.0, 15.0, 20.0), "zoom": (2.0, 5.0, 10.0, 15.0)}
 UNITS = {"rotation": "°", "zoom": " %"}
