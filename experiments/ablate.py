@@ -35,7 +35,8 @@ from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
 from evflow.training.batch import sample_batch
 from evflow.training.config import PRESETS, TrainConfig, as_dict
-from evflow.training.step import cut_block, init_state, make_run_step, optimiser
+from evflow.training.objective import cut_block
+from evflow.training.step import init_state, make_run_step, optimiser
 from experiments.shared.common import (
     begin,
     run_script,

@@ -28,7 +28,7 @@ from evflow.scenes import make_bank
 from evflow.training import losses
 from evflow.training.batch import Batch, sample_batch
 from evflow.training.config import TrainConfig, preset
-from evflow.training.step import cut_block
+from evflow.training.objective import cut_block
 from experiments.shared.common import at_least, estimator, run_script
 
 Array = jax.Array

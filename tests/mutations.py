@@ -32,7 +32,8 @@ class Mutation:
     tests: str
 
 
-PIXEL, STEP, NOISE = "simulator/pixel.py", "training/step.py", "simulator/noise.py"
+PIXEL, NOISE = "simulator/pixel.py", "simulator/noise.py"
+OBJECTIVE, STEP = "training/objective.py", "training/step.py"
 FLOW, VOXEL, SIMULATE = "tests/network/test_flow.py", "tests/test_voxel.py", "tests/simulator/"
 MUTATIONS = (
     Mutation("log-det", "network/flow/stack.py",
@@ -61,10 +62,10 @@ MUTATIONS = (
              f"{VOXEL} -k on_channels"),
     Mutation("beta of Eq. 6", "training/losses.py", "beta: float = 2.0", "beta: float = 1.0",
              "tests/training/test_losses.py -k condition"),
-    Mutation("event loss", STEP, "    for name, part in parts.items():\n        scale",
+    Mutation("event loss", OBJECTIVE, "    for name, part in parts.items():\n        scale",
              "    for name, part in parts.items():\n        if name == 'event':\n"
              "            continue\n        scale", "tests/training/test_losses.py -k total"),
-    Mutation("event loss without gradient", STEP, "_event_loss(generated, block, config.loss)",
+    Mutation("event loss without gradient", OBJECTIVE, "_event_loss(generated, block, config.loss)",
              "_event_loss(jax.lax.stop_gradient(generated), block, config.loss)",
              "tests/training/test_step.py -k teaches"),
     Mutation("one data key", STEP, "return jax.random.fold_in(kind, state.step)",

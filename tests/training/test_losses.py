@@ -9,7 +9,7 @@ import pytest
 
 from evflow.training import losses
 from evflow.training.config import LossConfig
-from evflow.training.step import total_loss
+from evflow.training.objective import total_loss
 
 
 def test_condition_loss_is_least_at_the_target() -> None:

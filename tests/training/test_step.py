@@ -19,10 +19,10 @@ from evflow.training import step as training_step
 from evflow.training.batch import sample_batch
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.losses import adaptive_weight
+from evflow.training.objective import loss_fn
 from evflow.training.step import (
     TrainState,
     init_state,
-    loss_fn,
     make_run_step,
     optimiser,
     step_key,
