@@ -13,6 +13,7 @@ from evflow.errors import CODES
 
 NOTES: dict[str, str] = {
     "events.layout": "how the file is laid out was inferred",
+    "events.coarse": "times of events lie on coarse steps",
     "events.late": "events whose time goes back were left out, sorted or joined",
     "events.outside": "events outside the sensor were left out",
     "events.partial": "only the part before the damage was read",

@@ -18,6 +18,7 @@ from evflow.errors import EvflowDataError, naming
 from evflow.files.regular import need_regular
 from evflow.io.decode.text import HEAD
 from evflow.io.decode.units import check_seconds, doubt
+from evflow.io.decode.written import Written, coarse, watched
 from evflow.io.formats import (
     aedat2,
     aedat3,
@@ -135,13 +136,12 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
     path = Path(path)
     found = find_format(path)
     try:
-        with naming(path):
+        with naming(path), watched() as written:
             recording = found.read(path, told)
             _check_named(recording, told)
             events = recording.events
-            check_seconds(events.t, events.size, told.time_unit, found.NAME)
-            if told.time_unit == "auto":
-                recording = _doubted(recording, found.NAME)
+            check_seconds(events.t, events.size, written.unit)
+            recording = _doubted(recording, found.NAME, told, written)
     except MemoryError as e:
         raise EvflowDataError(
             "EV009", f"{path} asks for more memory than there is.",
@@ -267,13 +267,18 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
     return WRITERS[WRITTEN[suffix] if format is None else format]
 
 
-def _doubted(recording: Recording, format: str) -> Recording:
-    """The recording, with a note where another unit of its times is likelier; EV023 where that must
-    be answered."""
-    found = doubt(recording.events, recording.frame_times, format)
-    if found is None:
+def _doubted(recording: Recording, format: str, told: Hints, written: Written) -> Recording:
+    """The recording, with a note where another unit of its times is likelier, or where they are
+    coarse; EV023 where that must be answered."""
+    said = coarse(recording.events.t, written)
+    found = doubt(recording.events, recording.frame_times, format, written.unit) if (
+        told.time_unit == "auto") else None
+    if found is not None:
+        note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
+    elif said:
+        note = Note("events.coarse", said)
+    else:
         return recording
-    note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
     return dataclasses.replace(recording, notes=(*recording.notes, note))
 
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
-from evflow.io.decode import columns, tables
+from evflow.io.decode import columns, tables, written
 from evflow.io.decode.stream import Chunk, Gathered, gather
-from evflow.io.decode.units import written_unit
+from evflow.io.decode.units import since_1970, written_unit
 from evflow.io.hints import Hints
 from evflow.notes import Note
 
@@ -108,8 +108,10 @@ def in_unit(
     chunks = itertools.chain(first, chunks)
     if not first or first[0].t.dtype.kind != "f":
         return chunks, "us"
-    return (in_us(all_whole(path, chunks), "us"), "us") if columns.whole(first[0].t) else (
-        chunks, "s")
+    t = first[0].t
+    if not columns.whole(t) or (len(t) and since_1970(float(t[0])) == ["s"]):
+        return chunks, "s"
+    return in_us(all_whole(path, chunks), "us"), "us"
 
 
 def all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -126,4 +128,5 @@ def in_us(chunks: Iterable[Chunk], unit: str) -> Iterator[Chunk]:
     """Chunks whose times are in that unit, with fractions or without, in us."""
     told = Hints(time_unit=unit)
     for chunk in chunks:
+        written.seen(chunk.t, unit)
         yield chunk._replace(t=told.microseconds(chunk.t, unit))

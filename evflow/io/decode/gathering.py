@@ -14,7 +14,7 @@ import numpy as np
 from evflow.checks import COLUMNS, RESET_US, Size
 from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
-from evflow.io.decode import late
+from evflow.io.decode import late, written
 from evflow.io.decode.chunk import Chunk
 from evflow.io.hints import Hints, dropped, within
 from evflow.notes import Note
@@ -61,6 +61,8 @@ class Gathering:
     def _times(self, chunk: Chunk) -> np.ndarray:
         if chunk.t.dtype.kind == "f" and not (told := np.abs(chunk.t) < 2.0**63).all():
             raise self._odd(chunk, "t", int(np.argmin(told)))
+        unit = self.native if self.hints.time_unit == "auto" else self.hints.time_unit
+        written.seen(chunk.t, unit)
         t = self.hints.microseconds(chunk.t, self.native, self.offset)
         t = self.joint(t) if self.joint else t
         if not self.seen:

@@ -20,8 +20,6 @@ from evflow.types import Events
 
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 UNITS = tuple(UNITS_US)  # each a thousandth of the one before
-SECONDS = (  # formats whose unit is s
-    "e2vid", "event_utils", "evreal", "ijrr", "mvsec", "text", "v2e-text")
 CERTAIN = (  # formats whose times are the camera's own
     "aedat2", "aedat3", "aedat4", "aedat", "evt2", "evt2.1", "evt3", "dat", "metavision", "rosbag",
     "rosbag2")
@@ -33,6 +31,7 @@ BLOCK = 1 << 20  # times looked at at once: they may lie on disk
 
 # Events per second and pixel, mean of a whole sensor.
 USUAL_HZ = 1.9  # amid the recordings at hand, .07 to 52
+RARER = {"ns": 3.0}  # log units by which that must fit better: the clocks of cameras count us
 FAST_HZ, SLOW_HZ = 100.0, 1.0  # few sensors send more, or less
 LEAST_EVENTS, FEW_EVENTS = 1_000, 100  # of which the rate alone tells; of which it says nothing
 MOST_HZ = 5_000.0  # none sends as many
@@ -46,6 +45,7 @@ POSSIBLE_S = (2e-5, 2.0)  # 50,000 frames/s to one in two seconds
 USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s, where only one unit of 1000 can fall
 MIDDLE_S = 0.02  # of two units the one nearer to 50 frames/s
 
+DIGITS = "Write them again as whole microseconds, or as float64 seconds with six decimals."
 LOOKS = {-6: "s read as us", -3: "ms read as us", 3: "ns read as us", 6: "us read as s"}
 ELSE = {  # the unit to pass, by the power of ten by which times are too long
     -6: "s", -3: "ms (or s where they were read in ms, us where in ns)",
@@ -137,10 +137,14 @@ def spoken_for(
     dated = [unit for unit in since_1970(first) if unit in units]
     if dated:
         return dated[0], f"in {dated[0]} they are dates since 1970"
-    rates = {unit: n / (1e-6 * UNITS_US[unit] * max(span, 1e-9) * pixels) for unit in units}
-    best = min(rates, key=lambda unit: abs(np.log(rates[unit] / USUAL_HZ)))
-    best = best if n >= FEW_EVENTS or "us" not in units else "us"
-    return best, f"in {best} they make {rates[best]:.3g} events per second and pixel"
+    lasting = {unit: 1e-6 * UNITS_US[unit] * max(span, 1e-9) for unit in units}  # s
+    rates = {unit: n / (s * pixels) for unit, s in lasting.items()}
+    best, other = sorted(rates, key=lambda unit: (
+        (n < FEW_EVENTS and unit != "us"),
+        abs(np.log(rates[unit] / USUAL_HZ)) + RARER.get(unit, 0.0)))[:2]
+    return best, (f"in {best} they last {lasting[best]:,.4g} s and make {rates[best]:.3g} events "
+                  f"per second and pixel, in {other} {lasting[other]:,.4g} s and "
+                  f"{rates[other]:.3g}")
 
 
 def check_text_seconds(t: np.ndarray, where: object, pixels: float) -> None:
@@ -152,6 +156,10 @@ def check_text_seconds(t: np.ndarray, where: object, pixels: float) -> None:
     whole = bool((t % 1 == 0).all())
     if not (whole and (len(t) >= LEAST or last >= LATE_S)) and last <= EPOCH_S[1]:
         return
+    if whole and since_1970(float(t[0])) == ["s"]:
+        raise EvflowDataError(
+            "EV003", f"{where}: all times are whole seconds, dates since 1970: the digits behind "
+            "were lost when they were written.", DIGITS)
     units = ("ms", "us", "ns") if whole else ("ms", "us")
     unit, why = spoken_for(len(t), last - float(np.nanmin(t)), pixels, float(t[0]), units)
     seen = (f"all times are whole numbers ({t[0]:.0f}, ...), not seconds" if whole else
@@ -160,13 +168,18 @@ def check_text_seconds(t: np.ndarray, where: object, pixels: float) -> None:
                           f"Pass time_unit={unit!r} (--time-unit {unit}).")
 
 
-def check_seconds(t_us: np.ndarray, size: Size, told: str, format: str) -> None:
+def check_seconds(t_us: np.ndarray, size: Size, read_in: str | None) -> None:
     """EV023 where times that were read in seconds are all whole ones.
 
-    t_us: (N,) int64, as read; told: the unit asked for, or "auto"; format: its name.
+    t_us: (N,) int64, as read; read_in: their unit in the file.
     """
-    in_seconds = told == "s" or (told == "auto" and format in SECONDS)
-    if not in_seconds or len(t_us) < LEAST or t_us[0] == t_us[-1] or not _all_on(S_US, t_us):
+    if read_in != "s" or len(t_us) < LEAST or not all_on(S_US, t_us):
+        return
+    if since_1970(float(t_us[0]) / S_US) == ["s"]:
+        raise EvflowDataError(
+            "EV023", f"all {len(t_us):,} event times are whole seconds, dates since 1970: the "
+            "digits behind were lost when they were written.", DIGITS)
+    if t_us[0] == t_us[-1]:
         return
     first, last = int(t_us[0]) // S_US, int(t_us[-1]) // S_US
     unit, why = spoken_for(len(t_us), last - first, size[0] * size[1], first, ("ms", "us", "ns"))
@@ -175,17 +188,18 @@ def check_seconds(t_us: np.ndarray, size: Size, told: str, format: str) -> None:
         f"camera is that coarse; {why}.", f"Pass --time-unit {unit} (time_unit={unit!r}).")
 
 
-def doubt(events: Events, frame_times: np.ndarray, format: str) -> Misread | None:
+def doubt(
+    events: Events, frame_times: np.ndarray, format: str, read_in: str | None
+) -> Misread | None:
     """What speaks against the unit in which a file of that format was read, with the unit that
-    speaks for itself; None where nothing does, or the format's unit is the camera's own.
+    speaks for itself; None where nothing does, or the format's unit is the camera's own. read_in:
+    the unit of the times in the file.
 
     Raises EV023 where the question must be answered: dates beyond 2099 that another unit makes
     dates of today; and whole milliseconds of which hardly any pixel has events.
     """
     if format in CERTAIN or not len(events):
         return None
-    read_in = "s" if format in ("e2vid", "mvsec", "v2e-text") else "us" if format in (
-        "npz", "v2e", "dsec", "evimo2") else None
     first = int(events.t[0])
     if abs(first) > EPOCH_S[1] * S_US and (late := _dated(first)):
         unit = _other(read_in, late)
@@ -235,7 +249,7 @@ def _stretched(events: Events, rate: float, read_in: str | None) -> Misread | No
     """Of times that make few events: are they too long?"""
     power = 3 if rate * 1e3 > SLOWEST_HZ else 6
     unit = _other(read_in, power)
-    ticks = _all_on(TICK_US, events.t, int(events.t[0]))
+    ticks = all_on(TICK_US, events.t, int(events.t[0]))
     few = (f"{len(events):,} events in {events.duration_us / S_US:,.1f} s are few, {rate:.2g} per "
            f"second and pixel; {10**power:,} times as fast they would be {rate * 10**power:.3g}")
     if ticks:
@@ -278,7 +292,7 @@ def _gaps(t: np.ndarray, longer: int) -> int:
     return total
 
 
-def _all_on(tick_us: int, t_us: np.ndarray, first: int = 0) -> bool:
+def all_on(tick_us: int, t_us: np.ndarray, first: int = 0) -> bool:
     """Do all times (N,) lie on ticks from `first` on? Most recordings answer at their first."""
     return not ((t_us[:LEAST] - first) % tick_us).any() and not any(
         ((t_us[at : at + BLOCK] - first) % tick_us).any() for at in range(0, len(t_us), BLOCK))

@@ -163,10 +163,58 @@ def test_text_in_seconds_that_are_milliseconds(tmp_path: Path) -> None:
     path.write_text("".join(f"{float(t) * 1e3!r} {x} {y} {p}\n" for t, x, y, p in rows))
     error = refused(path, size=(64, 48))  # read in s they lie on ticks of 1 ms, too
     assert error.code == "EV023"
-    assert "ms where they were read in s" in error.fix
+    assert error.fix.startswith("Pass --time-unit ms; if they are right")
 
 
 def test_a_jump_of_the_clock_is_no_unit() -> None:
     right = events(span_us=5_000_000)
     t = np.where(np.arange(20_000) < 12_000, right.t, right.t + 10**11)
     assert misread(Events(right.x, right.y, t, right.p, right.size), np.zeros(0, np.int64)) is None
+
+
+@pytest.mark.parametrize(("step", "form", "said"), [
+    (10_000, "{:.2f}", "steps of 10 ms"), (1_000, "{:.3f}", "steps of 1 ms"), (1, "{:.6f}", "")])
+def test_times_of_few_digits_are_told(tmp_path: Path, step: int, form: str, said: str) -> None:
+    t = np.sort(np.random.default_rng(0).integers(0, 500_000 // step, 4000)) * step
+    lines = (f"{form.format(v / 1e6)} {i % 64} {i % 48} {i % 2}" for i, v in enumerate(t))
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    notes = read_recording(tmp_path / "a.txt", size=(64, 48)).notes
+    assert [n.code for n in notes] == ["events.coarse"] * bool(said)
+    assert said in "".join(n.text for n in notes)
+
+
+@pytest.mark.parametrize(("kind", "zero", "apart"), [
+    (np.float64, 1.6e9, 0.24), (np.float32, 100.0, 7.6), (np.float32, 1.6e9, 128e6),
+    (np.float32, 300_000.0, 31_250)])
+def test_floats_that_do_not_hold_their_times(
+    tmp_path: Path, kind: type, zero: float, apart: float
+) -> None:
+    t = np.sort(np.random.default_rng(0).random(4000)) + zero
+    path = tmp_path / "a.npz"
+    np.savez(path, ts=t.astype(kind), x=np.arange(4000) % 64, y=np.arange(4000) % 48,
+             p=np.arange(4000) % 2, size=(64, 48))
+    assert np.spacing(kind(t[-1])) * 1e6 == pytest.approx(apart, rel=.1)
+    if apart > 1e4:
+        assert ("digits behind were lost" if zero > 1e9 else "float32, which at such numbers is "
+                "exact to 0.0312 s only") in refused(path).seen
+        return
+    notes = read_recording(path, time_unit="s").notes
+    assert [n.code for n in notes] == ["events.coarse"] * (apart > 1)
+
+
+def test_seconds_that_lost_their_digits(tmp_path: Path) -> None:
+    lines = (f"{1643243628 + i / 4000:.6g} {i % 64} {i % 48} {i % 2}" for i in range(4000))
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    for told in ({}, {"time_unit": "s"}):
+        assert "digits behind were lost" in refused(tmp_path / "a.txt", size=(64, 48), **told).seen
+
+
+def test_few_events_of_a_large_sensor_are_not_taken_for_nanoseconds(tmp_path: Path) -> None:
+    """3,000 in 2 s of 346x260 pixels; both readings are told, with how long they last."""
+    t = np.sort(np.random.default_rng(0).integers(0, 2_000_000, 3000))
+    (tmp_path / "a.txt").write_text("\n".join(
+        f"{v} {i * 7 % 346} {i * 5 % 260} {i % 2}" for i, v in enumerate(t.tolist())))
+    error = refused(tmp_path / "a.txt", size=(346, 260))
+    assert "--time-unit us" in error.fix
+    assert "in us they last 2 s" in error.seen or "in us they last 1.99" in error.seen
+    assert "in ns 0.00" in error.seen
