@@ -173,8 +173,7 @@ class Gathering:
         return EvflowDataError(
             "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "
             f"{width}x{height}, at {spot}{self.so_far()}",
-            "Wrong size? Pass size=(width, height), --size WxH; if it is right the file is "
-            "damaged: copy it again" + self.sound_part())
+            _outside(int(chunk.x[i]), int(chunk.y[i]), (width, height)) + self.sound_part())
 
     def _keep(self, chunk: Chunk, t: np.ndarray, a: int, b: int) -> None:
         """Keep the events from a to b; those before a are passed over."""
@@ -241,6 +240,21 @@ class Gathering:
             return x, y, t, on
         self.notes += self.lateness.notes()
         return x[order], y[order], t[order], on[order]
+
+
+def _outside(x: int, y: int, size: Size) -> str:
+    """What it may mean that an event at (x, y) lies outside a sensor."""
+    width, height = size
+    if min(x, y) < 0:
+        return ("No pixel is below 0: were they undistorted or moved? Use the raw ones. In AEDAT 2 "
+                "it is a wrong size: pass size=(width, height), --size WxH")
+    if x <= width and y <= height:
+        return ("Do coordinates begin at 1, as in MATLAB? Subtract 1; if the sensor is larger, "
+                "pass size=(width, height), --size WxH")
+    if x < height and y < width:
+        return f"Height before width? Pass size=({height}, {width}), --size {height}x{width}"
+    return ("Wrong size? Pass size=(width, height), --size WxH; if it is right the file is "
+            "damaged: copy it again")
 
 
 def place(path: Path, unit: str, number: int) -> str:

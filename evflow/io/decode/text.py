@@ -23,8 +23,8 @@ BLANKS = bytes.maketrans(b",;\"", b"   ")  # what else stands between numbers
 HEAD = 1 << 14  # bytes by which a file is recognised, and the order of its columns told
 BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
 MAX_LINE = 1000  # a longer one is not text
-WORD = re.compile(rb"\b(?:true|false|on|off)\b", re.IGNORECASE)
-ON = (b"true", b"on")
+WORD = re.compile(rb"\b(?:true|false|on|off|pos|neg|positive|negative)\b", re.IGNORECASE)
+ON = (b"true", b"on", b"pos", b"positive")
 
 
 def events(
@@ -58,7 +58,7 @@ def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
 
 def plain(block: bytes, byte: int) -> bytes:
     """Lines of as many bytes with blanks between their numbers: no commas, no byte order mark at
-    byte 0, and True and False, ON and OFF in any case as 1 and 0."""
+    byte 0, and words for a polarity (True, OFF, pos ...) in any case as 1 and 0."""
     if byte == 0 and block.startswith(codecs.BOM_UTF8):
         block = b"   " + block[len(codecs.BOM_UTF8):]
     if WORD.search(block, 0, MAX_LINE):  # where one line has one, all have
@@ -139,9 +139,9 @@ def is_number(field: bytes) -> bool:
 
 
 def is_float(field: bytes | str) -> bool:
-    """Is it a number, NaN and infinity among them?"""
+    """Is it a number, NaN and infinity among them? 1_000 is none in a table."""
     try:
         float(field)
     except ValueError:
         return False
-    return True
+    return b"_" not in field if isinstance(field, bytes) else "_" not in field

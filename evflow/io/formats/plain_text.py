@@ -34,6 +34,9 @@ NAME = "text"
 EXTENSIONS: tuple[str, ...] = (".csv", ".txt", ".tsv", ".dat", ".log")
 
 COMMAS = str.maketrans(",;", "  ")
+COMMA = re.compile(  # within a number: quoted, or where something else stands between numbers
+    rb'"-?\d{1,3}(?:,\d{3})+(?:\.\d+)?"|'
+    rb"(?=.*\d,\d)-?[\d.]+(?:,\d+)*(?:[;\t ]+-?[\d.]+(?:,\d+)*)+$")
 MOST = 12  # columns of a header
 TOOL = re.compile(r"^geometry:|@\d", re.MULTILINE)  # by headers of OpenEB and faery: us
 
@@ -84,12 +87,16 @@ def layout(head: bytes) -> Layout | None:
     names some of the columns, but not which is which."""
     rows: list[list[float]] = []
     headers: list[str] = []
-    told, said, byte, begin = "", "", 0, 0
+    told, said, odd, byte, begin = "", "", b"", 0, 0
+    if b"\r" in head.strip() and b"\n" not in head:
+        return None  # `unread_text` says why
     whole = head if len(head) < text.HEAD else head[: head.rfind(b"\n") + 1]
     for line in whole.splitlines(keepends=True):
         words, comment = _decoded(line), line.lstrip().startswith((b"#", b"%"))
         fields = text.plain(line, byte).partition(b"#")[0].split()
         byte += len(line)
+        if not comment and (found := COMMA.match(line.strip())):
+            raise _commas(found[0])
         header = not told and not any(map(text.is_float, _fields(words.replace('"', " "))))
         if not rows and (comment or header):
             told = words if words and not comment else told  # it must name what there is
@@ -97,15 +104,36 @@ def layout(head: bytes) -> Layout | None:
             begin, said = byte, f"{said}\n{words}"
         elif fields:
             if not all(map(text.is_number, fields)) or (rows and len(fields) != len(rows[0])):
+                odd = b"" if _told(fields, headers) else line
                 break  # damage, of which `text.events` tells where it is
             rows.append(list(map(float, fields)))
     if told and not headers and sum(map(bool, map(columns.meaning, _fields(told)))) >= 2:
         raise EvflowDataError(
             "EV008", f"its header is {told[:80]!r}: which columns are t, x, y and p?",
             "Name four columns t, x, y, p (timestamp, polarity, row, col are known too).")
+    if headers and odd and not rows:
+        raise EvflowDataError(
+            "EV008", f"below its header {headers[-1][:80]!r} stands {odd.strip()[:60]!r}.",
+            "Every line is numbers: t in seconds or whole microseconds, polarity 0 and 1, -1 and "
+            "1, or a word (true, false, on, off, pos, neg).")
     default = Layout("", "whole" if TOOL.search(said) else "auto", begin,
                      columns.written_size(said))
     return _laid_out(headers, rows, bool(told), default)
+
+
+def _told(fields: list[bytes], headers: list[str]) -> bool:
+    """Are the fields that the last header names numbers, NaN among them?"""
+    order = _order(headers[-1]) if headers else ""
+    return all(text.is_float(field) for field, name in zip(fields, order, strict=False)
+               if name != "-")
+
+
+def _commas(seen: bytes) -> EvflowDataError:
+    return EvflowDataError(
+        "EV008", f"its numbers have commas inside: {seen[:40].decode('ascii', 'replace')}.",
+        "Write them without separators of thousands." if seen.startswith(b'"') else
+        "Decimal commas become points by sed 's/,/./g', separators of thousands go by "
+        "sed 's/,//g'.")
 
 
 def _laid_out(

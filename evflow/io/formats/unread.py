@@ -5,17 +5,10 @@ from __future__ import annotations
 import io
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
 
 from evflow.files.archives import DAMAGE, npy_header
-
-
-class Known(NamedTuple):
-    """What a file is, and what to do."""
-
-    what: str
-    fix: str
-
+from evflow.io.formats import unread_text
+from evflow.io.formats.unread_text import Known
 
 NPZ = "np.savez('events.npz', t=t, x=x, y=y, p=p, size=(width, height)), t in microseconds"
 VIDEO = Known(
@@ -60,8 +53,7 @@ def known(path: Path, head: bytes) -> Known | None:
     """What a file is that begins so and that no format claims; None where that is not known."""
     for at, magic, found in MAGICS:
         if head.startswith(magic, at):
-            fix = found.fix.replace(" IN ", f" {path} ").replace("OUT", str(path.with_suffix("")))
-            return found._replace(fix=fix)
+            return _of(path, found)
     if head.startswith(PICKLES):
         return next(found for _, magic, found in MAGICS if magic == b"\x80\x04")
     if head.startswith(b"\x93NUMPY"):
@@ -75,7 +67,14 @@ def known(path: Path, head: bytes) -> Known | None:
     if path.suffix.lower() in (".aedat", ".dat") and b"\0" in head[:64]:
         return Known("data without a header, as AEDAT 1 of old jAER may be",
                      "Open it in jAER, and log it again: that writes AEDAT 2.")
-    return None
+    words = unread_text.known(head)
+    return None if words is None else _of(path, words)
+
+
+def _of(path: Path, found: Known) -> Known:
+    """With the names of the file and of one beside it."""
+    return found._replace(fix=found.fix.replace(" IN ", f" {path} ").replace(
+        "OUT", str(path.with_suffix(""))))
 
 
 def _array(head: bytes) -> Known | None:

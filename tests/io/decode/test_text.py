@@ -56,7 +56,7 @@ def test_e2vid_text_and_zips(tmp_path: Path) -> None:
     (tmp_path / "plain.txt").write_bytes(text)
     equal(read_events(tmp_path / "plain.txt"), want("e2vid").events)
     (tmp_path / "numbers.txt").write_text("3 4\n5 6\n")
-    assert "none of" in str(refused(tmp_path / "numbers.txt"))
+    assert "text of 2 columns of numbers" in str(refused(tmp_path / "numbers.txt"))
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("second.txt", text)
     assert refused(path).code == "EV008"
@@ -123,6 +123,8 @@ TEXTS = {  # name: text, and the unit that must be told
         f"{i},{line}\n" for i, line in enumerate(rows(SECONDS, comma=",").splitlines())), None),
     "bool.csv": ("t,x,y,p\n" + rows(SECONDS, comma=",").replace(",0\n", ",False\n").replace(
         ",1\n", ",True\n"), None),
+    "pos.csv": ("t;x;y;p\n" + rows(SECONDS, comma=";").replace(";0\n", ";neg\n").replace(
+        ";1\n", ";POS\n"), None),
 }
 
 
@@ -230,6 +232,17 @@ def test_other_numbers_are_no_events(tmp_path: Path, kind: str) -> None:
     ("t,x,y,p\n" + "1500000000123.5,3,4,1\n" * 3, "EV003", "since 1970"),
     ("t,x,y,p\nnan,3,4,1\n0.2,3,4,1\n", "EV009", "nan"),
     ("0.1,3,4,1\n0.2,3,garb,1\n", "EV009", "garb"),
+    ("t,x,y,p\n0.1,3,4,+\n0.2,3,4,-\n", "EV008", "below its header 't,x,y,p' stands"),
+    ("t,x,y,p\n2022-01-27T00:00:00.5,3,4,1\n", "EV008", "2022-01-27T"),
+    ("t;x;y;p\n0,1;3;4;1\n0,2;3;4;0\n", "EV008", "points by sed 's/,/./g'"),
+    ("0,1\t3\t4\t1\n0,2\t3\t4\t0\n", "EV008", "commas inside: 0,1"),
+    ("t_us x y p\n1,000 3 4 1\n2,000 3 4 0\n", "EV008", "by sed 's/,//g'"),
+    ('t_us,x,y,p\n999,3,4,1\n"1,000",3,4,1\n', "EV008", "without separators of thousands"),
+    ("t_us x y p\n1_000 3 4 1\n", "EV008", "1_000"),
+    ("0.1, 3, 4, 1\n0.2, 70, 4, 0\n", "EV005", "Wrong size?"),
+    ("t x y p\n0.1 3 -4 1\n0.2 7 4 0\n", "EV005", "No pixel is below 0"),
+    ("0.1 64 48 1\n0.2 1 1 0\n", "EV005", "begin at 1"),
+    ("0.1 40 60 1\n0.2 7 4 0\n", "EV005", "--size 48x64"),
 ])
 def test_unclear_text_is_told(tmp_path: Path, content: str, code: str, seen: str) -> None:
     path = tmp_path / "a.csv"
