@@ -1,7 +1,8 @@
 """The text header of Prophesee's files: lines `% key value`, then binary data.
 
 The header ends after `% end`, or before the first line that is not text beginning with `% `.
-What it tells of the sensor: width and height, or a name whose size is known.
+What it tells of the sensor: width and height, or a name whose size is known; and the encoding of
+the words, unless these are those of another (`evt_words`).
 """
 
 from __future__ import annotations
@@ -11,10 +12,14 @@ import re
 from pathlib import Path
 
 from evflow.checks import Size
+from evflow.io.decode import evt_words
+from evflow.io.decode.text import HEAD
 from evflow.notes import Note
 
 MAX_HEADER = 1 << 16  # bytes; real ones have 200 to 600
 TEXT = re.compile(rb"%[ \t][\x20-\x7e\t]*\r?\n|%\r?\n")
+ANY = re.compile(rb"%[^\r\n]*\r?\n")  # where a line `% end` says where the header ends
+END = re.compile(rb"^% *end[ \t]*\r?$", re.MULTILINE | re.IGNORECASE)
 
 SIDE = re.compile(r"\d{1,5}")  # pixels
 
@@ -67,16 +72,49 @@ class Header:
 def parse(head: bytes) -> Header:
     """The header at the beginning of these bytes; no fields where there is none."""
     fields: dict[str, str] = {}
-    start = 0
-    while line := TEXT.match(head, start):
+    start, line_of = 0, ANY if _ends(head) else TEXT
+    while line := line_of.match(head, start):
         start = line.end()
-        key, _, value = line[0][1:].decode("ascii").strip().partition(" ")
+        key, _, value = line[0][1:].decode("utf-8", "replace").strip().partition(" ")
         if key.lower() == "end" and not value:
             break
         fields[key.lower()] = value.strip()
     return Header(fields, start)
 
 
+def _ends(head: bytes) -> bool:
+    """Does a line `% end` end a header whose lines all begin with `%`? Then names in them may have
+    any letters."""
+    end = END.search(head)
+    return end is not None and all(
+        line.startswith(b"%") for line in head[: end.start()].splitlines())
+
+
 def read_header(path: Path) -> Header:
     with open(path, "rb") as f:
         return parse(f.read(MAX_HEADER))
+
+
+def sniffed(path: Path, head: bytes) -> str:
+    """The encoding of a RAW file that begins so, "" of what is none: what the header declares,
+    unless the words are those of another, and of that alone."""
+    header = parse(head)
+    declared = header.encoding
+    if declared not in ("", *evt_words.NAMES) or "version" in header.fields:
+        return declared
+    if not header.fields and path.suffix.lower() != ".raw":
+        return ""
+    found = evt_words.fitting(head[header.start :], header.order)
+    return found[0] if declared not in found and len(found) == 1 else declared
+
+
+def raw(path: Path) -> tuple[Header, str, tuple[Note, ...]]:
+    """The header of a RAW file, the encoding of its words, and a note where the header does not
+    tell it."""
+    header = read_header(path)
+    with open(path, "rb") as f:
+        encoding = sniffed(path, f.read(HEAD))
+    if encoding == header.encoding:
+        return header, encoding, ()
+    return header, encoding, (Note(
+        "events.layout", evt_words.said(header.encoding, encoding)),)

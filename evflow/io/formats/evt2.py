@@ -30,21 +30,22 @@ RESERVED = np.array([kind not in (0, 1, TIME, TRIGGER, 0xE, 0xF) for kind in ran
 
 def sniff(path: Path, head: bytes) -> bool:
     """EVT 2.0, and the encodings that no reader knows: `read` names them."""
-    return prophesee.parse(head).encoding not in ("", "EVT2.1", "EVT3")
+    return prophesee.sniffed(path, head) not in ("", "EVT2.1", "EVT3")
 
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises EV008 (another encoding) and what `stream.collect` raises."""
-    header = prophesee.read_header(path)
-    if header.encoding != "EVT2":
+    header, encoding, told = prophesee.raw(path)
+    if encoding != "EVT2":
         raise EvflowDataError(
-            "EV008", f"{path} is Prophesee RAW of encoding {header.encoding}; read are EVT2, "
+            "EV008", f"{path} is Prophesee RAW of encoding {encoding}; read are EVT2, "
             "EVT2.1 and EVT3.", "Convert it with Metavision: metavision_file_to_dat or "
             "metavision_file_to_csv.")
     size, notes = header.size()
     decoder = Decoder()
     source = words(path, header.start, f"{header.order}u4")
-    return collect(path, decoder.chunks(source), hints, size, lambda: notes + decoder.notes())
+    return collect(path, decoder.chunks(source), hints, size,
+                   lambda: (*notes, *told, *decoder.notes()))
 
 
 class Decoder:

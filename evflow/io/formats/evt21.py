@@ -34,18 +34,18 @@ PLACES_FROM = np.cumsum(_BITS.sum(1)) - _BITS.sum(1)
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    return prophesee.parse(head).encoding == "EVT2.1"
+    return prophesee.sniffed(path, head) == "EVT2.1"
 
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises what `stream.collect` raises."""
-    header = prophesee.read_header(path)
+    header, _, guessed = prophesee.raw(path)
     size, notes = header.size()
     swapped, told = _halves_swapped(path, header)
     decoder = Decoder()
     source = _whole(words(path, header.start, f"{header.order}u8"), swapped)
     return collect(path, decoder.chunks(source), hints, size,
-                   lambda: (*notes, *told, *decoder.notes()))
+                   lambda: (*notes, *guessed, *told, *decoder.notes()))
 
 
 class Decoder(evt2.Decoder):

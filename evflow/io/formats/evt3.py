@@ -41,16 +41,17 @@ PLACES_FROM = (np.cumsum(_BITS.sum(1)) - _BITS.sum(1)).astype(np.int32)
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    return prophesee.parse(head).encoding == "EVT3"
+    return prophesee.sniffed(path, head) == "EVT3"
 
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises what `stream.collect` raises."""
-    header = prophesee.read_header(path)
+    header, _, told = prophesee.raw(path)
     size, notes = header.size()
     decoder = Decoder()
     source = words(path, header.start, f"{header.order}u2")
-    return collect(path, decoder.chunks(source), hints, size, lambda: notes + decoder.notes())
+    return collect(path, decoder.chunks(source), hints, size,
+                   lambda: (*notes, *told, *decoder.notes()))
 
 
 class Decoder:

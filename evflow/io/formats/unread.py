@@ -61,7 +61,8 @@ def known(path: Path, head: bytes) -> Known | None:
     if head.startswith(b"PK"):
         return _archive(path)
     if path.suffix.lower() == ".raw":
-        return Known("no Prophesee RAW: that begins with lines `% key value`",
+        return Known("no Prophesee RAW: neither do lines `% evt 3.0` or `% format EVT3` begin it, "
+                     "nor are its words of EVT2, EVT2.1 or EVT3",
                      "Was it exported without its header, or is it raw video? Record it again, or "
                      "put the header of another recording of the camera before it.")
     if path.suffix.lower() in (".aedat", ".dat") and b"\0" in head[:64]:

@@ -43,7 +43,7 @@ FILES = {  # name: bytes, and what the message says
     "a.npy": (npy(np.zeros((5, 4, 3), np.uint8)), "an array (5, 4, 3) of uint8"),
     "b.npy": (npy(np.array([None])), "Python objects"),
     "a.zip": (zipped("left/a.raw", "right/b.raw"), "a zip archive of left/a.raw, right/b.raw"),
-    "a.raw": (bytes(range(99)), "begins with lines `% key value`"),
+    "a.raw": (bytes(range(99)), "lines `% evt 3.0` or `% format EVT3` begin it"),
     "old.dat": (b"\0\1\0\2\0\3" * 9, "AEDAT 1"),
     "utf16.csv": ("t,x,y,p\n0.1,3,4,1\n".encode("utf-16"), "iconv -f UTF-16 -t UTF-8"),
     "mac.csv": (b"t,x,y,p\r0.1,3,4,1\r0.2,3,4,1\r", "tr '\\r' '\\n' <"),
