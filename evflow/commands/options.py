@@ -82,6 +82,9 @@ class Reading:
     frames_topic: Annotated[str | None, value("NAME")] = None
     """The recording's images that are the frames of its events, where it holds several: a topic of
     a bag, an output of DV. Without it raw images near the events, which a note names."""
+    events_topic: Annotated[str | None, value("NAME")] = None
+    """Of several cameras in one file the one whose events are read: a topic of a bag, a group of
+    HDF5, an output of DV. Without it the first, and a note names the others."""
     no_frames: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Read the events alone, whatever the recording's frames are."""
     frames: Annotated[Path | None, value("PATH")] = None
@@ -124,7 +127,8 @@ class Reading:
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
             polarity=self.polarity, size=parse_size(self.size), partial=self.partial,
             drop_outside=self.drop_outside, no_frames=self.no_frames or not own,
-            frames_topic=self.frames_topic if own else None, late=self.late)
+            frames_topic=self.frames_topic if own else None, late=self.late,
+            events_topic=self.events_topic)
         if with_frames and (self.frames is not None or recording.has_frames):
             return self._seeing(recording)
         if with_frames:

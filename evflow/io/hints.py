@@ -7,7 +7,7 @@ so units, polarity, size and time range mean the same for every format.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
@@ -52,6 +52,7 @@ class Told(TypedDict, total=False):
     frames_topic: str | None
     no_frames: bool
     late: str
+    events_topic: str | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Hints:
     late: what becomes of times that go back: "stop" = they are refused, or with `partial` end the
         reading; "drop" leaves out as few events as make the others ordered; "sort" puts them in
         their place; "join" puts one clock behind the other.
+    events_topic: of several streams of events (of several cameras) the one to read.
     """
 
     start_s: float | None = None
@@ -84,6 +86,7 @@ class Hints:
     frames_topic: str | None = None
     no_frames: bool = False
     late: str = "stop"
+    events_topic: str | None = None
 
     def __post_init__(self) -> None:
         check_choices(
@@ -97,10 +100,11 @@ class Hints:
         if self.stop_s is not None and self.stop_s <= (self.start_s or 0.0):
             raise EvflowDataError(
                 "EV020", f"stop_s={self.stop_s} is not after start_s={self.start_s or 0.0}.")
-        if self.frames_topic is not None and not (
-                isinstance(self.frames_topic, str) and self.frames_topic.strip("/")):
-            raise EvflowDataError("EV020", f"frames_topic={self.frames_topic!r}.",
-                                  "Give the name of a topic or data set.")
+        for name in ("frames_topic", "events_topic"):
+            topic = getattr(self, name)
+            if topic is not None and not (isinstance(topic, str) and topic.strip("/")):
+                raise EvflowDataError("EV020", f"{name}={topic!r}.",
+                                      "Give the name of a topic, group or data set.")
         if self.frames_topic is not None and self.no_frames:
             raise EvflowDataError(
                 "EV020", f"frames_topic={self.frames_topic!r} and no_frames contradict.",
@@ -112,6 +116,24 @@ class Hints:
     def parse(given: Mapping[str, Any]) -> Hints:
         """Hints of keyword arguments; an unknown one raises EV020."""
         return Hints(**known(given, Hints, "Readers"))
+
+    def camera(self, names: Sequence[str]) -> tuple[str, tuple[Note, ...]]:
+        """Which of several streams of events to read, the first unless one is asked for: by its
+        name, or as the only one that ends so; and what is to be said. EV020 where none is it."""
+        named, best = self.events_topic, names[0]
+        if named is not None:
+            ends = [n for n in names if n == named] or [
+                n for n in names if f"/{n}".endswith("/" + named.strip("/"))]
+            if len(ends) != 1:
+                raise EvflowDataError(
+                    "EV020", f"events_topic={named!r} names {len(ends)} streams of events.",
+                    f"There are: {', '.join(names)}.")
+            best = ends[0]
+        elif len(names) == 1:
+            return best, ()
+        others = ", ".join(name for name in names if name != best) or "none"
+        return best, (Note("sensor.camera", f"events are those of {best}; not read: {others}"
+                           + ("" if others == "none" else "; --events-topic NAME reads another")),)
 
     def sensor(self, *known: Size | None, reach: tuple[int, int] | None = None) -> Size:
         """The first of `self.size` and `known` that is not None, or EV015.

@@ -113,7 +113,8 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
             size: (width, height); partial: of a damaged file, what lies before the damage;
             drop_outside: leave out events outside the sensor; frames_topic: which of several
             streams of images holds the frames; no_frames: read the events alone; late: "drop",
-            "sort" or "join" events whose time goes back.
+            "sort" or "join" events whose time goes back; events_topic: which of several streams
+            of events to read.
 
     Returns:
         The recording; without frames in the file they are (0, H, W). Its notes say what was
@@ -283,7 +284,11 @@ def _doubted(recording: Recording, format: str, told: Hints, written: Written) -
 
 
 def _check_named(recording: Recording, told: Hints) -> None:
-    """EV020 where a stream of images was named to a format that has none."""
+    """EV020 where a stream of images or events was named to a format that has no such."""
+    if told.events_topic is not None and all(n.code != "sensor.camera" for n in recording.notes):
+        raise EvflowDataError(
+            "EV020", f"events_topic={told.events_topic!r}, but there are no several streams of "
+            "events.", "Leave it out (--events-topic).")
     if told.frames_topic is not None and all(n.code != "frames.stream" for n in recording.notes):
         raise EvflowDataError(
             "EV020", f"frames_topic={told.frames_topic!r}, but no images stand beside the events.",

@@ -67,7 +67,8 @@ def _rises(words: np.ndarray, bits: int, most: int) -> bool:
     """Do the times in these bits of words (n,) go on, by steps of at most that many?"""
     if len(words) < LEAST:
         return False
-    steps = np.diff((words & bits).astype(np.int64)) & bits
+    times = (words & bits).astype(np.int64)
+    steps = (times[1:] - times[:-1]) & bits
     return bool((steps <= most).mean() >= FITS)
 
 

@@ -45,6 +45,11 @@ def walk(f: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
         yield group, found
 
 
+def has_columns(f: Any) -> bool:
+    """Does any group name four columns?"""
+    return any(columns.by_name(found) for _, found in walk(f))
+
+
 def tables_of(path: Path, f: Any) -> list[tuple[Any, arrays.Table]]:
     """(the group, the events) of all that may be events: named columns before compounds, those
     before matrices, the outer before the inner, a left camera before others."""

@@ -45,41 +45,44 @@ def sniff(path: Path, head: bytes) -> bool:
 def read(path: Path, hints: Hints) -> Recording:
     """Events (N,) and frames (T, H, W) uint8; colour frames become their luma.
 
-    Of several frame streams `streams.choose` takes one, by the names of their outputs in DV. Raises
-    EV008 (no event stream, or several), EV009 (damaged), EV010 (no `aedat`), and what
+    Of several event streams the first is read, or the one asked for; of several frame streams
+    `streams.choose` takes one, by the names of their outputs in DV. Raises EV008 (no event stream),
+    EV009 (damaged), EV010 (no `aedat`), and what
     `stream.gather` and `Recording` raise.
     """
     header = read_header(path)
     streams = _decoder(path).id_to_stream()
     events = [i for i, s in streams.items() if s["type"] == "events"]
-    if len(events) != 1:
+    if not events:
         kinds = ", ".join(f"{i}: {s['type']}" for i, s in sorted(streams.items()))
         raise EvflowDataError(
-            "EV008", f"{path} holds the streams {{{kinds}}}.",
-            "One event stream is read: export one camera alone.")
-    info = streams[events[0]]
-    size = hints.size or (info["width"], info["height"])
+            "EV008", f"{path} holds the streams {{{kinds}}}, none of events.",
+            "Record the events too, or pass the file that has them.")
     frames = {i: s for i, s in streams.items() if s["type"] == "frame"}
     names = stream_names(header.outputs, {*frames, *events})
+    camera, told = hints.camera([names[i] for i in sorted(events)])
+    source = next(i for i in events if names[i] == camera)
+    info = streams[source]
+    size = hints.size or (info["width"], info["height"])
     chosen = choose([ImageStream(names[i], (s["width"], s["height"])) for i, s in frames.items()],
-                    hints, size, names[events[0]])
+                    hints, size, camera)
     taken = [i for i in frames if chosen.stream and chosen.stream.name == names[i]]
     starts, damage = _packets(path, header.packets, header.table)
     with _before(path, damage) as sound:
-        reading = _Reading(sound, starts, damage, Aside(path, hints, size), taken)
+        reading = _Reading(sound, starts, damage, Aside(path, hints, size), source, taken)
         return reading.aside.collect(
-            reading.chunks(), lambda: (*chosen.notes, *reading.notes()))
+            reading.chunks(), lambda: (*told, *chosen.notes, *reading.notes()))
 
 
 class _Reading:
-    """Packets decoded in turn: events become chunks, frames of the streams `taken` are put
-    aside."""
+    """Packets decoded in turn: events of the stream `source` become chunks, frames of the streams
+    `taken` are put aside."""
 
     def __init__(
         self, sound: Path, starts: Iterable[int], damage: Damage | None, aside: Aside,
-        taken: list[int],
+        source: int, taken: list[int],
     ) -> None:
-        self.damage, self.aside, self.taken = damage, aside, taken
+        self.damage, self.aside, self.source, self.taken = damage, aside, source, taken
         self.decoder = iter(_decoder(sound))
         self.places = itertools.chain(starts, itertools.repeat(os.path.getsize(sound)))
         self.warned: set[str] = set()
@@ -107,7 +110,7 @@ class _Reading:
                     if packet is None:
                         self.decoder = iter(())
                         break
-                    if len(packet.get("events", ())):
+                    if len(packet.get("events", ())) and packet["stream_id"] == self.source:
                         found.append(packet["events"])
                         count += len(found[-1])
                         self.aside.follow(found[-1]["t"])

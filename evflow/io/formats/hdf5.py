@@ -13,7 +13,6 @@ from typing import Any
 from evflow.errors import EvflowDataError
 from evflow.io.decode import hdf5_search, tables
 from evflow.io.hints import Hints
-from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "hdf5"
@@ -36,10 +35,11 @@ def read(path: Path, hints: Hints) -> Recording:
                 f"{hdf5_search.listing(f)}.",
                 "Name the events x, y, t, p in one group, in Python: with h5py.File(path, 'a') as "
                 "f: f['events/x'] = f['its/name'], and so for y, t (us) and p. No data is copied.")
-        group, table = found[0]
+        name, notes = hints.camera([table.name for _, table in found])
+        group, table = next(pair for pair in found if pair[1].name == name)
         size = hdf5_search.told_size(f, group)
         gathered = table.gather(path, hints, size, _offset(hints, group))
-        return Recording.of_events(gathered.events, (*_said(found), *gathered.notes))
+        return Recording.of_events(gathered.events, (*notes, *gathered.notes))
 
 
 def _offset(hints: Hints, group: Any) -> int:
@@ -47,10 +47,3 @@ def _offset(hints: Hints, group: Any) -> int:
         return 0
     return hints.instant(group["t_offset"][()], "us")
 
-
-def _said(found: list[Any]) -> tuple[Note, ...]:
-    """Which of several was read."""
-    names = [table.name for _, table in found]
-    return () if len(names) == 1 else (Note(
-        "sensor.camera", f"of the events in {', '.join(names[:6])} those of {names[0]} were "
-        "read"),)

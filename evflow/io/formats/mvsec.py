@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.decode import tables
+from evflow.io.decode import hdf5_search, tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
 from evflow.notes import Note
@@ -23,10 +23,11 @@ NAME = "mvsec"
 EXTENSIONS: tuple[str, ...] = (".hdf5", ".h5")
 
 SIZE = (346, 260)
+SIDES = ("left", "right")
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    return tables.holds(head, path, lambda f: "davis" in f)
+    return tables.holds(head, path, lambda f: "davis" in f and not hdf5_search.has_columns(f))
 
 
 def read(path: Path, hints: Hints) -> Recording:
@@ -34,11 +35,12 @@ def read(path: Path, hints: Hints) -> Recording:
     raise. Frame times are those of the file: MVSEC does not say where in the exposure they lie."""
     with tables.opened(path) as f:
         davis = f["davis"]
-        side = next((s for s in ("left", "right") if f"davis/{s}/events" in f), None)
-        if side is None:
+        sides = [s for s in SIDES if f"davis/{s}/events" in f]
+        if not sides:
             raise EvflowDataError(
                 "EV008", f"{path}: /davis holds {sorted(davis)} without events.",
                 "The ground truth of MVSEC? Events are in the file *_data.hdf5.")
+        side, told = hints.camera(sides)
         camera = davis[side]
         data = tables.dataset(path, camera, "events", (None, 4))
 
@@ -48,7 +50,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
         chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
         found = gather(path, chunks, hints, SIZE, "s")
-        notes = (Note("sensor.camera", f"the {side} camera was read"),)
+        notes = told or (Note("sensor.camera", f"the {side} camera was read"),)
         if "image_raw" not in camera:
             return Recording.of_events(found.events, (*notes, *found.notes))
         images = tables.dataset_images(path, camera, "image_raw", "image_raw_ts")

@@ -48,8 +48,17 @@ def unreadable(encoding: str) -> str:
 
 def notes(encoding: str) -> tuple[Note, ...]:
     """What is to be said of frames that were so encoded and are converted here."""
-    order = ENCODINGS[encoding.lower()].order
-    return () if order in GREYS else (mosaic_note(order),)
+    known = ENCODINGS.get(encoding.lower())
+    return () if known is None or known.order in GREYS else (mosaic_note(known.order),)
+
+
+def unpacked(encoding: str, image: np.ndarray) -> np.ndarray:
+    """An image (H, W) or (H, W, C) that had an encoding before it was compressed: a mosaic is
+    compressed as it is, and becomes its luma."""
+    known = ENCODINGS.get(encoding)
+    if known is None or known.order in GREYS or image.ndim != 2 or min(image.shape) < 2:
+        return image
+    return mosaic_luma(image, known.order)
 
 
 def decode(

@@ -91,7 +91,8 @@ def test_several_topics_and_none(tmp_path: Path) -> None:
                  + array_messages(make(50).events, "/right/events"))
     got = read_recording(path)
     equal(got.events, want.events)
-    assert got.notes == (Note("events.unread", "topic /right/events was not read"),)
+    assert got.notes == (Note("sensor.camera", "events are those of /left/events; not read: "
+                              "/right/events; --events-topic NAME reads another"),)
     error = refused(write(path, image_messages(want)))
     assert error.code == "EV008"
     assert "/dvs/image_raw (sensor_msgs/msg/Image)" in str(error)

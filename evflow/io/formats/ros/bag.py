@@ -1,12 +1,16 @@
 """Recordings out of bags of ROS 1 and ROS 2: one topic of events, and the images beside it.
 
-sensor_msgs/Image and CompressedImage become frames, at their header's time, where the events are on
-ROS time; of several topics of images `streams.choose` takes one. Of several topics the first with
-events is read, and the others are named in a note.
+sensor_msgs/Image and CompressedImage become frames, at their header's time, or when they were
+recorded where no header has one, where the events are on ROS time; of several topics of images
+`streams.choose` takes one. Of several topics the first with events is read, or the one asked for,
+and the others are named in a note. Where no message of events tells the sensor's size, it is that
+of the only images that can be their frames.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -31,6 +35,8 @@ from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.notes import Note
 from evflow.types import Recording
 
+LOOKED = 16  # messages by which an encoding and a size are told
+
 
 def read_bag(bag: Bag, hints: Hints) -> Recording:
     """Raises EV008 (no events, unknown encoding), EV009 (damaged) and what `stream.gather` and
@@ -40,9 +46,10 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
         raise EvflowDataError(
             "EV008", f"{bag.path} holds no topic of events, but {sorted(bag.all())[:8]}.",
             f"Known messages: {', '.join(EVENT_TYPES)}.")
-    topic, kind = topics[0]
-    notes = tuple(Note("events.unread", f"topic {other} was not read") for other, _ in topics[1:])
-    first = bag.first(topic, kind)
+    topic, notes = hints.camera([name for name, _ in topics])
+    kind = dict(topics)[topic]
+    first, guessed = bag.sized(bag.first(topic, kind), topic, hints)
+    notes += guessed
     found = decoded(bag.path, first, bag.packets(topic, kind))
     events, span, told = gather(bag.path, found.chunks, hints, first.size, found.native)
     notes += (*found.notes(), *told)
@@ -58,8 +65,7 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
         if chosen.stream is None:
             return Recording.of_events(events, notes)
         stack = bag.stack(chosen.stream.name, events.size, hints, None if own_clock else span)
-        clock = Note("frames.clock", f"frame times are the header times of {chosen.stream.name}")
-        return stack.beside(events, hints, (clock, *notes))
+        return stack.beside(events, hints, (bag.clock(chosen.stream.name), *notes))
 
 
 class Bag:
@@ -116,8 +122,10 @@ class Bag:
             message = next(self.messages(topic))
             message.stamp_ns()
             if kind == COMPRESSED:
-                size = claimed_size(message.compressed())
-                return ImageStream(topic, size, "" if size else "compressed as is not known")
+                encoding, data = message.compressed()
+                size = claimed_size(data)
+                return ImageStream(topic, size, "" if size else "compressed as is not known",
+                                   encodings.notes(encoding))
             size, encoding = message.picture()
         except Damage as e:
             return ImageStream(topic, unusable=f"damaged: {e.seen}")
@@ -130,7 +138,7 @@ class Bag:
         index = read = 0
         while True:
             try:
-                _, _, raw = next(source)
+                _, recorded_ns, raw = next(source)
             except StopIteration:
                 return
             except (EvflowDataError, MemoryError):
@@ -139,29 +147,53 @@ class Bag:
                 raise self._failed(e) from e
             read += len(raw)
             check_expansion(read, self.stored, f"the index of {self.path}")
-            yield Message(bytes(raw), index, self.aligned)
+            yield Message(bytes(raw), index, self.aligned, recorded_ns)
             index += 1
 
     def packets(self, topic: str, kind: str) -> Iterator[Packet]:
-        """The messages of events, all of one encoding and size."""
-        first: tuple[str, Size | None] | None = None
+        """The messages of events, all of one encoding and size, where they tell it; but empty
+        ones, which some drivers send before they know either."""
+        encoding = size = None
         for message in self.messages(topic):
             packet = message.events(kind)
-            first = first or (packet.encoding, packet.size)
-            if (packet.encoding, packet.size) != first:
-                raise Damage(message.index, f"encoding and size change from {first} to "
+            if not packet.data:
+                yield packet
+                continue
+            encoding = packet.encoding if encoding is None else encoding
+            size = size or packet.size
+            if packet.encoding != encoding or packet.size not in (None, size):
+                raise Damage(message.index, f"encoding and size change from {(encoding, size)} to "
                              f"{(packet.encoding, packet.size)}", "message")
             yield packet
 
     def first(self, topic: str, kind: str) -> Packet:
-        """The first packet of a topic; EV001 (none), EV009."""
+        """The first packet of a topic that holds events, with the size that it or one of those
+        behind tells; EV001 (no message), EV009."""
+        found: list[Packet] = []
         try:
-            packet = next(self.packets(topic, kind), None)
+            found += itertools.islice(self.packets(topic, kind), LOOKED)
         except Damage as e:
-            raise self._wrong(topic, e) from e
-        if packet is None:
+            if not any(packet.data for packet in found):
+                raise self._wrong(topic, e) from e
+        if not found:
             raise EvflowDataError("EV001", f"{self.path}: topic {topic} holds no message.")
-        return packet
+        full = [packet for packet in found if packet.data] or found
+        return dataclasses.replace(full[0], size=next((p.size for p in full if p.size), None))
+
+    def sized(self, first: Packet, topic: str, hints: Hints) -> tuple[Packet, tuple[Note, ...]]:
+        """The packet with the size of the only images that can be its topic's frames, where it
+        has none itself, and a note that says so."""
+        if first.size or hints.size:
+            return first, ()
+        streams = self.image_streams(dataclasses.replace(hints, no_frames=False))
+        fits = {s.size: s.name for s in streams
+                if s.size and choose(streams, Hints(), s.size, topic).stream is not None}
+        if len(fits) != 1:
+            return first, ()
+        (size, name), = fits.items()
+        return dataclasses.replace(first, size=size), (Note(
+            "sensor.size", f"the sensor is taken as {size[0]}x{size[1]} after the images of "
+            f"{name}: messages of events have no size"),)
 
     def _wrong(self, topic: str, e: Damage) -> EvflowDataError:
         return EvflowDataError(
@@ -173,11 +205,23 @@ class Bag:
         """The images of a topic whose times lie in [start, stop) us."""
         found = FrameStack(topic, size)
         kind = next(c.msgtype for c in self.reader.connections if c.topic == topic)
+        stamped = self.stamped(topic)
         try:
             for message in self.messages(topic):
-                stamp = hints.instant(message.stamp_ns(), "ns")
+                ns = message.stamp_ns()
+                stamp = hints.instant(ns if stamped else message.recorded_ns, "ns")
                 if span is None or span[0] <= stamp < span[1]:
                     found.append(message.image(kind), stamp)
         except Damage as e:
             raise self._wrong(topic, e) from e
         return found
+
+    def stamped(self, topic: str) -> bool:
+        """Do headers of a topic have times? The first alone may have 0, of a simulation."""
+        return any(message.stamp_ns() for message in itertools.islice(self.messages(topic), 2))
+
+    def clock(self, topic: str) -> Note:
+        """What the times of the frames of a topic are."""
+        return Note("frames.clock", f"frame times are the header times of {topic}"
+                    if self.stamped(topic) else f"frame times are those at which {topic} was "
+                    "recorded: its headers have none")

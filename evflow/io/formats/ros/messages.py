@@ -57,10 +57,13 @@ class Packet:
 
 class Message:
     """The bytes of message number `index` of its topic, and how far they are read. aligned: those
-    of ROS 2."""
+    of ROS 2; recorded_ns: when it was recorded."""
 
-    def __init__(self, raw: bytes, index: int, aligned: bool = False) -> None:
+    def __init__(
+        self, raw: bytes, index: int, aligned: bool = False, recorded_ns: int = 0
+    ) -> None:
         self.raw, self.index, self.aligned, self.at = raw, index, aligned, 0
+        self.recorded_ns = recorded_ns
         if aligned and self._take(len(CDR_LITTLE))[:2] != CDR_LITTLE[:2]:
             raise Damage(index, f"it begins with {raw[:2].hex()}, which is no little-endian XCDR1",
                          "message")
@@ -134,15 +137,16 @@ class Message:
         height, width = self.fields("II")
         return (width, height), self.text()
 
-    def compressed(self) -> bytes:
-        """The file of an image in a CompressedImage whose header was read."""
-        self.text()  # its format, which the file tells too
-        return self.block()
+    def compressed(self) -> tuple[str, bytes]:
+        """The encoding that an image had before it was compressed (image_transport: "bayer_rggb8;
+        png compressed "), and its file, of a CompressedImage whose header was read."""
+        return self.text().partition(";")[0].strip().lower(), self.block()
 
     def image(self, kind: str) -> np.ndarray:
         """The pixels of an image whose header was read, as `encodings.decode` has them."""
         if kind == COMPRESSED:
-            return decoded(self.compressed(), f"message {self.index:,}")
+            encoding, data = self.compressed()
+            return encodings.unpacked(encoding, decoded(data, f"message {self.index:,}"))
         size, encoding = self.picture()
         big_endian, step = self.fields("BI")
         data = self.block()
