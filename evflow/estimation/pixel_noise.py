@@ -19,6 +19,7 @@ SPREAD, SPREAD_ERROR = 0.05, 0.6  # expected before any data, and the std of its
 NEGLIGIBLE = 1e-4  # probability of a spread that is left out
 LEAST_THETA = 0.01  # log units: thresholds are clamped there
 LAW_ODDS = 3.0  # log odds that it takes to let rates follow the thresholds
+SIGNAL = 0.25  # of the events of quiet pixels may be what is left of the signal
 
 AROUND = 9  # pixels: side of the neighbourhood in which events are company
 STILL = 0.05  # log units: of 3x3 pixels from frame to frame; less than any threshold of use
@@ -27,13 +28,16 @@ DRIFT = 0.1  # log units per second, of 5x5 pixels: slower than a frame's noise,
 
 def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
     """Rates (2, H, W), ON and OFF, relative to the camera's: 1, or as one over the thresholds
-    theta (2, H, W) where quiet (2, 2, H, W) of `quiet_time` makes that the likelier."""
+    theta (2, H, W) where quiet (2, 2, H, W) of `quiet_time` makes that the likelier. Signal that
+    is left near what moves follows the thresholds too: noise that does not, and a share of SIGNAL,
+    must be the less likely as well."""
     watched = quiet[:, 1] * ~hot
     law = 1.0 / np.maximum(np.asarray(theta, np.float64), LEAST_THETA)
     law *= (watched.sum((1, 2)) / np.maximum((watched * law).sum((1, 2)), 1e-30))[:, None, None]
-    odds = sum(_likelihood(n, w * r, hot) - _likelihood(n, w, hot)
-               for n, w, r in zip(quiet[:, 0], quiet[:, 1], law, strict=True))
-    return law if odds > LAW_ODDS else np.ones_like(law)
+    even, mixed, following = (sum(
+        _likelihood(n, w * (1.0 + share * (r - 1.0)), hot)
+        for n, w, r in zip(quiet[:, 0], quiet[:, 1], law, strict=True)) for share in (0, SIGNAL, 1))
+    return law if following - max(even, mixed) > LAW_ODDS else np.ones_like(law)
 
 
 def _likelihood(events: Array, expected: Array, hot: Array) -> float:

@@ -124,3 +124,11 @@ def test_rates_of_their_own_do_not_follow_the_thresholds() -> None:
     for rates in (0.2 * np.ones((2, *SHAPE)), np.zeros((2, *SHAPE))):
         law = threshold_law(quiet_counts(rates, 2.0), theta, NONE_HOT)
         np.testing.assert_array_equal(law, 1.0)
+
+
+def test_signal_left_among_even_noise_does_not_make_it_follow_the_thresholds() -> None:
+    """Near what moves, pixels of low thresholds send more: a seventh of all events are theirs."""
+    theta = np.maximum(np.random.default_rng(3).normal(0.2, 0.05, (2, *SHAPE)), 0.05)
+    signal = theta**-3.0
+    rates = 0.01 * (6.5 + signal / signal.mean((1, 2), keepdims=True)) / 7.5
+    np.testing.assert_array_equal(threshold_law(quiet_counts(rates, 4.0), theta, NONE_HOT), 1.0)
