@@ -69,6 +69,7 @@ NOTES: dict[str, str] = {
     "pixels.dead": "pixels never fire",
     "pixels.fast": "the photoreceptor is too fast for its cutoff to be seen",
     "pixels.hot": "pixels fire by themselves",
+    "noise.even": "the noise does not fall with light",
     "pixels.slow": "the photoreceptor's low-pass was measured",
     "pixels.unsure": "most pixels have no events of their own",
     "windows.skipped": "windows between frames were left out",

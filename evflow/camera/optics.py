@@ -19,7 +19,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.archives import load_npz
 
-MEASURED = ("cutoff_hz", "refractory_s")  # of a SensorModel
+MEASURED = ("cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # of a SensorModel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +92,5 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
                 raise EvflowDataError("EV009", f"{path}: {room}_{name} is no finite number.",
                                       "Make the file again: evflow estimate.")
             values[room][name] = float(value)
-    cutoff_hz, refractory_s = (values["sensor"].get(name, 0.0) for name in MEASURED)
-    sensor = SensorModel(
-        cutoff_hz=cutoff_hz, refractory_s=refractory_s, noise_resets_memory=True)
+    sensor = SensorModel(**values["sensor"], noise_resets_memory=True)
     return sensor, Optics(**values["optics"])

@@ -36,6 +36,8 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
             "EV015", f"{path} is a camera of {camera.shape} pixels, the recording of "
             f"{found.camera.shape}.", "Join two estimates of one camera.")
     sensor, optics = read_sensor(path)
+    sensor = dataclasses.replace(
+        sensor, leak_hz=found.sensor.leak_hz, shot_hz=found.sensor.shot_hz)
     valid = load_npz(Path(path)).get("valid", np.ones(camera.shape, bool)).astype(bool)
     maps = {name: getattr(camera, name) for name in THRESHOLDS}
     errors = {name: getattr(std, name) for name in THRESHOLDS}

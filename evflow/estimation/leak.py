@@ -23,7 +23,8 @@ Array = np.ndarray
 
 PERIODS = np.geomspace(0.02, 60.0, 131)  # s, 1 / leak_hz: steps of a sixteenth
 SPREADS = (0.04, 0.08, 0.14, 0.23, 0.32)  # std of the log of the period: v2e's pixels have .23
-RATIOS = np.exp(np.linspace(-1.8, 1.8, 25))  # of ON over OFF noise but for leak
+RATIOS = (0.15, 7.0)  # of ON over OFF noise but for leak, at most
+RATIO_STEPS = 6  # of expectation and maximisation
 RATIO_SPREAD = 0.5  # std of its log before any data
 ODDS = 8.0  # log odds that it takes to speak of leak
 LEAST_EVENTS = 200.0  # of leak, to tell its rate
@@ -35,19 +36,13 @@ FLOOR = 0.05  # relative error: periods of a grid, pixels that differ otherwise
 
 @dataclasses.dataclass(frozen=True)
 class Leak:
-    """hz, std_hz: of a pixel left alone, 0 and NaN where it is not told; rate_hz: events that it
-    sends, as others reset the memory; events: how many of those that were seen."""
+    """hz, std_hz: of a pixel that sends nothing else, 0 and NaN where it is not told; rate_hz:
+    events per second that were seen, fewer, as others reset the memory; events: how many."""
 
     hz: float = 0.0
     std_hz: float = float("nan")
     rate_hz: float = 0.0
     events: float = 0.0
-
-
-def surviving(leak_hz: float, others_hz: Array | float) -> Array:
-    """Leak events per second of a pixel whose memory others_hz other events reset."""
-    waited = np.asarray(others_hz, np.float64) / max(leak_hz, 1e-12)
-    return leak_hz * np.where(waited > 1e-6, waited / np.expm1(np.maximum(waited, 1e-6)), 1.0)
 
 
 def measured_leak(waits: Waits) -> Leak:
@@ -58,29 +53,25 @@ def measured_leak(waits: Waits) -> Leak:
     if on.sum() < LEAST_EVENTS:
         return Leak()
     others = float(2.0 * (off.sum() + 0.5) / seconds.sum())
-
-    def leaking(period: float, spread: float, fresh: bool) -> Array:
-        return seconds * _hazards(period, spread, others, fresh)[used]
-
     grid = [(period, spread, fresh) for fresh in (False, True) for spread in SPREADS
             for period in PERIODS]
-    likely = np.array([_likelihood(leaking(*point), on, off) for point in grid])
-    leaked = leaking(*grid[int(np.argmax(likely.max(1)))])
-    strange = _strangeness(leaked, on, off, int(np.argmax(likely.max(0))))
-    prior = -0.5 * (np.log(RATIOS) / RATIO_SPREAD) ** 2
-    none = special.logsumexp(_likelihood(0.0 * seconds, on, off) / strange + prior)
-    chance = special.logsumexp(likely / strange + prior, 1)
-    total = special.logsumexp(chance)
-    if total - np.log(len(grid)) - none < ODDS or leaked.sum() < LEAST_EVENTS:
+    leaked = seconds * np.stack([_hazards(*point, others)[used] for point in grid])
+    likely, expected = _likelihood(leaked, on, off)
+    best = int(np.argmax(likely))
+    strange = _strangeness(expected[:, best], on, off)
+    none = _likelihood(np.zeros((1, len(on))), on, off)[0][0]
+    total = special.logsumexp(likely / strange)
+    events = float(leaked[best].sum())
+    if total - np.log(len(grid)) - none / strange < ODDS or events < LEAST_EVENTS:
         return Leak()
-    weight, logs = np.exp(chance - total), np.log([point[0] for point in grid])
+    weight, logs = np.exp(likely / strange - total), np.log([period for period, *_ in grid])
     mean = float(weight @ logs)
     error = float(np.hypot(np.sqrt(weight @ (logs - mean) ** 2), FLOOR))
     hz = float(np.exp(-mean))
-    return Leak(hz, hz * error, float(leaked.sum() / seconds.sum()), float(leaked.sum()))
+    return Leak(hz, hz * error, events / float(seconds.sum()), events)
 
 
-def _hazards(period: float, spread: float, others: float, fresh: bool) -> Array:
+def _hazards(period: float, spread: float, fresh: bool, others: float) -> Array:
     """(2 K,) leak events per second that is waited, between EDGES: since the last event, and since
     pixels are watched that have sent none."""
     z = np.log(np.maximum(EDGES, 1e-9) / period) / spread
@@ -96,24 +87,24 @@ def _hazards(period: float, spread: float, others: float, fresh: bool) -> Array:
     return np.concatenate([own, (waiting * hazard).sum(0) / waiting.sum(0)])
 
 
-def _rates(leaked: Array, on: Array, off: Array) -> tuple[Array, Array]:
-    """(RATIOS, K) events that are expected, ON and OFF, at the most probable m of each time."""
-    ratio = RATIOS[:, None]
-    a, b = ratio * (1.0 + ratio), (on + off) * ratio - (1.0 + ratio) * leaked
-    m = np.maximum((b + np.sqrt(b * b + 4.0 * a * off * leaked)) / (2.0 * a), 1e-12)
-    return ratio * m + leaked, m
+def _likelihood(leaked: Array, on: Array, off: Array) -> tuple[Array, Array]:
+    """(G,) log probability of the events with so much leak (G, K), at the most probable m of each
+    time and ratio; and (2, G, K) ON and OFF events that are then expected."""
+    left = np.maximum(on.sum() - leaked.sum(1), 0.0)
+    for _ in range(RATIO_STEPS):
+        ratio = np.clip(left / (off.sum() + 0.5), *RATIOS)[:, None]
+        a, b = ratio * (1.0 + ratio), (on + off) * ratio - (1.0 + ratio) * leaked
+        m = np.maximum((b + np.sqrt(b * b + 4.0 * a * off * leaked)) / (2.0 * a), 1e-12)
+        expected = ratio * m + leaked
+        left = (on * ratio * m / expected).sum(1)
+    likely = off * np.log(m) - m + on * np.log(expected) - expected
+    prior = -0.5 * (np.log(ratio[:, 0]) / RATIO_SPREAD) ** 2
+    return likely.sum(1) + prior, np.stack([expected, m])
 
 
-def _likelihood(leaked: Array, on: Array, off: Array) -> Array:
-    """(RATIOS,) log probability of the events."""
-    expected_on, expected_off = _rates(leaked, on, off)
-    return (off * np.log(expected_off) - expected_off
-            + on * np.log(expected_on) - expected_on).sum(-1)
-
-
-def _strangeness(leaked: Array, on: Array, off: Array, ratio: int) -> float:
-    """How many times more the events scatter about what is expected than counts do; at least 1."""
-    expected = np.stack(_rates(leaked, on, off))[:, ratio]
+def _strangeness(expected: Array, on: Array, off: Array) -> float:
+    """How many times more the events scatter about what is expected (2, K) than counts do; at
+    least 1."""
     many = expected.min(0) > 5.0
     if not many.any():
         return 1.0

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 
 import jax
@@ -11,7 +12,9 @@ from jax.typing import ArrayLike
 
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
+from evflow.estimation.intervals import QuietWaits, Waits
 from evflow.estimation.pixel_noise import quiet_time
+from evflow.estimation.shot import by_light
 from evflow.light.log_maps import lin_log
 from evflow.network import api
 from evflow.recordings.glitches import exposed
@@ -105,15 +108,32 @@ def _scaled(stats: api.Stats, share: ArrayLike) -> api.Stats:
     return jax.tree.map(lambda leaf: leaf * share, stats)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Quiet:
+    """What quiet pixels did: maps (2, 2, H, W), ON and OFF, events and seconds; light: the same by
+    the light that they saw, of `by_light`; waits: for an event."""
+
+    maps: np.ndarray
+    light: np.ndarray
+    waits: Waits
+
+
 def quiet_times(
     windows: Iterable[Window], summary: Summary, hot: np.ndarray, seen_by: Photoreceptor
-) -> np.ndarray:
-    """The `quiet_time` of all windows: (2, 2, H, W), ON and OFF, events and seconds."""
+) -> Quiet:
+    """The `quiet_time` of all windows."""
     noise = np.array([summary.eta_on, summary.eta_off])
     total = np.zeros((2, 2, *hot.shape))
+    light, waits = 0.0, QuietWaits(hot.shape)
     for window in windows:
         frames = window.frame0, window.frame1
-        _, change = _mean_and_change(*(_light(f, seen_by) for f in frames))
-        total += quiet_time(window.events.count_map(), np.asarray(change),
-                            exposed(*frames), hot, window.window_s, noise)
-    return total
+        seen = [_light(f, seen_by) for f in frames]
+        _, change = _mean_and_change(*seen)
+        found = quiet_time(window.events.count_map(), np.asarray(change),
+                           exposed(*frames), hot, window.window_s, noise)
+        total += found
+        # As `seen_frames`: darker by one factor where light is added.
+        shown = 255.0 / (255.0 + max(seen_by.offset_dn, 0.0))
+        light = light + by_light(found, 0.5 * shown * (seen[0].astype(np.float32) + seen[1]), hot)
+        waits.add(window.events, (window.t0_us, window.t1_us), (found[:, 1] > 0).all(0) & ~hot)
+    return Quiet(total, np.asarray(light), waits.table())

@@ -6,6 +6,7 @@ import numpy as np
 
 from evflow.camera import Summary
 from evflow.estimation.refine import Found
+from evflow.estimation.shot import Shot
 from evflow.network.pooling import Stats
 from evflow.notes import Note
 from evflow.recordings.check.contents import ACTIVE_SHARE, VALID_EVENTS
@@ -71,3 +72,8 @@ def receptor_notes(found: Found | None) -> list[Note]:
             "frames show (dark current, black level): thresholds are those of that light. A gamma "
             "of the frames cannot be told from one recording."))
     return notes
+
+
+def noise_notes(shot: Shot) -> list[Note]:
+    return [Note("noise.even", "the noise does not fall with light as v2e's shot noise does: "
+                 "simulations have as much of it everywhere.")] if shot.even else []

@@ -19,6 +19,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.estimation import drift, maps
 from evflow.estimation.dead_time import DeadTime, dead_time
 from evflow.estimation.extent import EVERYTHING, Extent
+from evflow.estimation.leak import Leak, measured_leak
 from evflow.estimation.one_polarity import untold, without
 from evflow.estimation.pooled import need_shown, quiet_times, window_counts, window_stats
 from evflow.estimation.refine import (
@@ -33,8 +34,9 @@ from evflow.estimation.refine import (
 )
 from evflow.estimation.refine.doubt import doubted, signs
 from evflow.estimation.refine.path import STEPS
-from evflow.estimation.remarks import camera_notes, receptor_notes
+from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
+from evflow.estimation.shot import Shot, measured_noise, measured_shot, scatter
 from evflow.network import api
 from evflow.notes import Note
 from evflow.recordings.check.contents import VALID_EVENTS
@@ -47,6 +49,7 @@ Array = np.ndarray
 Advance = Callable[[], None]
 
 MOST_EVENTS = 16_000_000  # in which the dead time is looked for, the first
+SIGNAL_ERROR = 0.1  # relative, of noise rates where something moves: what is left of the signal
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -199,7 +202,9 @@ def estimate(
     else:
         again = _told(_windows(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
-    camera, error = maps.with_rates(camera, error, quiet, hot, summary, std)
+    camera, error = maps.with_rates(camera, error, quiet.maps, hot, summary, std)
+    leak = measured_leak(quiet.waits)
+    shot = measured_shot(quiet.light, leak.rate_hz, scatter(quiet.maps, hot), SIGNAL_ERROR)
     dead = dead_pixels(n_events)
     extent = extent or EVERYTHING
     thirds = drift.thirds(state.parts)
@@ -207,15 +212,17 @@ def estimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
         (*before, *camera_notes(stats, unknown, n_events, summary, hot, dead),
-         *receptor_notes(eyes.found), *after, *extent.notes(), *drift.notes(thirds)),
-        tuple(f"theta_{name}" for name in unknown), **_measured(eyes),
+         *receptor_notes(eyes.found), *noise_notes(shot), *after, *extent.notes(),
+         *drift.notes(thirds)),
+        tuple(f"theta_{name}" for name in unknown), **_measured(eyes, leak, shot),
         extent=extent, thirds=thirds)
 
 
-def _measured(eyes: Eyes) -> dict[str, Any]:
+def _measured(eyes: Eyes, leak: Leak, shot: Shot) -> dict[str, Any]:
     """The fields of a CameraEstimate that are not per pixel."""
     found, dead = eyes.found, eyes.dead
     sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
+    sensor, std = measured_noise(sensor, std, leak, shot)
     fields = {"sensor": dataclasses.replace(sensor, refractory_s=dead.seconds),
               "sensor_std": {**std, "refractory_s": dead.std_s}}
     return {**fields, "optics": found.optics, "receptor": found} if found else fields

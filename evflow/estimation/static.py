@@ -12,10 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera, Summary
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.levels import Bench, Level
+from evflow.estimation.intervals import waits_at_rest
+from evflow.estimation.leak import Leak, measured_leak
 from evflow.estimation.pixel_noise import pixel_rates
+from evflow.estimation.remarks import noise_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
+from evflow.estimation.shot import Shot, by_light, measured_noise, measured_shot, scatter
 from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
 from evflow.recordings.stillness import unlike_noise
@@ -29,7 +34,8 @@ def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraE
     A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
     over pixels that are not hot. Thresholds are those of the prior that the
     network was trained on, with its width; `valid` is False everywhere. lux: the illuminance, for
-    `.bench`, which `noise_over_light` joins.
+    `.bench`, which `noise_over_light` joins. Of its kinds, leak is told by its intervals, shot
+    noise where frames show the light.
     Raises EV011 (with frames: EV017) where the scene moves, or is too short to tell.
     """
     events = recording.events
@@ -49,14 +55,32 @@ def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraE
     def summary(theta: float, eta: tuple[float, ...], sigma: float) -> Summary:
         return Summary(*(jnp.float32(v) for v in (theta, theta, *eta, sigma, sigma)))
 
+    leak, shot = _kinds(recording, counts, hot)
+    sensor, std = measured_noise(SensorModel(noise_resets_memory=True), {}, leak, shot)
     total = counts.sum(0, dtype=np.uint32)
     level = () if lux is None else (Level(
         lux, 1, seconds, means[0], mean_errors[0], means[1], mean_errors[1]),)
     return CameraEstimate(
         camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
-        dead_pixels(total), 0, _notes(hot, total, recording.has_frames), THRESHOLDS,
+        dead_pixels(total), 0,
+        (*_notes(hot, total, recording.has_frames), *noise_notes(shot)), THRESHOLDS,
+        sensor=sensor, sensor_std=std,
         bench=Bench("lux", level) if level else None)
+
+
+def _kinds(recording: Recording, counts: np.ndarray, hot: np.ndarray) -> tuple[Leak, Shot]:
+    """Leak, and, where frames show the light, shot noise."""
+    events, begin = recording.events, int(recording.events.t[0])
+    if recording.has_frames:
+        begin = min(begin, int(recording.frame_times[0]))
+    leak = measured_leak(waits_at_rest(events, hot, (begin, int(events.t[-1]))))
+    if not recording.has_frames:
+        return leak, Shot()
+    watched = np.full(hot.shape, events.duration_us * 1e-6)
+    quiet = np.stack([np.stack([n, watched]) for n in counts])
+    light = by_light(quiet, recording.frame_dn(len(recording.frame_times) // 2), hot)
+    return leak, measured_shot(light, leak.rate_hz, scatter(quiet, hot))
 
 
 def noise_over_light(found: Sequence[CameraEstimate]) -> CameraEstimate:

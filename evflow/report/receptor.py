@@ -27,7 +27,10 @@ def receptor_panel(found: CameraEstimate, foretold: tuple[float, float] | None) 
             ["light added [DN]", spread(optics.offset_dn, optics.offset_dn_std)],
             ["events after frames [ms]", spread(1e3 * optics.delay_s, 1e3 * optics.delay_s_std)],
             ["dead time [ms]", spread(1e3 * sensor.refractory_s, 1e3 * std["refractory_s"])
-             if sensor.refractory_s else "not seen"]]
+             if sensor.refractory_s else "not seen"],
+            *([f"{label} [Hz per pixel]", spread(value, std[name]) if value else "not told apart"]
+              for label, name, value in (("leak", "leak_hz", sensor.leak_hz),
+                                         ("shot noise in the dark", "shot_hz", sensor.shot_hz)))]
     shares = [["all that was read", *(number(v, 3) for v in receptor.explained)]]
     if foretold is not None:
         shares.append(["second half, by the first", *(number(v, 3) for v in foretold)])

@@ -1,0 +1,83 @@
+"""Shot noise against light: how much of it a pixel would send in the dark.
+
+v2e's goes as 1 - .75 I01, from a tenth less than in the dark to a quarter (R/2 of each polarity,
+`shot_hz` R). Events of quiet pixels, by the light that they see, tell whether a camera's does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from evflow.camera.sensors import SensorModel
+from evflow.estimation.leak import Leak
+from evflow.light.log_maps import noise_factor, normalised_intensity
+
+Array = np.ndarray
+
+LIGHTS = 8  # steps of I01
+LEAST_EVENTS = 200.0
+ODDS = 3.0  # log odds that it takes to say whether noise follows light
+UNSURE = 0.25  # relative error of shot_hz where neither is said
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """hz, std_hz: v2e's rate in the dark, both polarities; 0 and NaN where it is not told. even:
+    enough events say that the noise does not fall with light as v2e's does."""
+
+    hz: float = 0.0
+    std_hz: float = float("nan")
+    even: bool = False
+
+
+def by_light(quiet: Array, dn: Array, hot: Array) -> Array:
+    """(2, 3, LIGHTS), ON and OFF: events, seconds and seconds times `noise_factor` of pixels, by
+    the light dn (H, W) that they see; quiet (2, 2, H, W): their events and seconds."""
+    i01 = normalised_intensity(np.clip(dn, 0.0, 255.0)[~hot].astype(np.float64))
+    step = np.minimum((i01 * LIGHTS).astype(np.int64), LIGHTS - 1)
+    factor = noise_factor(i01)
+    return np.array([[np.bincount(step, v, LIGHTS) for v in (n[~hot], s[~hot], s[~hot] * factor)]
+                     for n, s in quiet])
+
+
+def scatter(quiet: Array, hot: Array) -> float:
+    """How much more than counts the events (2, 2, H, W) of quiet pixels scatter; at least 1."""
+    events, seconds = quiet[:, 0][:, ~hot], quiet[:, 1][:, ~hot]
+    rate = events.sum(1) / np.maximum(seconds.sum(1), 1e-9)
+    expected = rate[:, None] * seconds
+    return max(1.0, float(((events - expected) ** 2).sum() / max(expected.sum(), 1e-9)))
+
+
+def measured_noise(
+    sensor: SensorModel, std: Mapping[str, float], leak: Leak, shot: Shot
+) -> tuple[SensorModel, dict[str, float]]:
+    """A circuit with what was measured of its noise, and the standard deviations."""
+    return (dataclasses.replace(sensor, leak_hz=leak.hz, shot_hz=shot.hz),
+            {**std, "leak_hz": leak.std_hz, "shot_hz": shot.std_hz})
+
+
+def measured_shot(light: Array, leak_hz: float, scattered: float, error: float = 0.0) -> Shot:
+    """v2e's shot noise, from events by light (2, 3, LIGHTS). leak_hz: ON events of another kind,
+    in any light; scattered: of `scatter`; error: relative, of the events, as where signal may be
+    among them."""
+    events, seconds, falling = np.moveaxis(light, 1, 0)
+    leaked = np.stack([leak_hz * seconds[0], np.zeros(LIGHTS)])
+    noise = np.maximum(events.sum(1) - leaked.sum(1), 0.0)
+    if noise.sum() < LEAST_EVENTS:
+        return Shot()
+    odds = 0.0
+    for n, other, sent, shapes in zip(events, leaked, noise, zip(falling, seconds, strict=True),
+                                      strict=True):
+        likely = []
+        for shape in shapes:
+            expected = np.maximum(sent * shape / shape.sum() + other, 1e-12)
+            likely.append(float((n * np.log(expected) * (n > 0) - expected).sum()))
+        odds += (likely[0] - likely[1]) / scattered
+    if odds < -ODDS:
+        return Shot(even=True)
+    hz = float((noise / falling.sum(1)).sum())
+    relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2)
+    return Shot(hz, hz * float(relative))

@@ -1,0 +1,145 @@
+"""Leak and shot noise told apart, on noise that is drawn here event by event, and by the simulator.
+"""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from evflow import Camera, Events, Recording, SensorModel, simulate
+from evflow.estimation.intervals import EDGES, QuietWaits, life_table, waits_at_rest
+from evflow.estimation.leak import measured_leak
+from evflow.estimation.shot import by_light, measured_shot, scatter
+from evflow.estimation.static import estimate_noise
+
+SHAPE = (48, 64)
+NONE_HOT = np.zeros(SHAPE, bool)
+
+
+def drawn(
+    leak_hz: float, on_hz: float, off_hz: float, seconds: float, running: bool = True, seed: int = 0
+) -> Events:
+    """Noise of pixels whose rates differ by a third, their leak by a quarter; every event resets
+    the memory. running: for long before; else since the beginning."""
+    rng, count = np.random.default_rng(seed), SHAPE[0] * SHAPE[1]
+    uneven = rng.gamma(9.0, 1.0 / 9.0, count)
+    period = np.exp(0.23 * rng.standard_normal(count)) / max(leak_hz, 1e-9)
+    t = np.full(count, -3.0 / max(leak_hz, 0.1) if running else 0.0)
+    last, active, found = t - running * rng.random(count) * period, np.arange(count), []
+    while len(active):
+        wait = rng.exponential(1.0 / np.maximum((on_hz + off_hz) * uneven[active], 1e-9))
+        leaks = np.maximum(last[active] + period[active], t[active])
+        at = np.minimum(t[active] + wait, leaks)
+        on = (at == leaks) | (rng.random(len(active)) < on_hz / max(on_hz + off_hz, 1e-9))
+        kept = at < seconds
+        active, at, on = active[kept], at[kept], on[kept]
+        t[active] = last[active] = at
+        found.append(np.stack([active, at * 1e6, on])[:, at >= 0])
+    pixel, times, on = np.concatenate(found, 1)[:, np.argsort(np.concatenate(found, 1)[1])]
+    return Events(pixel.astype(int) % SHAPE[1], pixel.astype(int) // SHAPE[1],
+                  times.astype(np.int64), on.astype(bool), SHAPE[::-1])
+
+
+@pytest.mark.parametrize(("leak_hz", "on_hz", "off_hz", "seconds", "running"), [
+    (0.1, 0.1, 0.1, 15.0, True), (0.1, 0.1, 0.1, 15.0, False), (0.3, 0.3, 0.2, 2.0, True),
+    (0.3, 1.0, 1.0, 10.0, True), (0.2, 0.0, 0.0, 4.0, True)])
+def test_leak_is_measured_at_a_quarter_at_least(
+    leak_hz: float, on_hz: float, off_hz: float, seconds: float, running: bool
+) -> None:
+    events = drawn(leak_hz, on_hz, off_hz, seconds, running)
+    found = measured_leak(waits_at_rest(events, NONE_HOT, (0, round(seconds * 1e6))))
+    assert found.events > 200
+    assert found.hz == pytest.approx(leak_hz, rel=0.15)
+    assert abs(found.hz - leak_hz) < 2.5 * found.std_hz < 0.25 * leak_hz
+
+
+@pytest.mark.parametrize(("leak_hz", "on_hz", "off_hz", "seconds", "running"), [
+    (0.0, 0.4, 0.1, 4.0, True), (0.0, 0.2, 0.2, 4.0, True),  # none
+    (0.3, 2.5, 2.5, 3.0, True),  # memories are reset before it comes
+    (0.1, 0.2, 0.2, 1.0, True), (0.3, 0.2, 0.2, 1.5, False)])  # too few leak
+def test_where_leak_cannot_be_told_nothing_is_said(
+    leak_hz: float, on_hz: float, off_hz: float, seconds: float, running: bool
+) -> None:
+    events = drawn(leak_hz, on_hz, off_hz, seconds, running)
+    found = measured_leak(waits_at_rest(events, NONE_HOT, (0, round(seconds * 1e6))))
+    assert found.hz == 0
+    assert np.isnan(found.std_hz)
+
+
+def test_regular_events_that_leak_does_not_explain_are_not_called_so() -> None:
+    """Both polarities at intervals of their own, as real pixels in some light: no leak."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.gamma(6.0, 0.1, (SHAPE[0] * SHAPE[1], 12)), 1)
+    on = rng.random(t.shape) < np.clip(1.6 - 2.0 * np.diff(t, axis=1, prepend=0.0), 0.1, 0.9)
+    pixel = np.broadcast_to(np.arange(len(t))[:, None], t.shape)
+    order = np.argsort(t, axis=None)
+    x, y = pixel.ravel()[order] % SHAPE[1], pixel.ravel()[order] // SHAPE[1]
+    events = Events(x, y, (t.ravel()[order] * 1e6).astype(np.int64), on.ravel()[order], SHAPE[::-1])
+    assert measured_leak(waits_at_rest(events, NONE_HOT)).hz == 0
+
+
+def test_a_life_table_holds_all_waits() -> None:
+    waits, ended = np.array([0.0005, 0.01, 0.5, 0.5, 3.0]), np.array([1, 2, 0, 1, 0])
+    seconds, on, off = life_table(waits, ended)
+    assert seconds.sum() == pytest.approx(waits.sum())
+    at = [np.searchsorted(EDGES, w, side="right") - 1 for w in waits]
+    assert on[at[0]] == on[at[2]] == off[at[1]] == 1
+    assert on.sum() == 2
+    assert off.sum() == 1
+    assert not seconds[at[4] + 1:].any()
+
+
+def test_waits_window_by_window_are_those_of_the_whole_where_all_is_quiet() -> None:
+    events = drawn(0.0, 0.5, 0.5, 2.0)
+    quiet, whole = QuietWaits(SHAPE), waits_at_rest(events, NONE_HOT, (0, 2_000_000))
+    for begin in range(0, 2_000_000, 250_000):
+        span = begin, begin + 250_000
+        quiet.add(events.slice(*span), span, ~NONE_HOT)
+    np.testing.assert_allclose(quiet.table().own, whole.own, rtol=1e-6, atol=1e-6)
+
+
+def test_what_happens_near_by_ends_a_wait() -> None:
+    quiet, still = QuietWaits(SHAPE), ~NONE_HOT
+    events = Events(np.array([3, 3]), np.array([2, 2]), np.array([10_000, 260_000]),
+                    np.array([True, False]), SHAPE[::-1])
+    for begin, calm in ((0, True), (100_000, False), (200_000, True)):
+        span = begin, begin + 100_000
+        quiet.add(events.slice(*span), span, still if calm else NONE_HOT)
+    seconds, on, off = quiet.table().own
+    assert seconds.sum() == pytest.approx(0.09 + 0.04)
+    assert on.sum() == off.sum() == 0
+
+
+def light(rate: np.ndarray, seconds: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
+    """Light (H, W) from black to white, and quiet (2, 2, H, W) of noise with this rate of I01."""
+    dn = np.broadcast_to(np.linspace(0.0, 255.0, SHAPE[1]), SHAPE)
+    sent = np.random.default_rng(0).poisson(rate((dn + 20.0) / 275.0) * seconds, (2, *SHAPE))
+    return dn, np.stack([np.stack([n, np.full(SHAPE, seconds)]) for n in sent])
+
+
+def test_shot_noise_is_that_of_the_dark_if_it_falls_with_light() -> None:
+    dn, quiet = light(lambda i01: 0.5 * 3.0 * (1.0 - 0.75 * i01))
+    found = measured_shot(by_light(quiet, dn, NONE_HOT), 0.0, scatter(quiet, NONE_HOT))
+    assert abs(found.hz - 3.0) < 2.5 * found.std_hz < 0.25
+    assert not found.even
+    dn, quiet = light(lambda i01: 0.5 + 0.0 * i01)
+    found = measured_shot(by_light(quiet, dn, NONE_HOT), 0.0, scatter(quiet, NONE_HOT))
+    assert found.even
+    assert found.hz == 0
+    few = measured_shot(0.01 * by_light(quiet, dn, NONE_HOT), 0.0, 1.0)
+    assert (few.hz, few.even) == (0.0, False)
+
+
+def test_the_simulator_s_leak_and_shot_noise_are_found() -> None:
+    sensor = SensorModel(leak_hz=0.3, leak_jitter=0.1, leak_fpn_decades=0.1, shot_hz=0.5,
+                         noise_resets_memory=True)
+    frame = np.broadcast_to(np.linspace(0.0, 255.0, 64).astype(np.uint8), SHAPE)
+    frames, times = np.repeat(frame[None], 41, 0), 250_000 * np.arange(41)
+    events = simulate(jax.random.key(0), frames, times, Camera.constant(SHAPE), model=sensor)
+    found = estimate_noise(Recording(events, frames, times))
+    for name in ("leak_hz", "shot_hz"):
+        truth, value = getattr(sensor, name), getattr(found.sensor, name)
+        assert value == pytest.approx(truth, rel=0.1)
+        assert abs(value - truth) < 2.5 * found.sensor_std[name] < 0.25 * truth
+    assert {"sensor_leak_hz", "sensor_shot_hz_std"} <= set(found.as_dict())
