@@ -51,7 +51,7 @@ def waits_at_rest(events: Events, hot: Array, span_us: tuple[int, int] | None = 
     """The waits of all pixels (H, W) that are not hot, of a scene at rest. span_us: for how long
     they were watched, if that is more than from the first event to the last."""
     begin, end = span_us or (int(events.t[0]), int(events.t[-1]))
-    width, height = events.size
+    width, _ = events.size
     pixel = events.y.astype(np.int64) * width + events.x
     order = np.argsort(pixel, kind="stable")
     order = order[~hot.ravel()[pixel[order]]]
