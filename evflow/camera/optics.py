@@ -11,6 +11,7 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,7 +81,7 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
     """The circuit and the optics in a camera.npz; those of an ideal pixel where it holds none.
     Raises EV009 where a value is no number, EV016 where there is no file."""
     held = load_npz(Path(path))
-    values: dict[str, dict[str, float]] = {"sensor": {}, "optics": {}}
+    values: dict[str, dict[str, Any]] = {"sensor": {}, "optics": {}}
     names = {"sensor": MEASURED, "optics": tuple(f.name for f in dataclasses.fields(Optics))}
     for room, wanted in names.items():
         for name in wanted:

@@ -14,7 +14,7 @@ from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.intervals import QuietWaits, Waits
 from evflow.estimation.pixel_noise import quiet_time
-from evflow.estimation.shot import by_light
+from evflow.estimation.shot import LIGHTS, by_light
 from evflow.light.log_maps import lin_log
 from evflow.network import api
 from evflow.recordings.glitches import exposed
@@ -124,7 +124,7 @@ def quiet_times(
     """The `quiet_time` of all windows."""
     noise = np.array([summary.eta_on, summary.eta_off])
     total = np.zeros((2, 2, *hot.shape))
-    light, waits = 0.0, QuietWaits(hot.shape)
+    light, waits = np.zeros((2, 3, LIGHTS)), QuietWaits(hot.shape)
     for window in windows:
         frames = window.frame0, window.frame1
         seen = [_light(f, seen_by) for f in frames]
@@ -134,6 +134,6 @@ def quiet_times(
         total += found
         # As `seen_frames`: darker by one factor where light is added.
         shown = 255.0 / (255.0 + max(seen_by.offset_dn, 0.0))
-        light = light + by_light(found, 0.5 * shown * (seen[0].astype(np.float32) + seen[1]), hot)
+        light += by_light(found, 0.5 * shown * (seen[0].astype(np.float32) + seen[1]), hot)
         waits.add(window.events, (window.t0_us, window.t1_us), (found[:, 1] > 0).all(0) & ~hot)
-    return Quiet(total, np.asarray(light), waits.table())
+    return Quiet(total, light, waits.table())
