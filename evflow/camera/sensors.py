@@ -1,14 +1,17 @@
 """Sensor models: what of an event camera is not per pixel, and known sensors by name.
 
-`SensorModel` is a frozen, hashable description of the pixel circuit; jit takes it as a static
-argument. `SENSORS` holds published settings, each with the thresholds that go with them.
+`SensorModel` is a frozen description of the pixel circuit, and a pytree: choices, and which of its
+numbers are off (0), belong to its structure, and the other numbers are leaves. So jit compiles
+once for all cameras of one structure, and grad and vmap reach their numbers. `SENSORS` holds
+published settings, each with the thresholds that go with them.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
+import jax
 import numpy as np
 
 from evflow.checks import require
@@ -32,10 +35,50 @@ WITHOUT = {
 }
 
 
+NUMBERS = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz")
+
+
+def is_off(value: Any) -> bool:
+    """Whether a number is 0 for certain: one that is traced may be anything."""
+    return isinstance(value, int | float) and value == 0
+
+
+def _settle(config: Any, name: str, low: float, rule: str) -> None:
+    """A field that is a number becomes a float, EV020 unless it is finite and at least low; one
+    that is traced stays as it is."""
+    value = getattr(config, name)
+    require(config, name, np.ndim(value) == 0, "one number; jax.vmap takes several")
+    if isinstance(value, jax.core.Tracer):
+        return
+    require(config, name, bool(np.isfinite(value)) and value >= low, rule)
+    object.__setattr__(config, name, float(value))
+
+
+class _Numbers:
+    """A frozen dataclass as a pytree of the fields that `leaves` names, which is decided when one
+    is made. What is put back is not looked at: JAX puts back tangents and placeholders too."""
+
+    leaves: tuple[str, ...]
+
+    def tree_flatten_with_keys(self) -> tuple[tuple[tuple[Any, Any], ...], Any]:
+        """Leaves with their names; and all else, `leaves` too."""
+        leaves = tuple((jax.tree_util.GetAttrKey(n), getattr(self, n)) for n in self.leaves)
+        return leaves, tuple((n, v) for n, v in vars(self).items() if n not in self.leaves)
+
+    @classmethod
+    def tree_unflatten(cls, structure: Any, leaves: Any) -> Any:
+        """The dataclass again."""
+        made = object.__new__(cls)
+        vars(made).update(structure)
+        vars(made).update(zip(made.leaves, leaves, strict=True))
+        return made
+
+
+@jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True)
-class Voltmeter:
+class Voltmeter(_Numbers):
     """Constants of DVS-Voltmeter (Lin et al., ECCV 2022, Eq. 10 and 11), for DN on 0..255 and
-    times in us.
+    times in us; a pytree of them.
 
     mu = k1 dL/dt / (L + k2) + k4 + k5 L per us, sigma = k3 sqrt(L) / (L + k2) + k6 per sqrt(us),
     in units of the published threshold. A contrast theta is the level k1 theta, so that
@@ -50,21 +93,25 @@ class Voltmeter:
     k6: float
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():  # the leak, k4 + k5 L, may have either sign
+        object.__setattr__(self, "leaves", tuple(f.name for f in dataclasses.fields(self)))
+        for name in self.leaves:  # the leak, k4 + k5 L, may have either sign
             low = {"k1": 1e-30, "k2": 1e-30, "k4": -np.inf, "k5": -np.inf}.get(name, 0.0)
-            good = bool(np.isfinite(value)) and value >= low
-            require(self, name, good, f"finite, and at least {low:g}")
+            _settle(self, name, low, f"finite, and at least {low:g}")
 
 
 DVS346 = Voltmeter(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
 DVS240 = Voltmeter(4.4241, 23.0, 2e-4, 1e-7, 5e-8, 1e-5)
 
 
+@jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True)
-class SensorModel:
-    """The pixel circuit: what is not per pixel. Frozen and hashable, a static argument of jit.
+class SensorModel(_Numbers):
+    """The pixel circuit: what is not per pixel. Frozen, and a pytree of the numbers that are on.
 
-    The default is v2e's noise-free pixel with true crossing times.
+    The default is v2e's noise-free pixel with true crossing times. A number that is 0 is off and
+    no leaf; all others are, `voltmeter` where `kind` says so: pass a model to jit, grad or vmap
+    as any other argument. A number that is traced when a model is made counts as on, and gives
+    what 0 gives where it is 0.
 
     Attributes:
         kind: "v2e": all of the below; "esim": log-eps intensity, and events that come within the
@@ -121,20 +168,16 @@ class SensorModel:
             if getattr(self, name) not in values:
                 raise EvflowDataError(
                     "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
-        for name in ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades",
-                     "shot_hz"):
-            value = getattr(self, name)
-            require(self, name, bool(np.isfinite(value)) and value >= 0, ">= 0")
+        for name in NUMBERS:
+            _settle(self, name, 0.0, ">= 0")
+        on = tuple(name for name in NUMBERS if not is_off(getattr(self, name)))
+        voltmeter = ("voltmeter",) if self.kind == "voltmeter" else ()
+        object.__setattr__(self, "leaves", (*on, *voltmeter))
         for name in WITHOUT[self.kind]:
-            if getattr(self, name):
+            if not is_off(getattr(self, name)):
                 raise EvflowDataError(
                     "EV020", f"SensorModel(kind={self.kind!r}, {name}={getattr(self, name)}).",
                     "A pixel of this kind has none; leave it out, or take kind='v2e'.")
-
-    @property
-    def waits(self) -> bool:
-        """Whether an event that comes within the refractory period of another fires later."""
-        return self.refractory_s > 0 and self.timestamps == "crossing" and self.kind == "v2e"
 
 
 @dataclasses.dataclass(frozen=True)

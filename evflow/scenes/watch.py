@@ -26,6 +26,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import Values, noise_factor, normalised_intensity
 from evflow.scenes.render import Scene, render, sample_scene
 from evflow.simulator import noise, sensor
+from evflow.simulator.constants import Constants
 from evflow.simulator.voxels import simulate_window
 
 Array = jax.Array
@@ -116,11 +117,12 @@ def voxels(
 ) -> Array:
     """Voxels (windows, H, W, 2 * bins) of log frames (windows * steps + 1, H, W) dt_s apart.
     phase: the contrast that is on the pixels, `memory`, or 0 where it is the first frame."""
-    medians = noise.nominal_thresholds(model, camera)
-    pixels, state = sensor.start(key, log_frames[0], camera, model, medians, phase)
+    law = Constants.of(model)
+    medians = noise.nominal_thresholds(law, camera)
+    pixels, state = sensor.start(key, log_frames[0], camera, law, medians, phase)
     parts = log_frames[1:].reshape(windows, -1, *log_frames.shape[1:])
 
     def window(state: sensor.SimState, part: Array) -> tuple[sensor.SimState, Array]:
-        return simulate_window(model, pixels, state, part, dt_s, bins)
+        return simulate_window(law, pixels, state, part, dt_s, bins)
 
     return jax.lax.scan(window, state, parts)[1]

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity, to_log
 from evflow.simulator import noise, pixel, sensor
+from evflow.simulator.constants import Constants
 from evflow.simulator.pixel import PixelState, Spikes
 from evflow.simulator.sensor import Sensor
 
@@ -53,7 +53,7 @@ class Block:
 
 # Takes K pixels through a block: (model, their sensor, their state, the block as they see it, their
 # numbers (K,), -1 for padding) -> (state, what they send). Hashable: `jit` compiles for each.
-Exit = Callable[[SensorModel, Sensor, PixelState, Block, Array], tuple[PixelState, Any]]
+Exit = Callable[[Constants, Sensor, PixelState, Block, Array], tuple[PixelState, Any]]
 
 
 @jax.tree_util.register_dataclass
@@ -70,18 +70,8 @@ class Sent:
     struck: Array | None
 
 
-def is_still(model: SensorModel) -> bool:
-    """Whether a pixel's memory stays as it is between events."""
-    return model.cutoff_hz <= 0 and model.leak_hz <= 0
-
-
-def waits(model: SensorModel) -> bool:
-    """Whether `PixelState.last` counts the seconds since an event."""
-    return model.refractory_s > 0 and model.timestamps == "crossing"
-
-
-@functools.partial(jax.jit, static_argnames=("model", "dtype"))
-def limits(model: SensorModel, camera: Camera, base: Array, dtype: np.dtype) -> Array:
+@functools.partial(jax.jit, static_argnames="dtype")
+def limits(model: Constants, camera: Camera, base: Array, dtype: np.dtype) -> Array:
     """(2, N) DN: only frames brighter than the first or darker than the second can make pixels
     with this memory fire. dtype: that of the frames."""
     inverse = LOG_MAPS[model.log_map][1]
@@ -93,9 +83,9 @@ def limits(model: SensorModel, camera: Camera, base: Array, dtype: np.dtype) -> 
     return jnp.stack([bright, dark]).astype(dtype)
 
 
-@functools.partial(jax.jit, static_argnames="model")
+@jax.jit
 def look(
-    model: SensorModel, sensor: Sensor, pixels: PixelState, block: Block
+    model: Constants, sensor: Sensor, pixels: PixelState, block: Block
 ) -> tuple[PixelState, Array]:
     """The pixels after the block where none of them fires, and (N,) which may."""
     def body(
@@ -103,7 +93,7 @@ def look(
     ) -> tuple[tuple[Array, Array, Array], None]:
         (lp, base, active), (frame, dt, salt) = carry, inputs
         log_i = to_log(frame, model.log_map)
-        if model.cutoff_hz > 0:
+        if model.corner is not None:
             log_i = pixel.low_pass(model, lp, log_i, _i01(frame), dt)
         if sensor.leaking is not None:
             drawn = noise.draw(sensor.words, salt)
@@ -113,7 +103,7 @@ def look(
     start = (pixels.lp, pixels.base, jnp.zeros(pixels.lp.shape, bool))
     (lp, base, active), _ = jax.lax.scan(
         body, start, (block.frames[1:], block.dt, block.salts))
-    last = pixels.last + jnp.sum(block.dt) if waits(model) else pixels.last
+    last = pixels.last + jnp.sum(block.dt) if model.is_dead_between else pixels.last
     if sensor.rates is not None:
         active |= look_for_noise(sensor, block)
     return PixelState(lp, base, last), active
@@ -140,9 +130,9 @@ def _i01(frame: Array) -> Array:
     return normalised_intensity(frame.astype(jnp.float32))
 
 
-@functools.partial(jax.jit, static_argnames=("model", "exit"), donate_argnames="after")
+@functools.partial(jax.jit, static_argnames="exit", donate_argnames="after")
 def step(
-    model: SensorModel, whole: Sensor, before: PixelState, after: PixelState, block: Block,
+    model: Constants, whole: Sensor, before: PixelState, after: PixelState, block: Block,
     at: Array, exit: Exit,
 ) -> tuple[PixelState, Any]:
     """Take the pixels `at` (K,) int32 through the block, whose frames (T + 1, K) are theirs alone,
@@ -156,9 +146,9 @@ def step(
     return _put_back(model, after, own, at), sent
 
 
-@functools.partial(jax.jit, static_argnames=("model", "exit"), donate_argnames="pixels")
+@functools.partial(jax.jit, static_argnames="exit", donate_argnames="pixels")
 def step_still(
-    model: SensorModel, whole: Sensor, pixels: PixelState, block: Block, at: Array,
+    model: Constants, whole: Sensor, pixels: PixelState, block: Block, at: Array,
     rested: Array | None, exit: Exit,
 ) -> tuple[PixelState, Any, Array]:
     """The same for sensors that are still. rested: (K,) seconds before the block in which the
@@ -179,8 +169,8 @@ def _gathered(maps: T, at: Array) -> T:
     return jax.tree.map(lambda m: m.at[at].get(mode="clip"), maps)
 
 
-def _put_back(model: SensorModel, pixels: PixelState, own: PixelState, at: Array) -> PixelState:
-    kept = ("base", "last") if model.refractory_s > 0 else ("base",)
+def _put_back(model: Constants, pixels: PixelState, own: PixelState, at: Array) -> PixelState:
+    kept = ("base", "last") if model.refractory_s is not None else ("base",)
     put = {name: getattr(pixels, name).at[at].set(
         getattr(own, name), mode="drop", unique_indices=True, indices_are_sorted=True)
         for name in kept}
@@ -188,7 +178,7 @@ def _put_back(model: SensorModel, pixels: PixelState, own: PixelState, at: Array
 
 
 def sent(
-    model: SensorModel, few: Sensor, pixels: PixelState, block: Block, number: Array
+    model: Constants, few: Sensor, pixels: PixelState, block: Block, number: Array
 ) -> tuple[PixelState, Sent]:
     """The `Exit` to events."""
     logs, i01 = to_log(block.frames, model.log_map), _i01(block.frames[1:])
@@ -205,7 +195,7 @@ def sent(
 
 
 def _spikes(
-    model: SensorModel, camera: Camera, pixels: PixelState, inputs: tuple[Any, ...]
+    model: Constants, camera: Camera, pixels: PixelState, inputs: tuple[Any, ...]
 ) -> tuple[PixelState, Spikes]:
     """The pixels after T intervals, and what they send in each. inputs: of `sensor.advance`, log
     intensities first."""
@@ -223,7 +213,7 @@ def _spikes(
         return after, (pixels, spikes.count)
 
     after, (begun, count) = jax.lax.scan(body, pixels, inputs)
-    if is_still(model):  # nor need it write what is known
+    if model.is_still:  # nor need it write what is known
         begun = dataclasses.replace(begun, lp=jnp.concatenate([pixels.lp[None], inputs[0][:-1]]))
     return after, dataclasses.replace(jax.vmap(advance)(begun, inputs)[1], count=count)
 
@@ -239,8 +229,8 @@ def _ticks(spikes: Spikes, dt_us: Array) -> Array:
     return jnp.maximum((when << 2) | (on << 1) | more, 1)
 
 
-@functools.partial(jax.jit, static_argnames="model")
-def strike(model: SensorModel, whole: Sensor, block: Block) -> Array | None:
+@jax.jit
+def strike(model: Constants, whole: Sensor, block: Block) -> Array | None:
     """Where there is noise in a block, bool (T, N), for sensors whose signal comes from
     elsewhere; None without noise."""
     one = functools.partial(sensor.disturb, model, whole)

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import to_log
 from evflow.simulator import active, noise, pack, sensor, voltmeter
 from evflow.simulator.active import BLOCK, Block, Exit
+from evflow.simulator.constants import Constants
 from evflow.simulator.lapse import Lapse
 from evflow.simulator.pack import Keys
 from evflow.simulator.pixel import PixelState
@@ -45,8 +45,9 @@ class Circuit(Protocol):
         (T + 1,) times of these and of the frame before."""
 
 
-def circuit(key: Array, frame: np.ndarray, start_us: int, camera: Camera, model: SensorModel
-            ) -> Circuit:
+def circuit(
+    key: Array, frame: np.ndarray, start_us: int, camera: Camera, model: Constants
+) -> Circuit:
     """The sensor at its first frame (H, W). camera: float32 maps (H, W)."""
     if model.kind == "voltmeter":
         return Brownian(key, frame, start_us, camera, model)
@@ -54,17 +55,17 @@ def circuit(key: Array, frame: np.ndarray, start_us: int, camera: Camera, model:
 
 
 def thresholds(
-    key: Array, frame: np.ndarray, start: int, camera: Camera, model: SensorModel, *,
+    key: Array, frame: np.ndarray, start: int, camera: Camera, model: Constants, *,
     exit: Exit, tick_s: float = 1e-6,
 ) -> Still | Drifting:
     """The same for all but DVS-Voltmeter, with any exit. tick_s: unit of the frames' times."""
-    kind = Still if active.is_still(model) else Drifting
+    kind = Still if model.is_still else Drifting
     return kind(exit, key, frame, start, camera, model, tick_s)
 
 
-@partial(jax.jit, static_argnames="model")
+@jax.jit
 def _start(
-    key: Array, frame: Array, camera: Camera, nominal: Array | None, *, model: SensorModel
+    key: Array, frame: Array, camera: Camera, nominal: Array | None, model: Constants
 ) -> tuple[Sensor, SimState]:
     return sensor.start(key, to_log(frame, model.log_map), camera, model, nominal)
 
@@ -78,7 +79,7 @@ class _Blocks:
     """What all kinds share: noise rates, and blocks padded to BLOCK frames."""
 
     def __init__(
-        self, key: Array, frame: np.ndarray, start: int, camera: Camera, model: SensorModel,
+        self, key: Array, frame: np.ndarray, start: int, camera: Camera, model: Constants,
         tick_s: float = 1e-6,
     ) -> None:
         self.model, self.begin, self.tick_s = model, start, tick_s
@@ -86,7 +87,8 @@ class _Blocks:
         if noise.is_noisy(model, camera):
             nominal = noise.nominal_thresholds(model, camera)
             self.most_hz = noise.most_rate(model, camera, nominal)
-        self.whole, state = _start(key, frame, camera, nominal, model=model)
+        self.law = model.on_device()  # as programs take it
+        self.whole, state = _start(key, frame, camera, nominal, self.law)
         self.here = jax.tree.map(np.asarray, self.whole)  # the same, for the host
         self.pixels, self.key = state.pixels, state.key
         self.interval, self.salts = 0, np.empty((0, 2), np.uint32)
@@ -135,7 +137,7 @@ class _Thresholds(_Blocks):
     def __init__(self, exit: Exit, *sensor: Any) -> None:
         super().__init__(*sensor)
         self.exit = exit
-        self.sizes = sizes(self.before.size, self.model, exit, self.before.dtype)
+        self.sizes = sizes(self.before.size, jax.tree.structure(self.law), exit, self.before.dtype)
 
     def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
         """What comes of each block; the device may still be at it."""
@@ -191,7 +193,7 @@ class Drifting(_Thresholds):
                 block, frames=np.stack(block.frames, out=next(self.buffers)))
             stepped = self._step(*looked) if looked else None
             # In line behind the step before, which it continues; nothing is waited for here.
-            after, may_send = active.look(self.model, self.whole, self.pixels, block)
+            after, may_send = active.look(self.law, self.whole, self.pixels, block)
             looked = block, np.diff(edges), after, may_send
             if stepped:
                 yield stepped
@@ -203,7 +205,7 @@ class Drifting(_Thresholds):
         pieces: list[Piece] = []
         for some, padded, seen in self.pieces(np.flatnonzero(may_send), block):
             after, sent = active.step(
-                self.model, self.whole, self.pixels, after, seen, padded, exit=self.exit)
+                self.law, self.whole, self.pixels, after, seen, padded, exit=self.exit)
             pieces.append((some, seen.frames, sent))
         self.pixels = after
         return pieces, block, ticks
@@ -216,7 +218,7 @@ class Still(_Thresholds):
     def __init__(self, *exit_and_sensor: Any) -> None:
         super().__init__(*exit_and_sensor)
         found = active.limits(
-            self.model, self.whole.camera, self.pixels.base, self.before.dtype)
+            self.law, self.whole.camera, self.pixels.base, self.before.dtype)
         self.bright, self.dark = np.array(found)
         self.seen = np.full(self.before.size, self.begin)  # when each was stepped last
         self.stepped: list[tuple[np.ndarray, Array]] = []  # pixels, their limits from then on
@@ -241,9 +243,9 @@ class Still(_Thresholds):
         self.stepped = []
         self.lapse.begin(block, np.diff(edges), self.pixels.base)
         for some, padded, seen in self.pieces(at, block):
-            rested = self._rested(some, padded, edges) if active.waits(self.model) else None
+            rested = self._rested(some, padded, edges) if self.model.is_dead_between else None
             self.pixels, sent, limits = active.step_still(
-                self.model, self.whole, self.pixels, seen, padded, rested, exit=self.exit)
+                self.law, self.whole, self.pixels, seen, padded, rested, exit=self.exit)
             self.stepped.append((some, limits))
             pieces.append((some, seen.frames, sent))
         return pieces, block, np.diff(edges)
@@ -265,7 +267,7 @@ class Brownian(_Blocks):
     """DVS-Voltmeter's pixels, and the camera's eta on top."""
 
     def __init__(
-        self, key: Array, frame: np.ndarray, start_us: int, camera: Camera, model: SensorModel
+        self, key: Array, frame: np.ndarray, start_us: int, camera: Camera, model: Constants
     ) -> None:
         key, self.signal = jax.random.split(key)
         super().__init__(key, frame, start_us, camera, model)
@@ -277,13 +279,13 @@ class Brownian(_Blocks):
             dt_us = np.diff(edges)
             block = self.block(frames, edges)
             block = dataclasses.replace(block, frames=np.stack(block.frames))
-            struck = active.strike(self.model, self.whole, block)
+            struck = active.strike(self.law, self.whole, block)
             signal = [self._interval(*each) for each in zip(frames, dt_us.tolist(), strict=True)]
             yield partial(self._packed, signal, struck, block, dt_us)
 
     def _interval(self, frame: np.ndarray, dt_us: float) -> Spiked:
         self.voltage, pixel, fraction, on = voltmeter.fired(
-            self.signal, self.count, self.model.voltmeter, self.camera, self.voltage, frame, dt_us)
+            self.signal, self.count, self.law.voltmeter, self.camera, self.voltage, frame, dt_us)
         self.count += 1
         return pixel, fraction, on
 

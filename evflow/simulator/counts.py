@@ -22,6 +22,7 @@ from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.simulator import noise, pixel, sensor
+from evflow.simulator.constants import Constants
 from evflow.simulator.grids import as_log
 from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor, SimState
@@ -56,7 +57,8 @@ def simulate_counts(
             size), EV020 (options, or a model that has no such counts).
     """
     model = model or SensorModel()
-    log_frames = as_log(model, jnp.asarray(plain("log_frames", log_frames)))
+    law = Constants.of(model)
+    log_frames = as_log(law, jnp.asarray(plain("log_frames", log_frames)))
     if log_frames.dtype != jnp.float64:
         log_frames = log_frames.astype(jnp.float32)
     if log_frames.ndim != 3 or len(log_frames) < 2:
@@ -67,7 +69,8 @@ def simulate_counts(
             "EV015", f"the camera is {camera.shape}, the frames {log_frames.shape[1:]}.")
     if not 0 <= smooth <= 1:
         raise EvflowDataError("EV020", f"smooth={smooth}.", "Choose 0 (exact) to 1.")
-    if model.kind == "voltmeter" or (smooth and (model.refractory_s or model.leak_jitter)):
+    if law.kind == "voltmeter" or (
+            smooth and not (law.refractory_s is None is law.leak_jitter)):
         raise EvflowDataError(
             "EV020", f"{model} has no {'smooth ' if smooth else ''}counts.",
             "Leave out refractory_s and leak_jitter, or add up simulate_voxels over bins.")
@@ -76,18 +79,18 @@ def simulate_counts(
     if timed and not 0 < float(frame_dt_s) < math.inf:
         raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}.", "A length in seconds, > 0.")
     camera = jax.tree.map(lambda m: jnp.asarray(m, log_frames.dtype), sensor.simulable(camera))
-    nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
+    nominal = noise.nominal_thresholds(law, camera) if noise.is_noisy(law, camera) else None
     if nominal is not None and timed:
-        noise.check_rate(noise.most_rate(model, camera, nominal), float(frame_dt_s))
+        noise.check_rate(noise.most_rate(law, camera, nominal), float(frame_dt_s))
     times = sensor.frame_times(frame_dt_s, len(log_frames) - 1)
     return _counts(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32), times,
-                   model=model, smooth=float(smooth))
+                   law, smooth=float(smooth))
 
 
-@partial(jax.jit, static_argnames=("model", "smooth"))
+@partial(jax.jit, static_argnames="smooth")
 def _counts(
     key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array,
-    times: Array, *, model: SensorModel, smooth: float,
+    times: Array, model: Constants, *, smooth: float,
 ) -> Array:
     steps, *shape = log_frames.shape
     camera, marks = sensor.possible(camera)
@@ -101,7 +104,7 @@ def _counts(
 
 
 def _scan(
-    clock: Array, model: SensorModel, whole: Sensor, state: SimState, frames: Array, dt: Array
+    clock: Array, model: Constants, whole: Sensor, state: SimState, frames: Array, dt: Array
 ) -> tuple[Array, Array]:
     """(ON, OFF) counts (N,) over flat log frames (T, N); clock: times (T + 1, 2) of all frames."""
     steps = jnp.arange(len(frames))
@@ -126,7 +129,7 @@ def _scan(
     return on, off
 
 
-def _struck(model: SensorModel, words: Array, struck: sensor.Struck) -> tuple[Array, Array]:
+def _struck(model: Constants, words: Array, struck: sensor.Struck) -> tuple[Array, Array]:
     """(ON, OFF) noise events of an interval, the ones of `simulate`."""
     u, mean = noise.uniform(struck.drawn), struck.odds.mean
 
@@ -152,7 +155,7 @@ def soft_floor(x: Array, width: float) -> Array:
 
 
 def _scan_smooth(
-    smooth: float, model: SensorModel, whole: Sensor, state: SimState, frames: Array, dt: Array
+    smooth: float, model: Constants, whole: Sensor, state: SimState, frames: Array, dt: Array
 ) -> tuple[Array, Array]:
     """(ON, OFF) smooth counts (N,); the memory moves by as much as they say."""
     camera = whole.camera
@@ -163,7 +166,7 @@ def _scan_smooth(
         pixels, on, off = carry
         i01 = sensor.i01_of(model, log_i)
         lp, base = log_i, pixels.base
-        if model.cutoff_hz > 0:
+        if model.corner is not None:
             lp = pixel.low_pass(model, pixels.lp, log_i, i01, dt)
         if whole.leaking is not None:
             base = base - whole.leaking * dt

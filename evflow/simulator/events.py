@@ -23,6 +23,7 @@ from evflow.errors import EvflowDataError
 from evflow.simulator import pack
 from evflow.simulator.active import BLOCK
 from evflow.simulator.circuits import circuit
+from evflow.simulator.constants import Constants
 from evflow.simulator.frames import blocks
 from evflow.simulator.sensor import simulable
 from evflow.types import Events
@@ -76,7 +77,7 @@ def simulate(
         >>> events = ef.simulate(jax.random.key(1), frames, times_us, camera)
     """
     if any(isinstance(leaf, jax.core.Tracer)
-           for leaf in jax.tree.leaves((key, frames, times_us, camera))):
+           for leaf in jax.tree.leaves((key, frames, times_us, camera, model))):
         raise EvflowDataError("EV020", "simulate was called within jit, vmap or grad.",
                               "There take simulate_voxels, or simulate_counts.")
     frames = np.asarray(plain("frames", frames))
@@ -86,7 +87,7 @@ def simulate(
             "EV002", f"frames {frames.shape} with times {times_us.shape}.",
             "Expected (T, H, W) frames and T times in microseconds.")
     video = blocks([frames], [times_us], camera.shape, BLOCK, copy=False)
-    parts = list(_packed(key, video, camera, model or SensorModel()))
+    parts = list(_packed(key, video, camera, Constants.of(model or SensorModel())))
     height, width = camera.shape
     x, y, t, p = (np.concatenate([getattr(part, name) for part, _ in parts]) for name in COLUMNS)
     events = Events.unchecked(x, y, t, p, (width, height))
@@ -133,13 +134,13 @@ def simulate_stream(
         ...         out.append(events)
     """
     video = blocks(frames_iter, times_iter, camera.shape, BLOCK, copy=True)
-    packed = _packed(key, video, camera, model or SensorModel())
+    packed = _packed(key, video, camera, Constants.of(model or SensorModel()))
     return packed if labels else (events for events, _ in packed)
 
 
 def _packed(
     key: Array, video: Iterator[tuple[list[np.ndarray], np.ndarray]], camera: Camera,
-    model: SensorModel,
+    model: Constants,
 ) -> Iterator[Labelled]:
     """While the device works on a block, one that is done is packed."""
     camera = _checked_camera(camera)

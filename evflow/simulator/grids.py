@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity, to_log
 from evflow.simulator import bins as weigh
 from evflow.simulator import noise, sensor, voltmeter
 from evflow.simulator.active import BLOCK, Block
 from evflow.simulator.bins import Schedule
+from evflow.simulator.constants import Constants
 from evflow.simulator.pixel import PixelState, Spikes
 from evflow.simulator.sensor import Sensor, Struck
 
@@ -29,7 +29,7 @@ Weights = tuple[list[Array], list[Array]]  # (ON, OFF), one (N,) per touched bin
 
 
 def scan(
-    model: SensorModel, whole: Sensor, pixels: PixelState, frames: Array, dt: Array, salts: Array,
+    model: Constants, whole: Sensor, pixels: PixelState, frames: Array, dt: Array, salts: Array,
     clock: Array, plan: Schedule, bins: int,
 ) -> tuple[PixelState, Array]:
     """Pixels (N,) after T intervals, and what those add to `bins` bins, (2 * bins, N).
@@ -57,7 +57,7 @@ def scan(
     return jax.lax.scan(body, (pixels, grid), inputs)[0]
 
 
-def as_log(model: SensorModel, frames: Array) -> Array:
+def as_log(model: Constants, frames: Array) -> Array:
     """Log intensity of frames, which they hold unless they are bytes."""
     return to_log(frames, model.log_map) if frames.dtype == jnp.uint8 else frames
 
@@ -91,7 +91,7 @@ class Touched:
         return low
 
     def __call__(
-        self, model: SensorModel, few: Sensor, pixels: PixelState, block: Block, _: Array
+        self, model: Constants, few: Sensor, pixels: PixelState, block: Block, _: Array
     ) -> tuple[PixelState, Array]:
         low, offset, wide = (jax.lax.dynamic_slice_in_dim(jnp.asarray(rows), block.first, BLOCK)
                              for rows in (self.plan.low, self.plan.offset, self.plan.wide))
@@ -103,7 +103,7 @@ class Touched:
 
 
 def scan_brownian(
-    key: Array, model: SensorModel, whole: Sensor, log_frames: Array, salts: Array, dt: Array,
+    key: Array, model: Constants, whole: Sensor, log_frames: Array, salts: Array, dt: Array,
     bins: int,
 ) -> Array:
     """DVS-Voltmeter's grid (N, 2 * bins) of flat log frames (T + 1, N), with the camera's noise.
@@ -148,7 +148,7 @@ def put(grid: Array, at: Array, count: int, low: ArrayLike, more: Array) -> Arra
 
 
 def _weights(
-    model: SensorModel, plan: Schedule, spikes: Spikes, offset: Array, wide: Array, dt: Array
+    model: Constants, plan: Schedule, spikes: Spikes, offset: Array, wide: Array, dt: Array
 ) -> Weights:
     """Weights of the signal events of an interval."""
     dead = model.refractory_s / jnp.maximum(dt, 1e-9) if model.waits else None
@@ -165,7 +165,7 @@ def _weights(
 
 
 def _noise_weights(
-    model: SensorModel, plan: Schedule, words: Array, struck: Struck, offset: Array
+    model: Constants, plan: Schedule, words: Array, struck: Struck, offset: Array
 ) -> Weights:
     """Weights of the noise events of one interval, each pixel's first and the few others."""
     u, mean = noise.uniform(struck.drawn), struck.odds.mean

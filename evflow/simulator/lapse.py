@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import log64
 from evflow.simulator import pack
 from evflow.simulator.active import Block, Sent
+from evflow.simulator.constants import Constants
 from evflow.simulator.pack import Keys
 
 Array = np.ndarray
@@ -29,7 +29,7 @@ class Lapse:
     """Of pixels that stand still between events: the events of blocks with intervals that are far
     longer than others'; the other blocks are no matter of this."""
 
-    def __init__(self, model: SensorModel) -> None:
+    def __init__(self, model: Constants) -> None:
         self.model = model
         self.before: deque[Array] = deque()  # what is remembered before blocks under way
         self.memory: Array | None = None  # log intensity (N,) float64, followed from block to block
@@ -55,7 +55,7 @@ class Lapse:
         return self._followed(self.memory, keys, camera, pieces, dt_us)
 
     def _is_far(self, dt_us: Array) -> bool:
-        return (int(dt_us.max(initial=0)) > FAR_US and self.model.refractory_s <= 0
+        return (int(dt_us.max(initial=0)) > FAR_US and self.model.refractory_s is None
                 and self.model.timestamps == "crossing")
 
     def _followed(

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import Values, noise_factor
+from evflow.simulator.constants import Constants
 
 Array = jax.Array
 
@@ -70,7 +70,7 @@ def uniform(bits: Values) -> Values:
 
 
 def event(
-    model: SensorModel, words: Values, drawn: Values, k: Values, share: Values
+    model: Constants, words: Values, drawn: Values, k: Values, share: Values
 ) -> tuple[Values, Values]:
     """The k-th (uint32) noise event of an interval: where it falls, a fraction (v2e puts it at
     the frame), and whether it is ON, as `share` of them are."""
@@ -155,28 +155,28 @@ def odds(rates: Rates, i01: Values, dt: Values) -> Odds:
     return Odds(mean, some(mean), xp.exp(-mean), on / xp.maximum(on + off, 1e-30))
 
 
-def rates(model: SensorModel, camera: Camera, reference: Array, nominal: Array) -> Rates:
+def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) -> Rates:
     """The camera's noise rates.
 
     reference: the I01 at which eta is given (the mean of the first frame). nominal: the median
     thresholds (ON, OFF); v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta.
     """
     eta = (camera.eta_on, camera.eta_off)
-    if not model.eta_intensity and model.shot_hz <= 0:
+    if not model.eta_intensity and model.shot_hz is None:
         return Rates(eta, None)
     zero = jnp.zeros_like(camera.eta_on)
     steady, varying = eta, (zero, zero)
     if model.eta_intensity:
         gain = 1.0 / noise_factor(reference)
         steady, varying = varying, (eta[0] * gain, eta[1] * gain)
-    if model.shot_hz > 0:
+    if model.shot_hz is not None:
         half = 0.5 * model.shot_hz
         varying = (varying[0] + half * (nominal[0] / camera.theta_on),
                    varying[1] + half * (nominal[1] / camera.theta_off))
     return Rates(steady, varying)
 
 
-def nominal_thresholds(model: SensorModel, camera: Camera) -> Array:
+def nominal_thresholds(model: Constants, camera: Camera) -> Array:
     """Median thresholds (ON, OFF) that shot noise refers to, (2, ...) for maps (..., H, W).
 
     A median is a sort, 17 ms on the device for a sensor of 346x260 and 1 ms on the host: call
@@ -184,7 +184,7 @@ def nominal_thresholds(model: SensorModel, camera: Camera) -> Array:
     """
     theta = (camera.theta_on, camera.theta_off)
     lead = camera.shape[:-2]
-    if model.shot_hz <= 0:
+    if model.shot_hz is None:
         return jnp.ones((2, *lead), jnp.float32)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in theta):
         return jnp.median(jnp.stack(theta).reshape(2, *lead, -1), axis=-1)
@@ -193,10 +193,10 @@ def nominal_thresholds(model: SensorModel, camera: Camera) -> Array:
         return jnp.asarray(np.median(maps.reshape(2, *lead, -1), axis=-1))
 
 
-def is_noisy(model: SensorModel, camera: Camera) -> bool:
+def is_noisy(model: Constants, camera: Camera) -> bool:
     """False only where no noise event can occur (host side; traced cameras count as noisy)."""
     etas = (camera.eta_on, camera.eta_off)
-    if model.shot_hz > 0 or any(isinstance(e, jax.core.Tracer) for e in etas):
+    if model.shot_hz is not None or any(isinstance(e, jax.core.Tracer) for e in etas):
         return True
     return any(bool(np.any(np.asarray(eta) > 0)) for eta in etas)
 
@@ -207,10 +207,10 @@ def peak(rates: Rates) -> Array:
     return on + off
 
 
-def most_rate(model: SensorModel, camera: Camera, nominal: Array) -> float:
+def most_rate(model: Constants, camera: Camera, nominal: Array) -> float:
     """Bound on the rate of any pixel at any intensity and reference, Hz (host side; 0 for traced
-    cameras, of which nothing is known)."""
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(camera)):
+    cameras and models, of which nothing is known)."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((camera, model))):
         return 0.0
     with jax.ensure_compile_time_eval():
         nominal = jnp.reshape(nominal, (*nominal.shape, 1, 1))
@@ -227,15 +227,15 @@ def check_rate(rate_hz: float, dt_s: float) -> None:
             "Rates (eta, shot_hz) are in Hz per pixel, typically .01-10; or shorten the interval.")
 
 
-def leak_rates(model: SensorModel, theta_on: Array, pattern: Array) -> Array:
+def leak_rates(model: Constants, theta_on: Array, pattern: Array) -> Array:
     """Contrast that leaks into ON per second: rate x fixed pattern x theta_on (v2e). Thresholds
     beyond what light can reach are those of dead pixels, which leak does not wake either."""
     return model.leak_hz * pattern * jnp.minimum(theta_on, LEAK_THETA)
 
 
-def leak(model: SensorModel, leaking: Array, words: Array, drawn: Array, dt: Array) -> Array:
+def leak(model: Constants, leaking: Array, words: Array, drawn: Array, dt: Array) -> Array:
     """Contrast leaked in an interval: `leak_rates` x dt x (1 - jitter N(0,1)) (v2e)."""
-    if model.leak_jitter <= 0:
+    if model.leak_jitter is None:
         return leaking * dt
     u, v = (further(words, drawn, jnp.uint32(JITTER + i)) for i in (0, 1))
     normal = jnp.sqrt(-2.0 * jnp.log(u)) * cosine(v)
@@ -252,8 +252,8 @@ def cosine(turns: Array) -> Array:
     return y * sine
 
 
-def leak_pattern(model: SensorModel, key: Array, shape: tuple[int, ...]) -> Array:
+def leak_pattern(model: Constants, key: Array, shape: tuple[int, ...]) -> Array:
     """Fixed pattern of leak rates: log-normal, median 1, `leak_fpn_decades` wide."""
-    if model.leak_hz <= 0 or model.leak_fpn_decades <= 0:
+    if model.leak_hz is None or model.leak_fpn_decades is None:
         return jnp.ones(shape, jnp.float32)
     return 10.0 ** (model.leak_fpn_decades * jax.random.normal(key, shape, jnp.float32))

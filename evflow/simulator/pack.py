@@ -13,11 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import normalised_intensity
 from evflow.simulator import noise
 from evflow.simulator.active import TICKS, Block, Sent
+from evflow.simulator.constants import Constants
 from evflow.simulator.sensor import Sensor
 from evflow.types import Events
 
@@ -66,7 +66,7 @@ def from_fractions(
 
 
 def signal(
-    model: SensorModel, keys: Keys, sent: Sequence[tuple[Array, Sent]], dt_us: Array
+    model: Constants, keys: Keys, sent: Sequence[tuple[Array, Sent]], dt_us: Array
 ) -> Iterator[Array]:
     """Keys of the signal events of a block, and zeros. sent: what some pixels send, and which they
     are."""
@@ -91,7 +91,7 @@ def _ranked(ranks: Array, pixels: Array) -> tuple[Array, Array]:
 
 
 def _progressions(
-    model: SensorModel, keys: Keys, sent: list[tuple[Sent, Array, Array]], dt_us: Array, skip: int
+    model: Constants, keys: Keys, sent: list[tuple[Sent, Array, Array]], dt_us: Array, skip: int
 ) -> Array:
     """All events but the first `skip` of each pixel and interval. sent: with what is sent, where
     in its arrays, and the pixels there."""
@@ -112,7 +112,7 @@ def _progressions(
 
 
 def noises(
-    model: SensorModel, keys: Keys, whole: Sensor, struck: Sequence[tuple[Array, Array, Any]],
+    model: Constants, keys: Keys, whole: Sensor, struck: Sequence[tuple[Array, Array, Any]],
     block: Block, dt_us: Array,
 ) -> Iterator[Array]:
     """Keys of the noise events of a block. whole: the sensor in NumPy. struck: some pixels, the

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
+from evflow.simulator.constants import Constants
 
 Array = jax.Array
 
@@ -47,9 +47,11 @@ class Spikes:
     earliest: Array | None
 
 
-def never_fired(model: SensorModel) -> float:
+def never_fired(model: Constants) -> Array | float:
     """`PixelState.last` of a pixel that has not fired yet."""
-    return 1e6 if model.timestamps == "crossing" else -model.refractory_s
+    if model.timestamps == "crossing":
+        return 1e6
+    return 0.0 if model.refractory_s is None else -model.refractory_s
 
 
 def exact(camera: Camera) -> Camera:
@@ -81,16 +83,16 @@ def floor_divide(a: Array, theta: Array) -> Array:
     return quotient + jnp.where(remainder >= theta, 1.0, 0.0) - jnp.where(remainder < 0, 1.0, 0.0)
 
 
-def low_pass(model: SensorModel, lp: Array, log_i: Array, i01: Array, dt: Array) -> Array:
+def low_pass(model: Constants, lp: Array, log_i: Array, i01: Array, dt: Array) -> Array:
     """First-order low-pass, eps = dt 2 pi fc, whose corner scales with intensity i01 (v2e) if the
     model's does."""
-    eps = dt * (2 * jnp.pi * model.cutoff_hz)
+    eps = dt * model.corner
     eps = jnp.minimum(i01 * eps if model.cutoff_by_light else eps, 1.0)
     return lp + eps * (log_i - lp)
 
 
 def crossings(
-    model: SensorModel, theta: Array, start: Array, end: Array, last: Array, dt: Array
+    model: Constants, theta: Array, start: Array, end: Array, last: Array, dt: Array
 ) -> tuple[Spikes, Array]:
     """Events at the true crossing of the interpolated contrast, and by how many thresholds the
     memory moves.
@@ -102,7 +104,7 @@ def crossings(
     inverse = jnp.where(rise > 0, 1.0 / jnp.where(rise > 0, rise, 1.0), 0.0)
     first = (theta - start) * inverse
     spikes = Spikes(crossed, first, theta * inverse, None)
-    if model.refractory_s <= 0:
+    if model.refractory_s is None:
         return spikes, crossed
     dt = jnp.maximum(dt, 1e-9)
     dead = model.refractory_s / dt
@@ -155,7 +157,7 @@ def slot_time(k: Array, total: Array, begin: Array, end: Array) -> Array:
 
 
 def slots(
-    model: SensorModel, theta: Array, end: Array, last: Array, dt: Array, begin: Array,
+    model: Constants, theta: Array, end: Array, last: Array, dt: Array, begin: Array,
     stop: Array, slots_used: Array,
 ) -> tuple[Spikes, Array]:
     """v2e's timestamps: the k-th event of every pixel sits in slot k of the frame's M slots.
@@ -169,7 +171,7 @@ def slots(
     total = jnp.maximum(slots_used, 1.0)
     one = 1.0 / total
     plain = Spikes(count, jnp.full_like(count, one), jnp.full_like(count, one), None)
-    if model.refractory_s <= 0:
+    if model.refractory_s is None:
         return plain, last
 
     def visit(k: Array, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, ...]:
@@ -190,7 +192,7 @@ def slots(
     return spikes, jnp.where(checked, new_last, last)
 
 
-def since_last(model: SensorModel, spikes: Spikes, last: Array, dt: Array) -> Array:
+def since_last(model: Constants, spikes: Spikes, last: Array, dt: Array) -> Array:
     """Seconds from the last signal event to the end of the interval (crossing times). count
     has no sign here."""
     k = spikes.count - 1.0
@@ -201,7 +203,7 @@ def since_last(model: SensorModel, spikes: Spikes, last: Array, dt: Array) -> Ar
 
 
 def contrast(
-    model: SensorModel, theta_on: Array, theta_off: Array, state: PixelState, log_i: Array,
+    model: Constants, theta_on: Array, theta_off: Array, state: PixelState, log_i: Array,
     i01: Array, leaked: Array | None, dt: Array,
 ) -> tuple[PixelState, Array, Array, Array]:
     """Advance to the end of an interval of dt seconds, before any event is sent.
@@ -210,7 +212,7 @@ def contrast(
     during the interval. Returns the state with its memory leaked; the threshold it moves
     towards, negative for OFF; the contrast towards it when the interval begins and ends.
     """
-    lp = log_i if model.cutoff_hz <= 0 else low_pass(model, state.lp, log_i, i01, dt)
+    lp = log_i if model.corner is None else low_pass(model, state.lp, log_i, i01, dt)
     base = state.base if leaked is None else state.base - leaked
     start, end = state.lp - state.base, lp - base
     rising = end > 0
@@ -219,7 +221,7 @@ def contrast(
 
 
 def send(
-    model: SensorModel, state: PixelState, theta: Array, start: Array, end: Array, dt: Array,
+    model: Constants, state: PixelState, theta: Array, start: Array, end: Array, dt: Array,
     begin: Array, stop: Array, slots_used: Array,
 ) -> tuple[PixelState, Spikes]:
     """The events of the interval that `contrast` led through, and the state after them. begin,
@@ -231,7 +233,7 @@ def send(
     else:
         spikes, moved = crossings(model, threshold, start, end, state.last, dt)
         last = state.last
-        if model.refractory_s > 0:
+        if model.refractory_s is not None:
             last = since_last(model, spikes, last, dt)
     signed = dataclasses.replace(spikes, count=jnp.sign(theta) * spikes.count)
     return PixelState(state.lp, state.base + moved * theta, last), signed

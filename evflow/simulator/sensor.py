@@ -15,10 +15,10 @@ import numpy as np
 
 from evflow.camera import Camera
 from evflow.camera.camera import THETA_MIN
-from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity
 from evflow.simulator import noise, pixel
+from evflow.simulator.constants import Constants
 from evflow.simulator.pixel import PixelState, Spikes
 
 Array = jax.Array
@@ -124,7 +124,7 @@ def possible(camera: Camera) -> tuple[Camera, Array]:
 
 
 def start(
-    key: Array, log_frame: Array, camera: Camera, model: SensorModel,
+    key: Array, log_frame: Array, camera: Camera, model: Constants,
     nominal: Array | None, phase: Array | float = 0.0,
 ) -> tuple[Sensor, SimState]:
     """The sensor and its state after the first log frame; maps of any one shape, kept flat.
@@ -145,7 +145,7 @@ def start(
         flat,
         noise.pixel_words(k_words, count),
         None if nominal is None else noise.rates(model, flat, reference, nominal),
-        noise.leak_rates(model, flat.theta_on, pattern) if model.leak_hz > 0 else None,
+        noise.leak_rates(model, flat.theta_on, pattern) if model.leak_hz is not None else None,
     )
     last = jnp.full_like(log_i, pixel.never_fired(model))
     pixels = PixelState(log_i, base, last)
@@ -153,13 +153,13 @@ def start(
         pixels, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32), k_intervals)
 
 
-def i01_of(model: SensorModel, log_i: Array) -> Array:
+def i01_of(model: Constants, log_i: Array) -> Array:
     """Normalised intensity of log intensities."""
     return normalised_intensity(LOG_MAPS[model.log_map][1](log_i))
 
 
 def disturb(
-    model: SensorModel, sensor: Sensor, i01: Array, salt: Array, dt: Array
+    model: Constants, sensor: Sensor, i01: Array, salt: Array, dt: Array
 ) -> Disturbance:
     """Leak and noise of an interval of dt seconds at normalised intensity i01 (N,). salt: the
     interval's `noise.salts`."""
@@ -173,7 +173,7 @@ def disturb(
 
 
 def advance(
-    model: SensorModel, camera: Camera, state: PixelState, log_i: Array, i01: Array,
+    model: Constants, camera: Camera, state: PixelState, log_i: Array, i01: Array,
     disturbance: Disturbance, dt: Array, clock: Clock,
 ) -> tuple[PixelState, Spikes]:
     """One frame interval of dt seconds that ends at the log frame log_i (N,), normalised

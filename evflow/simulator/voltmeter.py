@@ -19,7 +19,6 @@ published constants); where diffusion rules, events come late. Departures from t
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -144,7 +143,7 @@ def _round(
     return jax.vmap(advance)(c, elapsed, residual, *first, *last)
 
 
-@partial(jax.jit, static_argnames="voltmeter")
+@jax.jit
 def _first(
     key: Array, voltmeter: Voltmeter, camera: Camera, state: State, frame: Array | np.ndarray,
     dt_us: Array | float,

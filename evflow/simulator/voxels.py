@@ -25,6 +25,7 @@ from evflow.light.log_maps import check_log
 from evflow.simulator import circuits, noise, sensor
 from evflow.simulator.active import BLOCK
 from evflow.simulator.bins import Schedule
+from evflow.simulator.constants import Constants
 from evflow.simulator.grids import Touched, as_log, put, scan, scan_brownian
 from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor, SimState
@@ -36,7 +37,7 @@ TILE = 8192  # pixels; their maps and grid, some 1.5 MB, are worked on at a time
 
 
 def simulate_window(
-    model: SensorModel, whole: Sensor, state: SimState, log_frames: Array,
+    model: Constants, whole: Sensor, state: SimState, log_frames: Array,
     frame_dt_s: Array | float, bins: int, times: Array | None = None,
 ) -> tuple[SimState, Array]:
     """Advance through log_frames (T, H, W), T frames after the state's own, equally spaced: log
@@ -125,7 +126,7 @@ def simulate_voxels(
         >>> log_frames = to_log(frames)  # of evflow.light.log_maps
         >>> voxels = ef.simulate_voxels(key, log_frames, camera, frame_dt_s=1e-3)
     """
-    model = model or SensorModel()
+    law = Constants.of(model or SensorModel())
     log_frames = jnp.asarray(plain("log_frames", log_frames))
     if log_frames.dtype != jnp.uint8:
         log_frames = log_frames.astype(jnp.float32)
@@ -149,20 +150,20 @@ def simulate_voxels(
             "EV015", f"the camera's leading axes are {camera.shape[:-2]}, the frames' {lead}.",
             "Give one camera (H, W) or one for each video.")
     camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), sensor.simulable(camera))
-    if timed and _by_blocks(key, model, log_frames, camera):
-        return _in_blocks(key, np.asarray(log_frames), camera, float(frame_dt_s), model, bins)
-    nominal = noise.nominal_thresholds(model, camera) if noise.is_noisy(model, camera) else None
+    if timed and _by_blocks(key, law, log_frames, camera):
+        return _in_blocks(key, np.asarray(log_frames), camera, float(frame_dt_s), law, bins)
+    nominal = noise.nominal_thresholds(law, camera) if noise.is_noisy(law, camera) else None
     if nominal is not None and timed:
-        noise.check_rate(noise.most_rate(model, camera, nominal), float(frame_dt_s))
+        noise.check_rate(noise.most_rate(law, camera, nominal), float(frame_dt_s))
     times = sensor.frame_times(frame_dt_s, log_frames.shape[-3] - 1)
     return _voxels(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32), times,
-                   model=model, bins=bins, lead=lead)
+                   law, bins=bins, lead=lead)
 
 
-def _by_blocks(key: Array, model: SensorModel, frames: Array, camera: Camera) -> bool:
+def _by_blocks(key: Array, model: Constants, frames: Array, camera: Camera) -> bool:
     """Whether the host can tell which pixels may fire, and a CPU gains by it."""
     new = jnp.zeros(())  # traced within jit, even where all that is given is not
-    given = jax.tree.leaves((key, frames, camera, new))
+    given = jax.tree.leaves((key, model, frames, camera, new))
     traced = any(isinstance(value, jax.core.Tracer) for value in given)
     return (not traced and frames.ndim == 3 and frames.dtype == jnp.uint8
             and model.kind != "voltmeter" and model.timestamps != "v2e"
@@ -170,7 +171,7 @@ def _by_blocks(key: Array, model: SensorModel, frames: Array, camera: Camera) ->
 
 
 def _in_blocks(
-    key: Array, frames: np.ndarray, camera: Camera, frame_dt_s: float, model: SensorModel,
+    key: Array, frames: np.ndarray, camera: Camera, frame_dt_s: float, model: Constants,
     bins: int,
 ) -> Array:
     """Voxels (H, W, 2 * bins) of bytes (T, H, W), whose active pixels are stepped."""
@@ -193,10 +194,10 @@ def _in_blocks(
     return grid
 
 
-@partial(jax.jit, static_argnames=("model", "bins", "lead"))
+@partial(jax.jit, static_argnames=("bins", "lead"))
 def _voxels(
     key: Array, log_frames: Array, camera: Camera, nominal: Array | None, dt: Array,
-    times: Array, *, model: SensorModel, bins: int, lead: tuple[int, ...],
+    times: Array, model: Constants, *, bins: int, lead: tuple[int, ...],
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
         camera, marks = sensor.possible(camera)

@@ -76,31 +76,40 @@ def test_smooth_noise_is_its_expectation() -> None:
 
 
 @pytest.mark.parametrize("model", [
-    SensorModel(), SensorModel(cutoff_hz=200.0, leak_hz=5.0, shot_hz=5.0),
+    SensorModel(),
+    SensorModel(cutoff_hz=200.0, leak_hz=5.0, leak_fpn_decades=0.2, shot_hz=5.0),
     SensorModel(kind="esim")])
 def test_gradients_are_those_of_finite_differences(model: SensorModel) -> None:
-    """Of a weighted sum of counts, along each of the four maps and the contrast of the light."""
+    """Of a weighted sum of counts, along each of the four maps, the contrast of the light, and each
+    of the model's numbers."""
     weights = jax.random.uniform(jax.random.key(3), (*SHAPE, 2))
-    start: tuple[Any, ...] = (NOISY, to_log(FRAMES, model.log_map))
+    numbers = {path[0].name: float(value)
+               for path, value in jax.tree_util.tree_leaves_with_path(model)}
+    start: tuple[Any, ...] = (NOISY, to_log(FRAMES, model.log_map), model)
 
-    def total(camera: Camera, log: jax.Array) -> jax.Array:
+    def total(camera: Camera, log: jax.Array, model: SensorModel) -> jax.Array:
         return jnp.sum(weights * simulate_counts(
             KEY, log, camera, frame_dt_s=1e-3, model=model, smooth=1.0))
 
-    gradient = jax.jit(jax.grad(total, (0, 1)))(*start)
+    gradient = jax.jit(jax.grad(total, (0, 1, 2)))(*start)
     value = jax.jit(total)
-    for part in ("theta_on", "theta_off", "eta_on", "eta_off", "light"):
-        tangent = jax.tree.map(jnp.zeros_like, start)
+    for part in ("theta_on", "theta_off", "eta_on", "eta_off", "light", *numbers):
+        camera, light, of_model = jax.tree.map(jnp.zeros_like, start)
         if part == "light":
-            tangent = (tangent[0], start[1] - start[1].mean(0, keepdims=True))  # more contrast
+            light = start[1] - start[1].mean(0, keepdims=True)  # more contrast
+        elif part in numbers:  # by a share of itself
+            of_model = jax.tree_util.tree_map_with_path(
+                lambda path, _: numbers[part] * (path[0].name == part), model)  # noqa: B023
         else:
-            tangent = (dataclasses.replace(tangent[0], **{part: jnp.ones(SHAPE)}), tangent[1])
+            camera = dataclasses.replace(camera, **{part: jnp.ones(SHAPE)})
+        tangent = camera, light, of_model
         slope = sum(float(jnp.vdot(g, t)) for g, t in zip(
             jax.tree.leaves(gradient), jax.tree.leaves(tangent), strict=True))
-        step = {"eta_on": 1.0, "eta_off": 1.0, "light": 1e-3}.get(part, 2e-4)
+        step = {"eta_on": 1.0, "eta_off": 1.0, "light": 1e-3} | dict.fromkeys(numbers, 0.02)
+        change = step.get(part, 2e-4)
         ahead, behind = (jax.tree.map(lambda a, t: a + s * t, start, tangent)  # noqa: B023
-                         for s in (step, -step))
-        difference = (float(value(*ahead)) - float(value(*behind))) / (2 * step)
+                         for s in (change, -change))
+        difference = (float(value(*ahead)) - float(value(*behind))) / (2 * change)
         assert slope == pytest.approx(difference, rel=0.02, abs=1e-3 * abs(slope) + 1e-2), part
 
 

@@ -1,0 +1,95 @@
+"""The pixel circuit as programs take it: choices and what is off are structure, numbers are leaves.
+
+What is derived of a number is worked out here, on the host and in double precision where the number
+is known, so that a program computes with the same float32 as if it were written into it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from evflow.camera.sensors import NUMBERS, SensorModel, is_off
+
+Number = Any  # a float, what is traced, or None where it is off
+
+CHOICES = ("kind", "timestamps", "log_map", "cutoff_by_light", "eta_intensity",
+           "noise_resets_memory")
+
+AT_ONCE = 1e30  # per second: the corner of a low-pass that follows at once
+NO_TIME = 1e-12  # seconds: a dead time that delays nothing
+
+
+@partial(
+    jax.tree_util.register_dataclass, meta_fields=CHOICES, data_fields=(
+        "corner", *(name for name in NUMBERS if name != "cutoff_hz"), "voltmeter"))
+@dataclasses.dataclass(frozen=True)
+class Constants:
+    """A `SensorModel`, whose numbers are None where they are off. corner: of the low-pass at 255
+    DN, radians per second. voltmeter: a `Voltmeter`, None for other kinds."""
+
+    kind: str
+    timestamps: str
+    log_map: str
+    cutoff_by_light: bool
+    eta_intensity: bool
+    noise_resets_memory: bool
+    corner: Number
+    refractory_s: Number
+    leak_hz: Number
+    leak_jitter: Number
+    leak_fpn_decades: Number
+    shot_hz: Number
+    voltmeter: Any
+
+    @staticmethod
+    def of(model: SensorModel) -> Constants:
+        """Of known numbers floats, of traced ones what is traced. Raises EV020 for numbers that a
+        model cannot have, as a step along a gradient may lead to."""
+        model = dataclasses.replace(model)  # checked anew: what comes out of jit or tree.map is not
+        on = {name: None if is_off(value := getattr(model, name)) else value for name in NUMBERS}
+        return Constants(
+            **{name: getattr(model, name) for name in CHOICES},
+            corner=_corner(on.pop("cutoff_hz")), refractory_s=_dead(on.pop("refractory_s")), **on,
+            voltmeter=model.voltmeter if model.kind == "voltmeter" else None)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether a pixel's memory stays as it is between events."""
+        return self.corner is None and self.leak_hz is None
+
+    @property
+    def is_dead_between(self) -> bool:
+        """Whether `PixelState.last` counts the seconds since an event."""
+        return self.refractory_s is not None and self.timestamps == "crossing"
+
+    @property
+    def waits(self) -> bool:
+        """Whether an event that comes within the refractory period of another fires later."""
+        return self.is_dead_between and self.kind == "v2e"
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether any number is not known."""
+        return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self))
+
+    def on_device(self) -> Constants:
+        """The same for calls of many programs."""
+        return jax.tree.map(jnp.asarray, self)
+
+
+def _corner(cutoff_hz: Number) -> Number:
+    if isinstance(cutoff_hz, jax.core.Tracer):  # which may be 0
+        return jnp.where(cutoff_hz > 0, (2 * math.pi) * cutoff_hz, AT_ONCE)
+    return None if cutoff_hz is None else 2 * math.pi * cutoff_hz
+
+
+def _dead(refractory_s: Number) -> Number:
+    if isinstance(refractory_s, jax.core.Tracer):
+        return jnp.maximum(refractory_s, NO_TIME)
+    return refractory_s
