@@ -18,6 +18,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
+from evflow.camera.optics import Optics
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.network import architecture, coordinates, encoder, flow, pooling
 from evflow.network.architecture import Params, config_of
@@ -32,6 +34,7 @@ from evflow.network.inputs import (
     same_precision,
     summary_of_pixels,
 )
+from evflow.network.seen import photoreceptor, seen_changes
 
 Array = jax.Array
 
@@ -67,7 +70,8 @@ def pixel_context(window_s: Array, intensity: Array | None, shape: tuple[int, ..
 
 def code_from_video(
     params: Params, dL: ArrayLike, camera: Camera, *, window_s: ArrayLike = DEFAULT_WINDOW_S,
-    intensity: ArrayLike | None = None,
+    intensity: ArrayLike | None = None, sensor: SensorModel | None = None,
+    optics: Optics | None = None,
 ) -> Code:
     """Code without any events, from a video and a camera: what `generate` needs.
 
@@ -78,6 +82,10 @@ def code_from_video(
         camera: maps (..., H, W) or (H, W), whose summary enters the code.
         window_s: length of the window in seconds, a number or (...,).
         intensity: as in `summarize`.
+        sensor: the camera's circuit, whose `cutoff_hz` makes its pixels see the light late; None
+            is without low-pass. The light is at rest before the window.
+        optics: what frames that this camera recorded do not show (`found.optics`): light that is
+            added, and the delay of its events; None for other videos.
 
     Returns:
         The code.
@@ -85,7 +93,8 @@ def code_from_video(
     Raises:
         EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014
             (camera out of range), EV015 (camera of other pixels), EV018 (weights of the paper's
-            network, whose condition holds the events, or no weights), EV020 (window_s).
+            network, whose condition holds the events, or no weights), EV020 (window_s; or a
+            sensor whose low-pass depends on an intensity that is not given).
 
     Example:
         >>> dL = jnp.moveaxis(jnp.diff(log_frames, axis=0), 0, -1)  # of 17 frames (17, H, W)
@@ -105,7 +114,29 @@ def code_from_video(
     _, _, window_s, intensity = prepare(
         config, jnp.zeros((*dL.shape[:-1], 2 * config.bins)), dL[..., 0], window_s, intensity)
     known = summary_of_pixels(camera, dL.shape[:-1])
-    return Code(encoder.split_sign(dL), known, pixel_context(window_s, intensity, dL.shape[:-1]))
+    context = pixel_context(window_s, intensity, dL.shape[:-1])
+    return seen_code(Code(encoder.split_sign(dL), known, context), sensor, optics)
+
+
+def seen_code(code: Code, sensor: SensorModel | None, optics: Optics | None) -> Code:
+    """The code of what pixels see of the light of a code. EV020 where that depends on intensity,
+    and none is known; pixels of unknown intensity are taken for 55 DN."""
+    seen_by = photoreceptor(sensor, optics)
+    if seen_by.ideal:
+        return code
+    window_s, intensity = pooling.given_features(code.context)
+    traced = isinstance(code.context, jax.core.Tracer)
+    if not traced and not np.asarray(code.context)[..., 2].any():
+        raise EvflowDataError(
+            "EV020", "a slow pixel, or one that sees other light, and no intensity.",
+            "Its low-pass is as fast as the light is bright: give code_from_video the intensity, "
+            "the mean lin-log of the frames.")
+    rise, fall = jnp.split(code.changes, 2, -1)
+    changes, intensity = seen_changes(seen_by, rise - fall, intensity, window_s)
+    known = code.context[..., 2]
+    context = pooling.window_features(window_s, jnp.where(known > 0, intensity, jnp.nan),
+                                      known.shape)
+    return dataclasses.replace(code, changes=encoder.split_sign(changes), context=context)
 
 
 def _flow_condition(config: ModelConfig, code: Code) -> tuple[Array, Array]:
@@ -174,7 +205,10 @@ def _inverse(net: Params, y: Array, z: Array, code: Code, *, config: ModelConfig
     return flow.inverse(net["flow"], y - centre, z, u, config.flow)[0]
 
 
-def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
+def generate(
+    params: Params, key: Array, camera: Camera, code: Code, *, sensor: SensorModel | None = None,
+    optics: Optics | None = None,
+) -> Array:
     """Events of the scene of a code as another camera would see it, z ~ N(0, 1).
 
     The code's summary is replaced by the camera's. The camera has been running: its pixels' memory
@@ -187,15 +221,24 @@ def generate(params: Params, key: Array, camera: Camera, code: Code) -> Array:
         key: of jax.random, for z.
         camera: maps (..., H, W) or (H, W).
         code: of `code_from_video`, or of `encode`.
+        sensor: the circuit of this camera, whose `cutoff_hz` makes its pixels see the code's light
+            late; None where the code is of what they see (`code_from_video(sensor=...)`).
+        optics: as in `code_from_video`.
 
     Returns:
         Voxels (..., H, W, 32).
 
     Raises:
         EvflowDataError: EV002, EV014 (no valid camera), EV015 (camera of other pixels), EV018 (no
-            weights).
+            weights, or a sensor and the paper's network), EV020 (a sensor whose low-pass depends
+            on an intensity that the code does not have).
     """
     config, _ = parts(params)
+    if config.code == "feature" and not photoreceptor(sensor, optics).ideal:
+        raise EvflowDataError(
+            "EV018", "the paper's condition contains the events, and no light to be seen late.",
+            'Use load_weights("default").')
+    code = seen_code(code, sensor, optics)
     shape = code.context.shape[:-1]
     known = summary_of_pixels(camera, shape)
     y = jnp.broadcast_to(coordinates.unsquash(camera, config.output), (*shape, 4))

@@ -27,7 +27,7 @@ Array = jax.Array
 
 RIDGE, RIDGE_THETA = 0.5, 0.22  # pseudo-observations that hold an empty calibration at .22
 DEAD_CHANGE = 0.03  # log units: smaller changes are frame noise and do not choose a side
-WINDOW_S = 0.05  # window length about which the network's input is centred
+WINDOW_S, MIDDLE = 0.05, 4.0  # window length and log intensity about which inputs are centred
 SIGNAL_UNIT, EXPOSURE_UNIT = 1000.0, 100.0  # pixels with events, pixel seconds: scales of the std
 
 
@@ -78,8 +78,14 @@ def window_features(window_s: Array, intensity: Array | None, shape: tuple[int, 
         zero = jnp.zeros(shape, window.dtype)
         return jnp.stack([window, zero, zero], -1)
     known = jnp.isfinite(intensity)
-    value = jnp.where(known, intensity - 4.0, 0.0)
+    value = jnp.where(known, intensity - MIDDLE, 0.0)
     return jnp.stack([window, value, known.astype(window.dtype)], -1)
+
+
+def given_features(context: Array) -> tuple[Array, Array]:
+    """Window length in seconds and log intensity (...,) of `window_features`; an intensity that
+    was not given is about the middle."""
+    return WINDOW_S * jnp.exp(context[..., 0]), context[..., 1] + MIDDLE
 
 
 def pixel_features(voxels: Array, dlogI: Array, context: Array) -> Array:
