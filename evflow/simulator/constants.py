@@ -52,9 +52,10 @@ class Constants:
         """Of known numbers floats, of traced ones what is traced. Raises EV020 for numbers that a
         model cannot have, as a step along a gradient may lead to."""
         model = dataclasses.replace(model)  # checked anew: what comes out of jit or tree.map is not
-        on = {name: None if is_off(value := getattr(model, name)) else value for name in NUMBERS}
+        on: dict[str, Any] = {
+            name: None if is_off(value := getattr(model, name)) else value for name in NUMBERS}
+        on |= {name: getattr(model, name) for name in CHOICES}
         return Constants(
-            **{name: getattr(model, name) for name in CHOICES},
             corner=_corner(on.pop("cutoff_hz")), refractory_s=_dead(on.pop("refractory_s")), **on,
             voltmeter=model.voltmeter if model.kind == "voltmeter" else None)
 
