@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, Union
 
@@ -24,7 +25,7 @@ from evflow.commands.options import Compiling
 from evflow.commands.reconstruct import Reconstruct
 from evflow.commands.render import Render
 from evflow.commands.simulate import Simulate
-from evflow.commands.train import Train
+from evflow.commands.train import Train, with_configuration
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
@@ -39,10 +40,12 @@ COMMANDS: dict[str, type] = {
     "voxel": Voxel, "export": Export, "train": Train, "version": Version}
 
 
-def offered() -> Any:
+def offered(arguments: Sequence[str] = ()) -> Any:
     """The type of the command line: a command by its name. `bench` is one where there are
-    benchmarks."""
+    benchmarks; the options of `train` are made where it is what is asked for."""
     found = COMMANDS | ({"bench": Bench} if at_hand() else {})
+    if arguments[:1] == ["train"]:
+        found["train"] = with_configuration(arguments)
     named = tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in found.items())
     return Union[named]  # noqa: UP007 - of types that are not known beforehand
 
@@ -67,7 +70,7 @@ def main(argv: list[str] | None = None) -> int:
         with stoppable():
             arguments = understood(sys.argv[1:] if argv is None else argv)
             command = tyro.cli(
-                offered(), args=arguments, prog="evflow",
+                offered(arguments), args=arguments, prog="evflow",
                 description="Measure an event camera from its recording; simulate any video as it "
                 "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
             if isinstance(command, Compiling) and command.compile_cache:

@@ -33,6 +33,7 @@ from evflow.errors import CODES
 from evflow.io import write_recording
 from evflow.io.registry import FORMATS, WRITERS
 from evflow.notes import NOTES
+from evflow.training.config import TrainConfig
 from experiments import (
     coverage,
     curves,
@@ -218,6 +219,7 @@ def test_options_exist(document: Path) -> None:
         for field in dataclasses.fields(options):
             flag = field.name.replace("_", "-")
             known |= {f"--{flag}", f"--no-{flag}"}
+    known |= {f"--{field.name}" for field in dataclasses.fields(TrainConfig)}  # --loss.flow
     text = document.read_text("utf-8")
     assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known
 

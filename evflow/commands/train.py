@@ -1,10 +1,24 @@
-"""`evflow train`: the training of the network, on every device of every process."""
+"""`evflow train`: the training of the network, on every device of every process.
+
+Every number of a run's configuration is an option, `--loss.flow 0.1`, typed by its dataclass and
+with the preset's value as default. They are made of `TrainConfig` once a command line begins with
+`train`: it imports JAX, which other commands do without.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import re
+import typing
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
 
+import tyro
+
+from evflow.errors import EvflowDataError
 from evflow.training.options import TrainOptions
+
+PYTHON = ("sensors",)  # of a configuration: too much for a command line
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -20,6 +34,8 @@ class Train(TrainOptions):
 
     Example: evflow train --preset default --out runs/default --max-seconds 2400
 
+    Example: evflow train --preset debug --loss.flow 0.1 --model.flow.steps 4 --out runs/try
+
     Example: evflow train --out runs/default --coordinator HOST:PORT --processes 2 --process-id 0
     """
 
@@ -27,3 +43,45 @@ class Train(TrainOptions):
         from evflow.training.run import train_network
 
         train_network(self)
+
+
+def with_configuration(arguments: Sequence[str]) -> type[Train]:
+    """`Train` with an option for every field of the preset that the command line names."""
+    from evflow.training.config import PRESETS, TrainConfig
+
+    named = re.search(r"(?:^|\0)--preset[=\0]([^\0]+)", "\0".join(arguments))
+    config = PRESETS.get(named[1] if named else "default", PRESETS["default"])
+    _check_names(arguments, config)
+    hints, own = typing.get_type_hints(TrainConfig), {f.name for f in dataclasses.fields(Train)}
+    preset = next(f for f in dataclasses.fields(Train) if f.name == "preset")
+    explained = tyro.conf.arg(help="default: all parts; pixels: those that see pixels one by one, "
+                              "on many small scenes; paper: the paper's network and losses; debug: "
+                              "tiny, to see that it runs.")
+    fields: list[tuple[str, Any, Any]] = [
+        ("preset", Annotated[Literal[tuple(PRESETS)], explained],  # type: ignore[misc]
+         dataclasses.field(default=preset.default))]
+    fields += [(f.name, hints[f.name], dataclasses.field(default=getattr(config, f.name)))
+               for f in dataclasses.fields(TrainConfig)
+               if f.name not in own and f.name not in PYTHON]
+    return dataclasses.make_dataclass(
+        "Train", fields, bases=(Train,), frozen=True, kw_only=True,
+        namespace={"__doc__": Train.__doc__})
+
+
+def _check_names(arguments: Sequence[str], config: Any) -> None:
+    """EV020 where a dotted option is no field of the configuration, with those that there are."""
+    for word in arguments:
+        name = word.removeprefix("--").partition("=")[0].replace("-", "_")
+        if not word.startswith("--") or "." not in name:
+            continue
+        *groups, last = name.removeprefix("no_").split(".")
+        held: Any = config
+        for i, group in enumerate([*groups, last]):
+            known = {} if not dataclasses.is_dataclass(held) else {
+                f.name: getattr(held, f.name) for f in dataclasses.fields(held)}
+            if (key := group.removeprefix("no_")) not in known:
+                where = ".".join(groups[:i])
+                raise EvflowDataError(
+                    "EV020", f"a training has no option {word.partition('=')[0]}.",
+                    f"{where or 'A configuration'} has {', '.join(known) or 'no fields'}.")
+            held = known[key]

@@ -32,9 +32,10 @@ class RunOptions:
 class TrainOptions(RunOptions):
     """What a training run of the network is, and among which processes it runs."""
 
-    preset: Literal["default", "pixels", "paper", "debug"] = "default"
+    preset: str = "default"
     """default: all parts; pixels: those that see pixels one by one, on many small scenes; paper:
-    the paper's network and losses; debug: tiny, to see that it runs."""
+    the paper's network and losses; debug: tiny, to see that it runs. Others: `PRESETS` of
+    evflow.training.config."""
     steps: int | None = None
     """Number of steps (default: the preset's)."""
     scenes: int | None = None

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.errors import EvflowDataError
+from evflow.network.config import MODELS, ModelConfig
 from evflow.network.weights import load_weights, save_weights
 from evflow.process import devices
 from evflow.process.provenance import provenance
@@ -32,7 +33,7 @@ def train_network(options: TrainOptions) -> Metrics:
         tx = optimiser(config)
         bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures,
                          photos=not small)
-        state = init_state(config, tx, bank, "paper" if options.preset == "paper" else "default")
+        state = init_state(config, tx, bank, network_name(config.model))
         if options.start is not None:
             state = started_from(state, options.start)
         state, bank = devices.replicate((state, bank), mesh)
@@ -58,10 +59,12 @@ def _headline(figures: Metrics) -> str:
 
 
 def configuration(options: TrainOptions, devices: int) -> TrainConfig:
-    """The preset with the options' changes; EV020 where its scenes cannot be shared out."""
-    changes = {k: getattr(options, k) for k in ("seed", "steps", "scenes", "parts")}
+    """The preset with what the options say of its fields; EV020 where its scenes
+    cannot be shared out."""
+    changes = {f.name: getattr(options, f.name, None) for f in dataclasses.fields(TrainConfig)}
     config = dataclasses.replace(
         preset(options.preset), **{k: v for k, v in changes.items() if v is not None})
+    network_name(config.model)
     if config.scenes < 1:
         raise EvflowDataError("EV020", f"scenes={config.scenes}.", "A step takes one or more.")
     if config.scenes % devices:
@@ -69,6 +72,23 @@ def configuration(options: TrainOptions, devices: int) -> TrainConfig:
             "EV020", f"{config.scenes} scenes a step do not divide among {devices} devices.",
             f"Pass --scenes {math.ceil(config.scenes / devices) * devices}, or use fewer devices.")
     return config
+
+
+def network_name(model: ModelConfig) -> str:
+    """The name of a network's weights, which stands for all of it but the sizes that `config_of`
+    reads in the leaves; EV020 where no name does."""
+    for name, known in MODELS.items():
+        flow = dataclasses.replace(known.flow, steps=model.flow.steps, hidden=model.flow.hidden)
+        if model == dataclasses.replace(known, flow=flow, encoder_hidden=model.encoder_hidden,
+                                        summary_hidden=model.summary_hidden):
+            return name
+    unlike = ", ".join(
+        f"{field.name}={getattr(model, field.name)!r}" for field in dataclasses.fields(model)
+        if getattr(model, field.name) != getattr(MODELS["default"], field.name))
+    raise EvflowDataError(
+        "EV020", f"a network unlike any of {sorted(MODELS)} ({unlike}): its weights could not be "
+        "read again.", "Change flow.steps, flow.hidden, encoder_hidden and summary_hidden freely; "
+        "anything else makes another network, an entry of MODELS in evflow.network.config.")
 
 
 def started_from(state: TrainState, weights: str) -> TrainState:

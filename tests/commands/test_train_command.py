@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -10,10 +11,15 @@ import sys
 from pathlib import Path
 
 import pytest
+import tyro
 
 import evflow
 from evflow.cli import main
 from evflow.commands.bench import forwarded
+from evflow.commands.train import with_configuration
+from evflow.errors import EvflowDataError
+from evflow.training.config import PRESETS, TrainConfig
+from evflow.training.run import configuration
 
 ROOT = Path(__file__).parents[2]
 
@@ -100,3 +106,44 @@ def test_they_run_from_any_folder(installed: Path, tmp_path: Path) -> None:
     timed = run(tmp_path, "bench", "--quick", "--only", "voxels", "--out", "times.jsonl")
     assert timed.returncode == 0, timed.stderr
     assert all(json.loads(line) for line in (tmp_path / "times.jsonl").read_text().splitlines())
+
+
+def parsed(*words: str) -> TrainConfig:
+    """The configuration of a command line."""
+    arguments = ["train", "--preset", "debug", "--out", "run", *words]
+    return configuration(tyro.cli(with_configuration(arguments), args=arguments[1:]), 1)
+
+
+def test_every_number_of_the_configuration_is_an_option() -> None:
+    assert parsed() == PRESETS["debug"]
+    changed = parsed("--loss.flow", "0.1", "--model.flow.steps", "1", "--prior.theta", "0.1", "0.4",
+                     "--steps", "3", "--loss.no-adaptive", "--block", "8", "8", "--seed", "4")
+    base = PRESETS["debug"]
+    assert changed == dataclasses.replace(
+        base, loss=dataclasses.replace(base.loss, flow=0.1, adaptive=False), steps=3, block=(8, 8),
+        model=dataclasses.replace(base.model, flow=dataclasses.replace(base.model.flow, steps=1)),
+        prior=dataclasses.replace(base.prior, theta=(0.1, 0.4)), seed=4)
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["--model.flow.coupling", "affine"], "no option --model.flow.coupling. model.flow has"),
+    (["--los.flow", "1"], "no option --los.flow. A configuration has model, loss"),
+    (["--steps.flow", "1"], "no option --steps.flow. steps has no fields"),
+    (["--model.flow.levels", "3"], "unlike any of .*: its weights could not be read again"),
+    (["--prior.theta", "0.5", "0.1"], "Give .low, high."),
+])
+def test_what_is_no_configuration_is_refused(words: list[str], said: str) -> None:
+    with pytest.raises(EvflowDataError, match=f"EV020.*{said}"):
+        parsed(*words)
+
+
+def test_presets_are_the_choices(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(PRESETS, "mine", dataclasses.replace(PRESETS["debug"], clip=0.25))
+    with pytest.raises(SystemExit):
+        main(["train", "--preset", "mine", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "{default,pixels,paper,debug,mine}" in shown
+    assert "--clip FLOAT (default: 0.25)" in shown.replace(" │ │ ", " ")
+    assert "--model.flow.hidden INT" in shown
