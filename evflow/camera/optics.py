@@ -20,7 +20,8 @@ from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.archives import load_npz
 
-MEASURED = ("cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # of a SensorModel
+MEASURED = ("cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # of a SensorModel, with an error
+LAW = "cutoff_by_light"  # 1 or 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +45,7 @@ def as_arrays(
     """Scalars by the names that they have in camera.npz."""
     named = {f"sensor_{name}": getattr(sensor, name) for name in MEASURED}
     named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
+    named[f"sensor_{LAW}"] = float(sensor.cutoff_by_light)
     named |= {f"optics_{name}": value for name, value in dataclasses.asdict(optics).items()}
     return {name: np.asarray(value, np.float64) for name, value in named.items()}
 
@@ -82,7 +84,8 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
     Raises EV009 where a value is no number, EV016 where there is no file."""
     held = load_npz(Path(path))
     values: dict[str, dict[str, Any]] = {"sensor": {}, "optics": {}}
-    names = {"sensor": MEASURED, "optics": tuple(f.name for f in dataclasses.fields(Optics))}
+    names = {"sensor": (*MEASURED, LAW),
+             "optics": tuple(f.name for f in dataclasses.fields(Optics))}
     for room, wanted in names.items():
         for name in wanted:
             value = held.get(f"{room}_{name}")
@@ -93,5 +96,7 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
                 raise EvflowDataError("EV009", f"{path}: {room}_{name} is no finite number.",
                                       "Make the file again: evflow estimate.")
             values[room][name] = float(value)
+    if LAW in values["sensor"]:
+        values["sensor"][LAW] = bool(values["sensor"][LAW])
     sensor = SensorModel(**values["sensor"], noise_resets_memory=True)
     return sensor, Optics(**values["optics"])

@@ -62,8 +62,9 @@ def receptor_notes(found: Found | None) -> list[Note]:
                   f"above {found.least_cutoff_hz:.0f} Hz at 255 DN.")]
     if found.sensor[0].cutoff_hz:
         notes = [Note("pixels.slow", "the thresholds are those of the light behind the "
-                      "photoreceptor's low-pass; without it they come out otherwise where things "
-                      "move fast.")]
+                      "photoreceptor's low-pass"
+                      + ("" if found.seen.by_light else ", as fast in the dark as in light")
+                      + "; without it they come out otherwise where things move fast.")]
     optics = found.optics
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"

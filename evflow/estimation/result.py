@@ -41,8 +41,9 @@ class CameraEstimate:
         undetermined: those of `THRESHOLDS` that the recording does not tell: their values, and
             widths, are the prior's.
         sensor: the pixel circuit as far as it was measured: cutoff_hz, 0 where the photoreceptor
-            is too fast to be seen; refractory_s, 0 where too few pixels change that fast; leak_hz
-            and shot_hz, both parts of the camera's eta, 0 where fewer than 200 such events tell.
+            is too fast to be seen, and cutoff_by_light; refractory_s, 0 where too few pixels
+            change that fast; leak_hz and shot_hz, both parts of the camera's eta, 0 where fewer
+            than 200 such events tell.
         sensor_std: its standard deviations by field, NaN where nothing was measured.
         optics: what the frames show beside what the pixels saw.
         receptor: how both were found: the search for the photoreceptor and what it explains; None

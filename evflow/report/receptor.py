@@ -22,7 +22,8 @@ def receptor_panel(found: CameraEstimate, foretold: tuple[float, float] | None) 
         figures.explained(receptor.curve, receptor.explained[0], sensor.cutoff_hz),
         "share explained over the cutoff")
     fast = f"above {receptor.least_cutoff_hz:.0f}"
-    rows = [["cutoff [Hz at 255 DN]", spread(sensor.cutoff_hz, std["cutoff_hz"])
+    where = "at 255 DN" if sensor.cutoff_by_light else "in any light"
+    rows = [[f"cutoff [Hz {where}]", spread(sensor.cutoff_hz, std["cutoff_hz"])
              if sensor.cutoff_hz else fast],
             ["light added [DN]", spread(optics.offset_dn, optics.offset_dn_std)],
             ["events after frames [ms]", spread(1e3 * optics.delay_s, 1e3 * optics.delay_s_std)],

@@ -41,11 +41,12 @@ def _line(found: CameraEstimate, name: str, value: float, std: float) -> str:
 def measured(found: CameraEstimate) -> list[str]:
     """Of the circuit and the frames, a line for what was measured."""
     optics, sensor, std = found.optics, found.sensor, found.sensor_std
-    rows = [("cutoff (Hz at 255 DN)", sensor.cutoff_hz, std.get("cutoff_hz", math.nan)),
+    where = "at 255 DN" if sensor.cutoff_by_light else "in any light"
+    rows = [(f"cutoff (Hz {where})", sensor.cutoff_hz, std.get("cutoff_hz", math.nan)),
             ("dead time (ms)", 1e3 * sensor.refractory_s, 1e3 * std.get("refractory_s", math.nan)),
             ("leak (Hz/pixel)", sensor.leak_hz, std.get("leak_hz", math.nan)),
             ("shot noise (Hz, dark)", sensor.shot_hz, std.get("shot_hz", math.nan)),
             ("light added (DN)", optics.offset_dn, optics.offset_dn_std),
             ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std)]
-    return [f"{name:22} {spread(value, std):>15}"
+    return [f"{name:24} {spread(value, std):>15}"
             for name, value, std in rows if value and math.isfinite(std)]

@@ -33,6 +33,12 @@ CHANGES: dict[str, dict[str, Any]] = {
 }
 
 
+def ideal(protocol: Protocol) -> bool:
+    """Whether its pixels follow at once, and its frames show what they see."""
+    return not (protocol.model.cutoff_hz or protocol.model.refractory_s or protocol.exposure_ms
+                or protocol.dark_dn or protocol.black_dn or protocol.frame_noise_dn > 0.5)
+
+
 def draw_real(rng: np.random.Generator) -> Protocol:
     """A camera as it may be: a quarter are ideal, of the others each part is absent in some."""
     mismatch = float(np.exp(rng.uniform(np.log(0.02), np.log(0.15))))
@@ -52,6 +58,9 @@ def draw_real(rng: np.random.Generator) -> Protocol:
         cutoff_hz=some(0.7, 25.0, 600.0), refractory_s=some(0.5, 1e-4, 4e-3),
         leak_hz=some(0.5, 0.02, 0.3), shot_hz=some(0.5, 0.1, 5.0), noise_resets_memory=True)
     black, dark = float(rng.uniform(-8.0, 20.0)), some(0.4, 3.0, 40.0)
+    if rng.random() < 0.3:
+        sensor = dataclasses.replace(
+            sensor, cutoff_hz=0.4 * sensor.cutoff_hz, cutoff_by_light=False)
     return dataclasses.replace(
         protocol, model=sensor, exposure_ms=int(some(0.6, 3.0, 20.0)),
         frame_noise_dn=0.5 + some(0.5, 0.3, 2.5), dark_dn=dark,

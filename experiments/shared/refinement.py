@@ -18,7 +18,7 @@ COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier t
 def undoubted(params: Any, recording: Recording) -> tuple[Any, Summary, Summary] | None:
     """What refine/doubt.py goes by, and the summary and its std without it; None where too little
     happens."""
-    if len(recording.events) < 1000:
+    if len(recording.events) < 10 or not plan_windows(recording).pairs:
         return None
     refined = refine(read_whole(recording, params))
     return None if refined.signs is None else (refined.signs, refined.summary, refined.std)

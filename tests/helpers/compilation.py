@@ -24,7 +24,7 @@ FLAGS = ("--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_c
          "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true")
 
 # Programs, by module, that one estimate runs dozens of times: longer than they compile.
-OFTEN = {"evflow.estimation.refine.receptor_search": ("_sums", "_slopes")}
+OFTEN = {"evflow.estimation.refine.receptor_regression": ("_sums", "_slopes")}
 
 
 def compile_quickly(environment: MutableMapping[str, str]) -> None:

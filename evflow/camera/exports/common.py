@@ -10,7 +10,8 @@ import numpy as np
 from evflow.camera.sensors import SensorModel
 
 Maps = Mapping[str, np.ndarray]
-GREY = 1 - 0.75 * (128 + 20) / 275  # shot noise of v2e and of OpenEB at 128 DN over that at 0 DN
+PACE = (128 + 20) / 275  # of a low-pass that goes with light at 128 DN, of that at 255 DN
+GREY = 1 - 0.75 * PACE  # shot noise of v2e and of OpenEB at 128 DN over that at 0 DN
 MAD = 1.4826  # standard deviations in a median absolute deviation of a normal distribution
 
 NOISE = '''"""Adds the measured noise to simulated events: Poisson, per pixel and polarity."""
@@ -43,7 +44,9 @@ def add_noise(x, y, t_us, p, maps, start, stop, seed=0):
 class Settings:
     """The scalars nearest to a camera's maps: medians over the pixels, thresholds in natural-log
     units, rates in Hz per pixel and polarity; sigma: the spread of a threshold over the pixels.
-    cutoff_hz (at 255 DN), dead_s: of the circuit, 0 where they were not measured."""
+    cutoff_hz (at 255 DN, where it goes with light), dead_s: of the circuit, 0 where they were not
+    measured; even_hz: the measured cutoff where it is the same in any light: cutoff_hz is then
+    right at 128 DN."""
 
     width: int
     height: int
@@ -54,6 +57,7 @@ class Settings:
     eta_on: float
     eta_off: float
     cutoff_hz: float = 0.0
+    even_hz: float = 0.0
     dead_s: float = 0.0
 
     @staticmethod
@@ -71,14 +75,18 @@ class Settings:
             within = float(np.median(std[name])) if std else 0.0
             sigma[name.replace("theta", "sigma")] = float(np.hypot(spread, within))
         height, width = maps["theta_on"].shape
-        values = {**middle, **sigma, **(summary or {})}
-        return Settings(width, height, **values, cutoff_hz=sensor.cutoff_hz,
-                        dead_s=sensor.refractory_s)
+        cutoff = {"cutoff_hz": sensor.cutoff_hz}
+        if not sensor.cutoff_by_light:
+            cutoff = {"cutoff_hz": sensor.cutoff_hz / PACE, "even_hz": sensor.cutoff_hz}
+        values = {**middle, **sigma, **cutoff, **(summary or {})}
+        return Settings(width, height, **values, dead_s=sensor.refractory_s)
 
     @property
     def circuit(self) -> str:
         """What was measured of the circuit, in words."""
         cutoff = f"cutoff {self.cutoff_hz:.0f} Hz at 255 DN" if self.cutoff_hz else "no cutoff"
+        if self.even_hz:
+            cutoff = f"cutoff {self.even_hz:.0f} Hz in any light, which is that of {cutoff} in grey"
         dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
         return f"{cutoff}, {dead}"
 

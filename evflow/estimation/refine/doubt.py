@@ -22,11 +22,13 @@ from evflow.estimation.refine.receptor_search import Found
 Array = np.ndarray
 
 NAMES = (
-    "regression", "other_regression", "unexplained", "explained_more", "smear_10", "smear_20",
-    "theta_10", "theta_20", "frame_noise", "needed", "offset", "offset_std", "tau", "tau_std",
-    "open", "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal")
+    "regression", "other_regression", "ideal_regression", "unexplained", "explained_more",
+    "smear_10", "smear_20", "theta_10", "theta_20", "frame_noise", "needed", "odds", "offset",
+    "offset_unneeded", "offset_std", "tau", "tau_std", "even", "open", "open_unneeded",
+    "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal")
 BEYOND = 2.0  # standard deviations outside of what it learned on, beyond which a sign is held
 NARROWER = 0.5  # of the std before: what a recording leaves open is not learned away
+MOST_ODDS = 10.0
 POOR = 0.3  # share that a path leaves unexplained, from which on an offset is easily missed
 
 
@@ -35,20 +37,29 @@ def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Arra
     theta, error = (np.array([float(getattr(s, f"theta_{p}")) for p in ("on", "off")])
                     for s in (summary, std))
     needed = float(found.needed)
+    unneeded = 1.0 - needed
     pooled = np.log((found.theta if found.needed else found.ideal_theta) / theta)
+    ideally = np.log(found.ideal_theta / theta)
     ideal, seen = found.explained
     left = 1.0 - (seen if found.needed else ideal)
     offset_std, tau_std, _ = found.std
     shared = [np.log(left + 1e-3), np.log((1 - ideal + 1e-3) / (1 - seen + 1e-3)),
               *found.smear[:, 0]]
-    camera = [noise_dn / 3.0, needed, needed * found.seen.offset_dn / 20.0, np.log(offset_std),
-              needed * found.seen.tau_s * 1e3, np.log(tau_std * 1e3)]
+    chance = np.clip(found.chance, 1e-9, 1 - 1e-9)
+    odds = np.clip(np.log(chance / (1 - chance)), -MOST_ODDS, MOST_ODDS) / MOST_ODDS
+    camera = [noise_dn / 3.0, needed, odds, needed * found.seen.offset_dn / 20.0,
+              unneeded * found.seen.offset_dn / 20.0, np.log(offset_std),
+              needed * found.seen.tau_s * 1e3, np.log(tau_std * 1e3),
+              float(not found.seen.by_light)]
     rows = []
     for p in (0, 1):
-        own = [np.log(needed * found.theta_error[p] + 0.01), np.log(error[p] / theta[p]),
+        open_ = found.theta_error[p]
+        own = [np.log(needed * open_ + 0.01), np.log(unneeded * open_ + 0.01),
+               np.log(error[p] / theta[p]),
                np.log(theta[p]), np.log(theta[1 - p]), np.log(found.size), 1.0 - p,
-               (1 - needed) * left, (1 - needed) * float(left > POOR)]
-        rows.append([pooled[p], pooled[1 - p], *shared, *found.smear[:, 1 + p], *camera, *own])
+               unneeded * left, unneeded * float(left > POOR)]
+        rows.append([pooled[p], pooled[1 - p], ideally[p], *shared, *found.smear[:, 1 + p],
+                     *camera, *own])
     return np.array(rows, np.float64)
 
 

@@ -168,7 +168,7 @@ def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
     steps = (len(film.dn) - 1) // len(film.dt_s)
     dt_s = np.repeat(film.dt_s / steps, steps).astype(np.float32)
     values = (np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST)))
-    return np.asarray(_seen(film.dn, dt_s, *values))
+    return np.asarray(_seen(film.dn, dt_s, *values, seen_by.by_light))
 
 
 _seen, _log = jax.jit(seen_path), jax.jit(lin_log)  # one program each, not one an operation

@@ -13,7 +13,7 @@ from evflow.estimation.refine.smear import smeared
 
 Array = jax.Array
 
-PIXELS, EVENTS = 4096, 1 << 15  # of a stretch that are looked at
+PIXELS, EVENTS = 2048, 1 << 14  # of a stretch that are looked at
 SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
 TILES = (6, 8)  # blocks of the image whose errors are independent
 ENOUGH = 200  # events of either polarity to look at

@@ -33,12 +33,16 @@ def test_signs_are_those_that_are_named() -> None:
     assert seen[0]["regression"] == pytest.approx(np.log(0.19 / 0.2))
     assert seen[1]["regression"] == seen[0]["other_regression"]
     assert (seen[0]["theta_10"], seen[1]["theta_20"]) == (0.02, 0.06)
-    assert seen[0]["offset"] == 1.0
+    assert (seen[0]["offset"], seen[0]["offset_unneeded"], seen[0]["odds"]) == (1.0, 0.0, 1.0)
+    assert seen[0]["ideal_regression"] == pytest.approx(np.log(0.25 / 0.2))
+    assert seen[0]["open_unneeded"] == pytest.approx(np.log(0.01))
     assert seen[0]["open"] == pytest.approx(np.log(0.02 * 2.0 + 0.01))
     assert seen[0]["poor_ideal"] == 0.0
     ideal = [dict(zip(NAMES, row, strict=True)) for row in signs(found(0.0), 1.5, SUMMARY, STD)]
     assert ideal[0]["regression"] == pytest.approx(np.log(0.25 / 0.2))
     assert ideal[0]["offset"] == ideal[0]["needed"] == 0.0
+    assert (ideal[0]["offset_unneeded"], ideal[0]["odds"]) == (1.0, -1.0)
+    assert ideal[0]["open_unneeded"] == seen[0]["open"]
     assert ideal[1]["unexplained_ideal"] == pytest.approx(0.3)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine.path import STEPS
-from evflow.estimation.refine.receptor_data import sample
+from evflow.estimation.refine.receptor_data import Sample, sample
+from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_search import find
 from evflow.estimation.refine.sightings import sight
 from evflow.simulator.photoreceptor import FAST, seen_path
@@ -35,13 +36,16 @@ def film(seed: int = 0) -> np.ndarray:
     return 20 + 190 / (1 + np.exp(-1.5 * total))
 
 
-def integrated(dn: np.ndarray, dt_s: float, offset: float, tau_s: float, sub: int) -> np.ndarray:
+def integrated(
+    dn: np.ndarray, dt_s: float, offset: float, tau_s: float, sub: int, by_light: bool = True
+) -> np.ndarray:
     """The photoreceptor at `sub` instants of each step, by short explicit steps."""
     light = np.maximum(dn + offset, 0.1)
     u = lin_log(light)
     s, out = u[0].copy(), [u[0]]
     for i in range(len(dn) - 1):
-        rate = ((light[i] + light[i + 1]) / 2 + 20) / 275 / max(tau_s, 1e-12)
+        share = ((light[i] + light[i + 1]) / 2 + 20) / 275 if by_light else 1.0
+        rate = share / max(tau_s, 1e-12)
         for k in range(1, sub + 1):
             now = u[i] + (u[i + 1] - u[i]) * k / sub
             s = now + (s - now) * np.exp(-rate * dt_s / sub) if tau_s else now
@@ -68,28 +72,59 @@ def events_of(path: np.ndarray, dt_s: float, delay_s: float, on: float, off: flo
     return Events(x, y, t + 10_000, p, SHAPE[::-1])
 
 
-@pytest.mark.parametrize(("offset", "tau_s"), [(0.0, 0.0), (24.0, 2e-3), (-12.0, 5e-3)])
-def test_the_path_is_that_of_a_plain_integration(offset: float, tau_s: float) -> None:
+@pytest.mark.parametrize(("offset", "tau_s", "by_light"), [
+    (0.0, 0.0, True), (24.0, 2e-3, True), (-12.0, 5e-3, True), (24.0, 4e-3, False)])
+def test_the_path_is_that_of_a_plain_integration(
+    offset: float, tau_s: float, by_light: bool
+) -> None:
     dn = film()[:40].astype(np.float32)
     dt_s = FRAME_S / STEPS
-    want = integrated(dn, dt_s, offset, tau_s, 400)[::400]
+    want = integrated(dn, dt_s, offset, tau_s, 400, by_light)[::400]
     got = seen_path(dn, np.full(39, dt_s, np.float32), np.float32(offset),
-                    np.float32(max(tau_s, FAST)))
+                    np.float32(max(tau_s, FAST)), by_light)
     assert np.abs(np.asarray(got) - want).max() < (5e-3 if tau_s else 0.02)
 
 
-@pytest.mark.parametrize(("offset", "cutoff_hz", "delay_s"), [
-    (0.0, 0.0, 0.0), (0.0, 100.0, 0.0), (24.0, 200.0, 1e-3), (-12.0, 30.0, -1e-3)])
-def test_the_constants_are_found_again(offset: float, cutoff_hz: float, delay_s: float) -> None:
+def looked_at(
+    offset: float, cutoff_hz: float, delay_s: float = 0.0, by_light: bool = True
+) -> Sample:
+    """What such pixels, of .25 and .2, show of the film."""
     dn, dt_s = film(), FRAME_S / STEPS
     tau_s = 1 / (2 * np.pi * cutoff_hz) if cutoff_hz else 0.0
-    seen = integrated(dn, dt_s, offset, tau_s, SUB)
+    seen = integrated(dn, dt_s, offset, tau_s, SUB, by_light)
     events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2)
     times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
     s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
     data = sample([(dn.astype(np.float32), np.full(INTERVALS * STEPS, dt_s), s)])
     assert data is not None
-    found = find(data)
+    return data
+
+
+def test_slopes_are_those_of_differences() -> None:
+    """Gauss's and Newton's curvature, too, but for what the lin-log bends."""
+    model = Regression(looked_at(0.0, 60.0))
+    phi = np.array([2.0, 3e-3, 2e-4])
+    slopes = model.slopes(phi)
+    for k, step in enumerate(np.diag([0.4, 4e-5, 4e-5])):
+        rise = model.unexplained(phi + step) - model.unexplained(phi - step)
+        assert slopes.gradient[k] == pytest.approx(rise / (2 * step[k]), rel=0.05)
+        change = np.log(model.solved(phi + step)[0] / model.solved(phi - step)[0])
+        np.testing.assert_allclose(slopes.of_theta[:, k], change / (2 * step[k]), rtol=0.05)
+    best = find(model.data).seen
+    phi = np.array([best.offset_dn, best.tau_s, best.delay_s])
+    bent = model.slopes(phi).bent
+    np.testing.assert_allclose(bent[1:, 1:], model.curvature(phi)[1:, 1:], rtol=0.4)
+
+
+@pytest.mark.parametrize(("offset", "cutoff_hz", "delay_s", "by_light"), [
+    (0.0, 0.0, 0.0, True), (0.0, 100.0, 0.0, True), (24.0, 200.0, 1e-3, True),
+    (-12.0, 30.0, -1e-3, True), (0.0, 30.0, 0.0, False), (24.0, 60.0, 1e-3, False)])
+def test_the_constants_are_found_again(
+    offset: float, cutoff_hz: float, delay_s: float, by_light: bool
+) -> None:
+    tau_s = 1 / (2 * np.pi * cutoff_hz) if cutoff_hz else 0.0
+    found = find(looked_at(offset, cutoff_hz, delay_s, by_light))
+    assert found.seen.by_light == by_light
     std = np.sqrt(np.diag(found.covariance))
     assert found.needed == bool(offset or cutoff_hz)
     assert abs(found.seen.offset_dn - offset) < 3 * std[0] + 0.5

@@ -1,0 +1,147 @@
+"""The pooled regression behind a photoreceptor: how much of what the pixels see it explains.
+
+At an event the memory equals what the pixel sees, s of simulator/photoreceptor.py, so that s at a
+pixel's events is theta_on a - theta_off b plus a constant, a and b counting its events (b
+negatively). The squares of all pixels, about each one's means, are summed over blocks of the image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.estimation.refine.receptor_data import PIXELS, TILES, Sample
+from evflow.simulator.photoreceptor import seen_path
+
+Array = jax.Array
+
+SCALE = np.array([2.0, 2e-4, 2e-4])  # of offset (DN), tau and delay (s): what is little of each
+LEAST_BENT = 1e-9  # of the curvature in units of SCALE
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Slopes:
+    """Of the log of the share that is left, at one photoreceptor. by_block: (blocks, 3) its
+    gradient, a sum over blocks; bent: (3, 3), positive definite, nearly its curvature; of_theta:
+    (2, 3) gradient of log theta_on and log theta_off."""
+
+    by_block: np.ndarray
+    bent: np.ndarray
+    of_theta: np.ndarray
+
+    @property
+    def gradient(self) -> np.ndarray:
+        return np.asarray(self.by_block.sum(0))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Regression:
+    """A sample, and whether the low-pass goes with light; phi (3,) are offset, tau and delay."""
+
+    data: Sample
+    by_light: bool = True
+
+    def solved(self, phi: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """theta_on, theta_off of the regression, what it leaves and what there is."""
+        products = self._total(phi)
+        theta = np.linalg.solve(products[:2, :2], products[:2, 2])
+        return theta, left_over(products, theta), float(products[2, 2])
+
+    def unexplained(self, phi: np.ndarray) -> float:
+        """Log of the share of variance that the regression leaves."""
+        _, left, all_ = self.solved(phi)
+        return float(np.log(max(left, 1e-12) / all_))
+
+    def explained_by(self, phi: np.ndarray, theta: np.ndarray) -> float:
+        """Share of the variance that thresholds (2,) explain."""
+        products = self._total(phi)
+        return 1.0 - left_over(products, theta) / float(products[2, 2])
+
+    def slopes(self, phi: np.ndarray) -> Slopes:
+        """By Gauss and Newton: what is left is |My|^2 of the unit vector y, M taking off the
+        counts; of its second derivative only the part along y, which keeps its length, is known."""
+        blocks = self._by_block(phi, slopes=True)
+        total = blocks.sum(0)
+        counts, seen, all_ = total[:2, :2], total[:2, 2], float(total[2, 2])
+        theta = np.linalg.solve(counts, seen)
+        left = max(left_over(total, theta), 1e-12 * all_)
+        rest = np.array([*-theta, 1.0])
+        along = total[2, 3:] / all_
+        turned = total[3:, 3:] / all_ - np.outer(along, along)
+        of_counts = (total[:2, 3:] - np.outer(seen, along)) / np.sqrt(all_)
+        free = turned - of_counts.T @ np.linalg.solve(counts, of_counts)
+        return Slopes(
+            2 * (blocks[:, :3, 3:].transpose(0, 2, 1) @ rest / left - blocks[:, 2, 3:] / all_),
+            _positive(2 * (free * (all_ / left) - turned)),
+            np.linalg.solve(counts, total[:2, 3:]) / theta[:, None])
+
+    def curvature(self, phi: np.ndarray) -> np.ndarray:
+        """(3, 3), positive definite, by differences: the lin-log bends y itself, of which Gauss
+        and Newton know nothing."""
+        steps = np.diag(0.5 * SCALE)
+        rows = np.array([self.slopes(phi + step).gradient - self.slopes(phi - step).gradient
+                         for step in steps]) / SCALE[:, None]
+        return _positive(0.5 * (rows + rows.T))
+
+    def _total(self, phi: np.ndarray) -> np.ndarray:
+        return np.asarray(self._by_block(phi, slopes=False).sum(0))
+
+    def _by_block(self, phi: np.ndarray, *, slopes: bool) -> np.ndarray:
+        sums = _slopes if slopes else _sums
+        return np.asarray(sums(jnp.asarray(phi, jnp.float32), self.by_light, self.data), np.float64)
+
+
+def left_over(products: np.ndarray, theta: np.ndarray) -> float:
+    """Squares that thresholds (2,) leave of y, from the products (>= 3, >= 3) of (a, b, y)."""
+    rest = np.array([*-theta, 1.0])
+    return float(rest @ products[:3, :3] @ rest)
+
+
+def _products(phi: Array, by_light: Array, data: Sample, *, slopes: bool) -> Array:
+    """(blocks, M, M): weighted products of a, b, y and, if asked for, the slopes of y, about each
+    pixel's means."""
+    blocks = data.dn.shape[0] * TILES[0] * TILES[1]
+
+    def one(d: Sample) -> Array:
+        step_s = d.dt_s.mean()
+        at = jnp.clip(d.at - phi[2] / step_s, 0.0, len(d.dt_s) - 1e-3)
+        step = jnp.floor(at).astype(jnp.int32)
+
+        def path(two: Array) -> Array:
+            return seen_path(d.dn, d.dt_s, two[0], two[1], by_light)
+
+        def looked_up(s: Array) -> tuple[Array, Array]:
+            before, after = s[step, d.pixel], s[step + 1, d.pixel]
+            return before + (at - step) * (after - before), before - after
+
+        if slopes:
+            s, along = jax.linearize(path, phi[:2])
+            (y, fall), tangents = looked_up(s), [looked_up(along(e))[0] for e in jnp.eye(2)]
+            columns = [d.on, d.off, y, *tangents, fall / step_s]
+        else:
+            columns = [d.on, d.off, looked_up(path(phi[:2]))[0]]
+
+        def total(v: Array) -> Array:
+            return jax.ops.segment_sum(v, d.pixel, PIXELS)
+
+        v = jnp.stack(columns, -1)
+        mass = jnp.maximum(total(d.weight), 1e-9)[:, None]
+        v = v - (total(d.weight[:, None] * v) / mass)[d.pixel]
+        squares = d.weight[:, None, None] * v[:, :, None] * v[:, None, :]
+        return jax.ops.segment_sum(squares, d.block[d.pixel], blocks)
+
+    return jax.lax.map(one, data).sum(0)
+
+
+_sums, _slopes = (jax.jit(partial(_products, slopes=slopes)) for slopes in (False, True))
+
+
+def _positive(curvature: np.ndarray) -> np.ndarray:
+    """The curvature (3, 3) with no direction in which it is bent downward."""
+    units = np.outer(SCALE, SCALE)
+    values, vectors = np.linalg.eigh(curvature * units)
+    return np.asarray(vectors @ np.diag(np.maximum(values, LEAST_BENT)) @ vectors.T / units)
