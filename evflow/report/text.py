@@ -48,5 +48,5 @@ def measured(found: CameraEstimate) -> list[str]:
             ("shot noise (Hz, dark)", sensor.shot_hz, std.get("shot_hz", math.nan)),
             ("light added (DN)", optics.offset_dn, optics.offset_dn_std),
             ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std)]
-    return [f"{name:24} {spread(value, std):>15}"
+    return [f"{name:22} {spread(value, std):>15}"
             for name, value, std in rows if value and math.isfinite(std)]
