@@ -69,9 +69,9 @@ NOTES: dict[str, str] = {
     "pixels.dead": "pixels never fire",
     "pixels.fast": "the photoreceptor is too fast for its cutoff to be seen",
     "pixels.hot": "pixels fire by themselves",
-    "noise.even": "the noise does not fall with light",
     "pixels.slow": "the photoreceptor's low-pass was measured",
     "pixels.unsure": "most pixels have no events of their own",
+    "noise.even": "the noise does not fall with light",
     "windows.skipped": "windows between frames were left out",
     "truth.none": "no pixel has both events and known flow",
 }

@@ -120,7 +120,8 @@ def _products(phi: Array, by_light: Array, data: Sample, *, slopes: bool) -> Arr
 
         if slopes:
             s, along = jax.linearize(path, phi[:2])
-            (y, fall), tangents = looked_up(s), [looked_up(along(e))[0] for e in jnp.eye(2, dtype=phi.dtype)]
+            y, fall = looked_up(s)
+            tangents = [looked_up(along(e))[0] for e in jnp.eye(2, dtype=phi.dtype)]
             columns = [d.on, d.off, y, *tangents, fall / step_s]
         else:
             columns = [d.on, d.off, looked_up(path(phi[:2]))[0]]
