@@ -99,6 +99,42 @@ class Voltmeter(_Numbers):
             _settle(self, name, low, f"finite, and at least {low:g}")
 
 
+@jax.tree_util.register_pytree_with_keys_class
+@dataclasses.dataclass(frozen=True)
+class SecondOrder(_Numbers):
+    """Time constants in seconds of a photoreceptor of second order, its source follower, and a
+    differencing amplifier that events reset (Low and Lee, "Deblur e-NeRF", ECCV 2024); a pytree.
+
+    The photoreceptor has the natural frequency w, w^2 = (loop_gain + 1) / ((input + miller)
+    output), and the damping (input + output + (gain + 1) miller) / (2 w (input + miller) output),
+    where input_s and miller_s are given at 255 DN and go as 1 / light: in the dark it is a
+    low-pass of first order whose corner is proportional to light, and in bright light it may ring.
+    The defaults have that corner at 199 Hz for 255 DN.
+    """
+
+    input_s: float = 0.03
+    miller_s: float = 2e-4
+    output_s: float = 5e-4
+    gain: float = 49.0
+    loop_gain: float = 49.0
+    follower_s: float = 1.6e-4
+    amplifier_s: float = 1.6e-4
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "leaves", tuple(f.name for f in dataclasses.fields(self)))
+        for name in self.leaves:
+            low = 1e-9 if name in ("input_s", "output_s") else 0.0
+            _settle(self, name, low, f"finite, and at least {low:g}")
+
+    def at(self, cutoff_hz: float) -> SecondOrder:
+        """The same with photoreceptors that are faster or slower, such that in the dark they are
+        as a low-pass of first order of this `cutoff_hz` at 255 DN."""
+        slow_s = (self.input_s + (self.gain + 1) * self.miller_s) / (self.loop_gain + 1)
+        by = 1.0 / (2 * np.pi * cutoff_hz * slow_s)
+        return dataclasses.replace(self, input_s=by * self.input_s, miller_s=by * self.miller_s,
+                                   output_s=by * self.output_s)
+
+
 DVS346 = Voltmeter(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
 DVS240 = Voltmeter(4.4241, 23.0, 2e-4, 1e-7, 5e-8, 1e-5)
 
@@ -136,6 +172,8 @@ class SensorModel(_Numbers):
         noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
             False adds it to the stream (the paper).
         voltmeter: constants of kind "voltmeter".
+        photoreceptor: a `SecondOrder` in place of the low-pass of first order, for kind "v2e" with
+            crossing times. What light does within the refractory period is then lost.
 
     Raises:
         EvflowDataError: EV020 (an unknown choice, a negative value, or an option that a pixel of
@@ -158,6 +196,7 @@ class SensorModel(_Numbers):
     eta_intensity: bool = False
     noise_resets_memory: bool = False
     voltmeter: Voltmeter = DVS346
+    photoreceptor: SecondOrder | None = None
 
     def __post_init__(self) -> None:
         if self.log_map == "auto":
@@ -172,7 +211,14 @@ class SensorModel(_Numbers):
             _settle(self, name, 0.0, ">= 0")
         on = tuple(name for name in NUMBERS if not is_off(getattr(self, name)))
         voltmeter = ("voltmeter",) if self.kind == "voltmeter" else ()
-        object.__setattr__(self, "leaves", (*on, *voltmeter))
+        second = ("photoreceptor",) if self.photoreceptor is not None else ()
+        object.__setattr__(self, "leaves", (*on, *voltmeter, *second))
+        if second and (self.kind, self.timestamps, "cutoff_hz" in on) != ("v2e", "crossing", False):
+            raise EvflowDataError(
+                "EV020", f"SensorModel(kind={self.kind!r}, timestamps={self.timestamps!r}, "
+                f"cutoff_hz={self.cutoff_hz}) and a photoreceptor of second order.",
+                "It takes the place of the low-pass, in pixels of kind 'v2e' with crossing times: "
+                "photoreceptor=SecondOrder().at(cutoff_hz).")
         for name in WITHOUT[self.kind]:
             if not is_off(getattr(self, name)):
                 raise EvflowDataError(

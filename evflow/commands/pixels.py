@@ -50,6 +50,10 @@ class Pixels:
     """Corner of the photoreceptor's low-pass at white; 0: none."""
     cutoff_by_light: bool = True
     """The corner goes with intensity, as in v2e; else it is the same everywhere."""
+    photoreceptor: Literal["first-order", "second-order"] = "first-order"
+    """How the photoreceptor follows light: as v2e's low-pass, or as that of Deblur e-NeRF, which
+    may ring in bright light, with a source follower and an amplifier that events reset. Of the
+    same --cutoff-hz in the dark, or the camera's, or 199 Hz."""
     refractory_s: Annotated[float | None, value("SECONDS", "--refractory")] = None
     """Time after an event in which a pixel sends no other (v2e: .0005)."""
     leak_hz: Annotated[float | None, value("HZ", "--leak")] = None
@@ -78,16 +82,28 @@ class Pixels:
             told |= {name: getattr(self, name) for name in CHOICES}
         else:
             refuse(self, CHOICES, f"--sensor {self.sensor} has no such choice")
-        return dataclasses.replace(model, **told)
+        model = dataclasses.replace(model, **told)
+        return model if self.photoreceptor == "first-order" else self._second_order(model)
+
+    def _second_order(self, model: SensorModel) -> SensorModel:
+        from evflow.camera.sensors import SecondOrder
+
+        refuse(self, ("cutoff_by_light",), "a photoreceptor of second order goes with light")
+        if self.cutoff_hz == 0:
+            raise EvflowDataError("EV020", "--photoreceptor second-order and --cutoff-hz 0.",
+                                  "Give the corner that it has in the dark, or leave it out.")
+        cutoff_hz = model.cutoff_hz or self._circuit()[0].cutoff_hz
+        receptor = SecondOrder().at(cutoff_hz) if cutoff_hz else SecondOrder()
+        return dataclasses.replace(model, cutoff_hz=0.0, photoreceptor=receptor)
 
     def seen_by(self, recorded: bool) -> Photoreceptor:
-        """The measured camera's photoreceptor, unless --cutoff-hz names another; of its light and
+        """The measured camera's photoreceptor, unless options name another; of its light and
         clock only in front of frames that a camera recorded beside its events."""
         from evflow.camera.optics import Optics
         from evflow.simulator.photoreceptor import Photoreceptor
 
         sensor, optics = self._circuit()
-        if self.cutoff_hz is not None:
+        if self.cutoff_hz is not None or self.photoreceptor != "first-order":
             sensor = dataclasses.replace(sensor, cutoff_hz=0.0)
         return Photoreceptor.of(sensor, optics if recorded else Optics())
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from evflow.camera import Camera
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity, to_log
-from evflow.simulator import noise, pixel, sensor
+from evflow.simulator import noise, pixel, second_order, sensor
 from evflow.simulator.constants import Constants
 from evflow.simulator.pixel import PixelState, Spikes
 from evflow.simulator.sensor import Sensor
@@ -85,28 +85,35 @@ def limits(model: Constants, camera: Camera, base: Array, dtype: np.dtype) -> Ar
 
 @jax.jit
 def look(
-    model: Constants, sensor: Sensor, pixels: PixelState, block: Block
+    model: Constants, whole: Sensor, pixels: PixelState, block: Block
 ) -> tuple[PixelState, Array]:
     """The pixels after the block where none of them fires, and (N,) which may."""
     def body(
-        carry: tuple[Array, Array, Array], inputs: tuple[Array, Array, Array]
-    ) -> tuple[tuple[Array, Array, Array], None]:
-        (lp, base, active), (frame, dt, salt) = carry, inputs
-        log_i = to_log(frame, model.log_map)
+        carry: tuple[PixelState, Array], inputs: tuple[Array, Array, Array]
+    ) -> tuple[tuple[PixelState, Array], None]:
+        (own, active), (frame, dt, salt) = carry, inputs
+        log_i, base, inner = to_log(frame, model.log_map), own.base, own.inner
         if model.corner is not None:
-            log_i = pixel.low_pass(model, lp, log_i, _i01(frame), dt)
-        if sensor.leaking is not None:
-            drawn = noise.draw(sensor.words, salt)
-            base = base - noise.leak(model, sensor.leaking, sensor.words, drawn, dt)
-        return (log_i, base, active | _beyond(sensor.camera, log_i - base)), None
+            log_i = pixel.low_pass(model, own.lp, log_i, _i01(frame), dt)
+        elif inner is not None:
+            middle = 0.5 * (sensor.i01_of(model, inner.light) + _i01(frame))
+            log_i, inner = second_order.rest(model, own.lp, inner, log_i, middle, dt)
+        if whole.leaking is not None:
+            drawn = noise.draw(whole.words, salt)
+            base = base - noise.leak(model, whole.leaking, whole.words, drawn, dt)
+        compared = log_i if inner is None else inner.amplified
+        own = PixelState(log_i, base, own.last, inner)
+        return (own, active | _beyond(whole.camera, compared - base)), None
 
-    start = (pixels.lp, pixels.base, jnp.zeros(pixels.lp.shape, bool))
-    (lp, base, active), _ = jax.lax.scan(
-        body, start, (block.frames[1:], block.dt, block.salts))
+    active = jnp.zeros(pixels.lp.shape, bool)
+    if model.photoreceptor is not None and model.refractory_s is not None:
+        active = pixels.last < model.refractory_s  # whose reset ends within the block
+    (after, active), _ = jax.lax.scan(
+        body, (pixels, active), (block.frames[1:], block.dt, block.salts))
     last = pixels.last + jnp.sum(block.dt) if model.is_dead_between else pixels.last
-    if sensor.rates is not None:
-        active |= look_for_noise(sensor, block)
-    return PixelState(lp, base, last), active
+    if whole.rates is not None:
+        active |= look_for_noise(whole, block)
+    return dataclasses.replace(after, last=last), active
 
 
 def _beyond(camera: Camera, contrast: Array) -> Array:
@@ -171,9 +178,13 @@ def _gathered(maps: T, at: Array) -> T:
 
 def _put_back(model: Constants, pixels: PixelState, own: PixelState, at: Array) -> PixelState:
     kept = ("base", "last") if model.refractory_s is not None else ("base",)
-    put = {name: getattr(pixels, name).at[at].set(
+    put: dict[str, Any] = {name: getattr(pixels, name).at[at].set(
         getattr(own, name), mode="drop", unique_indices=True, indices_are_sorted=True)
         for name in kept}
+    if pixels.inner is not None and own.inner is not None:
+        amplified = pixels.inner.amplified.at[at].set(
+            own.inner.amplified, mode="drop", unique_indices=True, indices_are_sorted=True)
+        put["inner"] = dataclasses.replace(pixels.inner, amplified=amplified)
     return dataclasses.replace(pixels, **put)
 
 

@@ -27,11 +27,12 @@ NO_TIME = 1e-12  # seconds: a dead time that delays nothing
 
 @partial(
     jax.tree_util.register_dataclass, meta_fields=CHOICES, data_fields=(
-        "corner", *(name for name in NUMBERS if name != "cutoff_hz"), "voltmeter"))
+        "corner", *(name for name in NUMBERS if name != "cutoff_hz"), "voltmeter", "photoreceptor"))
 @dataclasses.dataclass(frozen=True)
 class Constants:
     """A `SensorModel`, whose numbers are None where they are off. corner: of the low-pass at 255
-    DN, radians per second. voltmeter: a `Voltmeter`, None for other kinds."""
+    DN, radians per second. voltmeter: a `Voltmeter`, None for other kinds. photoreceptor: a
+    `SecondOrder`, or None."""
 
     kind: str
     timestamps: str
@@ -46,6 +47,7 @@ class Constants:
     leak_fpn_decades: Number
     shot_hz: Number
     voltmeter: Any
+    photoreceptor: Any
 
     @staticmethod
     def of(model: SensorModel) -> Constants:
@@ -57,12 +59,13 @@ class Constants:
         on |= {name: getattr(model, name) for name in CHOICES}
         return Constants(
             corner=_corner(on.pop("cutoff_hz")), refractory_s=_dead(on.pop("refractory_s")), **on,
-            voltmeter=model.voltmeter if model.kind == "voltmeter" else None)
+            voltmeter=model.voltmeter if model.kind == "voltmeter" else None,
+            photoreceptor=model.photoreceptor)
 
     @property
     def is_still(self) -> bool:
         """Whether a pixel's memory stays as it is between events."""
-        return self.corner is None and self.leak_hz is None
+        return self.corner is None is self.leak_hz and self.photoreceptor is None
 
     @property
     def is_dead_between(self) -> bool:
@@ -72,7 +75,7 @@ class Constants:
     @property
     def waits(self) -> bool:
         """Whether an event that comes within the refractory period of another fires later."""
-        return self.is_dead_between and self.kind == "v2e"
+        return self.is_dead_between and self.kind == "v2e" and self.photoreceptor is None
 
     @property
     def is_traced(self) -> bool:

@@ -69,11 +69,12 @@ def simulate_counts(
             "EV015", f"the camera is {camera.shape}, the frames {log_frames.shape[1:]}.")
     if not 0 <= smooth <= 1:
         raise EvflowDataError("EV020", f"smooth={smooth}.", "Choose 0 (exact) to 1.")
-    if law.kind == "voltmeter" or (
-            smooth and not (law.refractory_s is None is law.leak_jitter)):
+    unsmooth = (law.refractory_s, law.leak_jitter, law.photoreceptor)
+    if law.kind == "voltmeter" or (smooth and any(part is not None for part in unsmooth)):
         raise EvflowDataError(
             "EV020", f"{model} has no {'smooth ' if smooth else ''}counts.",
-            "Leave out refractory_s and leak_jitter, or add up simulate_voxels over bins.")
+            "Leave out refractory_s, leak_jitter and photoreceptor, or add up simulate_voxels over "
+            "bins.")
     check_log("log_frames", log_frames)
     timed = not isinstance(frame_dt_s, jax.core.Tracer)
     if timed and not 0 < float(frame_dt_s) < math.inf:

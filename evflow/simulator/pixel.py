@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from evflow.camera import Camera
+from evflow.simulator import second_order
 from evflow.simulator.constants import Constants
 
 Array = jax.Array
@@ -24,11 +25,13 @@ Array = jax.Array
 @dataclasses.dataclass(frozen=True)
 class PixelState:
     """lp, base: log intensities. last: with crossing times, seconds since the last signal
-    event (positive); with v2e's slots, its time stamp in float32 seconds as v2e keeps it."""
+    event (positive); with v2e's slots, its time stamp in float32 seconds as v2e keeps it. inner:
+    None but with a photoreceptor of second order."""
 
     lp: Array
     base: Array
     last: Array
+    inner: second_order.Inner | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -237,3 +240,19 @@ def send(
             last = since_last(model, spikes, last, dt)
     signed = dataclasses.replace(spikes, count=jnp.sign(theta) * spikes.count)
     return PixelState(state.lp, state.base + moved * theta, last), signed
+
+
+def advance_second_order(
+    model: Constants, theta_on: Array, theta_off: Array, state: PixelState, log_i: Array,
+    i01: Array, leaked: Array | None, dt: Array,
+) -> tuple[PixelState, Spikes]:
+    """An interval of dt seconds of a pixel whose photoreceptor is of second order. i01: normalised
+    light in its middle."""
+    assert state.inner is not None
+    lp, inner = second_order.follow(model.photoreceptor, state.lp, state.inner, log_i, i01, dt)
+    base = state.base if leaked is None else state.base - leaked
+    fired = second_order.fire(
+        model, theta_on, theta_off, base, inner.amplified, state.last, state.lp, lp, dt)
+    inner = dataclasses.replace(inner, amplified=fired.amplified)
+    return (PixelState(lp, fired.base, fired.last, inner),
+            Spikes(fired.count, fired.first, fired.spacing, None))

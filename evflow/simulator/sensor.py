@@ -7,6 +7,7 @@ interval. Both are pure; jit, vmap and scan them. Pixels are one flat axis (N,).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -17,7 +18,7 @@ from evflow.camera import Camera
 from evflow.camera.camera import THETA_MIN
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity
-from evflow.simulator import noise, pixel
+from evflow.simulator import noise, pixel, second_order
 from evflow.simulator.constants import Constants
 from evflow.simulator.pixel import PixelState, Spikes
 
@@ -148,7 +149,8 @@ def start(
         noise.leak_rates(model, flat.theta_on, pattern) if model.leak_hz is not None else None,
     )
     last = jnp.full_like(log_i, pixel.never_fired(model))
-    pixels = PixelState(log_i, base, last)
+    inner = None if model.photoreceptor is None else second_order.at_rest(log_i)
+    pixels = PixelState(log_i, base, last, inner)
     return sensor, SimState(
         pixels, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32), k_intervals)
 
@@ -181,6 +183,14 @@ def advance(
 
     dt = 0 with the same frame changes nothing and emits nothing (padding).
     """
+    if model.photoreceptor is not None:
+        assert state.inner is not None
+        middle = 0.5 * (i01_of(model, state.inner.light) + i01)
+        step = functools.partial(pixel.advance_second_order, model)
+        state, spikes = jax.vmap(step, (0,) * 6 + (None,))(
+            camera.theta_on, camera.theta_off, state, log_i, middle, disturbance.leaked, dt)
+        return _reset(model, state, disturbance), spikes
+
     def contrast(
         on: Array, off: Array, s: PixelState, log: Array, i: Array, leak: Array | None
     ) -> tuple[PixelState, Array, Array, Array]:
@@ -196,7 +206,17 @@ def advance(
         return pixel.send(model, s, th, b, e, dt, *clock, most)
 
     state, spikes = jax.vmap(send)(state, theta, begin, end)
-    if disturbance.struck is not None and model.noise_resets_memory:
-        base = jnp.where(disturbance.struck.some, state.lp, state.base)
-        state = dataclasses.replace(state, base=base)
-    return state, spikes
+    return _reset(model, state, disturbance), spikes
+
+
+def _reset(model: Constants, state: PixelState, disturbance: Disturbance) -> PixelState:
+    """The memory after noise events, where they reset it."""
+    if disturbance.struck is None or not model.noise_resets_memory:
+        return state
+    some = disturbance.struck.some
+    state = dataclasses.replace(state, base=jnp.where(some, state.lp, state.base))
+    if state.inner is None:
+        return state
+    amplified = jnp.where(some, state.lp, state.inner.amplified)
+    return dataclasses.replace(
+        state, inner=dataclasses.replace(state.inner, amplified=amplified))

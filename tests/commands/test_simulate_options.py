@@ -15,7 +15,7 @@ import pytest
 from helpers.videos import drifting
 
 from evflow import Camera, read_events, read_recording, simulate
-from evflow.camera.sensors import SENSORS
+from evflow.camera.sensors import SENSORS, SecondOrder
 from evflow.cli import main
 from evflow.commands.pixels import Pixels
 from evflow.io.source import open_frames
@@ -47,6 +47,15 @@ def test_the_circuit_from_the_command_line() -> None:
         for other in set(told) - {name}:
             assert getattr(model, other) == getattr(SENSORS["noisy"].model, other)
     assert Pixels().model().cutoff_hz == 0
+
+
+def test_a_photoreceptor_of_second_order_has_the_corner_of_the_first() -> None:
+    for options, expected in (({}, SecondOrder()), ({"cutoff_hz": 80.0}, SecondOrder().at(80.0)),
+                              ({"sensor": "noisy"}, SecondOrder().at(30.0))):
+        pixels = Pixels(photoreceptor="second-order", **options)
+        assert pixels.model().photoreceptor == expected
+        assert pixels.model().cutoff_hz == pixels.seen_by(False).tau_s == 0
+    assert Pixels().model().photoreceptor is None
 
 
 def test_thresholds_that_differ_from_pixel_to_pixel() -> None:
@@ -129,7 +138,10 @@ def test_frames_of_light_in_a_format_of_bytes(
     (["--shot-hz", "-1"], "EV020"), (["--sensor", "esim", "--cutoff-hz", "30"], "EV020"),
     (["--mismatch", "-0.1"], "EV020"), (["--mismatch", "0.1", "--theta-on", "0"], "EV014"),
     (["--saccades", "5"], "EV020"), (["--crop", "99x9"], "EV020"),
-    (["--slow-motion", "0"], "EV020")])
+    (["--slow-motion", "0"], "EV020"),
+    (["--photoreceptor", "second-order", "--cutoff-hz", "0"], "EV020"),
+    (["--photoreceptor", "second-order", "--sensor", "esim"], "EV020"),
+    (["--photoreceptor", "second-order", "--no-cutoff-by-light"], "EV020")])
 def test_options_out_of_range(
     video: Path, options: list[str], code: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

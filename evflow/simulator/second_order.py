@@ -1,0 +1,187 @@
+"""A pixel whose photoreceptor is of second order: `SecondOrder` of camera/sensors.py.
+
+    photoreceptor    v'' + 2 a v' + w^2 v = w^2 u        u: log light; a, w grow with the light
+    source follower  lp' = (v - lp) / tau_f
+    amplifier        y' = (lp - y) / tau_d               an event comes where |y - base| = theta
+
+An event resets the amplifier: until the dead time is over y follows lp, where both then begin anew,
+base = y = lp. So what light does in a dead time is lost. Within an interval u moves linearly and
+the rates are those of its middle; photoreceptor and follower are then solved exactly, however long
+it is. lp is taken to move linearly too, with which the amplifier is solved exactly: from the first
+reset on, events are as far apart as dead time and rise together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from evflow.camera.sensors import SecondOrder
+from evflow.simulator.constants import Constants
+
+Array = jax.Array
+
+NEVER = 1e9  # in intervals: beyond any
+NO_TIME = 1e-9  # seconds
+APART = 1e-3  # (1 - follower's time x pole) of both poles, multiplied; nearer ones are moved apart
+LEAST_DELAY = 1e-3  # of the amplifier, in intervals
+SEARCH, RISE = 4, 4  # steps of Newton's method
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    """Of a pixel beside `PixelState`: log light u and its voltage v at the photoreceptor, v per
+    second, and y behind the amplifier; log units."""
+
+    light: Array
+    voltage: Array
+    slope: Array
+    amplified: Array
+
+
+def at_rest(log_i: Array) -> Inner:
+    return Inner(log_i, log_i, jnp.zeros_like(log_i), log_i)
+
+
+def constants(receptor: SecondOrder, i01: Array) -> tuple[Array, Array]:
+    """a and w of the photoreceptor, per second, at normalised light i01."""
+    tau_in, tau_mil = receptor.input_s / i01, receptor.miller_s / i01
+    pole = 1.0 / ((tau_in + tau_mil) * receptor.output_s)
+    damping = (tau_in + receptor.output_s + (receptor.gain + 1.0) * tau_mil) * pole
+    return 0.5 * damping, jnp.sqrt((receptor.loop_gain + 1.0) * pole)
+
+
+def decay(a: Array, w: Array, dt: Array) -> tuple[Array, Array]:
+    """exp(-a dt) (cosh, sinh / d)(d dt), d^2 = a^2 - w^2 of either sign."""
+    square = a * a - w * w
+    d = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-6 * w * w))  # nearer to 0 is not to be told
+    slow, fast = jnp.exp(-dt * (w * w) / (a + d)), jnp.exp(-dt * (a + d))
+    still = jnp.exp(-a * dt)
+    over = square > 0
+    even = jnp.where(over, 0.5 * (slow + fast), still * jnp.cos(d * dt))
+    odd = jnp.where(over, 0.5 * (slow - fast), still * jnp.sin(d * dt))
+    return even, odd / d
+
+
+def follow(
+    receptor: SecondOrder, lp: Array, inner: Inner, log_i: Array, i01: Array, dt: Array
+) -> tuple[Array, Inner]:
+    """lp after an interval of dt seconds in which log light moves to log_i, and photoreceptor. i01:
+    in its middle."""
+    a, w = constants(receptor, i01)
+    tau = jnp.maximum(receptor.follower_s, NO_TIME)
+    near = jnp.abs(1.0 - 2.0 * a * tau + (w * tau) ** 2) < APART
+    outwards = jnp.where(w * w * tau < a, -1.0, 1.0)  # of the two poles
+    tau = tau * (1.0 + jnp.where(near, APART**0.5 * outwards, 0.0))
+    far = 1.0 - 2.0 * a * tau + (w * tau) ** 2
+    rise = (log_i - inner.light) / jnp.maximum(dt, NO_TIME)
+    lag = rise * (2.0 * a / (w * w))
+    even, odd = decay(a, w, dt)
+    # z: v about a line that lags behind the light; q of it is what the follower makes of it.
+    z = inner.voltage - inner.light + lag
+    slope = inner.slope - rise
+    later = even * z + odd * (slope + a * z)
+    later_slope = even * slope - odd * (a * slope + w * w * z)
+
+    def followed(z: Array, slope: Array) -> Array:
+        return z - (tau / far) * (slope + tau * w * w * z)
+
+    gone = lp - inner.light + lag + tau * rise - followed(z, slope)
+    new = (log_i - lag - tau * rise + followed(later, later_slope)
+           + gone * jnp.exp(-dt / tau))
+    return new, Inner(log_i, log_i - lag + later, rise + later_slope, inner.amplified)
+
+
+def amplified(y: Array, start: Array, rise: Array, delay: Array, elapsed: Array) -> Array:
+    """y after `elapsed` of which lp moves from start by `rise` per interval. delay: tau_d, in
+    intervals."""
+    lag = rise * delay
+    return start + rise * elapsed - lag + (y - start + lag) * jnp.exp(-elapsed / delay)
+
+
+def _delay(model: Constants, dt: Array) -> Array:
+    """Of the amplifier, in intervals."""
+    delay = model.photoreceptor.amplifier_s / jnp.maximum(dt, NO_TIME)
+    return jnp.maximum(delay, LEAST_DELAY)
+
+
+def rest(
+    model: Constants, lp: Array, inner: Inner, log_i: Array, i01: Array, dt: Array
+) -> tuple[Array, Inner]:
+    """`follow`, and the amplifier of a pixel that sends no event."""
+    new, inner = follow(model.photoreceptor, lp, inner, log_i, i01, dt)
+    y = amplified(inner.amplified, lp, new - lp, _delay(model, dt), jnp.ones_like(dt))
+    return new, dataclasses.replace(inner, amplified=y)
+
+
+def rise_time(theta: Array, rise: Array, delay: Array) -> Array:
+    """How long after a reset y has risen by theta, in intervals, where lp rises all the time:
+    x - 1 + exp(-x) = theta / (rise delay), x in delays."""
+    wanted = theta / jnp.maximum(rise * delay, 1e-30)
+    x = jnp.minimum(jnp.sqrt(2.0 * wanted) + 0.5 * wanted, wanted + 1.0)
+    for _ in range(RISE):
+        x = x - (x + jnp.expm1(-x) - wanted) / -jnp.expm1(-x)
+    return jnp.minimum(x * delay, NEVER)
+
+
+def first_time(
+    y: Array, start: Array, rise: Array, delay: Array, level: Array, left: Array
+) -> Array:
+    """When y, beyond `level` after `left`, first meets it: from the straight line on, by Newton's
+    method."""
+    end = amplified(y, start, rise, delay, left)
+    low = jnp.where(jnp.abs(end - y) > 1e-12, (level - y) / jnp.where(end == y, 1.0, end - y), 1.0)
+    at = jnp.clip(low, 0.0, 1.0) * left
+    for _ in range(SEARCH):
+        value = amplified(y, start, rise, delay, at)
+        slope = rise - (value - start - rise * at + rise * delay) / delay
+        step = (level - value) / jnp.where(jnp.abs(slope) > 1e-9, slope, 1e9)
+        at = jnp.clip(at + step, 0.0, left)
+    return at
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Fired:
+    """What an interval ends with: the memory, y, seconds since the last event; and its events,
+    signed count, the first and their distance in intervals."""
+
+    base: Array
+    amplified: Array
+    last: Array
+    count: Array
+    first: Array
+    spacing: Array
+
+
+def fire(
+    model: Constants, theta_on: Array, theta_off: Array, base: Array, y: Array, last: Array,
+    start: Array, end: Array, dt: Array,
+) -> Fired:
+    """The events of an interval of dt seconds in which lp moves from start to end."""
+    long, delay = jnp.maximum(dt, NO_TIME), _delay(model, dt)
+    dead = jnp.zeros_like(last) if model.refractory_s is None else model.refractory_s / long
+    rise = end - start
+    waits = jnp.clip(dead - last / long, 0.0, 1.0)  # of a dead time before the interval
+    begin = start + rise * waits
+    base, y = (jnp.where(waits > 0, begin, value) for value in (base, y))
+    left = 1.0 - waits
+    contrast = amplified(y, begin, rise, delay, left) - base
+    up = contrast > 0
+    sign = jnp.where(up, 1.0, -1.0)
+    theta = jnp.where(up, theta_on, theta_off)
+    fires = sign * contrast >= theta
+    first = waits + first_time(y, begin, rise, delay, base + sign * theta, left)
+    spacing = dead + jnp.where(sign * rise > 0, rise_time(theta, sign * rise, delay), NEVER)
+    count = jnp.where(fires, 1.0 + jnp.floor(jnp.maximum(1.0 - first, 0.0) / spacing), 0.0)
+    at = first + (count - 1.0) * spacing
+    reset = jnp.minimum(at + dead, 1.0)
+    anew = start + rise * reset
+    return Fired(
+        jnp.where(fires, anew, base),
+        jnp.where(fires, amplified(anew, anew, rise, delay, 1.0 - reset),
+                  amplified(y, begin, rise, delay, left)),
+        jnp.where(fires, (1.0 - at) * dt, last + dt), sign * count, first, spacing)
