@@ -21,6 +21,8 @@ CHANGES: dict[str, dict[str, Any]] = {
     "ideal": {},
     **{f"cutoff {hz} Hz": {"model": SensorModel(cutoff_hz=hz, noise_resets_memory=True)}
        for hz in (300.0, 100.0, 30.0)},
+    "cutoff 40 Hz in any light": {"model": SensorModel(
+        cutoff_hz=40.0, cutoff_by_light=False, noise_resets_memory=True)},
     **{f"exposed {ms} ms": {"exposure_ms": ms} for ms in (10, 20)},
     **{f"frame noise {dn} DN": {"frame_noise_dn": dn} for dn in (1.0, 3.0)},
     **{f"black level {dn:+.0f} DN": {"black_dn": dn} for dn in (-8.0, 8.0, 16.0)},
