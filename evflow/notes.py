@@ -41,7 +41,7 @@ NOTES: dict[str, str] = {
     "frames.moved": "frame times were moved",
     "frames.none": "there are no frames",
     "frames.rate": "the frame rate varies",
-    "frames.raw": "grey frames were taken as a colour mosaic",
+    "frames.raw": "frames are a colour mosaic",
     "frames.repeated": "frames repeat the one before",
     "frames.replaced": "frames are those of another file",
     "frames.response": "how frames code light was taken as usual",

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import tyro
 
 from evflow.errors import EvflowDataError
+from evflow.light.colour import Colour
 
 if TYPE_CHECKING:
     from evflow.types import Recording
@@ -27,7 +28,7 @@ T = TypeVar("T")
 LARGEST = 1e13  # of any number: as milliseconds since 1970 until 2286, and whole microseconds
 
 ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # of --frames
-CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer")  # of any frames
+CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer", "colour")  # of any frames
 OWN = ("frames_topic", "no_frames")  # of the recording's
 
 
@@ -107,6 +108,9 @@ class Reading:
     bayer: Annotated[str | None, value("RGGB|BGGR|GRBG|GBRG")] = None
     """The frames are a raw colour mosaic whose cells begin so: turn it into luma. Not where the
     events come from behind the same filters: there a pixel's own value is what it sees."""
+    colour: Colour = "luma"
+    """What a pixel sees of colour: luma, or its own under this Bayer mosaic, where the events come
+    from behind it (a colour DAVIS): raw mosaics stay as they are, colour frames are laid under."""
 
     def read(self, path: Path, *, with_frames: bool = True) -> Recording:
         """The recording at `path`, these options obeyed. with_frames: False where the command looks
@@ -122,13 +126,17 @@ class Reading:
             raise EvflowDataError(
                 "EV020", f"{told} with --frames, which takes the place of the recording's own.",
                 "Give one of them.")
+        if self.bayer is not None and self.colour != "luma":
+            raise EvflowDataError(
+                "EV020", f"--bayer {self.bayer} makes luma of a mosaic, --colour {self.colour} "
+                "leaves it.", "Give one of them.")
         own = with_frames and self.frames is None
         recording = io.read_recording(
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
             polarity=self.polarity, size=parse_size(self.size), partial=self.partial,
             drop_outside=self.drop_outside, no_frames=self.no_frames or not own,
             frames_topic=self.frames_topic if own else None, late=self.late,
-            events_topic=self.events_topic)
+            events_topic=self.events_topic, colour=self.colour if own else "luma")
         if with_frames and (self.frames is not None or recording.has_frames):
             return self._seeing(recording)
         if with_frames:
@@ -147,7 +155,8 @@ class Reading:
             recording = adjust.with_frames(
                 recording, self.frames, offset_us=offset, fps=self.frames_fps,
                 timestamps=self.timestamps, time_unit=self.timestamps_unit,
-                full_scale=self.full_scale, partial=self.partial, bayer=self.bayer)
+                full_scale=self.full_scale, partial=self.partial, bayer=self.bayer,
+                colour=self.colour)
         if self.flip_frames != "none":
             recording = adjust.flipped(recording, self.flip_frames)
         recording = adjust.linearised(recording, self.response)

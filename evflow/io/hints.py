@@ -15,6 +15,7 @@ import numpy as np
 from evflow.checks import Size, check_polarity, check_size
 from evflow.errors import EvflowDataError
 from evflow.io.decode.units import UNITS_US, since_1970
+from evflow.light.colour import COLOURS
 from evflow.notes import Note
 
 POLARITIES = ("auto", "01", "pm1", "invert")
@@ -53,6 +54,7 @@ class Told(TypedDict, total=False):
     no_frames: bool
     late: str
     events_topic: str | None
+    colour: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +76,8 @@ class Hints:
         reading; "drop" leaves out as few events as make the others ordered; "sort" puts them in
         their place; "join" puts one clock behind the other.
     events_topic: of several streams of events (of several cameras) the one to read.
+    colour: what a pixel sees of colour: "luma", or a Bayer pattern: its own colour under that
+        mosaic, as the events of a colour sensor do. Raw mosaics then stay as they are.
     """
 
     start_s: float | None = None
@@ -87,10 +91,11 @@ class Hints:
     no_frames: bool = False
     late: str = "stop"
     events_topic: str | None = None
+    colour: str = "luma"
 
     def __post_init__(self) -> None:
         check_choices(
-            self, time_unit=("auto", *UNITS_US), polarity=POLARITIES, late=LATE)
+            self, time_unit=("auto", *UNITS_US), polarity=POLARITIES, late=LATE, colour=COLOURS)
         for name in ("start_s", "stop_s"):
             value = getattr(self, name)
             number = isinstance(value, int | float | np.number)

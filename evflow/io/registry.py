@@ -114,7 +114,7 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
             drop_outside: leave out events outside the sensor; frames_topic: which of several
             streams of images holds the frames; no_frames: read the events alone; late: "drop",
             "sort" or "join" events whose time goes back; events_topic: which of several streams
-            of events to read.
+            of events to read; colour: "luma", or the Bayer pattern that pixels see through.
 
     Returns:
         The recording; without frames in the file they are (0, H, W). Its notes say what was

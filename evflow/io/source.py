@@ -102,7 +102,7 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
             "Leave out --fps and --timestamps, or pass its images alone.")
     recording = read_recording(path, time_unit=told.time_unit, partial=told.partial,
                                start_s=told.start_s, stop_s=told.stop_s,
-                               frames_topic=told.frames_topic)
+                               frames_topic=told.frames_topic, colour=told.colour)
     if not recording.has_frames:
         raise EvflowDataError(
             "EV011", f"{path} has events but no frames{why_no_frames(recording.notes)}.",

@@ -24,7 +24,8 @@ Frames = Iterator[tuple[np.ndarray, int]]
 Colour = Literal["luma", "rggb", "bggr", "grbg", "gbrg"]
 COLOURS: tuple[str, ...] = get_args(Colour)
 PATTERNS = COLOURS[1:]
-CONVERTED = Note("frames.luma", "colour frames were converted to luma")
+CONVERTED = Note("frames.luma", "colour frames were converted to luma; where the events come from "
+                 "behind a colour mosaic (a colour DAVIS), pass --colour rggb, or how it begins")
 LUMA = ("frames.luma", "frames.mosaic")  # codes of notes on frames that are luma of colours
 
 CELLS = tuple(np.s_[row::2, column::2] for row in (0, 1) for column in (0, 1))
@@ -158,7 +159,14 @@ def parse_pattern(text: str) -> str:
 def mosaic_note(pattern: str) -> Note:
     """What is said of frames that were a mosaic."""
     return Note(
-        "frames.mosaic", f"frames were a colour mosaic ({pattern.upper()}) and are its luma")
+        "frames.mosaic", f"frames were a colour mosaic ({pattern.upper()}) and are its luma; where "
+        f"the events come from behind it too (a colour DAVIS), pass --colour {pattern.lower()}")
+
+
+def seen_note(pattern: str) -> Note:
+    """What is said of frames that are what pixels see under a mosaic."""
+    return Note("frames.raw", "each pixel of the frames has its own colour alone, of a mosaic that "
+                f"begins {pattern.upper()}")
 
 
 def are_luma(notes: Iterable[Note]) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io.source import open_frames
 from evflow.light import response as light
-from evflow.light.colour import are_luma, mosaic_luma, mosaic_note
+from evflow.light.colour import are_luma, as_seen, mosaic_luma, mosaic_note
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -81,9 +81,9 @@ def with_frames(
     """The recording with the frames of `path` in place of its own: a folder of images, a video, a
     NumPy stack, another recording.
 
-    hints: fps, timestamps, time_unit, full_scale, partial, bayer, as in `open_frames`; times are
-    those of the events' clock, after offset_us is added. Frames more than a second away from all
-    events are left out.
+    hints: fps, timestamps, time_unit, full_scale, partial, bayer, colour, as in `open_frames`;
+    times are those of the events' clock, after offset_us is added. Frames more than a second away
+    from all events are left out.
     Raises EV012 (no frame near the events), EV015 (another size), and what `open_frames` raises.
     """
     try:
@@ -99,7 +99,7 @@ def with_frames(
             f"{recording.events.size[0]}x{recording.events.size[1]}.",
             "Both must come from one sensor, uncropped.")
     kept, times, seen = [], [], []
-    for frame, time in source.open():
+    for frame, time in as_seen(source.open(), hints.get("colour", "luma")):
         seen.append(time + offset_us)
         if t[0] - MARGIN_US <= seen[-1] <= t[-1] + MARGIN_US:
             kept.append(frame)

@@ -150,7 +150,7 @@ def with_frames(
         check_times(times if order is None else times[order], f"{path}: frame times", strict=True)
         within = np.flatnonzero((times >= span[0]) & (times < span[1]))
         keep = slice(int(within[0]), int(within[-1]) + 1) if len(within) else slice(0)
-        stack = FrameStack(path, events.size)
+        stack = FrameStack(path, events.size, hints.colour)
         for image, time in zip(decode(keep), times[keep], strict=True) if len(within) else ():
             if span[0] <= time < span[1]:
                 stack.append(image, time)

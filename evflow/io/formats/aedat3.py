@@ -196,9 +196,9 @@ class _Reading:
     def notes(self) -> tuple[Note, ...]:
         said = [Note("events.unread", f"{n:,} {name} were not read")
                 for name, n in self.left.items() if n]
-        if self.mosaic:
-            said.append(Note("frames.mosaic", "frames are the raw mosaic of a colour sensor: "
-                             "--bayer converts them to luma"))
+        if self.mosaic and self.aside.hints.colour == "luma":
+            said.append(Note("frames.raw", "frames are the raw mosaic of a colour sensor, as its "
+                             "events are: --bayer RGGB would convert them to luma"))
         return tuple(said)
 
 

@@ -32,7 +32,7 @@ class Aside:
 
     def __init__(self, path: Path, hints: Hints, size: Size) -> None:
         self.path, self.hints, self.size = path, hints, size
-        self.stack = FrameStack(path, size)
+        self.stack = FrameStack(path, size, hints.colour)
         self.last, self.stop, self.begun = 0, sys.maxsize, False
 
     def append(self, image: np.ndarray, time_us: int, origin: tuple[int, int] = (0, 0)) -> None:

@@ -2,8 +2,8 @@
 bytes are, and how they become grey frames.
 
 Depths stay as they are, 8 or 16 bits. Colour becomes luma, as does a Bayer mosaic by the pattern
-that its encoding names. `8UC3` and the like are OpenCV's, in B, G, R. Numbers that are measures
-(32FC1: depth, flow) are no frames.
+that its encoding names, unless the mosaic itself is asked for. `8UC3` and the like are OpenCV's, in
+B, G, R. Numbers that are measures (32FC1: depth, flow) are no frames.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evflow.errors import EvflowDataError
 from evflow.light.colour import mosaic_luma, mosaic_note
 from evflow.notes import Note
 
@@ -46,23 +47,37 @@ def unreadable(encoding: str) -> str:
     return f"encoded as {name!r}, which is not known"
 
 
-def notes(encoding: str) -> tuple[Note, ...]:
-    """What is to be said of frames that were so encoded and are converted here."""
+def notes(encoding: str, seen: str = "luma") -> tuple[Note, ...]:
+    """What is to be said of frames that were so encoded and are converted here, unless pixels see
+    (`Hints.colour`) the mosaic."""
     known = ENCODINGS.get(encoding.lower())
-    return () if known is None or known.order in GREYS else (mosaic_note(known.order),)
+    mosaic = known is not None and known.order not in GREYS and seen == "luma"
+    return (mosaic_note(known.order),) if known and mosaic else ()
 
 
-def unpacked(encoding: str, image: np.ndarray) -> np.ndarray:
+def unpacked(encoding: str, image: np.ndarray, seen: str = "luma") -> np.ndarray:
     """An image (H, W) or (H, W, C) that had an encoding before it was compressed: a mosaic is
-    compressed as it is, and becomes its luma."""
+    compressed as it is."""
     known = ENCODINGS.get(encoding)
     if known is None or known.order in GREYS or image.ndim != 2 or min(image.shape) < 2:
         return image
-    return mosaic_luma(image, known.order)
+    return _of_mosaic(image, known.order, seen)
+
+
+def _of_mosaic(values: np.ndarray, pattern: str, seen: str) -> np.ndarray:
+    """What pixels see of a mosaic; EV020 where they are said to see another."""
+    if seen == "luma":
+        return mosaic_luma(values, pattern)
+    if seen != pattern:
+        raise EvflowDataError(
+            "EV020", f"colour={seen} (--colour), but the images are a mosaic that begins "
+            f"{pattern.upper()}.", f"Pass --colour {pattern}, or leave it out for luma.")
+    return values
 
 
 def decode(
-    encoding: str, data: bytes, size: tuple[int, int], step: int, *, big_endian: bool
+    encoding: str, data: bytes, size: tuple[int, int], step: int, *, big_endian: bool,
+    seen: str = "luma",
 ) -> np.ndarray:
     """Pixels (H, W), or (H, W, 3) in B, G, R, u8 or u16, of rows of `step` bytes.
 
@@ -79,7 +94,7 @@ def decode(
     if order not in GREYS:
         if min(size) < 2:
             raise ValueError(f"a mosaic of {width}x{height} has no cell")
-        return mosaic_luma(values, order)
+        return _of_mosaic(values, order, seen)
     if channels == 1:
         return values
     colour = values.reshape(height, width, channels)[..., :3]

@@ -12,21 +12,21 @@ from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
 from evflow.io.decode.late import longest
 from evflow.io.hints import Hints
-from evflow.light.colour import CONVERTED, luma
+from evflow.light.colour import CONVERTED, luma, mosaic, seen_note
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
 
 class FrameStack:
     """Images (H, W) or (H, W, 3) in B, G, R that come one by one, as the frames of a recording:
-    colour becomes luma. Kept as `Spool` does it.
+    colour becomes luma, or what pixels see of it. Kept as `Spool` does it.
 
     where: names their file in messages; size: (width, height) of the sensor: images of another one,
-    a region of it among them, are left out and counted.
+    a region of it among them, are left out and counted. seen: what pixels see, as `Hints.colour`.
     """
 
-    def __init__(self, where: object, size: Size) -> None:
-        self.where, self.size, self.colour = where, size, False
+    def __init__(self, where: object, size: Size, seen: str = "luma") -> None:
+        self.where, self.size, self.seen, self.colour = where, size, seen, False
         self.times: list[int] = []
         self.left: collections.Counter[str] = collections.Counter()
         self._spool: Spool | None = None
@@ -46,7 +46,8 @@ class FrameStack:
             self.left[f"{image.shape[1]}x{image.shape[0]}"
                       + (f" from x={origin[0]}, y={origin[1]}" if region else "")] += 1
             return
-        grey = image if image.ndim == 2 else luma(image[..., :3])
+        grey = (image if image.ndim == 2 else luma(image[..., :3]) if self.seen == "luma" else
+                mosaic(image[..., :3], self.seen))
         if self._spool is None:
             self._spool = Spool(grey.dtype)
         if grey.dtype != self._spool.dtype:
@@ -72,7 +73,9 @@ class FrameStack:
         if self._spool is None:
             return Recording.of_events(events, notes)
         frames = self._spool.array().reshape(-1, *self.size[::-1])
-        if self.colour:
+        if self.seen != "luma":
+            notes = (*notes, seen_note(self.seen))
+        elif self.colour:
             notes = (*notes, CONVERTED)
         order, told = in_order(times, hints)
         if order is not None:

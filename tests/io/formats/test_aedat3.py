@@ -90,7 +90,7 @@ def test_colours_mosaics_and_regions(tmp_path: Path) -> None:
         + frame(red[:9, :9, 0], (11, 19, 12, 18), place=(5, 6), size=size - 36)))
     found = read_recording(path)
     assert found.frames.shape == (1, 180, 240)
-    assert {"frames.mosaic", "frames.unused"} <= {note.code for note in found.notes}
+    assert {"frames.raw", "frames.unused"} <= {note.code for note in found.notes}
     assert any("9x9 from x=5, y=6" in text for text in texts(found.notes))
 
 

@@ -115,9 +115,9 @@ class Bag:
         """The topics of images that have messages, by name; none where none are wanted."""
         found = [] if hints.no_frames else self.reader.connections
         kinds = {c.topic: c.msgtype for c in found if c.msgtype in IMAGES and c.msgcount}
-        return [self._image_stream(*pair) for pair in sorted(kinds.items())]
+        return [self._image_stream(*pair, hints.colour) for pair in sorted(kinds.items())]
 
-    def _image_stream(self, topic: str, kind: str) -> ImageStream:
+    def _image_stream(self, topic: str, kind: str, seen: str) -> ImageStream:
         try:
             message = next(self.messages(topic))
             message.stamp_ns()
@@ -125,12 +125,12 @@ class Bag:
                 encoding, data = message.compressed()
                 size = claimed_size(data)
                 return ImageStream(topic, size, "" if size else "compressed as is not known",
-                                   encodings.notes(encoding))
+                                   encodings.notes(encoding, seen))
             size, encoding = message.picture()
         except Damage as e:
             return ImageStream(topic, unusable=f"damaged: {e.seen}")
         why = encodings.unreadable(encoding)
-        return ImageStream(topic, size, why, () if why else encodings.notes(encoding))
+        return ImageStream(topic, size, why, () if why else encodings.notes(encoding, seen))
 
     def messages(self, topic: str) -> Iterator[Message]:
         wanted = [c for c in self.reader.connections if c.topic == topic]
@@ -203,7 +203,7 @@ class Bag:
         self, topic: str, size: Size, hints: Hints, span: tuple[int, int] | None
     ) -> FrameStack:
         """The images of a topic whose times lie in [start, stop) us."""
-        found = FrameStack(topic, size)
+        found = FrameStack(topic, size, hints.colour)
         kind = next(c.msgtype for c in self.reader.connections if c.topic == topic)
         stamped = self.stamped(topic)
         try:
@@ -211,7 +211,7 @@ class Bag:
                 ns = message.stamp_ns()
                 stamp = hints.instant(ns if stamped else message.recorded_ns, "ns")
                 if span is None or span[0] <= stamp < span[1]:
-                    found.append(message.image(kind), stamp)
+                    found.append(message.image(kind, hints.colour), stamp)
         except Damage as e:
             raise self._wrong(topic, e) from e
         return found

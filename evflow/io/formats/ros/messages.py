@@ -142,17 +142,18 @@ class Message:
         png compressed "), and its file, of a CompressedImage whose header was read."""
         return self.text().partition(";")[0].strip().lower(), self.block()
 
-    def image(self, kind: str) -> np.ndarray:
+    def image(self, kind: str, seen: str = "luma") -> np.ndarray:
         """The pixels of an image whose header was read, as `encodings.decode` has them."""
         if kind == COMPRESSED:
             encoding, data = self.compressed()
-            return encodings.unpacked(encoding, decoded(data, f"message {self.index:,}"))
+            return encodings.unpacked(encoding, decoded(data, f"message {self.index:,}"), seen)
         size, encoding = self.picture()
         big_endian, step = self.fields("BI")
         data = self.block()
         if why := encodings.unreadable(encoding):
             raise Damage(self.index, f"it is {why}, as others of its topic are not", "message")
         try:
-            return encodings.decode(encoding, data, size, step, big_endian=bool(big_endian))
+            return encodings.decode(
+                encoding, data, size, step, big_endian=bool(big_endian), seen=seen)
         except ValueError as e:
             raise Damage(self.index, str(e), "message") from e
