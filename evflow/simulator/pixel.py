@@ -250,7 +250,7 @@ def advance_second_order(
     light in its middle."""
     assert state.inner is not None
     lp, inner = second_order.follow(model.photoreceptor, state.lp, state.inner, log_i, i01, dt)
-    base = state.base if leaked is None else state.base - leaked
+    base = state.base - (0.0 if leaked is None else leaked)
     fired = second_order.fire(
         model, theta_on, theta_off, base, inner.amplified, state.last, state.lp, lp, dt)
     inner = dataclasses.replace(inner, amplified=fired.amplified)
