@@ -4,6 +4,11 @@ The public names (`__init__.pyi`) load on first use, so that `import evflow` and
 stay instant.
 """
 
+from evflow.process import early
+
+if early.is_command():
+    early.end_on_interrupt()  # before anything else is loaded
+
 import lazy_loader
 
 __version__ = "0.1.0"

@@ -1,22 +1,18 @@
 """`python -m evflow` and the command `evflow`: what is done before anything else is loaded."""
 
-import os
-import signal
 import sys
 from typing import NoReturn
 
+from evflow.process import early
+
 
 def run() -> NoReturn:
-    """The process `evflow`. Ctrl-C ends it at once while modules are loaded, which takes a second
-    and which they do not all survive: nothing is begun yet."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # not where a shell has it ignored
-        signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    """The process `evflow`; `main` of cli.py takes Ctrl-C over."""
+    early.end_on_interrupt()
     from evflow.cli import run
     from evflow.process.terminal import open_closed
 
     open_closed()
-    signal.signal(signal.SIGINT, before)
     run()
     sys.exit()
 

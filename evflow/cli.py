@@ -29,6 +29,7 @@ from evflow.commands.train import Train, with_configuration
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
+from evflow.process import early
 from evflow.process.compilation import remember
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
@@ -67,6 +68,7 @@ def understood(arguments: list[str]) -> list[str]:
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the `evflow` command."""
     try:
+        early.interrupt_as_usual()
         with stoppable():
             arguments = understood(sys.argv[1:] if argv is None else argv)
             command = tyro.cli(
@@ -99,6 +101,7 @@ def run() -> NoReturn:
     """The process `evflow`: `main`, and its exit code."""
     print_anything()
     code = main()
+    early.end_on_interrupt()
     if code == INTERRUPTED:
         leave(code)
     sys.exit(code)

@@ -71,8 +71,9 @@ def _image(
 
     rows, shared = {"voxels": voxels, "dlogI": dlogI}, {"y": y}
     (shared if same else rows)["context"] = context
-    return chunks.by_platform(
-        lambda rows: _chunk(config, folded, **rows, **shared), rows, alone=alone)
+    # The way back computes a chunk again: of all pixels at once it would keep 250 kB each.
+    chunk = jax.checkpoint(lambda rows: _chunk(config, folded, **rows, **shared), prevent_cse=False)
+    return chunks.by_platform(chunk, rows, alone=alone)
 
 
 def _chunk(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -81,3 +82,25 @@ def test_it_is_encode_and_forward(name: str) -> None:
     if name == "paper":  # there is nothing around which y could be expected
         with pytest.raises(EvflowDataError, match="EV018"):
             api.log_prob(params, voxels, code)
+
+
+def kept_bytes(pixels: int) -> int:
+    """What the gradient over the parameters keeps of the way there, without computing it."""
+    known = Summary(*(jnp.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
+    voxels, dlogI = (jax.ShapeDtypeStruct((pixels, 8, *c), jnp.float32) for c in ((32,), ()))
+
+    def way_back(params: Any, voxels: Any, dlogI: Any) -> Any:
+        def loss(params: Any) -> Any:
+            return api.estimate(params, voxels, dlogI, summary=known).theta_on.sum()
+
+        return jax.vjp(loss, params)[1]
+
+    kept = jax.eval_shape(way_back, small_params(), voxels, dlogI)
+    return sum(math.prod(a.shape) * a.dtype.itemsize for a in jax.tree.leaves(kept))
+
+
+def test_a_gradient_keeps_what_goes_in_alone() -> None:
+    """Activations, 50 kB of every pixel of this small network, would fill the memory: a chunk's
+    are computed again."""
+    inputs = 4 * (32 + 1)  # voxels, dlogI
+    assert kept_bytes(4000) < 4000 * 8 * 3 * inputs  # chunks of either size have their own
