@@ -8,7 +8,8 @@ programming error, an `EvflowDataError` is something about the user's file or ar
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 CODES: dict[str, str] = {
     "EV001": "empty input",
@@ -57,6 +58,8 @@ class EvflowDataError(Exception):
         code: one of `CODES`, "EV001" and so on; stable, so programs may branch on it.
         seen: what was found, and where.
         fix: what to do about it; "" where there is nothing to say.
+        where: the file, or place in one, that `seen` names; None where it is about arrays or
+            options.
 
     Example:
         >>> try:
@@ -65,21 +68,22 @@ class EvflowDataError(Exception):
         ...     print(error.code, error.fix)
     """
 
-    def __init__(self, code: str, seen: str, fix: str = "") -> None:
+    def __init__(self, code: str, seen: str, fix: str = "", *, where: object = None) -> None:
         self.code, self.seen, self.fix = code, seen, fix
+        self.where = None if where is None else str(where)
         super().__init__(f"{code} {CODES[code]}: {seen}{' ' + fix if fix else ''}")
 
-    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+    def __reduce__(self) -> tuple[Callable[..., EvflowDataError], tuple[str, str, str]]:
         """Pickled by its parts, so that it passes from process to process."""
-        return type(self), (self.code, self.seen, self.fix)
+        return partial(type(self), where=self.where), (self.code, self.seen, self.fix)
 
 
 @contextlib.contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Every message from the block names the file: `path` is put before those that do not."""
+    """Every message from the block names its file: `path` is put before those that name none."""
     try:
         yield
     except EvflowDataError as e:
-        if str(path) in str(e):
+        if e.where is not None:
             raise
-        raise EvflowDataError(e.code, f"{path}: {e.seen}", e.fix) from e
+        raise EvflowDataError(e.code, f"{path}: {e.seen}", e.fix, where=path) from e

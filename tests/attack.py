@@ -33,6 +33,7 @@ TREE = Path(__file__).parents[1]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 BAD = ("wrong file", "wrong file that reads", "segmentation fault", "left after the signal",
        "left after the next run", "next run failed")
+AGAIN = 0.17  # the share of kills after which the command is run again though nothing is left
 SEQUENCE = """
 import dataclasses, sys
 import numpy as np
@@ -151,7 +152,7 @@ class Attack:
 
     def __init__(self, tree: Path, work: Path, seed: int) -> None:
         self.work, self.rng = work, random.Random(seed)
-        self.counts: dict[str, collections.Counter[str]] = {}
+        self.counts: dict[str, collections.Counter[str]] = {}  # by command and by signal
         self.window_s: dict[str, tuple[float, float]] = {}
         self._options: dict[str, Any] = {
             "cwd": tree, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL,
@@ -174,7 +175,7 @@ class Attack:
             self.window_s[name] = max(writes, end / 2), end
 
     def kill(self, name: str, victim: Victim, number: signal.Signals) -> None:
-        counts = self.counts.setdefault(name, collections.Counter())
+        counts = collections.Counter[str]()
         folder, whole = self._fresh("killed"), self.work / f"{name}-reference" / victim.out
         process = subprocess.Popen(victim.command(folder), **self._options)
         time.sleep(self.rng.uniform(*self.window_s[name]))
@@ -187,8 +188,10 @@ class Attack:
         cleans = number == signal.SIGINT or (number == signal.SIGTERM and not victim.plain)
         if cleans and code > 0:
             counts["left after the signal"] += bool(leftovers(folder))
-        if leftovers(folder) or counts["kills"] % 6 == 0:
+        if leftovers(folder) or self.rng.random() < AGAIN:
             self._run_again(counts, victim, folder, whole)
+        for which in (name, number.name):
+            self.counts.setdefault(which, collections.Counter()).update(counts)
 
     def _judge(
         self, counts: collections.Counter[str], victim: Victim, folder: Path, whole: Path
@@ -250,9 +253,11 @@ def turns(told: argparse.Namespace) -> Iterator[tuple[str, signal.Signals]]:
 
 def table(attack: Attack) -> str:
     columns = ["kills", "absent", "whole", "ended before", "next runs", *BAD]
-    total: collections.Counter[str] = sum(attack.counts.values(), collections.Counter())
+    signals = {number.name: attack.counts.pop(number.name) for number in SIGNALS
+               if number.name in attack.counts}
+    total: collections.Counter[str] = sum(signals.values(), collections.Counter())
     lines = ["".join(f"{text:>24}" for text in ("", *columns))]
-    for name, counts in [*attack.counts.items(), ("all", total)]:
+    for name, counts in [*attack.counts.items(), *signals.items(), ("all", total)]:
         lines.append(f"{name:>24}" + "".join(f"{counts[column]:>24}" for column in columns))
     return "\n".join(lines)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import evflow
-from evflow.errors import CODES
+from evflow.errors import CODES, naming
 
 ROOT = Path(evflow.__file__).parent
 # From the bottom up; a module may import from its own floor or below.
@@ -125,7 +125,15 @@ def test_the_library_does_not_know_its_scripts() -> None:
                 assert node.module.split(".")[0] not in ("experiments", "benchmarks"), path
 
 
+@pytest.mark.parametrize(("where", "seen"), [(None, "b/c.txt: it is odd."), ("c", "it is odd.")])
+def test_a_file_is_named_where_none_is(where: str | None, seen: str) -> None:
+    with pytest.raises(evflow.EvflowDataError) as caught, naming("b"), naming(Path("b/c.txt")):
+        raise evflow.EvflowDataError("EV009", "it is odd.", "Mend it.", where=where)
+    assert (caught.value.seen, caught.value.where) == (seen, where or "b/c.txt")
+
+
 def test_errors_pass_from_process_to_process() -> None:
-    error = pickle.loads(pickle.dumps(evflow.EvflowDataError("EV004", "seen.", "Fix it.")))
-    assert (error.code, error.seen, error.fix) == ("EV004", "seen.", "Fix it.")
+    made = evflow.EvflowDataError("EV004", "seen.", "Fix it.", where=Path("a.h5"))
+    error = pickle.loads(pickle.dumps(made))
+    assert (error.code, error.seen, error.fix, error.where) == ("EV004", "seen.", "Fix it.", "a.h5")
     assert str(error) == "EV004 timestamps not sorted: seen. Fix it."

@@ -49,7 +49,8 @@ def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.Zip
             yield archive
     except DAMAGE as e:
         raise EvflowDataError(
-            "EV009", f"{path} is damaged ({e or type(e).__name__}).", "Copy it again.") from e
+            "EV009", f"{path} is damaged ({e or type(e).__name__}).", "Copy it again.",
+            where=path) from e
 
 
 def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:

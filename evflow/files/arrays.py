@@ -24,7 +24,8 @@ def mapped(path: Path, shape: tuple[int | None, ...], *, fields: bool = False) -
     Raises EV009 (damaged, pickled, another shape), EV016 (absent).
     """
     if not path.is_file():
-        raise EvflowDataError("EV016", f"{path} is not there.", "Is the folder complete?")
+        raise EvflowDataError("EV016", f"{path} is not there.", "Is the folder complete?",
+                              where=path)
     try:
         with open(path, "rb") as f:
             found, fortran, dtype = npy_header(f)
@@ -32,19 +33,19 @@ def mapped(path: Path, shape: tuple[int | None, ...], *, fields: bool = False) -
     except (OSError, EOFError, ValueError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
-            "Copy or export it again.") from e
+            "Copy or export it again.", where=path) from e
     need, size = start + math.prod(found) * dtype.itemsize, os.path.getsize(path)
     if not (dtype.fields if fields else dtype.kind in "biuf") or need > size:
         raise EvflowDataError(
             "EV009", f"{path} claims {found} {dtype}, {need:,} bytes, and has {size:,}.",
-            "Cut off? Copy or export it again.")
+            "Cut off? Copy or export it again.", where=path)
     kept = found
     while len(kept) > len(shape) and kept[-1] == 1:
         kept = kept[:-1]
     if len(kept) != len(shape) or any(
             want is not None and want != got for want, got in zip(shape, kept, strict=True)):
         raise EvflowDataError(
-            "EV009", f"{path} has shape {found}; expected {shape}.", "Export it again.")
+            "EV009", f"{path} has shape {found}; expected {shape}.", "Export it again.", where=path)
     if math.prod(found) == 0:
         return np.zeros(kept, dtype)
     data = np.memmap(path, dtype, "r", start, found, "F" if fortran else "C")

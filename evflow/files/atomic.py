@@ -69,10 +69,12 @@ def written_aside(
     """`atomic_write` of a file or folder; move(temporary, path, overwrite) puts it in place."""
     path = Path(path)
     if os.path.exists(path) and not overwrite:  # false, not an error, for an impossible path
-        raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).")
+        raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).",
+                              where=path)
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise EvflowDataError(
-            "EV013", f"{path} is a device or a pipe.", "It is never replaced: choose a file.")
+            "EV013", f"{path} is a device or a pipe.", "It is never replaced: choose a file.",
+            where=path)
     temporary = aside(path, "tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,7 +88,7 @@ def written_aside(
         if e.errno in REASONS:
             raise EvflowDataError(
                 "EV019", f"{path} was not written ({REASONS[e.errno]}).",
-                "Nothing is left behind; free space or choose another output.") from e
+                "Nothing is left behind; free space or choose another output.", where=path) from e
         raise
     finally:
         with uninterrupted():

@@ -45,7 +45,8 @@ def _refuse_foreign(path: Path, names: Collection[str]) -> None:
     old = sorted(p.name for p in path.iterdir()) if path.is_dir() else []
     if foreign := [name for name in old if name not in names]:
         raise EvflowDataError(
-            "EV013", f"{path} is a folder that holds {foreign[:5]}.", "Choose another output.")
+            "EV013", f"{path} is a folder that holds {foreign[:5]}.", "Choose another output.",
+            where=path)
 
 
 @contextlib.contextmanager
@@ -61,7 +62,7 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     folder = Path(folder)
     if not overwrite and (old := [name for name in names if (folder / name).exists()]):
         raise EvflowDataError("EV013", f"{folder} holds {', '.join(old)}.",
-                              "Pass --overwrite (overwrite=True).")
+                              "Pass --overwrite (overwrite=True).", where=folder)
     stage = aside(folder / "stage", "tmp")
     new = not folder.exists()
     try:

@@ -18,4 +18,4 @@ def check_expansion(claimed: int, stored: int, where: object) -> None:
     if claimed > FREE + RATIO * stored:
         raise EvflowDataError(
             "EV009", f"{where} claims {claimed:,} bytes, stored in {stored:,}.",
-            "Damaged, or made to fill the memory? Copy or export it again.")
+            "Damaged, or made to fill the memory? Copy or export it again.", where=where)

@@ -26,7 +26,7 @@ def move_new(source: Path, target: Path) -> None:
     except FileExistsError as e:
         raise EvflowDataError(
             "EV013", f"{target} has appeared meanwhile.",
-            "It was left as it is: another process writes there.") from e
+            "It was left as it is: another process writes there.", where=target) from e
 
 
 def swap_folders(new: Path, old: Path, aside: Path) -> None:

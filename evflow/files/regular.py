@@ -15,7 +15,7 @@ def need_regular(path: AnyPath) -> AnyPath:
     """The path, where there is a file, a folder or nothing; EV016 for pipes, devices, sockets."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise EvflowDataError("EV016", f"{path} is a pipe, a device or a socket.",
-                              "Only files are read: save it to one first.")
+                              "Only files are read: save it to one first.", where=path)
     return path
 
 

@@ -14,7 +14,7 @@ from evflow.errors import EvflowDataError
 def not_whole(path: Path, what: str) -> EvflowDataError:
     """EV019 for a file that is not as it was written."""
     return EvflowDataError("EV019", f"{path} was not written whole: {what}.",
-                           "It was not kept. Does the disk work? Write it again.")
+                           "It was not kept. Does the disk work? Write it again.", where=path)
 
 
 def need_size(path: Path, size: int) -> None:

@@ -85,21 +85,22 @@ def find_format(path: str | os.PathLike) -> Format:
         head = b"" if path.is_dir() else _head(path)
     except (OSError, ValueError) as e:  # ValueError: a NUL in the name
         why = e.strerror if isinstance(e, OSError) and e.strerror else e
-        raise EvflowDataError("EV016", f"{path!s:.200} cannot be opened ({why}).") from e
+        raise EvflowDataError("EV016", f"{path!s:.200} cannot be opened ({why}).",
+                              where=path) from e
     claims = [f for f in FORMATS if f.sniff(path, head)]
     claims.sort(key=lambda f: path.suffix.lower() not in f.EXTENSIONS)
     if claims:
         return claims[0]
     if not path.is_dir() and not head:
-        raise EvflowDataError("EV009", f"{path} is empty (0 bytes).", "Copy it again.")
+        raise EvflowDataError("EV009", f"{path} is empty (0 bytes).", "Copy it again.", where=path)
     if not path.is_dir() and (other := unread.known(path, head)):
-        raise EvflowDataError("EV008", f"{path} is {other.what}.", other.fix)
+        raise EvflowDataError("EV008", f"{path} is {other.what}.", other.fix, where=path)
     seen = (f"the folder holds {sorted(p.name for p in path.iterdir())[:5]}" if path.is_dir()
             else f"it begins with {head[:16]!r}")
     raise EvflowDataError(
         "EV008", f"{path} is none of {', '.join(f.NAME for f in FORMATS)}: {seen}.",
         "Convert it, or check that it was copied completely. Text has lines of numbers `t x y p`, "
-        "decimal points, and a header where the order is another.")
+        "decimal points, and a header where the order is another.", where=path)
 
 
 def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
@@ -146,9 +147,10 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
     except MemoryError as e:
         raise EvflowDataError(
             "EV009", f"{path} asks for more memory than there is.",
-            "If it is sound, read a part: start_s, stop_s (--start, --stop).") from e
+            "If it is sound, read a part: start_s, stop_s (--start, --stop).", where=path) from e
     except OSError as e:
-        raise EvflowDataError("EV009", f"{path} cannot be read ({e}).", "Copy it again.") from e
+        raise EvflowDataError("EV009", f"{path} cannot be read ({e}).", "Copy it again.",
+                              where=path) from e
     return recording
 
 
@@ -264,7 +266,7 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
         kinds = ", ".join(f"{s or 'a folder'} ({name})" for s, name in WRITTEN.items())
         raise EvflowDataError(
             "EV020", f"the extension {suffix} of {path} stands for no format that can be written.",
-            f"Take one of {kinds}, or pass format (--format): {', '.join(WRITERS)}.")
+            f"Take one of {kinds}, or pass format (--format): {', '.join(WRITERS)}.", where=path)
     return WRITERS[WRITTEN[suffix] if format is None else format]
 
 

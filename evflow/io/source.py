@@ -49,7 +49,7 @@ def _open(path: Path, told: FrameHints) -> FrameSource:
     if not _is_recording(path):
         if told.frames_topic is not None:
             raise EvflowDataError("EV020", f"{path} is no recording, with streams of images.",
-                                  "Leave out frames_topic (--frames-topic).")
+                                  "Leave out frames_topic (--frames-topic).", where=path)
         return _folder(path, told) if path.is_dir() else _video(path, told)
     return _recording(path, told)
 
@@ -99,14 +99,14 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
     if told.fps is not None or told.timestamps is not None:
         raise EvflowDataError(
             "EV020", f"{path} is a recording, whose frames have their own times.",
-            "Leave out --fps and --timestamps, or pass its images alone.")
+            "Leave out --fps and --timestamps, or pass its images alone.", where=path)
     recording = read_recording(path, time_unit=told.time_unit, partial=told.partial,
                                start_s=told.start_s, stop_s=told.stop_s,
                                frames_topic=told.frames_topic, colour=told.colour)
     if not recording.has_frames:
         raise EvflowDataError(
             "EV011", f"{path} has events but no frames{why_no_frames(recording.notes)}.",
-            "Simulate a recording with frames, or a video.")
+            "Simulate a recording with frames, or a video.", where=path)
     white = told.full_scale or recording.full_scale
     told = dataclasses.replace(told, full_scale=white, start_s=None, stop_s=None)
     told, notes = _responding(told, "linear", "a recording's own frames")

@@ -89,7 +89,7 @@ def with_frames(
     try:
         source = open_frames(path, **hints)
     except EvflowDataError as e:
-        raise EvflowDataError(e.code, _reworded(e.seen), _reworded(e.fix)) from e
+        raise EvflowDataError(e.code, _reworded(e.seen), _reworded(e.fix), where=e.where) from e
     t = recording.events.t
     if not len(t):
         raise EvflowDataError("EV001", "the recording has no events.")

@@ -198,8 +198,9 @@ def _memory(name: str) -> int:
 
 
 def _without_path(error: EvflowDataError, at: Sample) -> bool:
-    """Whether the message leaves open which file it is about."""
-    return not any(str(path) in str(error) for path in (at.path, *at.targets))
+    """Whether the message leaves open which file it is about, or names it twice over."""
+    named = [str(path) for path in (at.path, *at.targets) if str(path) in str(error)]
+    return not named or any(f"{at.path}: {name}" in error.seen for name in named)
 
 
 def _lacked_memory(e: BaseException | None) -> bool:

@@ -120,7 +120,7 @@ def all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         if not columns.whole(chunk.t):
             raise EvflowDataError(
                 "EV003", f"{path}: the first times are whole, later ones are not.",
-                "Microseconds or seconds? Pass time_unit='us' or 's' (--time-unit).")
+                "Microseconds or seconds? Pass time_unit='us' or 's' (--time-unit).", where=path)
         yield chunk
 
 

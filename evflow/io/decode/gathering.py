@@ -127,7 +127,8 @@ class Gathering:
             return column
         if column.dtype.kind != "f":
             raise EvflowDataError(
-                "EV003", f"{self.path}: {name} has dtype {column.dtype}.", "Expected numbers.")
+                "EV003", f"{self.path}: {name} has dtype {column.dtype}.", "Expected numbers.",
+                where=self.path)
         with np.errstate(invalid="ignore"):
             whole = column.astype(np.int64)  # of NaN and infinity some integer, not equal to them
         same = whole == column
@@ -145,7 +146,7 @@ class Gathering:
         return EvflowDataError(
             code, f"{self.path}: {name} is {value} at {place}",
             fix.get(name, "Coordinates are raw integer pixels: were they undistorted? Use the raw "
-                    "ones."))
+                    "ones."), where=self.path)
 
     def _first_outside(self, chunk: Chunk, begin: int, end: int) -> int:
         """Index behind `begin` of the first event outside the sensor; what is left for none."""
@@ -168,12 +169,13 @@ class Gathering:
                 self.last = int(t[i - ahead - 1])
             return EvflowDataError(
                 "EV004", f"{self.path}: time goes back from {before:,} to {t[i]:,} us at {spot}"
-                f"{self.so_far()}", late.advice(t, i, before) + self.sound_part())
+                f"{self.so_far()}", late.advice(t, i, before) + self.sound_part(), where=self.path)
         width, height = self.size or (1 << 16, 1 << 16)
         return EvflowDataError(
             "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "
             f"{width}x{height}, at {spot}{self.so_far()}",
-            _outside(int(chunk.x[i]), int(chunk.y[i]), (width, height)) + self.sound_part())
+            _outside(int(chunk.x[i]), int(chunk.y[i]), (width, height)) + self.sound_part(),
+            where=self.path)
 
     def _keep(self, chunk: Chunk, t: np.ndarray, a: int, b: int) -> None:
         """Keep the events from a to b; those before a are passed over."""
@@ -192,7 +194,8 @@ class Gathering:
     def damaged(self, at: int, seen: str, unit: str, e: BaseException) -> None:
         """Where the bytes stop making sense: it is told by `check_damage`."""
         error = EvflowDataError(
-            "EV009", f"{self.path} is cut off or damaged at {place(self.path, unit, at)}: {seen}")
+            "EV009", f"{self.path} is cut off or damaged at {place(self.path, unit, at)}: {seen}",
+            where=self.path)
         self.damage = error, e
 
     def check_damage(self) -> None:
@@ -201,7 +204,8 @@ class Gathering:
             return
         error, e = self.damage
         error = EvflowDataError(
-            error.code, error.seen + self.so_far(), "Copy it again" + self.sound_part())
+            error.code, error.seen + self.so_far(), "Copy it again" + self.sound_part(),
+            where=error.where)
         error.__cause__ = e
         self.notes.append(self.hints.forgive(error, self.kept > 0))
 

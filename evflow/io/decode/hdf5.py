@@ -41,7 +41,7 @@ def plausible(path: Path, data: Any) -> Any:
     if data.nbytes > MAX_RATIO * os.path.getsize(path):
         raise EvflowDataError(
             "EV009", f"{path}: {data.name} claims {data.shape} {data.dtype} in a file of "
-            f"{os.path.getsize(path):,} bytes.", "Copy or write the file again.")
+            f"{os.path.getsize(path):,} bytes.", "Copy or write the file again.", where=path)
     return data
 
 
@@ -63,12 +63,12 @@ def need_filters(path: Path, data: Any, own: int | None = None) -> None:
     except ImportError as e:
         raise EvflowDataError(
             "EV010", f"{path} is compressed by HDF5 filter {max(filters)}, which needs the package "
-            "'hdf5plugin'.", 'pip install "evflow-jax[io]"') from e
+            "'hdf5plugin'.", 'pip install "evflow-jax[io]"', where=path) from e
     if missing := [number for number in filters if not h5py.h5z.filter_avail(number)]:
         raise EvflowDataError(
             "EV010", f"{path}: {data.name} is compressed by HDF5 filter {missing[0]}, which HDF5 "
             "and hdf5plugin lack.", "Name its plugin's folder in HDF5_PLUGIN_PATH, or repack "
-            "the file where it was written: h5repack -f GZIP=1 in.h5 out.h5.")
+            "the file where it was written: h5repack -f GZIP=1 in.h5 out.h5.", where=path)
 
 
 class Disk(io.FileIO):

@@ -52,7 +52,7 @@ def opened(path: Path) -> Iterator[Any]:
     except DAMAGE as e:
         raise EvflowDataError(
             "EV009", f"{path} is cut off or damaged ({type(e).__name__}: {e}).",
-            "Copy it again; h5ls and h5dump show what is left.") from e
+            "Copy it again; h5ls and h5dump show what is left.", where=path) from e
 
 
 def _file(path: Path) -> Any:
@@ -71,20 +71,20 @@ def dataset(
     if name not in group:
         raise EvflowDataError(
             "EV008", f"{path}: {group.name} holds {sorted(group)[:8]} but not {name!r}.",
-            "Another layout? Convert it to one that `evflow info` names.")
+            "Another layout? Convert it to one that `evflow info` names.", where=path)
     data = group[name]
     found = getattr(data, "shape", None)
     if found is None or len(found) != len(shape) or any(
             want is not None and want != got for want, got in zip(shape, found, strict=True)):
         raise EvflowDataError(
             "EV009", f"{path}: {name} of {group.name} has shape {found}; expected {shape}.",
-            "Write the file again.")
+            "Write the file again.", where=path)
     need_filters(path, plausible(path, data), own_filter)
     block = math.prod(data.chunks or (0,)) * data.dtype.itemsize
     if block > MAX_RATIO * os.path.getsize(path) + (1 << 20):  # HDF5 decodes whole blocks
         raise EvflowDataError(
             "EV009", f"{path}: {name} claims blocks of {block:,} bytes in a file of "
-            f"{os.path.getsize(path):,}.", "Copy or write the file again.")
+            f"{os.path.getsize(path):,}.", "Copy or write the file again.", where=path)
     return data
 
 
@@ -117,7 +117,8 @@ def same_length(path: Path, columns: dict[str, Any]) -> int:
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise EvflowDataError(
-            "EV009", f"{path} has columns of different length: {lengths}.", "Write it again.")
+            "EV009", f"{path} has columns of different length: {lengths}.", "Write it again.",
+            where=path)
     return next(iter(lengths.values()))
 
 
@@ -147,7 +148,7 @@ def with_frames(
         stamps, decode = images.load()
         times, told = beside_events(stamps, path, native, hints, events)
         order, _ = in_order(times, hints)
-        check_times(times if order is None else times[order], f"{path}: frame times", strict=True)
+        check_times(times if order is None else times[order], "frame times", strict=True)
         within = np.flatnonzero((times >= span[0]) & (times < span[1]))
         keep = slice(int(within[0]), int(within[-1]) + 1) if len(within) else slice(0)
         stack = FrameStack(path, events.size, hints.colour)

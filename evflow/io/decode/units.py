@@ -159,13 +159,13 @@ def check_text_seconds(t: np.ndarray, where: object, pixels: float) -> None:
     if whole and since_1970(float(t[0])) == ["s"]:
         raise EvflowDataError(
             "EV003", f"{where}: all times are whole seconds, dates since 1970: the digits behind "
-            "were lost when they were written.", DIGITS)
+            "were lost when they were written.", DIGITS, where=where)
     units = ("ms", "us", "ns") if whole else ("ms", "us")
     unit, why = spoken_for(len(t), last - float(np.nanmin(t)), pixels, float(t[0]), units)
     seen = (f"all times are whole numbers ({t[0]:.0f}, ...), not seconds" if whole else
             f"{last:.6f} s are no time since 1970")
     raise EvflowDataError("EV003", f"{where}: {seen}; {why}.",
-                          f"Pass time_unit={unit!r} (--time-unit {unit}).")
+                          f"Pass time_unit={unit!r} (--time-unit {unit}).", where=where)
 
 
 def check_seconds(t_us: np.ndarray, size: Size, read_in: str | None) -> None:

@@ -59,13 +59,13 @@ def read(path: Path, hints: Hints) -> Recording:
     if old and known != DVS128:
         raise EvflowDataError(
             "EV008", f"{path} is AEDAT 1 of the chip {chip!r}; that of a DVS128 is read.",
-            "Open it in jAER, and log it again: that writes AEDAT 2.")
+            "Open it in jAER, and log it again: that writes AEDAT 2.", where=path)
     size = hints.size or known
     if size is None:
         raise EvflowDataError(
             "EV015", f"the header of {path} ({start:,} bytes) "
             + (f"names the chip {chip!r}, which is not known." if chip else "names no chip."),
-            f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.")
+            f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.", where=path)
     dvs128 = (known or size) == DVS128
     aside = Aside(path, hints, size)
     decoder = Decoder(size, dvs128, aside)

@@ -88,7 +88,7 @@ def read(path: Path, hints: Hints) -> Recording:
     if size is None:
         raise EvflowDataError(
             "EV015", f"the header of {path} names the sources {chips or 'none'}, of unknown size.",
-            f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.")
+            f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.", where=path)
     chosen = choose([ImageStream("frames", size)], hints, size)
     reading = _Reading(Aside(path, hints, size), size, head.startswith(FIRST),
                        chosen.stream is not None)
@@ -222,7 +222,7 @@ def _next(path: Path, f: IO[bytes]) -> Packet | None:
     if packet.kind & COMPRESSED:
         raise EvflowDataError(
             "EV008", f"{path} is AEDAT 3 of a compressed format (the packet at byte {at:,}).",
-            "Convert it to AEDAT 4 with DV.")
+            "Convert it to AEDAT 4 with DV.", where=path)
     return packet
 
 

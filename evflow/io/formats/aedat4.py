@@ -57,7 +57,7 @@ def read(path: Path, hints: Hints) -> Recording:
         kinds = ", ".join(f"{i}: {s['type']}" for i, s in sorted(streams.items()))
         raise EvflowDataError(
             "EV008", f"{path} holds the streams {{{kinds}}}, none of events.",
-            "Record the events too, or pass the file that has them.")
+            "Record the events too, or pass the file that has them.", where=path)
     frames = {i: s for i, s in streams.items() if s["type"] == "frame"}
     names = stream_names(header.outputs, {*frames, *events})
     camera, told = hints.camera([names[i] for i in sorted(events)])
@@ -181,14 +181,14 @@ def _decoder(path: Path) -> Any:
     except ImportError as e:
         raise EvflowDataError(
             "EV010", f"reading {path} needs the package 'aedat'.",
-            'pip install "evflow-jax[io]"') from e
+            'pip install "evflow-jax[io]"', where=path) from e
     try:
         return aedat.Decoder(os.fspath(path))
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as e:
         raise EvflowDataError(
-            "EV009", f"{path} cannot be decoded ({e}).", "Copy it again.") from e
+            "EV009", f"{path} cannot be decoded ({e}).", "Copy it again.", where=path) from e
 
 
 def _mid_exposure(frame: dict[str, Any]) -> int:

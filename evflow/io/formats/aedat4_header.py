@@ -53,7 +53,8 @@ def read_header(path: Path) -> Header:
         table = struct.unpack_from("<q", header, place)[0] if place else -1
     except (ValueError, struct.error, expat.ExpatError) as e:
         raise EvflowDataError(
-            "EV009", f"{path} has a damaged AEDAT4 header ({e}).", "Copy it again.") from e
+            "EV009", f"{path} has a damaged AEDAT4 header ({e}).", "Copy it again.",
+            where=path) from e
     return Header(len(MAGIC) + 4 + size, table, outputs)
 
 

@@ -41,18 +41,19 @@ def read(path: Path, hints: Hints) -> Recording:
     if version not in ("2", "2.0"):
         raise EvflowDataError(
             "EV008", f"{path} is DAT of version {version[:20]!r}; version 2 is read.",
-            "Its bits have another meaning: convert it with the camera's software.")
+            "Its bits have another meaning: convert it with the camera's software.", where=path)
     with open(path, "rb") as f:
         f.seek(header.start)
         kind = f.read(2)
     if len(kind) < 2 or kind[1] != RECORD.itemsize:
         raise EvflowDataError(
             "EV009", f"{path}: at byte {header.start:,}, behind its header, are {kind!r}; expected "
-            f"an event type and the size {RECORD.itemsize}.", "Cut off? Copy it again.")
+            f"an event type and the size {RECORD.itemsize}.", "Cut off? Copy it again.", where=path)
     if kind[0] not in (0x00, 0x0C):
         raise EvflowDataError(
             "EV008", f"{path} holds {TYPES.get(kind[0], 'records of an unknown type')} "
-            f"({kind[0]:#04x} at byte {header.start:,}), not events.", "Pass the file of events.")
+            f"({kind[0]:#04x} at byte {header.start:,}), not events.", "Pass the file of events.",
+            where=path)
     size, notes = header.size()
     return collect(path, _chunks(path, header.start + 2), hints, size, lambda: notes)
 

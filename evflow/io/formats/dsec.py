@@ -167,7 +167,7 @@ def _columns(path: Path, f: Any) -> dict[str, Any]:
     if missing:
         raise EvflowDataError(
             "EV008", f"{path}: /events holds {sorted(group)} but not {missing}.",
-            "Expected the DSEC layout: /events/{x, y, t, p}.")
+            "Expected the DSEC layout: /events/{x, y, t, p}.", where=path)
     columns = {name: tables.dataset(path, group, name, (None,)) for name in ("x", "y", "t", "p")}
     tables.same_length(path, columns)
     return columns
@@ -176,7 +176,8 @@ def _columns(path: Path, f: Any) -> dict[str, Any]:
 def _scalar(path: Path, f: Any, name: str) -> Any:
     """The one value of a data set of shape () or (1,); EV009."""
     if getattr(f[name], "size", None) != 1:
-        raise EvflowDataError("EV009", f"{path}: {name} is no single number.", "Write it again.")
+        raise EvflowDataError("EV009", f"{path}: {name} is no single number.", "Write it again.",
+                              where=path)
     return plausible(path, f[name])[()]
 
 

@@ -50,7 +50,7 @@ def read(path: Path, hints: Hints) -> Recording:
         if first is None:
             raise EvflowDataError(
                 "EV009", f"{path} begins with {line[:40]!r}; expected `width height`.",
-                "Copy or write it again.")
+                "Copy or write it again.", where=path)
         return collect(path, text.events(f, (4,), len(line)), hints,
                        (int(first[1]), int(first[2])), native="s")
 
@@ -74,7 +74,7 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
         if len(names) != 1:
             raise EvflowDataError(
                 "EV008", f"{path} holds {len(names)} texts: {sorted(names)[:5]}.",
-                "Pass a zip with one text of events.")
+                "Pass a zip with one text of events.", where=path)
         with archive.open(names[0]) as inner:
             yield inner
 

@@ -79,7 +79,7 @@ def _time(path: Path, image: Any) -> Any:
     if "timestamp" not in image.attrs:
         raise EvflowDataError(
             "EV008", f"{path}: {image.name} has no attribute 'timestamp'.",
-            "Write the file again, with the time of each image in seconds.")
+            "Write the file again, with the time of each image in seconds.", where=path)
     return np.asarray(image.attrs["timestamp"]).reshape(-1)[0]
 
 

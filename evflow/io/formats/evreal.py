@@ -96,7 +96,8 @@ def _told_size(path: Path) -> Size | None:
     except (ValueError, KeyError, TypeError, RecursionError) as e:
         raise EvflowDataError(
             "EV009", f"{file} does not tell sensor_resolution = [height, width] ({e}).",
-            "Correct it, or move it away and pass size=(width, height), --size WxH.") from e
+            "Correct it, or move it away and pass size=(width, height), --size WxH.",
+            where=file) from e
 
 
 class EvrealWriter(EventWriter):

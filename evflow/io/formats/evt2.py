@@ -40,7 +40,7 @@ def read(path: Path, hints: Hints) -> Recording:
         raise EvflowDataError(
             "EV008", f"{path} is Prophesee RAW of encoding {encoding}; read are EVT2, "
             "EVT2.1 and EVT3.", "Convert it with Metavision: metavision_file_to_dat or "
-            "metavision_file_to_csv.")
+            "metavision_file_to_csv.", where=path)
     size, notes = header.size()
     decoder = Decoder()
     source = words(path, header.start, f"{header.order}u4")

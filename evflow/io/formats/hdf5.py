@@ -34,7 +34,8 @@ def read(path: Path, hints: Hints) -> Recording:
                 "EV008", f"{path} is HDF5 without a layout that is known. It holds "
                 f"{hdf5_search.listing(f)}.",
                 "Name the events x, y, t, p in one group, in Python: with h5py.File(path, 'a') as "
-                "f: f['events/x'] = f['its/name'], and so for y, t (us) and p. No data is copied.")
+                "f: f['events/x'] = f['its/name'], and so for y, t (us) and p. No data is copied.",
+                where=path)
         name, notes = hints.camera([table.name for _, table in found])
         group, table = next(pair for pair in found if pair[1].name == name)
         size = hdf5_search.told_size(f, group)

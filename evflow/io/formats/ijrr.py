@@ -75,11 +75,12 @@ def read(path: Path, hints: Hints) -> Recording:
             if len(found) != 1:
                 raise EvflowDataError(
                     "EV008", f"{path} holds {len(found)} recordings: {sorted(map(str, found))}.",
-                    "Unpack it and pass one folder.")
+                    "Unpack it and pass one folder.", where=path)
             parent = "" if found[0].parent == PurePosixPath(".") else f"{found[0].parent}/"
             return _read(path, zipfile.Path(archive, parent), EVENTS, hints)
     except ValueError as e:
-        raise EvflowDataError("EV009", f"{path} is damaged ({e}).", "Copy it again.") from e
+        raise EvflowDataError("EV009", f"{path} is damaged ({e}).", "Copy it again.",
+                              where=path) from e
 
 
 def _is_events(name: str) -> bool:
@@ -128,7 +129,7 @@ def _some(
         seen = seen or len(chunk.t) > 0
         yield chunk
     if not (seen or size or hints.size):
-        raise EvflowDataError("EV001", f"{path} holds no event.")
+        raise EvflowDataError("EV001", f"{path} holds no event.", where=path)
 
 
 def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
@@ -140,17 +141,19 @@ def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
             continue
         if len(fields) != 2 or not text.is_number(fields[0]):
             raise EvflowDataError(
-                "EV009", f"{index}, line {number:,} is {content[:60]!r}; expected t[s] path.")
+                "EV009", f"{index}, line {number:,} is {content[:60]!r}; expected t[s] path.",
+                where=index)
         seconds.append(float(fields[0]))
         names.append(fields[1].decode("utf-8"))
     back = np.flatnonzero(np.diff(seconds) <= 0)
     if len(back):
         raise EvflowDataError(
             "EV004", f"{index}: time {seconds[back[0] + 1]:.9g} comes after {seconds[back[0]]:.9g} "
-            f"({len(back):,} such).", "Times must increase: lines out of order, or repeated?")
+            f"({len(back):,} such).", "Times must increase: lines out of order, or repeated?",
+            where=index)
     if len(set(names)) < len(names):  # each would be decoded: little text, much memory
         raise EvflowDataError("EV009", f"{index} has {len(names):,} lines for {len(set(names)):,} "
-                              "images.", "Give each time its own image.")
+                              "images.", "Give each time its own image.", where=index)
     return np.array(seconds), names
 
 
@@ -163,5 +166,5 @@ def _image(root: Root, name: str) -> np.ndarray:
     if not file.is_file():
         raise EvflowDataError(
             "EV016", f"images.txt names {name}, which is not in {root}.",
-            "Restore the image, or remove its line.")
+            "Restore the image, or remove its line.", where=root)
     return decode(file)

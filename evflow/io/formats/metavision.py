@@ -43,7 +43,7 @@ def read(path: Path, hints: Hints) -> Recording:
             raise EvflowDataError(
                 "EV008", f"{path}: {EVENTS} has the fields {data.dtype.names}.",
                 "Expected x, y, p and t. Convert it with Metavision: metavision_file_to_dat or "
-                "metavision_file_to_csv.")
+                "metavision_file_to_csv.", where=path)
         packed = filters_of(data) == [ecf.FILTER]
         chunks = _unpacked(data, path) if packed else tables.blocks(
             table.n, table.rows, table.stored)

@@ -47,6 +47,6 @@ def read(path: Path, hints: Hints) -> Recording:
         raise EvflowDataError(
             "EV008", f"{path} holds {data.dtype} {data.shape}, no events: {first[:120]} ...",
             "Columns are t, x, y and p: whole pixels, times that never fall, a polarity of two "
-            "values.")
+            "values.", where=path)
     found = table.gather(path, hints, None)
     return Recording.of_events(found.events, found.notes)

@@ -96,7 +96,7 @@ def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
         "EV008", f"{path} holds {held[:400] or 'nothing'}, but not {missing}." if not fit else
         f"{path} holds several arrays that may be events: {', '.join(t.name for t in fit)}.",
         "Expected the keys t, x, y, p, size, and optionally frames, frame_times; or one array of "
-        "events alone.")
+        "events alone.", where=path)
 
 
 def _with_frames(
@@ -111,7 +111,7 @@ def _with_frames(
         return Recording.of_events(events, notes)
     with events_alone():
         if "frame_times" not in found:
-            raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.")
+            raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.", where=path)
         times, told = beside_events(found["frame_times"].whole(), path, "us", hints, events)
         frames = found["frames"].spooled()
         order, late = in_order(times, hints)

@@ -61,12 +61,14 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     if missing:
         raise EvflowDataError(
             "EV016", f"{source} names {missing[0]}, which is not in {folder} "
-            f"({len(missing)} of {len(names)} are not).", "Restore the images or remove the lines.")
+            f"({len(missing)} of {len(names)} are not).", "Restore the images or remove the lines.",
+            where=source)
     if len(us) != len(files) or len(set(names)) != len(names):
         raise EvflowDataError(
             "EV002", f"{folder} holds {len(files)} images, {source} times for "
             f"{len(set(names)) if names else len(us)}.",
-            "Images lost, or of another recording? Give each image one time, or pass --fps.")
+            "Images lost, or of another recording? Give each image one time, or pass --fps.",
+            where=folder)
     files = [by_name[name] for name in names] if names else files
     return ImageFolder(tuple(files), us, notes + made)
 
@@ -76,7 +78,8 @@ def list_images(folder: Path) -> list[Path]:
     try:
         entries = list(folder.iterdir())
     except OSError as e:
-        raise EvflowDataError("EV016", f"{folder} cannot be listed ({e.strerror}).") from e
+        raise EvflowDataError("EV016", f"{folder} cannot be listed ({e.strerror}).",
+                              where=folder) from e
     return sorted((p for p in entries if p.suffix.lower() in SUFFIXES
                    and not p.name.startswith(".")), key=lambda p: natural(p.name))
 
@@ -98,7 +101,7 @@ def decode(file: Path | zipfile.Path) -> np.ndarray:
             raise OSError(0, "it is no regular file")
         data = file.read_bytes()
     except OSError as e:
-        raise EvflowDataError("EV016", f"{file} cannot be read ({e.strerror}).") from e
+        raise EvflowDataError("EV016", f"{file} cannot be read ({e.strerror}).", where=file) from e
     return decoded(data, file)
 
 
@@ -117,7 +120,7 @@ def decoded(data: bytes, where: object) -> np.ndarray:
     if image is None or not whole:
         raise EvflowDataError(
             "EV009", f"{where} ({len(data):,} bytes) is {'not a sound' if whole else 'a cut-off'} "
-            "image.", "Copy it again.")
+            "image.", "Copy it again.", where=where)
     return image
 
 
@@ -146,7 +149,7 @@ def _exr(data: bytes, file: object) -> np.ndarray | None:
         raise EvflowDataError(
             "EV008", f"{file} is an EXR with {kind}, which this OpenCV ({cv2.__version__}) does "
             "not read.", "Save it as scan lines with ZIP or no compression, or as .hdr; or take "
-            "Debian's python3-opencv, which reads it.")
+            "Debian's python3-opencv, which reads it.", where=file)
     return image[..., :3] if image.ndim == 3 else image
 
 
@@ -161,7 +164,8 @@ def _find(root: Path) -> tuple[Path, list[Path]]:
     seen = (f"holds images in {sorted(p.name for p in below)[:5]}" if below else
             f"holds no image ({', '.join(s[1:] for s in SUFFIXES)}): "
             f"{sorted(p.name for p in root.iterdir())[:5]}")
-    raise EvflowDataError("EV008", f"{root} {seen}.", "Pass the one folder that has the frames.")
+    raise EvflowDataError("EV008", f"{root} {seen}.", "Pass the one folder that has the frames.",
+                          where=root)
 
 
 def _made(folder: Path) -> tuple[Note, ...]:
@@ -188,4 +192,4 @@ def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:
     near = [str(p) for name in TIMES if (p := folder.parent / name).is_file()]
     raise EvflowDataError(
         "EV020", f"{folder} has images but no file of their times ({', '.join(TIMES[:3])}, ...).",
-        f"Pass --fps, or --timestamps {near[0] if near else 'FILE'}.")
+        f"Pass --fps, or --timestamps {near[0] if near else 'FILE'}.", where=folder)

@@ -151,17 +151,18 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
         elif image.time_us <= last:
             raise EvflowDataError(
                 "EV004", f"{image.where} is at {image.time_us} us, the frame before at {last} us.",
-                "Frame times must increase: pass --fps, or correct --timestamps.")
+                "Frame times must increase: pass --fps, or correct --timestamps.",
+                where=image.where)
         if frame.shape[:2] != first[0].shape[:2]:
             raise EvflowDataError(
                 "EV015", f"{image.where} is {frame.shape[1]}x{frame.shape[0]}, the first frame "
                 f"{first[0].shape[1]}x{first[0].shape[0]}.",
-                "All frames must be of one size: sort out the others.")
+                "All frames must be of one size: sort out the others.", where=image.where)
         if depth != first[1] or frame.ndim != first[0].ndim:
             raise EvflowDataError(
                 "EV003", f"{image.where} is {'grey' if frame.ndim == 2 else 'colour'} {depth}, the "
                 f"first frame {'grey' if first[0].ndim == 2 else 'colour'} {first[1]}.",
-                "All frames must have one bit depth and number of channels.")
+                "All frames must have one bit depth and number of channels.", where=image.where)
         last = image.time_us
         yield frame, last
 
@@ -175,7 +176,8 @@ def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> t
         pixels = pixels[..., 0]
     if pixels.ndim != 2 and not (pixels.ndim == 3 and pixels.shape[-1] in (3, 4)):
         raise EvflowDataError(
-            "EV002", f"{where} has shape {pixels.shape}.", "Expected (H, W) or (H, W, 3).")
+            "EV002", f"{where} has shape {pixels.shape}.", "Expected (H, W) or (H, W, 3).",
+            where=where)
     pixels = np.asarray(pixels, np.float32) if pixels.dtype.kind == "f" else pixels
     values.white_of(pixels.dtype, where)
     if hints.clip:
@@ -216,5 +218,5 @@ def existing(path: str | os.PathLike) -> Path:
         pattern = any(c in path.name for c in "%*?")
         raise EvflowDataError(
             "EV016", f"no file or folder at {path}.",
-            "For a sequence of images pass their folder." if pattern else "")
+            "For a sequence of images pass their folder." if pattern else "", where=path)
     return need_regular(path)

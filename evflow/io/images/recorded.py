@@ -39,7 +39,7 @@ class FrameStack:
         if image.ndim != 2 and not (image.ndim == 3 and image.shape[-1] in (3, 4)):
             raise EvflowDataError(
                 "EV002", f"{self.where} has a frame of shape {image.shape}.",
-                "Expected (H, W) or (H, W, 3).")
+                "Expected (H, W) or (H, W, 3).", where=self.where)
         width, height = self.size
         if image.shape[:2] != (height, width):
             region = image.shape[0] <= height and image.shape[1] <= width and any(origin)
@@ -53,7 +53,7 @@ class FrameStack:
         if grey.dtype != self._spool.dtype:
             raise EvflowDataError(
                 "EV003", f"{self.where} has frames of {self._spool.dtype} and {grey.dtype}.",
-                "Use those of one bit depth.")
+                "Use those of one bit depth.", where=self.where)
         self._spool.append(grey.ravel())
         self.colour |= image.ndim == 3
         self.times.append(time)

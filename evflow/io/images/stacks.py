@@ -100,7 +100,7 @@ def open_stack(path: Path, hints: FrameHints) -> Stack:
     except (OSError, EOFError, ValueError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
-            "Copy or save it again.") from e
+            "Copy or save it again.", where=path) from e
     _check(stack)
     us, notes = _times(stack, hints, times)
     return dataclasses.replace(stack, times_us=us, notes=notes)
@@ -112,7 +112,7 @@ def cut_off(path: object, read: int, promised: int, why: str) -> EvflowDataError
         "EV009", f"{read:,} of the {promised:,} frames of {path} can be read"
         f"{f' ({why})' if why else ''}.",
         "Cut off or damaged: copy it again"
-        + (", or pass --partial (partial=True) to use those." if read else "."))
+        + (", or pass --partial (partial=True) to use those." if read else "."), where=path)
 
 
 def _open_npy(path: Path, partial: bool) -> Stack:
@@ -134,7 +134,7 @@ def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
         if member is None:
             raise EvflowDataError(
                 "EV008", f"{path} holds {sorted(names)} but no frames.",
-                f"Expected {', '.join(FRAMES)}; or t, x, y, p for a recording.")
+                f"Expected {', '.join(FRAMES)}; or t, x, y, p for a recording.", where=path)
         with archive.open(member + ".npy") as f:
             shape, fortran, dtype = npy_header(f)
         clock = next((name for name in TIMES if name in names), None)
@@ -144,7 +144,7 @@ def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
     if fortran and len(shape) > 1:
         raise EvflowDataError(
             "EV009", f"{path} holds {member} in Fortran order, whose frames are not together.",
-            "Save np.ascontiguousarray(frames).")
+            "Save np.ascontiguousarray(frames).", where=path)
     stack = Stack(path, member + ".npy", shape, dtype, False, 0, np.zeros(0, np.int64), ())
     return stack, times
 
@@ -156,12 +156,13 @@ def _check(stack: Stack) -> None:
         raise EvflowDataError(
             "EV002", f"{stack.path} has shape {shape}.",
             "Channels come last: np.moveaxis(frames, 1, -1)." if first else
-            "Expected frames (T, H, W), or (T, H, W, 3) in R, G, B.")
+            "Expected frames (T, H, W), or (T, H, W, 3) in R, G, B.", where=stack.path)
     if stack.member:
         check_expansion(math.prod(shape[1:]) * stack.dtype.itemsize, stack.path.stat().st_size,
                         f"one frame of {stack.path}")
     if min(shape) == 0:
-        raise EvflowDataError("EV001", f"{stack.path} holds frames of shape {shape}.")
+        raise EvflowDataError("EV001", f"{stack.path} holds frames of shape {shape}.",
+                              where=stack.path)
 
 
 def _times(
@@ -179,9 +180,9 @@ def _times(
     else:
         raise EvflowDataError(
             "EV020", f"{stack.path} holds {count:,} frames but no times.",
-            "Pass --fps or --timestamps FILE.")
+            "Pass --fps or --timestamps FILE.", where=stack.path)
     if len(us) != count and not (hints.partial and len(us) > count):
         raise EvflowDataError(
             "EV002", f"{stack.path} holds {count:,} frames, {where} {len(us):,} times.",
-            "Give one time per frame, or pass --fps.")
+            "Give one time per frame, or pass --fps.", where=stack.path)
     return us[:count], notes

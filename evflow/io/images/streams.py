@@ -90,7 +90,8 @@ def events_alone() -> Iterator[None]:
         late = " Late frames: --late drop, or sort." if e.code == "EV004" else ""
         raise EvflowDataError(
             e.code, e.seen,
-            f"{e.fix}{late} The events alone: --no-frames (no_frames=True).".lstrip()) from e
+            f"{e.fix}{late} The events alone: --no-frames (no_frames=True).".lstrip(),
+            where=e.where) from e
 
 
 def _named(

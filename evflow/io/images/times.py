@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from evflow.checks import check_times
-from evflow.errors import EvflowDataError
+from evflow.errors import EvflowDataError, naming
 from evflow.files.arrays import mapped
 from evflow.io.decode.text import is_float
 from evflow.io.decode.units import (
@@ -63,23 +63,26 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
     if times.ndim != 1 or times.dtype.kind not in "iuf":
         raise EvflowDataError(
             "EV002", f"{where} holds times of shape {times.shape} and dtype {times.dtype}.",
-            "Expected one number per frame.")
+            "Expected one number per frame.", where=where)
     if len(times) == 0:
-        raise EvflowDataError("EV001", f"{where} holds no frame time.")
+        raise EvflowDataError("EV001", f"{where} holds no frame time.", where=where)
     if not np.isfinite(times).all():
         raise EvflowDataError(
-            "EV007", f"{where} holds {(~np.isfinite(times)).sum():,} times that are not finite.")
+            "EV007", f"{where} holds {(~np.isfinite(times)).sum():,} times that are not finite.",
+            where=where)
     back = np.flatnonzero(times[1:] <= times[:-1])
     if len(back):
         at = int(back[0]) + 1
         raise EvflowDataError(
             "EV004", f"{where}: time {at:,} is {times[at]}, the one before {times[at - 1]} "
-            f"({len(back):,} such).", "Frame times must increase: lines out of order, or repeated?")
+            f"({len(back):,} such).", "Frame times must increase: lines out of order, or repeated?",
+            where=where)
     notes: Notes = ()
     if unit == "auto":
         unit, notes = _video_unit(times, where)
     us = Hints(time_unit=unit).microseconds(times, unit)
-    return check_times(us, f"{where}, read in {unit}", strict=True), notes
+    with naming(where):
+        return check_times(us, f"times read in {unit}", strict=True), notes
 
 
 def beside_events(
@@ -118,7 +121,7 @@ def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
     raise EvflowDataError(
         "EV003", f"{where}: steps of {usual_step(times):g} (from {times[0]}) have no clear unit"
         + (f": {would}." if would else "."),
-        f"Is it {', '.join(UNITS_US)}? {TELL.capitalize()}.")
+        f"Is it {', '.join(UNITS_US)}? {TELL.capitalize()}.", where=where)
 
 
 def _rows(path: Path) -> tuple[list[list[str]], str]:
@@ -127,9 +130,9 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
         data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b"\0"
         text = data.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
-        raise EvflowDataError("EV009", f"{path} cannot be read as text ({e}).") from e
+        raise EvflowDataError("EV009", f"{path} cannot be read as text ({e}).", where=path) from e
     if "\0" in text:
-        raise EvflowDataError("EV009", f"{path} is not a text file of times.")
+        raise EvflowDataError("EV009", f"{path} is not a text file of times.", where=path)
     rows: list[list[str]] = []
     words = ""
     for number, line in enumerate(text.splitlines(), 1):
@@ -141,7 +144,7 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
         if rows and len(fields) != len(rows[0]):
             raise EvflowDataError(
                 "EV009", f"{path}, line {number:,} is {line[:60]!r}; lines before it have "
-                f"{len(rows[0])} columns.", "Cut off or damaged? Copy it again.")
+                f"{len(rows[0])} columns.", "Cut off or damaged? Copy it again.", where=path)
         rows.append(fields)
     return rows, written_unit(words)
 
@@ -164,7 +167,7 @@ def _columns(
     if times is None or sum(label) > 1:
         raise EvflowDataError(
             "EV008", f"{path} has lines like {' '.join(rows[0])[:60]!r}; which column is the time?",
-            "Keep one time per line, `time name`, or begin and end of the exposure.")
+            "Keep one time per line, `time name`, or begin and end of the exposure.", where=path)
     named = columns[label.index(True)] if any(label) else ()
     if all(map(str.isdecimal, named)) and not set(named) <= set(known):
         return times, []
@@ -188,7 +191,7 @@ def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
         if not is_float(field):
             raise EvflowDataError(
                 "EV009", f"{path}: {field[:40]!r} at time {number:,} is not a number.",
-                "Cut off or damaged? Copy it again.")
+                "Cut off or damaged? Copy it again.", where=path)
     try:
         return np.array([int(f) for f in fields], np.int64)
     except (ValueError, OverflowError):

@@ -46,7 +46,7 @@ def white_of(dtype: np.dtype, where: str) -> float:
     """DN of a saturated pixel; EV003 where images have no such depth."""
     if dtype.str[1:] not in WHITE:
         raise EvflowDataError(
-            "EV003", f"{where} is {dtype}.", "Expected uint8, uint16 or floats.")
+            "EV003", f"{where} is {dtype}.", "Expected uint8, uint16 or floats.", where=where)
     return WHITE[dtype.str[1:]]
 
 
@@ -95,11 +95,12 @@ def _scaled(
     told = meaning(pixels) if (floats and full_scale is None and not bright) or low < 0 else None
     if told:
         raise EvflowDataError("EV003", f"{where} spans {low:g}..{high:g} where white is "
-                              f"{white:g}: {told.what}?", told.fix)
+                              f"{white:g}: {told.what}?", told.fix, where=where)
     if high > white * 1.001:
         raise EvflowDataError(
             "EV003", f"{where} reaches {high:g}, beyond white at {white:g}.",
-            f"Pass the value of white: --full-scale {_likely_white(high, floats):g} (full_scale=).")
+            f"Pass the value of white: --full-scale {_likely_white(high, floats):g} (full_scale=).",
+            where=where)
     return pixels.astype(np.float32) * np.float32(255 / white), bright or high > 0
 
 
@@ -107,14 +108,14 @@ def _exponential(pixels: np.ndarray, where: str, full_scale: float | None) -> np
     """Light of natural logarithms of it."""
     if pixels.dtype.kind != "f":
         raise EvflowDataError("EV003", f"{where} is {pixels.dtype}: whole numbers are no "
-                              "logarithms.", "Leave out --response log.")
+                              "logarithms.", "Leave out --response log.", where=where)
     _check_finite(pixels, where)
     white = full_scale or 255.0
     if (high := float(pixels.max())) > np.log(white) + 1e-2:
         raise EvflowDataError(
             "EV003", f"{where} reaches {high:.4g}, but the logarithm of white, {white:g}, is "
             f"{np.log(white):.4g}.", f"Pass the value of white: --full-scale {np.exp(high):.4g}, "
-            "or leave out --response log.")
+            "or leave out --response log.", where=where)
     return np.exp(pixels) * np.float32(255 / white)
 
 
@@ -123,7 +124,7 @@ def _check_finite(pixels: np.ndarray, where: str) -> None:
     if not finite.all():
         raise EvflowDataError(
             "EV007", f"{where} holds {(~finite).sum():,} NaN or infinite values.",
-            "The log of dark pixels? Give linear intensity.")
+            "The log of dark pixels? Give linear intensity.", where=where)
 
 
 def _likely_white(high: float, floats: bool) -> float:

@@ -83,7 +83,8 @@ class Video:
         assert self.times_us is not None
         return EvflowDataError(
             "EV002", f"{self.path} has {count} frames, {self.hints.timestamps} "
-            f"{len(self.times_us):,} times.", "Give one time per frame, or pass --fps.")
+            f"{len(self.times_us):,} times.", "Give one time per frame, or pass --fps.",
+            where=self.path)
 
 
 class Clock:
@@ -115,7 +116,7 @@ class Clock:
             raise EvflowDataError(
                 "EV004", f"frame {index} of {self.path} is at {now:.0f} us, the one before at "
                 f"{self.last_us:.0f} us: its container's times do not increase.",
-                f"Pass --fps {self.fps:.6g} to count frames instead.")
+                f"Pass --fps {self.fps:.6g} to count frames instead.", where=self.path)
         if index:
             step = now - self.last_us
             self.steps = min(self.steps[0], step), max(self.steps[1], step)
@@ -141,13 +142,13 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
     if path.suffix.lower() in SUFFIXES:
         raise EvflowDataError(
             "EV008", f"{path} is one picture.", "For a sequence of images pass their folder; to "
-            "move a sensor over one picture, --saccades 10 (evflow simulate).")
+            "move a sensor over one picture, --saccades 10 (evflow simulate).", where=path)
     with _capture(path) as capture:
         if not capture.isOpened():
             raise EvflowDataError(
                 "EV008", f"{path} is neither a recording nor a video that OpenCV can open.",
                 "A cut-off mp4 has lost its index: copy it again. Other kinds: convert them to mp4 "
-                "(H.264) or avi (MJPG).")
+                "(H.264) or avi (MJPG).", where=path)
         rate = capture.get(cv2.CAP_PROP_FPS)
         claimed = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         if claimed > 0 and 0 < rate < 1e6:  # counted from 0, where a film may begin later
@@ -155,7 +156,8 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
         claimed = max(0, claimed)
         good, first = capture.read()
         if not good:
-            raise EvflowDataError("EV009", f"no frame of {path} can be decoded.", "Copy it again.")
+            raise EvflowDataError("EV009", f"no frame of {path} can be decoded.", "Copy it again.",
+                                  where=path)
         if not hints.partial and claimed > 1:
             _check_end(path, capture, claimed)
         if not hints.partial:
@@ -165,7 +167,8 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
         times, _, told = read_times(Path(hints.timestamps), hints.time_unit)
         notes += told
     if not (rate and 0 < rate < 1e6) and times is None and hints.fps is None:
-        raise EvflowDataError("EV020", f"{path} states no frame rate ({rate:g}).", "Pass --fps.")
+        raise EvflowDataError("EV020", f"{path} states no frame rate ({rate:g}).", "Pass --fps.",
+                              where=path)
     return Video(path, first.shape[1::-1], float(rate), claimed, hints, times, notes)
 
 
@@ -203,7 +206,7 @@ def _check_bytes(path: Path) -> None:
     if end > total:
         raise EvflowDataError(
             "EV009", f"{path} ends {end - total:,} bytes early, at byte {total:,}.",
-            "Cut off: copy it again, or pass --partial (partial=True).")
+            "Cut off: copy it again, or pass --partial (partial=True).", where=path)
 
 
 def _boxes_end(f: IO[bytes], total: int) -> int:

@@ -45,7 +45,7 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
     if not topics:
         raise EvflowDataError(
             "EV008", f"{bag.path} holds no topic of events, but {sorted(bag.all())[:8]}.",
-            f"Known messages: {', '.join(EVENT_TYPES)}.")
+            f"Known messages: {', '.join(EVENT_TYPES)}.", where=bag.path)
     topic, notes = hints.camera([name for name, _ in topics])
     kind = dict(topics)[topic]
     first, guessed = bag.sized(bag.first(topic, kind), topic, hints)
@@ -97,10 +97,11 @@ class Bag:
         """What the reader's exception says of the bag, or of the packages that are there."""
         if isinstance(e, ImportError):
             return EvflowDataError("EV010", f"reading {self.path} needs the package 'rosbags'.",
-                                   'pip install "evflow-jax[ros]"')
+                                   'pip install "evflow-jax[ros]"', where=self.path)
         return EvflowDataError(
             "EV009", f"{self.path} is cut off or damaged ({e or type(e).__name__}).",
-            f"Copy it again; if its recording was interrupted, run `{self.mend}` on it.")
+            f"Copy it again; if its recording was interrupted, run `{self.mend}` on it.",
+            where=self.path)
 
     def all(self) -> list[str]:
         return [f"{c.topic} ({c.msgtype})" for c in self.reader.connections]
@@ -176,7 +177,8 @@ class Bag:
             if not any(packet.data for packet in found):
                 raise self._wrong(topic, e) from e
         if not found:
-            raise EvflowDataError("EV001", f"{self.path}: topic {topic} holds no message.")
+            raise EvflowDataError("EV001", f"{self.path}: topic {topic} holds no message.",
+                                  where=self.path)
         full = [packet for packet in found if packet.data] or found
         return dataclasses.replace(full[0], size=next((p.size for p in full if p.size), None))
 
@@ -197,7 +199,8 @@ class Bag:
 
     def _wrong(self, topic: str, e: Damage) -> EvflowDataError:
         return EvflowDataError(
-            "EV009", f"{self.path}, topic {topic}, message {e.byte:,}: {e.seen}.", "Copy it again.")
+            "EV009", f"{self.path}, topic {topic}, message {e.byte:,}: {e.seen}.", "Copy it again.",
+            where=self.path)
 
     def stack(
         self, topic: str, size: Size, hints: Hints, span: tuple[int, int] | None

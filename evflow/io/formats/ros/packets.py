@@ -45,7 +45,7 @@ def decoded(path: Path, first: Packet, packets: Iterable[Packet]) -> Decoded:
         raise EvflowDataError(
             "EV008", f"{path}: events are encoded as {first.encoding[:20]!r}.",
             f"Known encodings: evt3, {', '.join(filter(None, known))}; convert the bag with "
-            "event_camera_tools.")
+            "event_camera_tools.", where=path)
     return Decoded(_counted(known[first.encoding](packets)), "ns")
 
 

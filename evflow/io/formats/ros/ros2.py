@@ -137,7 +137,7 @@ def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
             raise
         raise EvflowDataError(
             "EV019", f"{tempfile.gettempdir()}, where {path} is unpacked, is full.",
-            "Set TMPDIR to a folder with room, or unpack it: zstd -d.") from e
+            "Set TMPDIR to a folder with room, or unpack it: zstd -d.", where=path) from e
     return Path(out.name)
 
 
