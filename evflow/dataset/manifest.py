@@ -19,6 +19,7 @@ from evflow.dataset.sequence import EventSequence, sequence_names
 from evflow.dataset.store import SUFFIXES, Format
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_text
+from evflow.files.limits import FREE, read_whole
 from evflow.files.regular import need_regular
 from evflow.process.provenance import sha256
 
@@ -214,7 +215,7 @@ def _fault(folder: Path, entry: Record, *, deep: bool) -> str | None:
 def _read(path: Path) -> dict[str, Any]:
     """One manifest; EV009 where it is cut off or is none."""
     try:
-        content = json.loads(need_regular(path).read_text())
+        content = json.loads(read_whole(need_regular(path), FREE))
         shapes = {"dataset": dict, "sequences": dict, "made_by": list}
         if not all(isinstance(content[k], kind) for k, kind in shapes.items()):
             raise TypeError("not a manifest")

@@ -7,10 +7,24 @@ Recordings expand 3- to 20-fold (text, gzip, frames); what expands beyond `RATIO
 
 from __future__ import annotations
 
+import zipfile
+from pathlib import Path
+
 from evflow.errors import EvflowDataError
 
 FREE = 256 << 20  # bytes that any file may take
 RATIO = 64
+WHOLE = 1 << 30  # bytes of a file that is read at once; the largest JSON of COCO has half of it
+
+
+def read_whole(path: Path | zipfile.Path, most: int = WHOLE) -> bytes:
+    """All bytes of a file; EV009 where they are more than `most`: another file, or a sparse one,
+    of which a few bytes stand for any number of zeros."""
+    if isinstance(path, Path) and (size := path.stat().st_size) > most:
+        raise EvflowDataError(
+            "EV009", f"{path} has {size:,} bytes, and would have to be read whole.",
+            "No file of its kind is so large: is it the right one?", where=path)
+    return path.read_bytes()
 
 
 def check_expansion(claimed: int, stored: int, where: object) -> None:

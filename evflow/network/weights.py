@@ -21,6 +21,7 @@ from safetensors.numpy import save
 from evflow.checks import need
 from evflow.errors import EvflowDataError, naming
 from evflow.files.atomic import atomic_text
+from evflow.files.limits import read_whole
 from evflow.network import tensors
 from evflow.process.provenance import sha256
 
@@ -65,7 +66,7 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
             path).
     """
     path = weights_path(name_or_path)
-    data = path.read_bytes()
+    data = read_whole(path)
     with naming(path):
         card = _card(data)
         try:
@@ -144,7 +145,7 @@ def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
     """The card that was saved with the weights: command, seed, steps, data, figures."""
     path = weights_path(name_or_path)
     with naming(path):
-        card = _card(path.read_bytes())
+        card = _card(read_whole(path))
     card.pop(DIGEST, None)  # of this file; a card goes on to others
     return card
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.files.limits import read_whole
 from evflow.io.images.frames import existing
 from evflow.scenes.rle import decode_rle
 
@@ -87,7 +88,7 @@ def read_coco(path: str | os.PathLike, images: str | os.PathLike | None = None) 
     """
     path = existing(path)
     try:
-        data = json.loads(path.read_bytes())
+        data = json.loads(read_whole(path))
     except (OSError, ValueError, RecursionError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is not sound JSON ({e}).", "Cut off? Copy it again.") from e

@@ -19,6 +19,7 @@ import orbax.checkpoint as ocp
 
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import aside, atomic_text
+from evflow.files.limits import FREE, read_whole
 from evflow.files.regular import is_there
 from evflow.process import devices
 
@@ -189,7 +190,7 @@ def _stored_shape(leaf: Any) -> tuple[int, ...]:
 def _read(path: Path) -> dict[str, Any]:
     """A configuration; EV009 where it is damaged."""
     try:
-        saved = json.loads(path.read_text())
+        saved = json.loads(read_whole(path, FREE))
         if not isinstance(saved, dict):
             raise ValueError("it is no configuration")
     except (OSError, ValueError, RecursionError) as e:

@@ -20,6 +20,7 @@ from evflow.io import read_recording
 from evflow.io.source import open_frames
 from evflow.network.weights import load_weights
 from evflow.scenes import read_coco
+from evflow.training.checkpoint import Checkpoints
 from evflow.training.log import lines_until
 
 Put = Callable[[Path], None]
@@ -87,4 +88,19 @@ def test_what_has_no_end_is_refused(
     with pytest.raises(EvflowDataError) as caught:
         read(tmp_path / name, put)
     assert caught.value.code == "EV016"
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "read"), [
+    ("times.txt", times), ("x", beside), one("a.png", lambda p: open_frames(p.parent, fps=25)),
+    one("a.safetensors", load_weights), one("a.json", read_coco), one("m.jsonl", lambda p: [*lines_until(p, 3)]),
+    one("config.json", lambda p: Checkpoints(p.parent).check_config({}))])
+def test_what_is_read_whole_is_not_too_large(tmp_path: Path, name: str, read: Any) -> None:
+    """A sparse file of three bytes stands for more than there is memory."""
+    def put(path: Path) -> None:
+        path.write_bytes(b"{}\n")
+        os.truncate(path, 1 << 36)
+
+    with pytest.raises(EvflowDataError, match=r"EV009.*has 68,719,476,736 bytes") as caught:
+        read(tmp_path / name, put)
     assert str(tmp_path) in str(caught.value)

@@ -36,12 +36,15 @@ def load_h5py() -> Any:
 
 
 def plausible(path: Path, data: Any) -> Any:
-    """The data set, unless it claims more than the file can hold; EV009."""
+    """The data set, unless it claims more than the file can hold, or blocks of it are missing or
+    expand beyond measure; EV009."""
+    from evflow.io.decode.hdf5_blocks import check_blocks
     check_expansion(data.nbytes, os.path.getsize(path), f"{path}: {data.name} {data.shape}")
     if data.nbytes > MAX_RATIO * os.path.getsize(path):
         raise EvflowDataError(
             "EV009", f"{path}: {data.name} claims {data.shape} {data.dtype} in a file of "
             f"{os.path.getsize(path):,} bytes.", "Copy or write the file again.", where=path)
+    check_blocks(path, data)
     return data
 
 

@@ -8,6 +8,7 @@ holds text of variable length before HDF5 walks it (`hdf5_heaps`).
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import h5py
 from evflow.errors import EvflowDataError
 from evflow.io.decode.hdf5_heaps import Heaps
 
-MOST_LINKS = 16  # soft links followed in one path, as HDF5 itself does
+MOST_LINKS = 16  # soft links followed for one name, those within links included, as HDF5 does
 FIX = ("Only what is in the file itself is read. Copy it in: with h5py, values = f[name][:]; "
        "del f[name]; f[name] = values.")
 
@@ -99,8 +100,9 @@ def _of_heap(at: Any, name: Any) -> Any:
         return h5py.AttributeManager(kind(found))[name]
 
 
-def _opened(at: Any, path: bytes, links: int = MOST_LINKS) -> Any:
-    """The object at a path from the group `at` on."""
+def _opened(at: Any, path: bytes, links: Iterator[int] | None = None) -> Any:
+    """The object at a path from the group `at` on. links: those that may still be followed."""
+    links = iter(range(MOST_LINKS)) if links is None else links
     if path.startswith(b"/"):
         at = h5py.h5o.open(at, b"/")
     for part in path.split(b"/"):
@@ -128,12 +130,12 @@ def _linked(at: Any, part: bytes) -> Any:
         raise ValueError(f"{part.decode(errors='replace')} cannot be opened ({e})") from e
 
 
-def _followed(at: Any, part: bytes, links: int) -> Any:
+def _followed(at: Any, part: bytes, links: Iterator[int]) -> Any:
     """What the soft link `part` stands for; ValueError where it leads nowhere, which is damage: a
     part that may be absent would be one that was lost unseen."""
     try:
-        if links:
-            return _opened(at, at.links.get_val(part), links - 1)
+        if next(links, None) is not None:
+            return _opened(at, at.links.get_val(part), links)
     except KeyError:
         pass
     raise ValueError(f"{part.decode(errors='replace')} is a link that leads nowhere")

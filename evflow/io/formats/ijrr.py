@@ -18,6 +18,7 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.archives import DAMAGE, unzipped
+from evflow.files.limits import FREE, read_whole
 from evflow.files.regular import is_there
 from evflow.io.decode import tables, text
 from evflow.io.decode.stream import Chunk, gather
@@ -135,7 +136,7 @@ def _some(
 def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
     """Times (T,) as written, seconds by the format, and names of the images."""
     seconds, names = [], []
-    for number, content in enumerate(index.read_bytes().split(b"\n"), 1):
+    for number, content in enumerate(read_whole(index, FREE).split(b"\n"), 1):
         fields = content.partition(b"#")[0].split()
         if not fields:
             continue

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.files.limits import check_expansion
+from evflow.files.limits import check_expansion, read_whole
 from evflow.files.regular import is_there
 from evflow.io.images import exr
 from evflow.io.images.frames import FrameHints, Image
@@ -99,7 +99,7 @@ def decode(file: Path | zipfile.Path) -> np.ndarray:
     try:
         if not file.is_file():  # a pipe has no end
             raise OSError(0, "it is no regular file")
-        data = file.read_bytes()
+        data = read_whole(file)
     except OSError as e:
         raise EvflowDataError("EV016", f"{file} cannot be read ({e.strerror}).", where=file) from e
     return decoded(data, file)

@@ -18,6 +18,7 @@ import numpy as np
 from evflow.checks import check_times
 from evflow.errors import EvflowDataError, naming
 from evflow.files.arrays import mapped
+from evflow.files.limits import read_whole
 from evflow.io.decode.text import is_float
 from evflow.io.decode.units import (
     UNITS_US,
@@ -127,8 +128,7 @@ def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
 def _rows(path: Path) -> tuple[list[list[str]], str]:
     """The fields of every line with data, all of one length, and the unit written, or "auto"."""
     try:
-        data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b"\0"
-        text = data.decode("utf-8-sig")
+        text = read_whole(path, MAX_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
         raise EvflowDataError("EV009", f"{path} cannot be read as text ({e}).", where=path) from e
     if "\0" in text:
