@@ -93,7 +93,8 @@ def test_what_has_no_end_is_refused(
 
 @pytest.mark.parametrize(("name", "read"), [
     ("times.txt", times), ("x", beside), one("a.png", lambda p: open_frames(p.parent, fps=25)),
-    one("a.safetensors", load_weights), one("a.json", read_coco), one("m.jsonl", lambda p: [*lines_until(p, 3)]),
+    one("a.safetensors", load_weights), one("a.json", read_coco),
+    one("m.jsonl", lambda p: [*lines_until(p, 3)]),
     one("config.json", lambda p: Checkpoints(p.parent).check_config({}))])
 def test_what_is_read_whole_is_not_too_large(tmp_path: Path, name: str, read: Any) -> None:
     """A sparse file of three bytes stands for more than there is memory."""

@@ -210,6 +210,10 @@ def summary(value: Any) -> Summary:
     return Summary(*[jnp.asarray(value, jnp.float32)] * 6)
 
 
+def without_summary(params: Any) -> Any:
+    return {name: {k: v for k, v in net.items() if k != "summary"} for name, net in params.items()}
+
+
 @pytest.mark.parametrize(("code", "call"), [
     ("EV002", lambda p, v, d: api.estimate(p, v[..., :31], d)),
     ("EV002", lambda p, v, d: api.estimate(p, v, d[:-1])),
@@ -222,6 +226,7 @@ def summary(value: Any) -> Summary:
     ("EV020", lambda p, v, d: api.estimate(p, v, d, window_s=0.0)),
     ("EV018", lambda p, v, d: api.estimate({"other": {}}, v, d)),
     ("EV018", lambda p, v, d: api.estimate({"default": {}}, v, d)),
+    ("EV018", lambda p, v, d: api.finish(without_summary(p), api.summarize(p, v, d))),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, window_s=np.full(3, 0.05))),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, intensity=d.T[:2] * 0)),
     ("EV003", lambda p, v, d: api.estimate(p, v, d, intensity=np.full(d.shape, 128.0))),
