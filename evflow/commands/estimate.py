@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from evflow.estimation.result import CameraEstimate
     from evflow.types import Recording
 
-FILES = ("camera.npz", "camera.json", "maps.png", "histograms.png", "report.html")
+FILES = ("camera.npz", "camera.json", "report.html", *(
+    f"{name}.{kind}" for name in ("maps", "histograms") for kind in ("png", "pdf", "svg")))
 READ = ("effort", "budget_s", "on_interrupt")  # options of how much is read
 SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate notes these itself
 
@@ -86,7 +87,9 @@ class Estimate(Compiling, Reading):
     reconstruct_weights: str = "e2vid-small"
     """Of that network: a released name, a .safetensors path, or a published checkpoint."""
     plots: bool = True
-    """Write maps and histograms as PNG (needs matplotlib)."""
+    """Draw maps and histograms (needs matplotlib)."""
+    figures: Literal["png", "pdf", "svg"] = "png"
+    """Format of these, two columns of a paper wide."""
     report: bool = True
     """Write report.html: the recording re-simulated, a held-out half, in panels (needs
     matplotlib; takes about as long as the estimate), or what a bench shows, level by level."""
@@ -131,8 +134,8 @@ class Estimate(Compiling, Reading):
                      "protocol": self.protocol,
                      "recording_notes": as_dicts(recording.notes), **facts}
             if self.plots:
-                plots.camera_maps(found, out / "maps.png")
-                plots.camera_histograms(found, out / "histograms.png")
+                plots.camera_maps(found, out / f"maps.{self.figures}")
+                plots.camera_histograms(found, out / f"histograms.{self.figures}")
             tested = self._report(out, found, recording) if self.report else {}
             facts |= {key: tested[key] for key in ("grade", "verdict") if key in tested}
             write_json(out / "camera.json", facts)

@@ -113,13 +113,18 @@ class Flow(Windowed):
     def _film(
         self, flows: Iterator[np.ndarray], recording: Recording, edges: np.ndarray, full_px: float
     ) -> str:
+        from evflow.report.caption import captioned
         from evflow.report.flow import flow_image
         from evflow.report.video import enlarged, write_video
 
         def pictures() -> Iterator[np.ndarray]:
             for i, flow in enumerate(flows):
                 events = recording.events.slice(int(edges[i]), int(edges[i + 1]))
-                yield enlarged(flow_image(flow, events, full_px), self.scale)
+                picture = enlarged(flow_image(flow, events, full_px), self.scale)
+                at_s = (int(edges[i]) + int(edges[i + 1])) / 2e6 - int(recording.events.t[0]) / 1e6
+                window_ms = (int(edges[i + 1]) - int(edges[i])) / 1e3
+                yield captioned(picture, f"{at_s:.3f} s   {window_ms:.3g} ms   full colour: "
+                                f"{full_px:.1f} px")
 
         count = len(edges) - 1
         fps = lasting(count, int(edges[-1] - edges[0])) if self.fps is None else self.fps

@@ -42,6 +42,8 @@ class Render(Reading):
     """Instant of the .png, seconds from the first event; without it the busiest."""
     scale: Annotated[int | None, value("N")] = None
     """Screen pixels per pixel; without it as many as make the film 640 wide."""
+    caption: bool = True
+    """Print time, length and colours in a line beneath."""
     codec: Literal["mpeg4", "vp9"] = "mpeg4"
     """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
     overwrite: bool = False
@@ -56,7 +58,7 @@ class Render(Reading):
         check_finite(self)
         film = Film(fps=self.fps, window_us=round(1000 * self.window_ms), slow=self.slow,
                     over_frames=self.over_frames, scale=self.scale, codec=self.codec,
-                    window_events=self.window_events)
+                    window_events=self.window_events, caption=self.caption)
         if self.window_events is not None:
             refuse(self, ("window_ms", "slow"), "the pictures go by --window-events")
         film.check_target(self.out, overwrite=self.overwrite)

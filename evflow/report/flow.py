@@ -8,7 +8,8 @@ import numpy as np
 from evflow.types import Events
 
 WHEEL = 6  # the wheel that explains the colours takes this part of the shorter side
-GROUND = 1.0  # white, where there are no events and at rest
+REST = 1.0  # white, where nothing moves
+GROUND = 0.13  # dark, where there are no events: on white, slow motion would be lost
 
 
 def flow_colours(flow: np.ndarray, full_px: float) -> np.ndarray:
@@ -18,12 +19,12 @@ def flow_colours(flow: np.ndarray, full_px: float) -> np.ndarray:
     x, y = np.asarray(flow, np.float32)
     hue = np.degrees(np.arctan2(y, x)) % 360.0
     saturation = np.minimum(np.hypot(x, y) / np.float32(full_px), 1.0)
-    hsv = np.stack([hue, saturation, np.full_like(hue, GROUND)], -1)
+    hsv = np.stack([hue, saturation, np.full_like(hue, REST)], -1)
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
 
 
 def flow_image(flow: np.ndarray, events: Events, full_px: float) -> np.ndarray:
-    """The colours at pixels with events, white elsewhere, the wheel in the upper right corner;
+    """The colours at pixels with events, dark elsewhere, the wheel in the upper right corner;
     (H, W, 3) on 0..1."""
     active = events.count_map().sum(0) > 0
     image = np.where(active[..., None], flow_colours(flow, full_px), GROUND)
@@ -34,7 +35,7 @@ def flow_image(flow: np.ndarray, events: Events, full_px: float) -> np.ndarray:
 
 
 def wheel(side: int) -> np.ndarray:
-    """The colours of all directions as a disc on white, (side, side, 3)."""
+    """The colours of all directions as a disc, (side, side, 3)."""
     reach = np.linspace(-1.0, 1.0, side, dtype=np.float32)
     flow = np.stack(np.meshgrid(reach, reach))
     inside = np.hypot(*flow) <= 1.0

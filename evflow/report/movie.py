@@ -18,6 +18,7 @@ from PIL import Image
 from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import Progress
 from evflow.files.atomic import atomic_write
+from evflow.report.caption import captioned
 from evflow.report.plots import event_image
 from evflow.report.resimulate import busiest_instant
 from evflow.report.video import CODECS, FPS, SCALES, Codec, check_within, enlarged, write_video
@@ -32,7 +33,8 @@ class Film:
     """How events become pictures. fps: pictures per second; window_us: how long one gathers
     events; window_events: instead, of how many events one is, the next of those that follow;
     slow: times slower than life; over_frames: on the frames nearest in time; scale:
-    screen pixels per pixel, None for as many as make it 640 wide;
+    screen pixels per pixel, None for as many as make it 640 wide; caption: time, length and
+    colours in a line beneath;
     codec: of .mp4, "mpeg4" (players) or "vp9" (browsers too; some 50 times slower). Raises
     EV020."""
 
@@ -43,6 +45,7 @@ class Film:
     scale: int | None = None
     codec: Codec = "mpeg4"
     window_events: int | None = None
+    caption: bool = False
 
     def __post_init__(self) -> None:
         for name, bounds in (("fps", FPS), ("window_us", (1, 10**9)), ("slow", (1e-3, 1e6)),
@@ -113,6 +116,9 @@ def write_sheet(
     parts = [enlarged(part, film.scale) for part in parts]
     gap = np.full((parts[0].shape[0], GAP, 3), 255, np.uint8)
     sheet = np.concatenate([piece for part in parts for piece in (part, gap)][:-1], 1)
+    if film.caption:
+        sheet = captioned(sheet, _caption(events, begin, end, "   {}x{} pixels".format(
+            *events.size)))
     with atomic_write(path, overwrite=overwrite) as temporary:
         Image.fromarray(sheet).save(temporary, "png", optimize=True)
     inside = len(events.slice(begin, end))
@@ -136,9 +142,19 @@ def _pictures(
         shown = event_image(recording.events, begin, end)
         if film.over_frames:
             shown = _over(_frame(recording, (begin + end) // 2, white), shown)
-        yield enlarged(shown, film.scale)
+        picture = enlarged(shown, film.scale)
+        if film.caption:
+            picture = captioned(picture, _caption(recording.events, begin, end))
+        yield picture
         if progress:
             progress(i + 1, count)
+
+
+def _caption(events: Events, begin: int, end: int, more: str = "") -> str:
+    """When, for how long, and what the colours are."""
+    at_s = ((begin + end) / 2 - int(events.t[0])) / 1e6
+    return (f"{at_s:.3f} s   {(end - begin) / 1e3:.3g} ms   ON red, OFF blue: full at 3 events"
+            f"{more}")
 
 
 def _windows(recording: Recording, film: Film) -> list[tuple[int, int]]:

@@ -15,10 +15,21 @@ from evflow.camera import PARAMETERS, Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.result import CameraEstimate
 from evflow.files.atomic import atomic_text
+from evflow.report.page import spread
 from evflow.types import Events
 
 TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON [Hz]", "eta_off": "η OFF [Hz]"}
+SYMBOLS = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON", "eta_off": "η OFF"}
+UNITS = {"the": "natural log units", "eta": "Hz per pixel"}
+PRINT_DPI = 250
+PRINT: Any = {
+    "font.size": 7, "axes.titlesize": 8, "axes.linewidth": 0.6, "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6, "xtick.major.size": 2.5, "ytick.major.size": 2.5,
+    "legend.frameon": False, "legend.handlelength": 1.2, "axes.spines.top": False,
+    "axes.spines.right": False, "pdf.fonttype": 42, "svg.fonttype": "none",
+    "svg.hashsalt": "evflow"}
 ON_COLOUR, OFF_COLOUR = (0.80, 0.20, 0.18), (0.13, 0.35, 0.75)  # red and blue, as in the paper
+FIGURES = ("png", "pdf", "svg")
 LEAST_RANGE = 0.05  # of a map's middle value, to either side
 
 
@@ -40,10 +51,12 @@ def new_figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Any, path: str | os.PathLike) -> None:
-    """Write it as PNG; an existing file is replaced."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
+def save_figure(figure: Any, path: str | os.PathLike, dpi: float = 110) -> None:
+    """Write it as PNG, or PDF or SVG where the path ends so; an existing file is replaced."""
+    buffer, kind = io.BytesIO(), os.fspath(path).rpartition(".")[2].lower()
+    kind = kind if kind in FIGURES else "png"
+    dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
+    figure.savefig(buffer, format=kind, dpi=dpi, metadata=dated)
     atomic_text(path, buffer.getvalue(), overwrite=True)
 
 
@@ -69,49 +82,117 @@ def robust_range(values: np.ndarray, share: float = 1.0) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def _map(axis: Any, values: np.ndarray, title: str) -> None:
+def _map(axis: Any, values: np.ndarray, title: str, unit: str = "", cmap: str = "viridis") -> None:
+    """A map in a colour range that hot pixels do not stretch; arrows where values lie outside."""
     low, high = robust_range(values)
-    image = axis.imshow(values, vmin=low, vmax=high, cmap="viridis")
-    axis.figure.colorbar(image, ax=axis, shrink=0.8)
+    finite = values[np.isfinite(values)]
+    below, above = bool((finite < low).any()), bool((finite > high).any())
+    image = axis.imshow(values, vmin=low, vmax=high, cmap=cmap, interpolation="nearest")
+    bar = axis.figure.colorbar(image, ax=axis, location="bottom", pad=0.03, aspect=22, extend=(
+        "both" if below and above else "min" if below else "max" if above else "neither"))
+    bar.locator = _few_ticks()
+    bar.update_ticks()
+    if unit:
+        bar.set_label(unit)
     axis.set_title(title)
-    axis.set_axis_off()
+    height, width = values.shape
+    axis.set_xticks([-0.5, width / 2 - 0.5, width - 0.5], ["0", "x [pixels]", str(width)])
+    axis.set_yticks([-0.5, height - 0.5], [0, height])
+    axis.tick_params(axis="x", length=0)
+    for tick, side in zip(axis.get_xticklabels(), ("left", "center", "right"), strict=True):
+        tick.set_ha(side)
+    axis.spines[:].set_visible(False)
+
+
+def _few_ticks() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(4)
+
+
+def _printed() -> Any:
+    """A context in which figures are drawn for two columns of a paper."""
+    import matplotlib
+
+    return matplotlib.rc_context(PRINT)
 
 
 def camera_maps(found: CameraEstimate, path: str | os.PathLike) -> None:
-    """The four maps above their standard deviations."""
-    figure = new_figure(15, 6.2)
-    axes = figure.subplots(2, 4)
-    for column, name in enumerate(PARAMETERS):
-        _map(axes[0, column], np.asarray(getattr(found.camera, name)), TITLES[name])
-        _map(axes[1, column], np.asarray(getattr(found.std, name)), f"std of {TITLES[name]}")
-    save_figure(figure, path)
+    """The four maps above their standard deviations, of .png, .pdf or .svg by the ending."""
+    require()
+    with _printed():
+        height, width = found.n_events.shape
+        figure = new_figure(7.2, 2 * (0.85 + min(1.6 * height / width, 4.0)))
+        axes = figure.subplots(2, 4)
+        for column, name in enumerate(PARAMETERS):
+            for axis, maps, sign, cmap in ((axes[0, column], found.camera, "", "viridis"),
+                                           (axes[1, column], found.std, "std of ", "cividis")):
+                if name in found.undetermined:
+                    axis.set_title(f"{sign}{SYMBOLS[name]}")
+                    axis.text(0.5, 0.5, "not measured", ha="center", va="center")
+                    axis.set(xticks=[], yticks=[])
+                else:
+                    _map(axis, np.asarray(getattr(maps, name)), f"{sign}{SYMBOLS[name]}",
+                         UNITS[name[:3]], cmap)
+        for axis in axes[:, 0]:
+            axis.set_ylabel("y [pixels]")
+        save_figure(figure, path, dpi=PRINT_DPI)
 
 
 def _histogram(axis: Any, found: CameraEstimate, name: str, truth: Camera | None) -> None:
+    """Pixels of a map: all (grey), those with events of their own, the truth (black, dashed)."""
     values = np.asarray(getattr(found.camera, name))
-    parts = {"all pixels": values.ravel(), "pixels with events": values[found.valid]}
+    colour = ON_COLOUR if name.endswith("on") else OFF_COLOUR
+    parts = {"all pixels": (values[np.isfinite(values)], {"color": "0.75"})}
+    if 0 < found.valid.sum() < found.valid.size:
+        parts["with events"] = (values[found.valid], {"color": colour, "histtype": "step"})
+    else:
+        parts = {"all pixels": (parts["all pixels"][0], {"color": colour, "alpha": 0.6})}
     if truth is not None:
-        parts["truth"] = np.asarray(getattr(truth, name)).ravel()
-    top = max(float(np.percentile(v, 99.5)) for v in parts.values() if v.size)
-    bins = np.linspace(0.0, max(1.2 * top, 1e-3), 60)
-    for label, v in parts.items():
+        parts["truth"] = (np.asarray(getattr(truth, name)).ravel(),
+                          {"color": "k", "histtype": "step", "ls": "--"})
+    spans = [robust_range(v, 0.5) for v, _ in parts.values() if v.size]
+    low, high = min(s[0] for s in spans), max(s[1] for s in spans)
+    bins = np.linspace(max(0.0, low - 0.1 * (high - low)), high + 0.1 * (high - low), 60)
+    for label, (v, look) in parts.items():
         if v.size:
-            axis.hist(v, bins=bins, density=True, histtype="step", label=label)
-    summary = float(getattr(found.summary, name))
-    axis.axvline(summary, color="0.4", lw=1, ls="--", label=f"summary {summary:.3f}")
-    axis.set_title(TITLES[name])
-    axis.set_yticks([])
-    axis.legend(fontsize=7)
+            axis.hist(v, bins=bins, label=label, **look)
+    summary, std = (float(getattr(s, name)) for s in (found.summary, found.summary_std))
+    axis.axvline(summary, ymax=0.6, color="k", lw=1, label=spread(summary, std))
+    axis.set_title(SYMBOLS[name])
+    axis.set_xlabel(UNITS[name[:3]])
+    axis.set_ylabel("pixels")
+    axis.locator_params(nbins=4)
+    axis.set_ylim(top=1.6 * axis.get_ylim()[1])  # room for the legend
+    axis.legend(fontsize="small", loc="upper right", labelspacing=0.25, borderaxespad=0.1)
 
 
 def camera_histograms(
     found: CameraEstimate, path: str | os.PathLike, truth: Camera | None = None
 ) -> None:
-    """Histograms of the four maps; the truth beside them where it is known."""
-    figure = new_figure(14, 3.2)
-    for axis, name in zip(figure.subplots(1, 4), PARAMETERS, strict=True):
-        _histogram(axis, found, name, truth)
-    save_figure(figure, path)
+    """Histograms of the four maps; the truth beside them where it is known; .png, .pdf or .svg."""
+    require()
+    with _printed():
+        figure = new_figure(7.2, 2.2)
+        for axis, name in zip(figure.subplots(1, 4), PARAMETERS, strict=True):
+            if name in found.undetermined and truth is None:
+                axis.set_title(SYMBOLS[name])
+                axis.text(0.5, 0.5, "not measured", ha="center", va="center")
+                axis.set(xticks=[], yticks=[])
+            else:
+                _histogram(axis, found, name, truth)
+                _contrast_axis(axis, name)
+        save_figure(figure, path, dpi=PRINT_DPI)
+
+
+def _contrast_axis(axis: Any, name: str) -> None:
+    """Thresholds in percent of contrast along the upper edge."""
+    if name.startswith("theta"):
+        axis.set_title("")
+        upper = axis.secondary_xaxis("top", functions=(
+            lambda theta: 100 * np.expm1(theta), lambda percent: np.log1p(percent / 100)))
+        upper.set_xlabel(f"{SYMBOLS[name]}, contrast [%]")
+        upper.xaxis.set_major_locator(_few_ticks())
 
 
 def comparison(

@@ -127,7 +127,8 @@ def _write_film(
     if readable != count:
         raise EvflowDataError("EV019", f"{readable} of {count} pictures can be read again.",
                               "Is the disk full? Nothing was kept.")
-    return f"{size[0]}x{size[1]}, {codec}"
+    browsers = " (for browsers --codec vp9, or ffmpeg -c:v libx264)" if codec == "mpeg4" else ""
+    return f"{size[0]}x{size[1]}, {codec}{browsers}"
 
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], count: int, fps: float) -> str:

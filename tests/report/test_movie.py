@@ -13,7 +13,9 @@ from PIL import Image
 from evflow import Events, EvflowDataError, Recording, write_events
 from evflow.cli import main
 from evflow.report import movie
+from evflow.report.caption import captioned
 from evflow.report.movie import Film, write_film, write_sheet
+from evflow.report.plots import new_figure, save_figure
 
 
 def two_corners() -> Recording:
@@ -165,3 +167,25 @@ def test_render_on_the_command_line(
         assert "EV013" in capsys.readouterr().err
         assert main([*command, "--overwrite", "--over-frames", "--scale", "1"]) == 0
     assert len(pictures(tmp_path / "a.mp4")) == 9  # 300 ms at 30 pictures a second
+
+
+def test_a_caption_is_a_strip_of_one_size() -> None:
+    """Beneath, even, of the same letters whatever the digits; the picture itself is untouched."""
+    picture = np.full((96, 320, 3), 7, np.uint8)
+    one, other = (captioned(picture, f"{t} s   33 ms") for t in ("0.111", "88.888"))
+    assert one.shape == other.shape == (112, 320, 3)
+    assert (one[:96] == 7).all()
+    assert one[96:].min() < 100  # ink
+    assert (one[96:, 200:] == 255).all()
+    assert captioned(picture[:, :40], "many words that do not fit")[96:].min() < 255
+
+
+@pytest.mark.parametrize(("kind", "head"), [
+    ("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml"), ("2", b"\x89PNG")])
+def test_figures_are_what_their_ending_says(kind: str, head: bytes, tmp_path: Path) -> None:
+    figure = new_figure(1.0, 1.0)
+    save_figure(figure, tmp_path / f"a.{kind}", dpi=40)
+    save_figure(figure, tmp_path / f"b.{kind}", dpi=40)
+    first, second = ((tmp_path / f"{name}.{kind}").read_bytes() for name in "ab")
+    assert first == second  # no date in it
+    assert first.startswith(head)

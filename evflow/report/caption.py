@@ -1,0 +1,35 @@
+"""A line of text beneath a picture: its time, and what its colours mean. Pillow's own font."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+LEAST, SHARE = 16, 28  # pixels high, and that part of the width, whichever is more
+INK, GROUND = 40, 255
+
+
+def captioned(picture: np.ndarray, words: str) -> np.ndarray:
+    """(H, W, 3) uint8 above a white strip with the words; the height stays even."""
+    width = picture.shape[1]
+    strip = 2 * (max(LEAST, width // SHARE) // 2)
+    image = Image.new("L", (width, strip), GROUND)
+    ImageDraw.Draw(image).text((strip // 4, strip // 2), words, INK, anchor="lm",
+                               font=_font(words, width - strip // 2, strip))
+    text = np.repeat(np.asarray(image)[..., None], 3, -1)
+    return np.concatenate([picture, text])
+
+
+def _font(words: str, width: int, strip: int) -> Any:
+    """The largest that the words, their numbers as wide as any, fit in."""
+    plain = "".join("0" if c.isdigit() else c for c in words)  # one size for all of a film
+    return next((font for size in range(round(0.62 * strip), 7, -1)
+                 if (font := _sized(size)).getlength(plain) <= width), _sized(7))
+
+
+@lru_cache(maxsize=64)
+def _sized(size: int) -> Any:
+    return ImageFont.load_default(size)
