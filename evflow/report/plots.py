@@ -143,7 +143,8 @@ def _histogram(axis: Any, found: CameraEstimate, name: str, truth: Camera | None
     """Pixels of a map: all (grey), those with events of their own, the truth (black, dashed)."""
     values = np.asarray(getattr(found.camera, name))
     colour = ON_COLOUR if name.endswith("on") else OFF_COLOUR
-    parts = {"all pixels": (values[np.isfinite(values)], {"color": "0.75"})}
+    parts: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
+        "all pixels": (values[np.isfinite(values)], {"color": "0.75"})}
     if 0 < found.valid.sum() < found.valid.size:
         parts["with events"] = (values[found.valid], {"color": colour, "histtype": "step"})
     else:
