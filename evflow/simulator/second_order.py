@@ -25,6 +25,7 @@ Array = jax.Array
 
 NEVER = 1e9  # in intervals: beyond any
 NO_TIME = 1e-9  # seconds
+TINY = 1e-9  # a rise that reaches no threshold; its square is no 0, by which gradients divide
 APART = 1e-3  # (1 - follower's time x pole) of both poles, multiplied; nearer ones are moved apart
 LEAST_DELAY = 1e-3  # of the amplifier, in intervals
 SEARCH, RISE = 4, 4  # steps of Newton's method
@@ -120,7 +121,7 @@ def rest(
 def rise_time(theta: Array, rise: Array, delay: Array) -> Array:
     """How long after a reset y has risen by theta, in intervals, where lp rises all the time:
     x - 1 + exp(-x) = theta / (rise delay), x in delays."""
-    wanted = theta / jnp.maximum(rise * delay, 1e-30)
+    wanted = theta / jnp.maximum(rise * delay, TINY)
     x = jnp.minimum(jnp.sqrt(2.0 * wanted) + 0.5 * wanted, wanted + 1.0)
     for _ in range(RISE):
         x = x - (x + jnp.expm1(-x) - wanted) / -jnp.expm1(-x)

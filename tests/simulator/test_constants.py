@@ -14,7 +14,7 @@ import pytest
 from helpers.videos import SHAPE, code_of, drifting, milliseconds
 
 from evflow.camera import Camera
-from evflow.camera.sensors import NUMBERS, SensorModel
+from evflow.camera.sensors import NUMBERS, SecondOrder, SensorModel
 from evflow.light.log_maps import to_log
 from evflow.simulator import simulate, simulate_counts, simulate_voxels
 from evflow.simulator.constants import Constants
@@ -90,7 +90,13 @@ def test_a_traced_number_counts_as_on_and_0_gives_what_0_gives() -> None:
         assert float(jnp.abs(found - expected).max()) <= 1
 
 
-def test_gradients_reach_the_low_pass_through_times_of_events() -> None:
+@pytest.mark.parametrize(("model", "names"), [
+    (SensorModel(cutoff_hz=150.0), ("cutoff_hz",)),
+    pytest.param(SensorModel(photoreceptor=SecondOrder(amplifier_s=1e-3)),
+                 ("input_s", "amplifier_s"), marks=pytest.mark.slow)])
+def test_gradients_reach_what_is_slow_through_times_of_events(
+    model: SensorModel, names: tuple[str, ...]
+) -> None:
     """A brighter and brighter pixel: its events come later the slower it follows."""
     log = jnp.broadcast_to(jnp.linspace(3.1, 5.3, 21)[:, None, None], (21, *SHAPE))
     when = jnp.arange(16.0)
@@ -99,11 +105,16 @@ def test_gradients_reach_the_low_pass_through_times_of_events() -> None:
         on = simulate_voxels(KEY, log, QUIET, frame_dt_s=1e-3, model=model)[..., :16]
         return jnp.vdot(on.sum((0, 1)), when) / jnp.sum(on)
 
-    model = SensorModel(cutoff_hz=150.0)
-    slope = jax.grad(mean_time)(model).cutoff_hz
-    ahead, behind = (float(mean_time(SensorModel(cutoff_hz=hz))) for hz in (150.5, 149.5))
-    assert float(slope) == pytest.approx(ahead - behind, rel=0.02)
-    assert float(slope) < -1e-3
+    by_name = {path[-1].name: (float(value), float(slope)) for (path, value), slope in zip(
+        jax.tree_util.tree_leaves_with_path(model), jax.tree.leaves(jax.grad(mean_time)(model)),
+        strict=True)}
+    for name in names:
+        ahead, behind = (float(mean_time(jax.tree_util.tree_map_with_path(
+            lambda path, value: value * by if path[-1].name == name else value,  # noqa: B023
+            model))) for by in (1.005, 0.995))
+        value, slope = by_name[name]
+        assert value * slope == pytest.approx(100 * (ahead - behind), rel=0.02)
+        assert abs(value * slope) > 0.1
 
 
 @pytest.mark.parametrize("bad", [
