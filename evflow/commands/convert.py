@@ -51,7 +51,8 @@ class Convert(Reading):
         notes = list(recording.notes)
         if recording.has_frames and (why := writer.refuses(recording.frames.dtype)):
             notes.append(Note(
-                "frames.unused", f"{why}: the {len(recording.frames)} frames were left out."))
+                "frames.unused", f"{why}: the {len(recording.frames)} frames were left out; .h5 "
+                "and .npz hold them."))
             recording = Recording.of_events(recording.events)
         io.write_recording(self.out, recording, writer.NAME, overwrite=self.overwrite)
         for note in notes:

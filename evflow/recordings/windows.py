@@ -197,4 +197,5 @@ def check_overlap(recording: Recording) -> None:
         raise EvflowDataError(
             "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but frames {times[0]:,}.."
             f"{times[-1]:,} us.",
-            "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms.")
+            "Are both on one clock and in one unit? If they begin together, --frames-offset-ms "
+            f"{(int(t[0]) - int(times[0])) / 1e3:.3f}; in another unit, --time-unit.")

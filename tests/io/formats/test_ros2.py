@@ -4,6 +4,7 @@ data errors."""
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -96,3 +97,12 @@ def test_damaged_copies_only_raise_data_errors(tmp_path: Path, storage: str) -> 
     file, = folder.glob(f"*{SUFFIX[storage]}")
     damage(file, 100, lambda: survives(folder))
     damage(folder / "metadata.yaml", 100, lambda: survives(folder))
+
+
+def test_real_event_camera_msgs(data_file: Callable[[str], Path]) -> None:
+    got = read_recording(data_file("data/formats/davis346_event_camera_msgs.mcap"))
+    events = got.events
+    assert (len(events), events.size) == (571_266, (346, 260))
+    assert (events.t[0], events.t[-1]) == (1_744_227_144_732_712, 1_744_227_145_732_708)
+    assert int(events.p.sum()) == 211_043
+    assert not got.notes
