@@ -93,6 +93,9 @@ class Estimate(Compiling, Reading):
     report: bool = True
     """Write report.html: the recording re-simulated, a held-out half, in panels (needs
     matplotlib; takes about as long as the estimate), or what a bench shows, level by level."""
+    simulators: bool = False
+    """Also tell in the report how well the pixels of v2e, ESIM and DVS-Voltmeter, each with its
+    own best constants, foretell the held-out half (takes about as long as the report)."""
     checks: bool = True
     """Stop where `evflow check` finds errors."""
     overwrite: bool = False
@@ -116,6 +119,8 @@ class Estimate(Compiling, Reading):
         if not moving:
             refuse(self, ("weights", "window_ms", "reconstruct", *READ),
                    "of use with --protocol motion only")
+        if not (moving and self.report):
+            refuse(self, ("simulators",), "of use in the report of --protocol motion only")
         if not self.reconstruct:
             refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
         if self.protocol != "static":
@@ -137,7 +142,8 @@ class Estimate(Compiling, Reading):
                 plots.camera_maps(found, out / f"maps.{self.figures}")
                 plots.camera_histograms(found, out / f"histograms.{self.figures}")
             tested = self._report(out, found, recording) if self.report else {}
-            facts |= {key: tested[key] for key in ("grade", "verdict") if key in tested}
+            facts |= {key: tested[key] for key in ("grade", "verdict", "simulators")
+                      if key in tested}
             write_json(out / "camera.json", facts)
         said = [f"verdict: {tested['grade']}", *tested["verdict"]] if tested else []
         print(json.dumps(facts, indent=2) if self.json else
@@ -258,7 +264,8 @@ class Estimate(Compiling, Reading):
             return write_report(
                 out / "report.html", found, recording, weights=self.weights,
                 source=self.recording, command=command,
-                min_window_us=round(self.window_ms * 1000), progress=progress)
+                min_window_us=round(self.window_ms * 1000), progress=progress,
+                simulators=self.simulators)
 
 
 def so_far(summary: Summary, std: Summary) -> str:

@@ -39,6 +39,7 @@ from evflow.report.resimulate import (
     resimulate,
     usable_runs,
 )
+from evflow.report.simulators import as_dicts, simulators_panel, try_simulators
 from evflow.report.streams import (
     Names,
     count_panel,
@@ -84,7 +85,7 @@ def write_report(
     path: str | os.PathLike, found: CameraEstimate, recording: Recording, *,
     weights: str | os.PathLike = "default", source: str | os.PathLike | None = None,
     command: str = "", min_window_us: int = 40_000, seed: int = 0, overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | None = None, simulators: bool = False,
 ) -> dict[str, Any]:
     """Write a self-contained HTML report on an estimated camera, and return its numbers.
 
@@ -103,11 +104,14 @@ def write_report(
         seed: of the re-simulations.
         overwrite: replace a file that exists.
         progress: progress(done, total) is called after each stage.
+        simulators: also try the pixels of v2e, ESIM and DVS-Voltmeter, each with its own best
+            constants of the first half, on the second; takes about as long as the rest.
 
     Returns:
         JSON-ready numbers, which also lie in the page: "grade" ("good", "fair", "poor"),
         "verdict" (what was seen and what to do, a sentence each), "trial"
-        and "held_out" (each None, or what `compare` says, with the "ceiling" of the counts' r).
+        and "held_out" (each None, or what `compare` says, with the "ceiling" of the counts' r);
+        "simulators" where they were tried, the nearest first.
 
     Raises:
         EvflowDataError: EV010 (matplotlib is missing), EV013 (exists), EV015 (a recording of
@@ -129,9 +133,14 @@ def write_report(
               *_trial_panels(recording, evidence), receptor_panel(found, evidence.foretold),
               fault_panel(found), extent_panel(found), _held_panel(found, evidence),
               _assumptions(found, recording, weights, source, command)]
+    rivals: dict[str, Any] = {}
+    if simulators:
+        tried, why_not = try_simulators(recording, evidence.half, evidence.held, seed)
+        panels.insert(-1, simulators_panel(tried, why_not or evidence.why_not_held))
+        rivals = {"simulators": as_dicts(tried)}
     step()
     numbers = {"grade": worst(judged), "verdict": sentences(judged),
-               "trial": _numbers(evidence.trial), "held_out": _numbers(evidence.held)}
+               "trial": _numbers(evidence.trial), "held_out": _numbers(evidence.held), **rivals}
     name = Path(source).name if source else "an event camera"
     page.write_page(path, f"Camera report: {name}", repr(recording), panels, numbers,
                     overwrite=overwrite)

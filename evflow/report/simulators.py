@@ -1,0 +1,261 @@
+"""Which simulator foretells this camera? The pixels of v2e, ESIM and DVS-Voltmeter side by side.
+
+Each has its own best constants, from the first half of a recording, and is tried on the same frames
+of the second. v2e's pixel is the measured camera, pixel by pixel, behind its photoreceptor; ESIM's
+has one threshold per polarity and no noise; DVS-Voltmeter's is that of
+`baselines/voltmeter_fit.py`. All thresholds are scaled so that the first half has as many events
+as were recorded; the camera is shown as measured, too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from evflow.baselines.voltmeter_fit import THETA, measured_constants, regressed
+from evflow.camera import Camera
+from evflow.camera.sensors import SensorModel
+from evflow.errors import EvflowDataError
+from evflow.estimation.pooled import quiet_times
+from evflow.estimation.refine import receptor_sample
+from evflow.estimation.refine.stretches import INTERVALS
+from evflow.estimation.result import CameraEstimate
+from evflow.metrics.streams import compare
+from evflow.recordings.windows import iter_windows
+from evflow.report.page import Panel, number, paragraph, table
+from evflow.report.resimulate import LEARNT_SECONDS, Trial, usable_runs
+from evflow.simulator import simulate
+from evflow.simulator.interpolate import upsample
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, seen_frames
+from evflow.types import Events, Recording
+
+Array = np.ndarray
+Run = tuple[int, int]  # first and last frame
+Pixels = Callable[[Array], tuple[Camera, SensorModel]]  # of thresholds (2,), ON and OFF
+
+LEARNT, TRIED = 4, 5  # frame intervals at most, the busiest of each half
+TRIES = 3  # simulations of the first half, by which thresholds are scaled
+CLOSE = 0.02  # distances that differ by less are alike
+DARKEST = 0.255  # DN: ESIM's log(L / 255 + .001)
+LABELS = {"measured": "the camera as measured", "v2e": "v2e", "esim": "ESIM",
+          "voltmeter": "DVS-Voltmeter"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Tried:
+    """name: of LABELS; constants: its best; untold: those of them that the recording does not tell;
+    numbers: "counts_r" and "space_time_r", "intervals" (distance in decades), "events_on" and
+    "events_off" (made over recorded); distance: their mean distance from 1, 1, 0, 1 and 1."""
+
+    name: str
+    constants: dict[str, float]
+    untold: tuple[str, ...]
+    numbers: dict[str, float | None]
+    distance: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Film:
+    """Frames (T, H, W) in DN, filled up by optical flow, at times_us (T,); real: what was
+    recorded in the span of time, which begins a frame later where there is room."""
+
+    frames: Array
+    times_us: Array
+    real: Events
+    span_us: tuple[int, int]
+
+    @staticmethod
+    def of(recording: Recording, run: Run, most: int) -> Film:
+        """The busiest frame intervals of a run, at most so many."""
+        times = recording.frame_times
+        before = np.searchsorted(recording.events.t, times)
+        n = min(most, run[1] - run[0])
+        starts = np.arange(run[0], run[1] - n + 1)
+        first = int(starts[np.argmax(before[starts + n] - before[starts])])
+        pairs = ((recording.frame_dn(i), int(times[i])) for i in range(first, first + n + 1))
+        frames, instants = zip(*upsample(pairs), strict=True)
+        span = int(times[first + (n > 1)]), int(times[first + n])
+        return Film(np.stack([np.asarray(f, np.float32) for f in frames]), np.array(instants),
+                    recording.events.slice(*span), span)
+
+    def simulated(
+        self, key: jax.Array, camera: Camera, model: SensorModel, seen_by: Photoreceptor = IDEAL
+    ) -> Events:
+        """Events of a camera in the span."""
+        pairs = zip(self.frames, self.times_us.tolist(), strict=True)
+        frames, times = zip(*seen_frames(pairs, seen_by), strict=True)
+        events = simulate(key, np.stack(frames), np.array(times), camera, model=model)
+        return events.slice(*self.span_us)
+
+
+def which_simulator(
+    recording: Recording, found: CameraEstimate, first: Run, second: Run, seed: int = 0
+) -> tuple[Tried, ...]:
+    """The pixels on frames of the second run, the nearest first. found: the estimate of the
+    first run. Raises EV017 where too little happens to tell."""
+    run = tuple(range(*first))
+    data = receptor_sample([(recording, run[k:k + INTERVALS])
+                            for k in range(0, len(run), INTERVALS)])
+    learnt, tried = Film.of(recording, first, LEARNT), Film.of(recording, second, TRIED)
+    if data is None or not len(learnt.real) or not len(tried.real):
+        raise EvflowDataError("EV017", "too little happens to tell simulators apart.",
+                              "Record more motion.")
+    key, shape = jax.random.key(seed), found.n_events.shape
+    seen_by = Photoreceptor.of(found.sensor, found.optics)
+    own = SensorModel(refractory_s=found.sensor.refractory_s, noise_resets_memory=True)
+
+    def scaled(scale: Array) -> tuple[Camera, SensorModel]:
+        return dataclasses.replace(
+            found.camera, theta_on=found.camera.theta_on * np.float32(scale[0]),
+            theta_off=found.camera.theta_off * np.float32(scale[1])), own
+
+    def esim(theta: Array) -> tuple[Camera, SensorModel]:
+        return _even(shape, theta), SensorModel(kind="esim")
+
+    constants = measured_constants(data, quiet_light(recording, first, found))
+
+    def voltmeter(theta: Array) -> tuple[Camera, SensorModel]:
+        fitted = dataclasses.replace(constants.voltmeter, k1=1.0 / float(theta[0]))
+        return _even(shape, theta), SensorModel(kind="voltmeter", voltmeter=fitted)
+
+    scale = matched(key, np.ones(2), scaled, learnt, seen_by)
+    theta = matched(key, regressed(data, DARKEST, tied=False)[0], esim, learnt)
+    level = matched(key, np.full(2, 1.0 / constants.voltmeter.k1), voltmeter, learnt, tied=True)
+    circuit = voltmeter(level)[1].voltmeter
+    rows = (("measured", scaled(np.ones(2)), seen_by, _constants(found, np.ones(2)), ()),
+            ("v2e", scaled(scale), seen_by, _constants(found, scale), ()),
+            ("esim", esim(theta), IDEAL, dict(zip(("theta_on", "theta_off"), theta, strict=True)),
+             ()),
+            ("voltmeter", voltmeter(level), IDEAL, dataclasses.asdict(circuit), constants.untold))
+    made = []
+    for name, (camera, model), sight, values, untold in rows:
+        numbers = likeness(tried, tried.simulated(key, camera, model, sight))
+        made.append(Tried(name, {k: float(v) for k, v in values.items()}, untold, numbers,
+                          distance(numbers)))
+    return tuple(sorted(made, key=lambda one: one.distance))
+
+
+def try_simulators(
+    recording: Recording, half: CameraEstimate | None, held: Trial | None, seed: int = 0
+) -> tuple[tuple[Tried, ...], str]:
+    """`which_simulator` of what a report holds out: the estimate of the first half, and the frames
+    on which it was tried; or why not."""
+    if half is None or held is None:
+        return (), "there is no second half to try them on."
+    times, end = recording.frame_times, held.frames[0]
+    runs = [(a, min(b, end)) for a, b in usable_runs(recording) if a < end]
+    first, last = max(runs, key=lambda run: run[1] - run[0])
+    late = int(np.searchsorted(times, times[last] - LEARNT_SECONDS * 1e6))
+    try:
+        return which_simulator(recording, half, (max(first, late), last), held.frames, seed), ""
+    except EvflowDataError as error:
+        return (), error.seen
+
+
+def _even(shape: tuple[int, ...], theta: Array) -> Camera:
+    """Pixels that are all alike, without noise of their own."""
+    return Camera.constant(shape, theta_on=float(theta[0]), theta_off=float(theta[1]), eta_on=0.0,
+                           eta_off=0.0)
+
+
+def _constants(found: CameraEstimate, scale: Array) -> dict[str, float]:
+    """What a camera's pixel is made of, its thresholds scaled."""
+    return {"theta_on": float(found.summary.theta_on) * float(scale[0]),
+            "theta_off": float(found.summary.theta_off) * float(scale[1]),
+            "sigma_on": float(found.summary.sigma_on), "sigma_off": float(found.summary.sigma_off),
+            "eta_on": float(found.summary.eta_on), "eta_off": float(found.summary.eta_off),
+            "cutoff_hz": found.sensor.cutoff_hz, "refractory_s": found.sensor.refractory_s,
+            "offset_dn": found.optics.offset_dn, "delay_s": found.optics.delay_s}
+
+
+def quiet_light(recording: Recording, run: Run, found: CameraEstimate) -> Array:
+    """(2, 3, LIGHTS), of `by_light`, of the windows between the frames of a run."""
+    begin, end = (int(recording.frame_times[i]) for i in run)
+    part = Recording(recording.events.slice(begin, end), recording.frames[run[0]:run[1] + 1],
+                     recording.frame_times[run[0]:run[1] + 1])
+    return quiet_times(iter_windows(part), found.summary, found.hot, IDEAL).light
+
+
+def matched(
+    key: jax.Array, theta: Array, pixels: Pixels, film: Film, seen_by: Photoreceptor = IDEAL, *,
+    tied: bool = False,
+) -> Array:
+    """theta (2,) at which as many events are made as were recorded: steps in the logs of both, with
+    the slope between them, -1 at first. tied: the same for both polarities."""
+    def counts(events: Events) -> Array:
+        on = float(events.p.sum())
+        return np.log((np.full(2, len(events)) if tied else np.array([on, len(events) - on])) + 0.5)
+
+    logs, slope, wanted = np.log(theta), -np.ones(2), counts(film.real)
+    before: tuple[Array, Array] | None = None
+    for _ in range(TRIES):
+        made = counts(film.simulated(key, *pixels(np.exp(logs)), seen_by))
+        if before is not None and (moved := np.abs(logs - before[0]) > 1e-3).any():
+            step = np.where(moved, logs - before[0], 1.0)
+            slope = np.where(moved, np.clip((made - before[1]) / step, -3.0, -0.3), slope)
+        before = logs, made
+        logs = np.clip(logs + (wanted - made) / slope, *np.log(THETA))
+        if np.abs(made - wanted).max() < CLOSE:
+            break
+    return np.exp(logs)
+
+
+def likeness(film: Film, made: Events) -> dict[str, float | None]:
+    """The `numbers` of Tried."""
+    if not len(made):
+        return {"counts_r": None, "space_time_r": None, "intervals": None, "events_on": 0.0,
+                "events_off": 0.0}
+    said = compare(film.real, made, span_us=film.span_us)
+    ratio = said["rate_hz"]["ratio"]
+    return {"counts_r": said["counts"]["r"]["both"], "space_time_r": said["space_time_r"],
+            "intervals": said["intervals"]["wasserstein_decades"], "events_on": ratio["on"],
+            "events_off": ratio["off"]}
+
+
+def distance(numbers: dict[str, float | None]) -> float:
+    """The mean of 1 - r of the counts, 1 - r in space and time, the distance of the intervals in
+    decades, and the logs of both ratios of events together; what is undefined counts as nothing in
+    common."""
+    def known(name: str, worst: float) -> float:
+        value = numbers[name]
+        return worst if value is None else value
+
+    ratio = np.mean([abs(np.log(max(known(n, 1.0), 1e-2))) for n in ("events_on", "events_off")])
+    return float(np.mean([1.0 - known("counts_r", 0.0), 1.0 - known("space_time_r", 0.0),
+                          known("intervals", 1.0), ratio]))
+
+
+def verdict(tried: Sequence[Tried]) -> str:
+    """Which is nearest, in a sentence."""
+    best = [LABELS[t.name] for t in tried if t.distance < tried[0].distance + CLOSE]
+    if len(best) == 1:
+        return f"Nearest to what was recorded: {best[0]}."
+    return f"Alike, and nearest to what was recorded: {', '.join(best[:-1])} and {best[-1]}."
+
+
+def as_dicts(tried: Sequence[Tried]) -> list[dict[str, Any]]:
+    """JSON-ready values."""
+    return [{**dataclasses.asdict(one), "untold": list(one.untold)} for one in tried]
+
+
+def simulators_panel(tried: Sequence[Tried], why_not: str) -> Panel:
+    """The table; why_not: the reason where it is empty."""
+    title = "Which simulator foretells this camera?"
+    if not tried:
+        return Panel("simulators", title, paragraph(f"Absent: {why_not}", "note"))
+    rows = [[LABELS[t.name], *(number(t.numbers[n], 3) for n in t.numbers), number(t.distance, 3)]
+            for t in tried]
+    constants = [[LABELS[t.name], ", ".join(
+        f"{k} {'not told' if k in t.untold else format(v, '.3g')}" for k, v in t.constants.items())]
+                 for t in tried]
+    return Panel("simulators", title, paragraph(
+        f"{verdict(tried)} Constants are those of the first half, thresholds scaled to its number "
+        f"of events (but for the camera as measured); tried on at most {TRIED} frame intervals of "
+        "the second.")
+        + table(["pixel", "counts r", "space-time r", "intervals [decades]", "ON made / recorded",
+                 "OFF", "distance"], rows)
+        + table(["pixel", "constants"], constants, numeric=False))
