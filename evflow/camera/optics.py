@@ -98,5 +98,5 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
             values[room][name] = float(value)
     if LAW in values["sensor"]:
         values["sensor"][LAW] = bool(values["sensor"][LAW])
-    sensor = SensorModel(**values["sensor"], noise_resets_memory=True)
+    sensor = SensorModel(**values["sensor"], eta_is_all=True, noise_resets_memory=True)
     return sensor, Optics(**values["optics"])

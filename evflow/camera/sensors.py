@@ -167,6 +167,9 @@ class SensorModel(_Numbers):
         leak_jitter: relative jitter of each leak step.
         leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.
         shot_hz: v2e's shot-noise rate in Hz, both polarities together, on top of the camera's eta.
+        eta_is_all: the camera's eta is all of its noise, as that of a measured camera is: leak is a
+            part of eta_on, and shot_hz how much all other noise would be in the dark, uneven as
+            eta is. False: leak and shot noise come on top of eta.
         eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
             of the first frame.
         noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
@@ -193,6 +196,7 @@ class SensorModel(_Numbers):
     leak_jitter: float = 0.0
     leak_fpn_decades: float = 0.0
     shot_hz: float = 0.0
+    eta_is_all: bool = False
     eta_intensity: bool = False
     noise_resets_memory: bool = False
     voltmeter: Voltmeter = DVS346

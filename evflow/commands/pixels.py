@@ -27,9 +27,9 @@ class Pixels:
     """Whose pixels see; what a command that simulates inherits."""
 
     camera: Annotated[Path | None, value("FILE")] = None
-    """camera.npz from evflow estimate, with its cutoff and dead time, and, where VIDEO is a
-    recording, the light that its frames lack; without it the thresholds below, or the sensor's
-    own."""
+    """camera.npz from evflow estimate, with its cutoff, dead time, leak and shot noise, and, where
+    VIDEO is a recording, the light that its frames lack; without it the thresholds below, or the
+    sensor's own."""
     draw: bool = False
     """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
     the most likely values are too even."""
@@ -57,7 +57,8 @@ class Pixels:
     refractory_s: Annotated[float | None, value("SECONDS", "--refractory")] = None
     """Time after an event in which a pixel sends no other (v2e: .0005)."""
     leak_hz: Annotated[float | None, value("HZ", "--leak")] = None
-    """ON events per second and pixel that leak without light."""
+    """ON events per second and pixel that leak without light; of a measured camera, on top of all
+    its noise."""
     leak_jitter: Annotated[float | None, value("SHARE")] = None
     """Relative jitter of the leak (v2e: .1)."""
     leak_fpn_decades: Annotated[float | None, value("DECADES")] = None
@@ -74,8 +75,12 @@ class Pixels:
         from evflow.camera.sensors import known_sensor
 
         model = known_sensor(self.sensor).model
-        if dead_s := self._circuit()[0].refractory_s:
-            model = dataclasses.replace(model, refractory_s=dead_s)
+        circuit = self._circuit()[0]
+        if circuit.refractory_s:
+            model = dataclasses.replace(model, refractory_s=circuit.refractory_s)
+        if self.leak_hz is None and self.shot_hz is None and (circuit.leak_hz or circuit.shot_hz):
+            model = dataclasses.replace(model, leak_hz=circuit.leak_hz, shot_hz=circuit.shot_hz,
+                                        eta_is_all=True)
         told: dict[str, Any] = {name: number for name in CIRCUIT
                                 if (number := getattr(self, name)) is not None}
         if model.kind == "v2e":

@@ -54,8 +54,9 @@ def scatter(quiet: Array, hot: Array) -> float:
 def measured_noise(
     sensor: SensorModel, std: Mapping[str, float], leak: Leak, shot: Shot
 ) -> tuple[SensorModel, dict[str, float]]:
-    """A circuit with what was measured of its noise, and the standard deviations."""
-    return (dataclasses.replace(sensor, leak_hz=leak.hz, shot_hz=shot.hz),
+    """A circuit with what was measured of its noise, all of which is the camera's eta, and the
+    standard deviations."""
+    return (dataclasses.replace(sensor, leak_hz=leak.hz, shot_hz=shot.hz, eta_is_all=True),
             {**std, "leak_hz": leak.std_hz, "shot_hz": shot.std_hz})
 
 

@@ -106,7 +106,7 @@ def which_simulator(
                               "Record more motion.")
     key, shape = jax.random.key(seed), found.n_events.shape
     seen_by = Photoreceptor.of(found.sensor, found.optics)
-    own = SensorModel(refractory_s=found.sensor.refractory_s, noise_resets_memory=True)
+    own = dataclasses.replace(found.sensor, cutoff_hz=0.0)  # which the frames went through
 
     def scaled(scale: Array) -> tuple[Camera, SensorModel]:
         return dataclasses.replace(

@@ -18,7 +18,7 @@ from evflow.camera.sensors import NUMBERS, SensorModel, is_off
 
 Number = Any  # a float, what is traced, or None where it is off
 
-CHOICES = ("kind", "timestamps", "log_map", "cutoff_by_light", "eta_intensity",
+CHOICES = ("kind", "timestamps", "log_map", "cutoff_by_light", "eta_is_all", "eta_intensity",
            "noise_resets_memory")
 
 AT_ONCE = 1e30  # per second: the corner of a low-pass that follows at once
@@ -38,6 +38,7 @@ class Constants:
     timestamps: str
     log_map: str
     cutoff_by_light: bool
+    eta_is_all: bool
     eta_intensity: bool
     noise_resets_memory: bool
     corner: Number

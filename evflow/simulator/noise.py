@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.shares import beside_leak
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import Values, noise_factor
 from evflow.simulator.constants import Constants
@@ -159,9 +160,10 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
     """The camera's noise rates.
 
     reference: the I01 at which eta is given (the mean of the first frame). nominal: the median
-    thresholds (ON, OFF); v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta.
+    thresholds (ON, OFF); v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta. Where eta is
+    all noise, leak is taken off, and `nominal` makes the mean of the rest 1, which is shot noise.
     """
-    eta = (camera.eta_on, camera.eta_off)
+    eta = _but_leak(model, camera)
     if not model.eta_intensity and model.shot_hz is None:
         return Rates(eta, None)
     zero = jnp.zeros_like(camera.eta_on)
@@ -169,6 +171,9 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
     if model.eta_intensity:
         gain = 1.0 / noise_factor(reference)
         steady, varying = varying, (eta[0] * gain, eta[1] * gain)
+    if model.shot_hz is not None and model.eta_is_all:
+        half = 0.5 * model.shot_hz
+        return Rates((zero, zero), (half * nominal[0] * eta[0], half * nominal[1] * eta[1]))
     if model.shot_hz is not None:
         half = 0.5 * model.shot_hz
         varying = (varying[0] + half * (nominal[0] / camera.theta_on),
@@ -176,8 +181,17 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
     return Rates(steady, varying)
 
 
+def _but_leak(model: Constants, camera: Camera) -> tuple[Array, Array]:
+    """Noise rates ON and OFF, without the leak that is among them where eta is all noise."""
+    on, off = camera.eta_on, camera.eta_off
+    if not model.eta_is_all or model.leak_hz is None:
+        return on, off
+    return beside_leak(on, off, model.leak_hz, model.noise_resets_memory), off
+
+
 def nominal_thresholds(model: Constants, camera: Camera) -> Array:
-    """Median thresholds (ON, OFF) that shot noise refers to, (2, ...) for maps (..., H, W).
+    """Median thresholds (ON, OFF) that shot noise refers to, (2, ...) for maps (..., H, W); where
+    eta is all noise, one over the mean of what is not leak.
 
     A median is a sort, 17 ms on the device for a sensor of 346x260 and 1 ms on the host: call
     it outside jit where the camera is known. Models without shot noise do not look.
@@ -186,11 +200,21 @@ def nominal_thresholds(model: Constants, camera: Camera) -> Array:
     lead = camera.shape[:-2]
     if model.shot_hz is None:
         return jnp.ones((2, *lead), jnp.float32)
+    if model.eta_is_all:
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((camera, model))):
+            return _one_over_mean(model, camera)
+        with jax.ensure_compile_time_eval():
+            return _one_over_mean(model, camera)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in theta):
         return jnp.median(jnp.stack(theta).reshape(2, *lead, -1), axis=-1)
     maps = np.stack([np.asarray(t) for t in theta])
     with jax.ensure_compile_time_eval():  # known within jit too, for `most_rate`
         return jnp.asarray(np.median(maps.reshape(2, *lead, -1), axis=-1))
+
+
+def _one_over_mean(model: Constants, camera: Camera) -> Array:
+    mean = jnp.stack(_but_leak(model, camera)).mean((0, -2, -1))
+    return jnp.broadcast_to(1.0 / jnp.maximum(mean, 1e-12), (2, *camera.shape[:-2]))
 
 
 def is_noisy(model: Constants, camera: Camera) -> bool:

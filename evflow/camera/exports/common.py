@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from evflow.camera.sensors import SensorModel
+from evflow.camera.shares import beside_leak
 
 Maps = Mapping[str, np.ndarray]
 PACE = (128 + 20) / 275  # of a low-pass that goes with light at 128 DN, of that at 255 DN
@@ -44,9 +45,9 @@ def add_noise(x, y, t_us, p, maps, start, stop, seed=0):
 class Settings:
     """The scalars nearest to a camera's maps: medians over the pixels, thresholds in natural-log
     units, rates in Hz per pixel and polarity; sigma: the spread of a threshold over the pixels.
-    cutoff_hz (at 255 DN, where it goes with light), dead_s: of the circuit, 0 where they were not
-    measured; even_hz: the measured cutoff where it is the same in any light: cutoff_hz is then
-    right at 128 DN."""
+    cutoff_hz (at 255 DN, where it goes with light), dead_s, leak_hz and shot_hz (v2e's, in the
+    dark), both parts of eta: of the circuit, 0 where they were not measured; even_hz: the measured
+    cutoff where it is the same in any light: cutoff_hz is then right at 128 DN."""
 
     width: int
     height: int
@@ -59,6 +60,8 @@ class Settings:
     cutoff_hz: float = 0.0
     even_hz: float = 0.0
     dead_s: float = 0.0
+    leak_hz: float = 0.0
+    shot_hz: float = 0.0
 
     @staticmethod
     def of(
@@ -79,7 +82,14 @@ class Settings:
         if not sensor.cutoff_by_light:
             cutoff = {"cutoff_hz": sensor.cutoff_hz / PACE, "even_hz": sensor.cutoff_hz}
         values = {**middle, **sigma, **cutoff, **(summary or {})}
-        return Settings(width, height, **values, dead_s=sensor.refractory_s)
+        return Settings(width, height, **values, dead_s=sensor.refractory_s,
+                        leak_hz=sensor.leak_hz, shot_hz=sensor.shot_hz)
+
+    @property
+    def leak_seen(self) -> float:
+        """Hz of the ON noise that are leak."""
+        on, off = np.float64(self.eta_on), np.float64(self.eta_off)
+        return float(on - beside_leak(on, off, self.leak_hz)) if self.leak_hz else 0.0
 
     @property
     def circuit(self) -> str:
@@ -88,7 +98,8 @@ class Settings:
         if self.even_hz:
             cutoff = f"cutoff {self.even_hz:.0f} Hz in any light, which is that of {cutoff} in grey"
         dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
-        return f"{cutoff}, {dead}"
+        leak = f", leak {self.leak_hz:.3f} Hz, a part of the ON noise" if self.leak_hz else ""
+        return f"{cutoff}, {dead}{leak}"
 
     @property
     def sigma(self) -> float:

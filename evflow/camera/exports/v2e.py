@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from v2ecore.emulator import EventEmulator
 
-GREY = 0.59636  # v2e's shot noise at 128 DN over that in the dark
+GAIN = {gain:.5f}  # shot noise in the dark over the measured; at 128 DN v2e has .59636 of it
 
 maps = {{k: torch.tensor(v) for k, v in np.load(Path(__file__).with_name("maps.npz")).items()}}
 emulator = EventEmulator(
     pos_thres={theta_on:.5f}, neg_thres={theta_off:.5f}, sigma_thres=0.01,
-    cutoff_hz={cutoff_hz:.1f}, leak_rate_hz=0.0, refractory_period_s={dead_s:.6f},
-    shot_noise_rate_hz=2 / GREY, device="cpu")
+    cutoff_hz={cutoff_hz:.1f}, leak_rate_hz={leak_hz:.5f}, refractory_period_s={dead_s:.6f},
+    shot_noise_rate_hz=2 * GAIN, device="cpu")
 video, step, found, frame = cv2.VideoCapture(sys.argv[1]), 1 / float(sys.argv[2]), [], 0
 while True:
     more, image = video.read()
@@ -36,7 +36,9 @@ while True:
     if frame == 0:  # v2e draws its thresholds at the first frame: here they are replaced
         emulator.pos_thres, emulator.neg_thres = maps["theta_on"], maps["theta_off"]
         # v2e's probability of a noise event is (R / 2) dt f(I) times these
-        emulator.pos_thres_pre_prob, emulator.neg_thres_pre_prob = maps["eta_on"], maps["eta_off"]
+        # what of the ON noise is leak, v2e adds itself
+        emulator.pos_thres_pre_prob = torch.clamp(maps["eta_on"] - {leak_seen:.5f}, min=0)
+        emulator.neg_thres_pre_prob = maps["eta_off"]
     if events is not None:
         found.append(events)
     frame += 1
@@ -68,17 +70,25 @@ What v2e cannot represent
 
 def export(maps: Maps, s: Settings) -> Export:
     """Scalars for the command line, a script for the maps."""
-    leak, both = max(s.eta_on - s.eta_off, 0.0), min(s.eta_on, s.eta_off)
-    shot = 2 * (both if leak else (s.eta_on + s.eta_off) / 2) / GREY
+    told, on = bool(s.leak_hz or s.shot_hz), s.eta_on
+    if told:
+        leak, on = s.leak_hz, s.eta_on - s.leak_seen
+        shot = s.shot_hz or (on + s.eta_off) / GREY
+    else:
+        leak, both = max(s.eta_on - s.eta_off, 0.0), min(s.eta_on, s.eta_off)
+        shot = 2 * (both if leak else (s.eta_on + s.eta_off) / 2) / GREY
+    gain = s.shot_hz / max(on + s.eta_off, 1e-12) if s.shot_hz else 1 / GREY
     command = (
         f"v2e -i VIDEO -o OUT --output_width {s.width} --output_height {s.height} "
         f"--pos_thres {s.theta_on:.4f} --neg_thres {s.theta_off:.4f} --sigma_thres {s.sigma:.4f} "
         f"--cutoff_hz {s.cutoff_hz:.1f} --leak_rate_hz {leak:.4f} --shot_noise_rate_hz {shot:.4f} "
         f"--refractory_period {s.dead_s:.6f} --dvs_h5 events.h5")
     excess = (
+        "the noise\n  that is not leak, as measured" if told else
         "the OFF noise (measured {eta_off:.4f} Hz); what\n  ON has more of it ({eta_on:.4f} Hz) is "
         "--leak_rate_hz, a regular drift" if leak else
         "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))
     values = vars(s) | {
         "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess}
-    return Export(TEXT.format(**values), {"run_v2e.py": SCRIPT.format(**vars(s))})
+    source = SCRIPT.format(**vars(s) | {"gain": gain, "leak_seen": s.leak_seen})
+    return Export(TEXT.format(**values), {"run_v2e.py": source})
