@@ -58,7 +58,7 @@ def _at_rest(light: Array, k2: float) -> tuple[tuple[float, ...], tuple[str, ...
     few = events.sum() < LEAST_EVENTS
     if few or used.sum() < FEW_LIGHTS or dn.max() < CONTRAST * dn.min():
         rates = (events.sum(1) + 0.5) / np.maximum(seconds.sum(1), 1e-9) * 1e-6  # per us
-        drift, sigma = passage_rates(rates[:, None])
+        drift, sigma = passage_rates(np.full((2, 1), rates.mean()) if few else rates[:, None])
         untold = ("k3", "k4", "k5", "k6") if few else ("k3", "k5")
         return (0.0, float(drift[0]), 0.0, float(sigma[0])), untold
     rates = (events[:, used] + 0.5) / seconds[:, used] * 1e-6
