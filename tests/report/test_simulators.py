@@ -37,7 +37,7 @@ def test_what_is_the_same_is_no_distance_away_and_nothing_is_far() -> None:
     assert distance(SAME) == 0
     for name, value in (("counts_r", 0.5), ("counts_ceiling", 1.0), ("intervals", 0.3),
                         ("events_on", 2.0), ("events_on", 0.5), ("space_time_r", None)):
-        assert distance({**SAME, name: value}) > 0.05
+        assert distance({**SAME, name: value}) > 0.04
     events = Events(np.array([1, 2]), np.array([1, 1]), np.array([5, 9]), np.array([1, 0], bool),
                     (4, 3))
     film = Film(np.zeros((2, 3, 4), np.float32), np.array([0, 20]), events, (0, 20))
@@ -68,7 +68,7 @@ def test_recordings_of_a_simulator_choose_it(kind: str, others: tuple[str, ...])
     even pixel that diffuses; ESIM's is v2e's without all that, and has two thresholds."""
     recording, camera = hidden(15, 440)
     frames = recording.frames.astype(np.float32)
-    even = Camera.constant(frames.shape[1:], theta_on=0.25, theta_off=0.4, eta_on=0.0, eta_off=0.0)
+    even = Camera.constant(frames.shape[1:], 0.25, 0.4, eta_on=0.0, eta_off=0.0)
     models = {"v2e": SensorModel(cutoff_hz=40.0, shot_hz=2.0, noise_resets_memory=True),
               "esim": SensorModel(kind="esim"),
               "voltmeter": SensorModel(kind="voltmeter", voltmeter=Voltmeter(
@@ -76,7 +76,8 @@ def test_recordings_of_a_simulator_choose_it(kind: str, others: tuple[str, ...])
     if kind == "esim":
         frames = np.rint(frames * (90.0 / 255.0))
     if kind == "voltmeter":
-        even = dataclasses.replace(even, theta_on=0.8 * even.theta_on, theta_off=0.5 * even.theta_off)
+        even = dataclasses.replace(even, theta_on=0.8 * even.theta_on,
+                                   theta_off=0.5 * even.theta_off)
     film = Film.of(Recording(recording.events, frames.astype(np.uint8), recording.frame_times),
                    (0, len(frames) - 1), len(frames))
     uneven = dataclasses.replace(camera, eta_on=0.0 * camera.eta_on, eta_off=0.0 * camera.eta_off)

@@ -16,14 +16,18 @@ from helpers.videos import by_pixel
 
 from evflow.camera import Camera, CameraPrior
 from evflow.camera.sensors import SensorModel
+from evflow.camera.shares import beside_leak
 from evflow.simulator import simulate
+from evflow.simulator.constants import Constants
 from evflow.simulator.noise import (
     cosine,
     draw,
     event,
     further,
+    nominal_thresholds,
     pixel_words,
     poisson,
+    rates,
     salts,
     uniform,
 )
@@ -149,6 +153,28 @@ def test_leak_is_on_events_at_its_rate_whatever_the_threshold() -> None:
     pixel, t, _ = by_pixel(events)
     gaps = np.diff(t)[np.diff(pixel) == 0]
     np.testing.assert_allclose(gaps, 20_000, atol=20)
+
+
+def test_leak_is_a_part_of_eta_that_is_all_noise() -> None:
+    model = SensorModel(leak_hz=8.0, eta_is_all=True, noise_resets_memory=True)
+    on, off = still(model, (12.0, 6.0), 4.0).count_map().reshape(2, -1).mean(1) / 4.0
+    assert on == pytest.approx(12.0, rel=0.03)  # of which leak is 4 Hz: the others reset it
+    assert off == pytest.approx(6.0, rel=0.02)
+    alone = beside_leak(np.float64(12.0), np.float64(6.0), 8.0)
+    assert 12.0 - alone == pytest.approx((alone + 6.0) / np.expm1((alone + 6.0) / 8.0), rel=1e-3)
+
+
+def test_eta_that_is_all_noise_follows_light_where_there_is_shot_noise() -> None:
+    """As much of it in all as shot_hz says, as uneven as eta is."""
+    model = Constants.of(SensorModel(shot_hz=6.0, eta_is_all=True))
+    uneven = jnp.asarray(np.random.default_rng(0).gamma(4.0, 0.25, (8, 8)), jnp.float32)
+    camera = Camera(0.2 * jnp.ones((8, 8)), 0.2 * jnp.ones((8, 8)), 2.0 * uneven, uneven)
+    nominal = nominal_thresholds(model, camera)
+    for i01, factor in ((0.1, 0.925), (1.0, 0.25)):
+        on, off = rates(model, camera, jnp.float32(0.5), nominal).at(jnp.float32(i01))
+        assert float((on + off).mean()) == pytest.approx(6.0 * factor, rel=1e-5)
+        np.testing.assert_allclose(on, 2.0 * off, rtol=1e-5)
+        np.testing.assert_allclose(off / off.mean(), uneven / uneven.mean(), rtol=1e-5)
 
 
 def test_leak_has_a_fixed_log_normal_pattern_and_jitter() -> None:

@@ -36,8 +36,8 @@ while True:
     if frame == 0:  # v2e draws its thresholds at the first frame: here they are replaced
         emulator.pos_thres, emulator.neg_thres = maps["theta_on"], maps["theta_off"]
         # v2e's probability of a noise event is (R / 2) dt f(I) times these
-        # what of the ON noise is leak, v2e adds itself
-        emulator.pos_thres_pre_prob = torch.clamp(maps["eta_on"] - {leak_seen:.5f}, min=0)
+        # but for the leak of the median pixel, which v2e adds itself
+        emulator.pos_thres_pre_prob = (maps["eta_on"] - {leak_seen:.5f}).clip(min=0)
         emulator.neg_thres_pre_prob = maps["eta_off"]
     if events is not None:
         found.append(events)
