@@ -57,7 +57,7 @@ class Interval:
 
     bends: half the acceleration at a and at b, (H, W, 2) in pixels per squared interval; None
     where nothing accelerates. speed_px: how far the fast pixels would move at their greatest
-    velocity. grid: of `motion.grid`.
+    velocity, 0 where motion is lost. grid: of `motion.grid`.
     """
 
     a: Frame
@@ -69,7 +69,11 @@ class Interval:
 
     def at(self, fractions: Iterable[float], *, sharp: bool = True) -> Iterator[np.ndarray]:
         """The pictures (H, W) in DN, float32, at fractions of the interval; not sharp: warped
-        bilinearly from the frames as they are."""
+        bilinearly from the frames as they are. Where motion is lost, mixtures of both."""
+        if self.motion.lost:
+            for s in fractions:
+                yield cv2.addWeighted(self.a.dn, 1 - s, self.b.dn, s, 0)
+            return
         a, b = (self.a.doubled, self.b.doubled) if sharp else (self.a.dn, self.b.dn)
         how = cv2.INTER_CUBIC if sharp else cv2.INTER_LINEAR
         scale = np.float32(2 if sharp else 1)
@@ -130,10 +134,12 @@ class _Pair:
 
 def _acceleration(first: _Pair, second: _Pair) -> np.ndarray | None:
     """Half the acceleration at the frame that two intervals share, (h, w, 2) in pixels per us^2 at
-    half the resolution; None where one interval is much the longer. Where flow is not trusted, as
-    at the edges of what moves and of the picture, it is that of what lies around."""
+    half the resolution; None where one interval is much the longer, or its motion lost. Where flow
+    is not trusted, as at the edges of what moves and of the picture, it is that of what lies
+    around."""
     before, after = first.length, second.length
-    if max(before, after) > UNEVEN * min(before, after):
+    lost = first.motion.lost or second.motion.lost
+    if lost or max(before, after) > UNEVEN * min(before, after):
         return None
     jump = second.motion.halves[0] / after + first.motion.halves[1] / before
     trusted = first.motion.trusted[1] & second.motion.trusted[0]
@@ -149,6 +155,8 @@ def _interval(
     pair: _Pair, before: np.ndarray | None, after: np.ndarray | None, places: np.ndarray
 ) -> Interval:
     """before, after: `_acceleration` at its frames; of one alone, it is constant."""
+    if pair.motion.lost:
+        return Interval(pair.a, pair.b, pair.motion, None, 0.0, places)
     there, back = pair.motion.halves
     fast, bends = speed(there), None
     first, second = (after if before is None else before), (before if after is None else after)

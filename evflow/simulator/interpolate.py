@@ -34,7 +34,8 @@ def upsample(
     pairs: (frame (H, W) in DN 0..255, time in us). Yields float32 frames; the given ones come
     out unchanged, those between lie evenly in time. What lies between two comes after the frame
     that follows them was read. `warn` is told, at the end, where motion needs more than MAX_STEPS
-    steps and where optical flow fails. Raises EV002 (frames too small or of changing size), EV020.
+    steps, where optical flow fails and where the scene is cut. Raises EV002 (frames too small or of
+    changing size), EV020.
     """
     if not max_motion_px > 0:
         raise EvflowDataError("EV020", f"max_motion_px={max_motion_px}.", "It must be > 0.")
@@ -49,7 +50,8 @@ def upsample(
     for number, interval in enumerate(intervals(watched())):
         wanted = math.ceil(interval.speed_px / max_motion_px)
         t0, t1 = interval.a.time, interval.b.time
-        seen.append(_Seen(t0, t1, interval.speed_px, wanted, interval.motion.failed))
+        seen.append(_Seen(t0, t1, interval.speed_px, wanted, interval.motion.failed,
+                          interval.motion.lost))
         yield interval.a.dn, t0
         times = _times(t0, t1, min(MAX_STEPS, wanted), number)
         fractions = [(t - t0) / (t1 - t0) for t in times]
@@ -74,13 +76,15 @@ def _times(t0: int, t1: int, steps: int, number: int) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class _Seen:
-    """Of an interval from t0 to t1 us: motion, the steps that it wants, share of wrong flow."""
+    """Of an interval from t0 to t1 us: motion, the steps that it wants, share of wrong flow,
+    whether its motion is lost."""
 
     t0: int
     t1: int
     motion_px: float
     wanted: int
     failed: float
+    lost: bool
 
 
 def _notes(seen: list[_Seen]) -> Iterator[Note]:
@@ -91,12 +95,18 @@ def _notes(seen: list[_Seen]) -> Iterator[Note]:
         yield Note("frames.fast", f"motion of {worst.motion_px:.0f} px between the frames at "
                    f"{worst.t0} and {worst.t1} us is too fast to interpolate well; {MAX_STEPS} "
                    f"steps were used{_many(fast, seen)}.")
-    failed = [s for s in seen if s.failed > FAILED]
+    lost = [s for s in seen if s.lost]
+    if lost:
+        yield Note("frames.cut", f"next to nothing of the frame at {lost[0].t0} us is found again "
+                   f"in that at {lost[0].t1} us{_many(lost, seen)}: a cut, or motion too fast to "
+                   "follow. The one fades into the other, which pixels see as a flash of all that "
+                   "differs; --start and --stop take a single shot.")
+    failed = [s for s in seen if s.failed > FAILED and not s.lost]
     if failed:
         worst = max(failed, key=lambda s: s.failed)
         yield Note("frames.flow", f"optical flow fails in {worst.failed:.0%} of the pixels that "
                    f"change between the frames at {worst.t0} and {worst.t1} us{_many(failed, seen)}"
-                   ": a cut, noise, or motion too fast or too intricate to follow. Events there "
+                   ": noise, or motion too fast or too intricate to follow. Events there "
                    "are those of a fade; more frames a second would tell.")
 
 

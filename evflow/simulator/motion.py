@@ -21,6 +21,8 @@ BETTER = 0.9  # of the difference without a shift: what a shift must reach to be
 APART_PX, APART = 1.0, 0.05  # forward and backward flow may differ by so much, and of the motion
 CHANGED, MISFITS = 5.0, 3.0  # codes: differences of frames that are more than their noise
 MISFIT = 0.5  # of the local contrast: what a right flow leaves far below, and a wrong one exceeds
+LOST, MUCH = 0.9, 0.4  # of the pixels that change, and these of the picture: so many are wrong
+# where another scene begins, and else where things turn by 30 degrees
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,13 +30,15 @@ class Motion:
     """Of frame a (H, W) to frame b. there: (H, W, 2) float32 pixels (x, y) that carry a into b;
     back: those that carry b into a; halves: both at half the resolution, (h, w, 2); trusted: where
     these undo each other, (h, w) bool on a and on b; failed: share of the pixels that change, and
-    stay in view, whose flow is wrong."""
+    stay in view, whose flow is wrong; lost: whether next to nothing of a is found in b, as where a
+    film is cut."""
 
     there: np.ndarray
     back: np.ndarray
     halves: tuple[np.ndarray, np.ndarray]
     trusted: tuple[np.ndarray, np.ndarray]
     failed: float
+    lost: bool
 
 
 class MotionFinder:
@@ -138,10 +142,10 @@ def _overlap(image: np.ndarray, x: int, y: int) -> np.ndarray:
 
 def _verdict(
     a: np.ndarray, b: np.ndarray, there: np.ndarray, back: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray], float]:
-    """(trusted, failed) of Motion, of halved frames and flows. A flow is wrong where the other does
-    not undo it, or where the frame that it warps differs from the real one by half the contrast
-    around; a change of light alone is neither."""
+) -> tuple[tuple[np.ndarray, np.ndarray], float, bool]:
+    """(trusted, failed, lost) of Motion, of halved frames and flows. A flow is wrong where the
+    other does not undo it, or where the frame that it warps differs from the real one by half the
+    contrast around; a change of light alone is neither."""
     at, seen_in_b = _ends(there)
     trusted_there = _undone(there, back, at)
     trusted = trusted_there, _undone(back, there, _ends(back)[0])
@@ -150,7 +154,8 @@ def _verdict(
     contrast = cv2.blur(np.abs(texture), (5, 5))
     changes = seen_in_b & (cv2.blur(cv2.absdiff(a, b), (3, 3)) > CHANGED)
     wrong = ~trusted_there | (misfit > np.maximum(MISFIT * contrast, MISFITS))
-    return trusted, float((wrong & changes).sum() / max(1, changes.sum()))
+    failed = float((wrong & changes).sum() / max(1, changes.sum()))
+    return trusted, failed, failed > LOST and float(changes.mean()) > MUCH
 
 
 def _ends(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

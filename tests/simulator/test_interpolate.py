@@ -189,15 +189,43 @@ def test_fast_pans_of_fine_textures_are_followed(dx: int) -> None:
     assert error < 0.1 * faded
 
 
-@pytest.mark.parametrize(("second", "failed"), [
-    (shifted(5.0), False), (0.7 * shifted(5.0), False), (shifted(0), False),
-    (shifted(0)[::-1].copy(), True), (shifted(0).T.copy(), True)])
-def test_flow_that_fails_is_told_with_its_share(second: np.ndarray, failed: bool) -> None:
-    """Unrelated pictures; not what moves, gets darker or stays."""
+FOLDED = np.where(np.arange(SIZE) < SIZE * 0.6, shifted(5.0), shifted(0)[::-1])
+
+
+@pytest.mark.parametrize(("second", "code"), [
+    (shifted(5.0), ""), (0.7 * shifted(5.0), ""), (shifted(0), ""), (FOLDED, "frames.flow"),
+    (shifted(0)[::-1].copy(), "frames.cut"), (shifted(4).T.copy(), "frames.cut")])
+def test_flow_that_fails_is_told_with_its_share(second: np.ndarray, code: str) -> None:
+    """Unrelated pictures, whole or in part; not what moves, gets darker or stays."""
     told: list[Note] = []
     list(upsample([(shifted(0), 0), (second, 40_000)], max_motion_px=9.0, warn=told.append))
-    assert [note.code for note in told] == ["frames.flow"] * failed
-    assert all(re.search(r"in \d\d% of the pixels.*0 and 40000 us", note.text) for note in told)
+    assert [note.code for note in told] == [code] * bool(code)
+    assert all(re.search(r"0( us.*)? and 40000 us|at 0 us .* at 40000 us", note.text)
+               for note in told)
+    assert all(re.search(r"in \d\d% of the pixels", note.text) for note in told
+               if code == "frames.flow")
+
+
+def test_nothing_is_warped_across_a_cut() -> None:
+    """A shot is filled up as it would be alone, and fades into the next."""
+    shots = [[shifted(4.0 * i) for i in range(3)], [shifted(6.0 * i).T.copy() for i in range(3)]]
+    told: list[Note] = []
+    film = [(frame, 10_000 * i) for i, frame in enumerate(shots[0] + shots[1])]
+    made = list(upsample(film, warn=told.append))
+    assert [t for _, t in made if 20_000 < t < 30_000] == []
+    before = [pair for pair in made if pair[1] <= 20_000]
+    for (frame, t), (alone, t_alone) in zip(before, upsample(film[:3]), strict=True):
+        assert t == t_alone
+        np.testing.assert_array_equal(frame, alone)
+    for t, frame in ((t, frame) for frame, t in made if 30_000 < t < 50_000):
+        truth = shifted(6.0 * (t - 30_000) / 10_000).T
+        assert np.abs(frame - truth)[INNER].mean() < 2.0
+    note, = told
+    assert note.code == "frames.cut"
+    assert re.search("at 20000 us .* at 30000 us", note.text)
+    cut = list(intervals(film))[2]
+    middle, = cut.at([0.5])
+    np.testing.assert_allclose(middle, (film[2][0] + film[3][0]) / 2, rtol=1e-5)
 
 
 @pytest.mark.parametrize("step", [0.0, -1.0, float("nan")])
