@@ -24,6 +24,8 @@ from evflow.notes import Note
 
 RADIANCE = (".hdr", ".exr", ".pfm")  # whose numbers have no white
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RADIANCE)
+EXIF, HEAD = (b"Exif\0\0", b"eXIf"), 1 << 16  # what may tell which side is up, and where
+UPRIGHT = 6  # OpenCV's IMREAD_ANYCOLOR | IMREAD_ANYDEPTH: as it is, but as EXIF turns it
 MADE = "made from the events by"  # how `evflow reconstruct` marks images in their file of times
 TIMES = ("timestamps.txt", "images.txt", "image_timestamps.txt", "timestamp.txt", "times.txt",
          "info.txt", "rgb.txt", "data.csv", "timestamps.csv", "timestamps.npy")
@@ -53,7 +55,7 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     made = _made(folder)
     if hints.fps is not None:
         times = np.array([hints.at_rate(i) for i in range(len(files))], np.int64)
-        return ImageFolder(tuple(files), times, made)
+        return ImageFolder(tuple(files), times, made + _gaps(files))
     source = _times_file(root, folder, hints)
     by_name = {file.name: file for file in files}
     us, names, notes = read_times(source, hints.time_unit, by_name)
@@ -71,6 +73,24 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
             where=folder)
     files = [by_name[name] for name in names] if names else files
     return ImageFolder(tuple(files), us, notes + made)
+
+
+def _gaps(files: list[Path]) -> tuple[Note, ...]:
+    """What is said where the only number that differs between names jumps."""
+    parts = [natural(file.name)[0] for file in files]
+    alike = len({len(part) for part in parts}) == 1
+    varying = [i for i, same in enumerate(zip(*parts, strict=False)) if len(set(same)) > 1]
+    if not alike or len(varying) != 1 or not (at := varying[0]) % 2:
+        return ()
+    numbers = np.array([part[at] for part in parts], np.float64)
+    steps = np.diff(numbers)
+    jumps = np.flatnonzero(steps > np.median(steps))
+    if not len(jumps):
+        return ()
+    many = f", and {len(jumps) - 1} more times" if len(jumps) > 1 else ""
+    return (Note("frames.gaps", f"the numbers of the images jump from {files[jumps[0]].name} to "
+                 f"{files[jumps[0] + 1].name}{many}: images lost? They are taken as evenly spaced; "
+                 "--timestamps keeps gaps in time."),)
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -128,7 +148,11 @@ def _by_opencv(data: bytes) -> np.ndarray | None:
     import cv2
 
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is not None and image.shape[2:] != (4,) and any(
+                mark in data[:HEAD] for mark in EXIF):
+            return cv2.imdecode(np.frombuffer(data, np.uint8), UPRIGHT)
+        return image
     except cv2.error:
         return None
 

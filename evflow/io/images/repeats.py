@@ -50,6 +50,8 @@ class Runs:
     def repeats(self) -> np.ndarray:
         """Whether each frame is one that a converter showed again, (T,) bool."""
         lengths = np.diff([*self.firsts, len(self.times)])
+        if len(lengths) < 2:  # nothing moves
+            return np.zeros(len(self.times), bool)
         alike = np.abs(np.diff(lengths)) <= 1
         three = alike[1:] & alike[:-1]
         many = np.zeros(len(lengths), bool)

@@ -46,7 +46,10 @@ def white_of(dtype: np.dtype, where: str) -> float:
     """DN of a saturated pixel; EV003 where images have no such depth."""
     if dtype.str[1:] not in WHITE:
         raise EvflowDataError(
-            "EV003", f"{where} is {dtype}.", "Expected uint8, uint16 or floats.", where=where)
+            "EV003", f"{where} is {dtype}.", "Expected uint8, uint16 or floats: "
+            + ("255 * frames.astype(np.uint8)." if dtype.kind == "b" else
+               "frames.astype(np.float32), with white at --full-scale where that is not 255."),
+            where=where)
     return WHITE[dtype.str[1:]]
 
 

@@ -23,11 +23,13 @@ from evflow.io.images.frames import FrameHints, Image, existing
 from evflow.io.images.matroska import first_stamp_s
 from evflow.io.images.stacks import cut_off
 from evflow.io.images.times import read_times
+from evflow.io.images.transfer import hdr_note
 from evflow.notes import Note
 
 SLACK = 1.5  # frames; containers without a count have it from their duration, rounded
 SLACK_SHARE = 0.001
 REST = "the rest is missing, damaged, or trimmed away by an edit list"
+BLACK, NOT_BLACK = 2, 1e-3  # codes; share of the bytes of a black picture that may be brighter
 TICK_US = 1000.5  # Matroska and WebM round times to the millisecond
 
 
@@ -50,12 +52,14 @@ class Video:
         Raises EV002 (more or fewer frames than `timestamps`), EV004 (the container's times do
         not increase), EV009 (fewer frames than the container promises, unless `partial`).
         """
-        clock, count = Clock(self.path, self.fps), 0
+        clock, count, first, still = Clock(self.path, self.fps), 0, None, True
         with _capture(self.path) as capture:
             while True:
                 good, pixels = capture.read()
                 if not good:
                     break
+                first = pixels if first is None else first
+                still = still and np.array_equal(first, pixels)
                 yield Image(pixels, self._time(count, clock, capture), self._name(count))
                 count += 1
         lost = min(self.claimed - count, self.claimed - 1 - clock.last_us * self.fps * 1e-6)
@@ -65,7 +69,8 @@ class Video:
             raise cut_off(self.path, count, self.claimed, REST)
         if self.times_us is not None and count < len(self.times_us) and not self.hints.partial:
             raise self._miscounted(f"{count:,}")
-        self.notes.extend(note for note in clock.notes() if note not in self.notes)
+        told = clock.notes() + ([_still(self.path, count)] if still and count > 1 else [])
+        self.notes.extend(note for note in told if note not in self.notes)
 
     def _name(self, index: int) -> str:
         return f"frame {index} of {self.path}"
@@ -156,13 +161,18 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
         claimed = max(0, claimed)
         good, first = capture.read()
         if not good:
-            raise EvflowDataError("EV009", f"no frame of {path} can be decoded.", "Copy it again.",
-                                  where=path)
+            codec = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little")
+            raise EvflowDataError(
+                "EV009", f"no frame of {path} can be decoded; its codec is "
+                f"{codec.decode('ascii', 'replace')}, which OpenCV may not know here.",
+                f"Convert it: ffmpeg -i {path.name} -c:v libx264 -crf 12 new.mp4; or, where it is "
+                "damaged, copy it again.", where=path)
+        _check_converted(path, capture, claimed, first)
         if not hints.partial and claimed > 1:
             _check_end(path, capture, claimed)
         if not hints.partial:
             _check_bytes(path)
-    times, notes = None, list[Note]()
+    times, notes = None, list(hdr_note(path))
     if hints.timestamps is not None:
         times, _, told = read_times(Path(hints.timestamps), hints.time_unit)
         notes += told
@@ -170,6 +180,28 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
         raise EvflowDataError("EV020", f"{path} states no frame rate ({rate:g}).", "Pass --fps.",
                               where=path)
     return Video(path, first.shape[1::-1], float(rate), claimed, hints, times, notes)
+
+
+def _check_converted(path: Path, capture: Any, claimed: int, first: np.ndarray) -> None:
+    """EV009 where all frames are the same black: OpenCV does not convert interlaced ones, and says
+    so on the terminal alone."""
+    if claimed < 2 or np.median(first) > BLACK or (first > BLACK).mean() > NOT_BLACK:
+        return
+    for share in (0.25, 0.5, 0.75):
+        capture.set(cv2.CAP_PROP_POS_FRAMES, int(share * claimed))
+        good, other = capture.read()
+        if not good or not np.array_equal(first, other):
+            return
+    raise EvflowDataError(
+        "EV009", f"all frames of {path} are decoded to the same black picture: interlaced video "
+        "that OpenCV does not convert here?",
+        f"Make whole frames of its fields: ffmpeg -i {path.name} -vf bwdif new.mp4.", where=path)
+
+
+def _still(path: Path, count: int) -> Note:
+    return Note("frames.still", f"all {count:,} frames of {path} are the same to the byte: nothing "
+                "moves; or it is interlaced, which OpenCV does not convert in some versions: make "
+                f"whole frames of its fields (ffmpeg -i {path.name} -vf bwdif new.mp4).")
 
 
 def _check_end(path: Path, capture: Any, claimed: int) -> None:
