@@ -8,21 +8,18 @@ same random numbers, so that their differences are the cameras'.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from evflow.baselines.base import usable
-from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine import Chunk, make_chunk, refinement_chunks
 from evflow.estimation.refine.noise import combined_rate, quiet_events
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.pixels import pixel_evidence
-from evflow.estimation.refine.trace import Trace, trace_of_camera
+from evflow.estimation.refine.trace import Trace, draw, trace_of_camera
 from evflow.light.log_maps import lin_log
 from evflow.types import Recording
 
@@ -47,11 +44,15 @@ class Scene:
     def simulate(self, key: Array, rows: np.ndarray, fresh: float) -> np.ndarray:
         """Statistics (V, 4, 2) of the cameras rows (V, 6); fresh: 1 where the memory starts at
         the first frame's brightness, 0 where it may lie anywhere between the thresholds."""
-        start = jnp.asarray(fresh, jnp.float32)
-        made = [[_simulated(jax.random.fold_in(key, i), c.path, c.dt_s, c.bright, row,
-                            start if i == 0 else jnp.zeros_like(start), self.steps)
-                 for i, c in enumerate(self.chunks)] for row in jnp.asarray(rows, jnp.float32)]
-        return np.asarray(made, np.float64).sum(1)
+        totals = np.zeros((len(rows), 4, 2))
+        for i, c in enumerate(self.chunks):
+            draws = draw(jax.random.fold_in(key, i), c.bright.shape, len(c.dt_s), self.steps)
+            start = np.full(2, 0.0 if i else fresh, np.float32)
+            for total, row in zip(totals, np.asarray(rows, np.float32), strict=True):
+                made = trace_of_camera(draws, c.path, c.dt_s, draws.thresholds(row), row[2:4],
+                                       1 - start, self.steps)
+                total += statistics(made, c.bright)
+        return totals
 
 
 def scene_of(recording: Recording, path: Path, quiet: bool = True) -> Scene:
@@ -96,27 +97,10 @@ def _runs(found: list[int]) -> list[list[int]]:
     return [part.tolist() for part in np.split(np.array(found), breaks)]
 
 
-@jax.jit
-def statistics(trace: Trace, bright: Array) -> Array:
+def statistics(trace: Trace, bright: np.ndarray) -> np.ndarray:
     """(4, 2): sums over pixels of the counts, of their square roots and of the pixels that fire
     at all, ON and OFF; then the number of pixels there are, twice."""
-    counts = jnp.asarray(trace.counts).sum(0) * bright[None]
-    pixels = jnp.full(2, bright.sum(), counts.dtype)
-    return jnp.stack([counts.sum((1, 2)), jnp.sqrt(counts).sum((1, 2)),
-                      (counts > 0).sum((1, 2)).astype(counts.dtype), pixels])
-
-
-@partial(jax.jit, static_argnames="steps")
-def _simulated(
-    key: Array, path: Array, dt_s: Array, bright: Array, row: Array, fresh: Array, steps: int
-) -> Array:
-    """Statistics (4, 2) of one camera on one chunk."""
-    k_pixels, k_trace = jax.random.split(key)
-    draws = jax.random.normal(k_pixels, (2, *path.shape[1:]))
-    on, off, eta_on, eta_off, sigma_on, sigma_off = row
-    full = jnp.ones_like(draws[0])
-    camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
-                    jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
-                    eta_on * full, eta_off * full)
-    start = (1.0 - fresh) * jnp.ones(2)
-    return statistics(trace_of_camera(k_trace, path, dt_s, camera, start, steps), bright)
+    counts = trace.counts.sum(0, dtype=np.float64) * bright
+    pixels = np.full(2, float(bright.sum()))
+    return np.stack([counts.sum((1, 2)), np.sqrt(counts).sum((1, 2)), (counts > 0).sum((1, 2)),
+                     pixels])

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -19,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import THETA_MIN, Camera, Summary
+from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine.moments import Moments, measure
 from evflow.estimation.refine.noise import (
@@ -33,7 +32,7 @@ from evflow.estimation.refine.noise import (
 )
 from evflow.estimation.refine.path import STEPS, Chunk
 from evflow.estimation.refine.signal import told_apart
-from evflow.estimation.refine.trace import FRESH, RUNNING, trace_of_camera
+from evflow.estimation.refine.trace import FRESH, RUNNING, Draws, draw, trace_of_camera
 from evflow.light.log_maps import lin_log_inverse, noise_factor, normalised_intensity
 from evflow.network.coordinates import squashed_summary, unsquash_summary
 
@@ -73,29 +72,6 @@ class FusionNet(nn.Module):
         return out[..., :6], out[..., 6:] - 1.0
 
 
-@partial(jax.jit, static_argnames="steps")
-def _simulated(
-    key: Array, number: Array, path: Array, dt_s: Array, bright: Array, values: Array,
-    start: Array, steps: int,
-) -> Moments:
-    """Moments of a camera on one chunk. values (6,): theta, eta, sigma; cameras of one key and
-    number see the same random numbers, so that their differences are the cameras'."""
-    k_pixels, k_trace = jax.random.split(jax.random.fold_in(key, number))
-    draws = jax.random.normal(k_pixels, (2, *path.shape[1:]), path.dtype)
-    on, off, eta_on, eta_off, sigma_on, sigma_off = values
-    full = jnp.ones_like(draws[0])
-    camera = Camera(jnp.maximum(on + sigma_on * draws[0], THETA_MIN),
-                    jnp.maximum(off + sigma_off * draws[1], THETA_MIN),
-                    eta_on * full, eta_off * full)
-    trace = trace_of_camera(k_trace, path, dt_s, camera, start, steps)
-    return measure(trace, path, dt_s, bright, steps)
-
-
-@partial(jax.jit, static_argnames="steps")
-def _recorded(trace: Any, path: Array, dt_s: Array, bright: Array, steps: int) -> Moments:
-    return measure(trace, path, dt_s, bright, steps)
-
-
 def _total(parts: Sequence[Moments]) -> Moments:
     return jax.tree.map(lambda *leaves: np.sum([np.asarray(a) for a in leaves], 0), *parts)
 
@@ -120,6 +96,7 @@ class Fit:
 
     def __init__(self, chunks: list[Chunk], start: Summary, std: Summary, seed: int) -> None:
         self.chunks, self.key = chunks, jax.random.key(seed)
+        self.draws: dict[int, Draws] = {}
         self.simulated: dict[tuple[int, bytes, bytes], Moments] = {}
         self.names = [f.name for f in dataclasses.fields(Summary)]
         self.prior = np.array([float(getattr(start, n)) for n in self.names])
@@ -131,7 +108,7 @@ class Fit:
         self.values[2:4] = combined_rate(self.quiet, self.prior[2:4], self.prior_std[2:4])
         self.start = self.later = RUNNING
         self.factor = _mean_factor(chunks)
-        self.recorded = _total([_recorded(c.recorded, c.path, c.dt_s, c.bright, STEPS)
+        self.recorded = _total([measure(c.recorded, c.path, c.dt_s, c.bright, STEPS)
                                 for c in chunks])
 
     def simulate(self, values: np.ndarray, starts: Sequence[Start] = ()) -> Moments:
@@ -147,13 +124,15 @@ class Fit:
 
     def _moments(self, i: int, row: np.ndarray, start: np.ndarray) -> Moments:
         """Moments of a camera on chunk i, each once: a pass asks for what the last one asked."""
-        known = (i, row.tobytes(), start.tobytes())
+        known, c = (i, row.tobytes(), start.tobytes()), self.chunks[i]
+        if i not in self.draws:
+            self.draws[i] = draw(jax.random.fold_in(self.key, np.uint32(i)), c.bright.shape,
+                                 len(c.dt_s), STEPS)
         if known not in self.simulated:
-            # One by one: a program for every number of cameras takes seconds to compile.
-            c = self.chunks[i]
-            made = _simulated(
-                self.key, np.uint32(i), c.path, c.dt_s, c.bright, row, start, STEPS)
-            self.simulated[known] = jax.device_get(made)
+            draws = self.draws[i]
+            trace = trace_of_camera(
+                draws, c.path, c.dt_s, draws.thresholds(row), row[2:4], start, STEPS)
+            self.simulated[known] = measure(trace, c.path, c.dt_s, c.bright, STEPS)
         return self.simulated[known]
 
     def choose_start(self, others: Sequence[Start] = (FRESH,)) -> None:

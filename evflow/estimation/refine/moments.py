@@ -13,11 +13,11 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from evflow.estimation.refine.trace import NEVER, Trace
 
-Array = jax.Array
+Array = np.ndarray
 
 LAGS = (1, 2, 4, 0)  # frames between the ends of dL; 0: from the first event on
 DEAD, FULL = 0.1, 0.5  # log units: changes below do not choose a side, above weigh no more
@@ -47,51 +47,44 @@ class Moments:
 
 def measure(trace: Trace, path: Array, dt_s: Array, bright: Array, steps: int) -> Moments:
     """Moments of one chunk: path (K*steps + 1, H, W), dt_s (K,), bright (H, W) bool."""
-    frames = path[::steps]
-    used = bright.astype(path.dtype)
-    known = (trace.step != NEVER) & bright
-    step = jnp.where(trace.step != NEVER, trace.step, 0)
-    before = jnp.take_along_axis(path, step[None], 0)[0]
-    after = jnp.take_along_axis(path, step[None] + 1, 0)[0]
-    origin = before + trace.fraction * (after - before)
-    since, changes = _since_first(trace, step, frames, origin, steps)
+    flat, first = path.reshape(len(path), -1), trace.step.ravel()
+    counts = trace.counts.reshape(len(dt_s), 2, -1)
+    known = np.flatnonzero((first != NEVER) & bright.ravel())
+    step = first[known]
+    origin = flat[step, known]
+    origin = origin + trace.fraction.ravel()[known] * (flat[step + 1, known] - origin)
+    since = _since_first(counts[..., known], trace.first_on.ravel()[known], step // steps)
+    begun = np.arange(len(since))[:, None] * steps > step
+    changes = np.where(begun, flat[::steps][:, known] - origin, np.float32(0.0))
     balance = []
     for lag in LAGS:
         n = since[lag:] - since[:-lag] if lag else since[1:]
         dL = changes[lag:] - changes[:-lag] if lag else changes[1:]
-        balance.append(_sides(n, dL, known, squares=False))
-    counts = jnp.asarray(trace.counts) * used[None, None]
-    total = counts.sum(0)
+        balance.append(_sides(n, dL, squares=False))
+    total = counts.sum(0) * bright.ravel()
     return Moments(
-        jnp.stack(balance), _sides(since[1:], changes[1:], known, squares=True),
-        roots=jnp.sqrt(total).sum((1, 2)),
-        active=(total > 0).sum((1, 2)).astype(path.dtype),
-        events=total.sum((1, 2)),
-        early=(known & (step < steps // 4)).sum().astype(path.dtype),
-        pixels=used.sum(), exposure=used.sum() * dt_s.sum())
+        np.stack(balance), _sides(since[1:], changes[1:], squares=True),
+        roots=np.sqrt(total).sum(1, dtype=np.float64),
+        active=(total > 0).sum(1).astype(np.float64), events=total.sum(1, dtype=np.float64),
+        early=np.asarray((step < steps // 4).sum(), float), pixels=np.asarray(bright.sum(), float),
+        exposure=np.asarray(bright.sum() * dt_s.sum(dtype=np.float64)))
 
 
-def _since_first(
-    trace: Trace, step: Array, frames: Array, origin: Array, steps: int
-) -> tuple[Array, Array]:
-    """Counts (K+1, 2, H, W) after the first event and change (K+1, H, W) since it, up to each
-    frame; 0 before it."""
-    interval = step // steps
-    first = jnp.stack([trace.first_on, ~trace.first_on]) & (trace.step != NEVER)[None]
-    here = jnp.arange(trace.counts.shape[0])[:, None, None] == interval[None]
-    counts = trace.counts - (here[:, None] & first[None]).astype(frames.dtype)
-    since = jnp.concatenate([jnp.zeros_like(counts[:1]), jnp.cumsum(counts, 0)])
-    begun = jnp.arange(frames.shape[0])[:, None, None] * steps > step[None]
-    return since, jnp.where(begun, frames - origin[None], 0.0)
+def _since_first(counts: Array, first_on: Array, interval: Array) -> Array:
+    """Counts (K+1, 2, N) after the first event up to each frame; 0 before it."""
+    counts[interval, np.where(first_on, 0, 1), np.arange(len(interval))] -= 1
+    return np.concatenate([np.zeros_like(counts[:1]), np.cumsum(counts, 0)])
 
 
-def _sides(n: Array, dL: Array, known: Array, *, squares: bool) -> Array:
+def _sides(n: Array, dL: Array, *, squares: bool) -> Array:
     """Weighted sums over the brighter and the darker pixels, (2, 4) or (2, 7). 1/(1+n): else the
     few pixels at the threshold's clamp, with most of the events, decide alone."""
-    on, off = n[:, 0], n[:, 1]
-    weight = known[None] / (1.0 + on + off)
-    one = jnp.ones_like(dL)
-    terms = ([on * on, off * off, on * off, on * dL, off * dL, dL * dL, one] if squares
-             else [on, off, dL, jnp.abs(dL)])
-    sides = [weight * jnp.clip(s * dL - DEAD, 0.0, FULL) for s in (1.0, -1.0)]
-    return jnp.stack([jnp.stack([(z * term).sum() for term in terms]) for z in sides])
+    rows = []
+    for side in (1, -1):
+        at = np.nonzero(side * dL > DEAD)
+        on, off, change = (a[at].astype(np.float64) for a in (n[:, 0], n[:, 1], dL))
+        weight = np.minimum(side * change - DEAD, FULL) / (1 + on + off)
+        terms = ((on * on, off * off, on * off, on * change, off * change, change * change, 1.0)
+                 if squares else (on, off, change, np.abs(change)))
+        rows.append([float((weight * term).sum()) for term in terms])
+    return np.array(rows)

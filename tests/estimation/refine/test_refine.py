@@ -30,7 +30,13 @@ from evflow.estimation.refine.fit import FusionNet
 from evflow.estimation.refine.moments import measure
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_evidence
 from evflow.estimation.refine.stretches import plan_chunks
-from evflow.estimation.refine.trace import FRESH, NEVER, trace_of_camera, trace_of_events
+from evflow.estimation.refine.trace import (
+    FRESH,
+    NEVER,
+    draw,
+    trace_of_camera,
+    trace_of_events,
+)
 from evflow.estimation.state import Eyes, State, add_path
 from evflow.light.log_maps import lin_log
 from evflow.recordings import plan_windows
@@ -66,8 +72,10 @@ def test_simulated_trace_is_the_trace_of_the_simulated_events(
     video: tuple[np.ndarray, np.ndarray], camera: Camera, events: Events
 ) -> None:
     frames, times = video
-    dt_s = jnp.full(INTERVALS, STEPS * 1e-3)
-    made = trace_of_camera(jax.random.key(2), lin_log(frames), dt_s, camera, FRESH, STEPS)
+    theta = np.stack([np.ravel(camera.theta_on), np.ravel(camera.theta_off)])
+    made = trace_of_camera(
+        draw(jax.random.key(2), SHAPE, INTERVALS, STEPS), np.asarray(lin_log(frames)),
+        np.full(INTERVALS, STEPS * 1e-3), theta, np.zeros(2), np.array(FRESH), STEPS)
     seen = trace_of_events(events, times[::STEPS], STEPS)
     np.testing.assert_array_equal(made.counts, seen.counts)
     np.testing.assert_array_equal(made.first_on, seen.first_on)
@@ -109,16 +117,15 @@ def test_moments_add_over_the_sensor(
     video: tuple[np.ndarray, np.ndarray], events: Events
 ) -> None:
     frames, times = video
-    path, dt_s = lin_log(frames), jnp.full(INTERVALS, STEPS * 1e-3)
+    path, dt_s = np.asarray(lin_log(frames)), np.full(INTERVALS, STEPS * 1e-3)
     trace = trace_of_events(events, times[::STEPS], STEPS)
-    compiled = jax.jit(measure, static_argnums=4)
 
     def of(rows: slice) -> object:
         part = dataclasses.replace(
             trace, step=trace.step[rows], fraction=trace.fraction[rows],
             first_on=trace.first_on[rows], counts=trace.counts[:, :, rows])
-        bright = jnp.ones((rows.stop - rows.start, SHAPE[1]), bool)
-        return compiled(part, path[:, rows], dt_s, bright, STEPS)
+        bright = np.ones((rows.stop - rows.start, SHAPE[1]), bool)
+        return measure(part, path[:, rows], dt_s, bright, STEPS)
 
     whole = of(slice(0, SHAPE[0]))
     halves = [of(slice(0, 5)), of(slice(5, SHAPE[0]))]
