@@ -164,6 +164,8 @@ class Events:
             plane = np.where(self.p[part], 0, height)
             index = (plane + self.y[part]) * width + self.x[part]
             counts += np.bincount(index, minlength=counts.size).astype(np.uint32)
+            if len(self) > 1 << 22:  # they may lie on the disk
+                forget(self.x, self.y, self.p)
         return counts.reshape(2, height, width)
 
 
@@ -260,6 +262,12 @@ class Recording:
             float32 (H, W), scaled so that `full_scale` is 255 DN.
         """
         return self.frames[index].astype(np.float32) * np.float32(255 / self.full_scale)
+
+
+def release(recording: Recording) -> None:
+    """Give back the memory of what was read of a recording that lies on the disk."""
+    events = recording.events
+    forget(events.x, events.y, events.t, events.p, recording.frames)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

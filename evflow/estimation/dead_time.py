@@ -11,9 +11,11 @@ import dataclasses
 
 import numpy as np
 
+from evflow.files.spool import forget
 from evflow.types import Events
 
 MOST_EVENTS = 2_000_000  # that are looked at: of a longer recording, those of some of the pixels
+BLOCK = 1 << 20  # at a time: they may lie on the disk
 SHORTEST_US, LONGEST_US = 20.0, 50_000.0
 STEP = 1.03  # from one candidate to the next
 ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # of a candidate: where there are many, and where few
@@ -61,14 +63,19 @@ def dead_time(events: Events) -> DeadTime:
 def own_intervals(events: Events) -> np.ndarray:
     """(N,) int64, microseconds between successive events of a pixel, whatever their polarity."""
     width, height = events.size
-    pixel = events.y.astype(np.int64) * width + events.x
-    t = events.t
-    if len(pixel) > MOST_EVENTS:
-        share = -(-len(pixel) // MOST_EVENTS)
-        # Every k-th pixel of a shuffled order: rows and columns of a sensor may differ.
-        used = np.random.default_rng(0).permutation(height * width) % share == 0
+    # Every k-th pixel of a shuffled order: rows and columns of a sensor may differ.
+    share = max(1, -(-len(events) // MOST_EVENTS))
+    used = np.random.default_rng(0).permutation(height * width) % share == 0
+    parts = []
+    for first in range(0, len(events), BLOCK):
+        part = slice(first, first + BLOCK)
+        pixel = events.y[part].astype(np.int64) * width + events.x[part]
         kept = used[pixel]
-        pixel, t = pixel[kept], t[kept]
+        parts.append((pixel[kept], events.t[part][kept]))
+        forget(events.x, events.y, events.t)
+    if not parts:
+        return np.zeros(0, np.int64)
+    pixel, t = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(pixel, kind="stable")
     pixel, t = pixel[order], t[order]
     return np.diff(t)[np.diff(pixel) == 0]

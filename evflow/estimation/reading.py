@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from evflow.estimation.refine.stretches import INTERVALS, PART, Stretch, most_simulated, spread
+from evflow.files.spool import forget
 
 Array = np.ndarray
 Effort = Literal["quick", "normal", "full"]
@@ -104,6 +105,7 @@ def _cells(stretch: Stretch) -> Array:
     part = events.slice(*stretch.span_us)
     columns, rows = -(-width // CELL), -(-height // CELL)
     cell = part.y[::SAMPLE].astype(np.int64) // CELL * columns + part.x[::SAMPLE] // CELL
+    forget(events.x, events.y)
     return np.bincount(cell, minlength=columns * rows) * (SAMPLE / CELL**2)
 
 

@@ -38,16 +38,17 @@ def on_disk(limit: int = LITTLE) -> Iterator[None]:
         _limit.reset(before)
 
 
-def forget(array: np.ndarray) -> None:
-    """Give back the memory of what was read of a mapped array: it stays in its file, and is read
+def forget(*arrays: np.ndarray) -> None:
+    """Give back the memory of what was read of mapped arrays: it stays in their files, and is read
     again where it is asked for. Others stay as they are."""
-    base: Any = array
-    while isinstance(base, np.ndarray):
-        mapped = getattr(base, "_mmap", None)
-        if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
-            mapped.madvise(mmap.MADV_DONTNEED)
-            return
-        base = base.base
+    for array in arrays:
+        base: Any = array
+        while isinstance(base, np.ndarray):
+            mapped = getattr(base, "_mmap", None)
+            if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
+                mapped.madvise(mmap.MADV_DONTNEED)
+                break
+            base = base.base
 
 
 class Spool:

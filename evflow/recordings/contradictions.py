@@ -13,12 +13,13 @@ import dataclasses
 
 import numpy as np
 
-from evflow.types import Recording
+from evflow.types import Recording, release
 
 Array = np.ndarray
 
 PIXELS = 4096  # looked at, evenly spread
 DARK_DN, BRIGHT_DN = 15.0, 252.0  # beyond, the change of log brightness means little
+FRAMES = 64  # looked at before their memory is given back: they may lie on the disk
 LEAST_PIXELS, LEAST_INTERVALS = 100, 6
 FOLLOWS = 0.4  # median correlation of change and net events: below, they cannot judge frames
 LITTLE, MUCH = 0.5, 2.0  # of the median correlation, of the median rest
@@ -83,6 +84,8 @@ def _moments(recording: Recording, i: int) -> Array:
     stride = max(1, int(np.sqrt(height * width / PIXELS)))
     before, after = (recording.frame_dn(j)[::stride, ::stride] for j in (i, i + 1))
     t0, t1 = (int(t) for t in recording.frame_times[i:i + 2])
+    if i % FRAMES == 0:
+        release(recording)
     on, off = recording.events.slice(t0, t1).count_map()[:, ::stride, ::stride]
     shown = (np.minimum(before, after) > DARK_DN) & (np.maximum(before, after) < BRIGHT_DN)
     if not shown.any():

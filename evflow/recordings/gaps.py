@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
+
+from evflow.files.spool import forget
 
 Array = np.ndarray
 
 PACKET = 64  # events: the time they take says how dense the recording is
 SAMPLES = 1_000_000  # packets looked at
 GAP_PACKETS, GAP_US = 10, 10_000  # a gap is longer than both
+BLOCK = 1 << 22  # events looked at at a time
 TICKS = 3.0  # and than this many of the pauses between two times: some simulators know few times
 
 
@@ -19,10 +24,27 @@ def event_gaps(t: Array) -> Array:
         return np.zeros(0, np.int64)
     stride = len(t) // SAMPLES + 1
     packet = float(np.median(t[PACKET::stride] - t[:-PACKET:stride]))
-    between = np.diff(t)
-    longest = np.flatnonzero(between > max(GAP_PACKETS * packet, GAP_US))
+    long = max(GAP_PACKETS * packet, GAP_US)
+    longest = np.concatenate([first + np.flatnonzero(d > long) for first, d in _pauses(t)])
     if not len(longest):
         return longest
-    pauses = between[between > 0]
-    usual = np.quantile(pauses[::len(pauses) // SAMPLES + 1], 0.95)
-    return longest[between[longest] > TICKS * usual]
+    usual = _usual_pause(t)
+    return longest[t[longest + 1] - t[longest] > TICKS * usual]
+
+
+def _pauses(t: Array) -> Iterator[tuple[int, Array]]:
+    """(number of the first, t[i + 1] - t[i]) block by block: the times may lie on the disk."""
+    for first in range(0, len(t) - 1, BLOCK):
+        yield first, np.diff(t[first : first + BLOCK + 1])
+        forget(t)
+
+
+def _usual_pause(t: Array) -> float:
+    """What 95 % of the pauses between two different times do not exceed, of SAMPLES of them."""
+    stride = sum(int(np.count_nonzero(d)) for _, d in _pauses(t)) // SAMPLES + 1
+    some, before = [], 0
+    for _, d in _pauses(t):
+        pauses = d[d > 0]
+        some.append(pauses[-before % stride :: stride])
+        before += len(pauses)
+    return float(np.quantile(np.concatenate(some), 0.95))

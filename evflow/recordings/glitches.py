@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from evflow.recordings.contradictions import contradicted
-from evflow.types import Recording
+from evflow.recordings.contradictions import FRAMES, contradicted
+from evflow.types import Recording, release
 
 DARK_DN, LEAST = 15.0, 0.1  # pixels below do not count; so many of all must be brighter
 STRIDE = 4  # every 4th pixel of every 4th row tells a whole frame's fault
@@ -35,6 +35,8 @@ def faulty_frames(
                           "all of the frame changes by more than the events say (auto-exposure?)")
     shown: list[np.ndarray] = []
     for i in range(len(recording.frame_times)):
+        if i % FRAMES == 0:
+            release(recording)
         small = recording.frame_dn(i)[::STRIDE, ::STRIDE]
         shown = [*shown[-2:], np.log(np.maximum(small, 1.0))]
         if len(shown) == 3 and _glitch(*shown) and not _lit(recording, i - 1):

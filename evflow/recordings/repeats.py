@@ -14,7 +14,8 @@ import numpy as np
 
 from evflow.io.images.cadence import evened
 from evflow.notes import Note
-from evflow.types import Recording
+from evflow.recordings.contradictions import FRAMES
+from evflow.types import Recording, release
 
 Array = np.ndarray
 
@@ -26,8 +27,13 @@ STRIDE = 4  # every 4th pixel of every 4th row is compared first
 def repeated_frames(recording: Recording) -> Array:
     """Indices (R,) of frames that equal the one before while pixels fire."""
     frames, times = recording.frames, recording.frame_times
-    return np.array([i for i in range(1, len(frames)) if _equal(frames[i - 1], frames[i])
-                     and _fires(recording, int(times[i - 1]), int(times[i]))], int)
+    found = []
+    for i in range(1, len(frames)):
+        if i % FRAMES == 0:
+            release(recording)
+        if _equal(frames[i - 1], frames[i]) and _fires(recording, *times[i - 1:i + 1].tolist()):
+            found.append(i)
+    return np.array(found, int)
 
 
 def without_repeats(recording: Recording) -> Recording:

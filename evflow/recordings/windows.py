@@ -8,6 +8,7 @@ a faulty frame: there the brightness path between its two frames is unknown for 
 from __future__ import annotations
 
 import dataclasses
+import weakref
 from collections.abc import Iterator
 
 import numpy as np
@@ -112,7 +113,17 @@ class _Obstacles:
         return None
 
 
+_KNOWN: weakref.WeakKeyDictionary[Recording, _Obstacles] = weakref.WeakKeyDictionary()
+
+
 def _obstacles(recording: Recording, start: int, stop: int) -> _Obstacles:
+    """Looked for once in a recording, which cannot change: it takes a pass over all events."""
+    if recording not in _KNOWN:
+        _KNOWN[recording] = _look(recording, start, stop)
+    return _KNOWN[recording]
+
+
+def _look(recording: Recording, start: int, stop: int) -> _Obstacles:
     times, t = recording.frame_times, recording.events.t
     late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
     gaps = event_gaps(t)

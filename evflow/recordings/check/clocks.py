@@ -30,10 +30,9 @@ def _gaps(recording: Recording) -> list[Finding]:
     at = event_gaps(t)
     if not len(at):
         return []
-    between = np.diff(t)
-    rest = int(t[-1] - t[0]) - int(between[at].sum())
-    longest = int(at[np.argmax(between[at])])
-    lost_us = int(between[longest])
+    lost = t[at + 1] - t[at]
+    rest = int(t[-1] - t[0]) - int(lost.sum())
+    longest, lost_us = int(at[np.argmax(lost)]), int(lost.max())
     from_s, to_s = ((int(t[i]) - int(t[0])) / 1e6 for i in (longest, longest + 1))
     if lost_us > max(JUMP_US, rest):
         return [Finding(
@@ -41,7 +40,7 @@ def _gaps(recording: Recording) -> list[Finding]:
             f"than the {rest / 1e6:.3f} s that hold events: another clock from event "
             f"{longest + 1:,} on?", f"Read the parts alone: --stop {from_s:.3f} and "
             f"--start {to_s:.3f}.")]
-    more = f" ({len(at)} gaps, {between[at].sum() / 1e6:.2f} s in all)" if len(at) > 1 else ""
+    more = f" ({len(at)} gaps, {lost.sum() / 1e6:.2f} s in all)" if len(at) > 1 else ""
     return [Finding(
         "EV025", "warning", f"no events between {from_s:.3f} s and {to_s:.3f} s{more}: dropped "
         "packets, or a scene that stood still?",

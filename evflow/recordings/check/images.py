@@ -6,8 +6,9 @@ import numpy as np
 
 from evflow.light.colour import LUMA
 from evflow.recordings.check.findings import Finding
+from evflow.recordings.contradictions import FRAMES
 from evflow.recordings.repeats import repeated_frames
-from evflow.types import Recording
+from evflow.types import Recording, release
 
 WHITE_DN, BLACK_DN = 254.5, 0.5
 FRAME_SHARE, ALL_SHARE = 0.5, 0.25  # of the pixels of one frame, and of all frames
@@ -24,6 +25,8 @@ def images(recording: Recording) -> list[Finding]:
 def _exposure(recording: Recording) -> list[Finding]:
     shares = []
     for i in range(len(recording.frame_times)):
+        if i % FRAMES == 0:
+            release(recording)
         frame = recording.frame_dn(i)
         shares.append(((frame >= WHITE_DN).mean(), (frame <= BLACK_DN).mean()))
     found = []
