@@ -21,10 +21,11 @@ import cv2
 import jax
 import numpy as np
 
-from evflow import Camera, CameraEstimate, Events, Recording, estimate_camera, simulate_stream
+from evflow import Camera, CameraEstimate, estimate_camera, read_recording, simulate_stream
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
+from evflow.io import open_writer
 from evflow.network.weights import load_weights
 from experiments.shared.common import begin, conclude, markdown, run_script
 
@@ -83,34 +84,39 @@ def film(options: Options, rng: np.random.Generator) -> Iterator[np.ndarray]:
                              flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
-def make(options: Options) -> tuple[Recording, Camera]:
-    """The recording and its camera, simulated or as kept before."""
+def make(options: Options) -> tuple[Path, Camera]:
+    """The file of the recording, written now or kept before, and its camera."""
     width, height = options.size
     name = f"{width}x{height}_{options.seconds:g}s_{options.frames_hz}hz_{options.mismatch:g}_" \
            f"{options.seed}"
-    path = options.keep / f"{name}.npz"
+    path = options.keep / f"{name}.h5"
     k_camera, k_events = jax.random.split(jax.random.key(options.seed))
     prior = CameraPrior(theta=(0.2, 0.3), mismatch=(options.mismatch, options.mismatch))
     camera = Camera.sample(k_camera, (height, width), prior)
     if not path.exists():
-        kept: list[np.ndarray] = []
+        write(path, options, k_events, camera)
+    return path, camera
 
-        def watched() -> Iterator[np.ndarray]:
-            for i, frame in enumerate(film(options, np.random.default_rng(options.seed))):
-                if i % (1000 // options.frames_hz) == 0:
-                    kept.append(np.clip(np.rint(frame), 0, 255).astype(np.uint8))
-                yield frame
 
-        model = SensorModel(noise_resets_memory=True)
-        times = iter(range(0, 1000 * round(1000 * options.seconds) + 1, 1000))
-        events = Events.concatenate(list(
-            simulate_stream(k_events, watched(), times, camera, model=model)))
-        options.keep.mkdir(parents=True, exist_ok=True)
-        np.savez(path, x=events.x, y=events.y, t=events.t, p=events.p, frames=np.stack(kept),
-                 frame_times=np.arange(len(kept)) * (1_000_000 // options.frames_hz))
-    with np.load(path) as file:
-        events = Events(file["x"], file["y"], file["t"], file["p"], (width, height))
-        return Recording(events, file["frames"], file["frame_times"]), camera
+def write(path: Path, options: Options, key: jax.Array, camera: Camera) -> None:
+    """The recording's file, event by event as they are simulated, and its frames."""
+    kept: list[np.ndarray] = []
+
+    def watched() -> Iterator[np.ndarray]:
+        for i, frame in enumerate(film(options, np.random.default_rng(options.seed))):
+            if i % (1000 // options.frames_hz) == 0:
+                kept.append(np.clip(np.rint(frame), 0, 255).astype(np.uint8))
+            yield frame
+
+    times = iter(range(0, 1000 * round(1000 * options.seconds) + 1, 1000))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open_writer(path, options.size) as out:
+        for events in simulate_stream(key, watched(), times, camera,
+                                      model=SensorModel(noise_resets_memory=True)):
+            out.append(events)
+        step = 1000 * (1000 // options.frames_hz)
+        for i, frame in enumerate(kept):
+            out.append_frames(frame[None], np.array([i * step]))
 
 
 def score(found: CameraEstimate, camera: Camera) -> dict[str, float]:
@@ -131,8 +137,9 @@ def score(found: CameraEstimate, camera: Camera) -> dict[str, float]:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "long_recordings")
-    recording, camera = make(options)
+    path, camera = make(options)
     before, wall = time.process_time(), time.monotonic()
+    recording = read_recording(path)
     found = estimate_camera(recording, load_weights(options.weights), effort=options.effort)
     result = {"cpu_s": time.process_time() - before, "wall_s": time.monotonic() - wall,
               "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
