@@ -31,7 +31,10 @@ from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
     from evflow.camera import Summary
+    from evflow.estimation.halves import First
+    from evflow.estimation.pipeline import Measured
     from evflow.estimation.result import CameraEstimate
+    from evflow.recordings.check import Report
     from evflow.types import Recording
 
 FILES = ("camera.npz", "camera.json", "report.html", *(
@@ -105,7 +108,6 @@ class Estimate(Compiling, Reading):
 
     def run(self) -> None:
         from evflow.files.folders import staged
-        from evflow.recordings.repeats import without_repeats
         from evflow.report import plots
         from evflow.report.text import describe
 
@@ -127,13 +129,10 @@ class Estimate(Compiling, Reading):
             refuse(self, ("thresholds",), "of use with --protocol static only")
         need_packages(self.recording, *self.more, pictures=self.plots or self.report)
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
-            recording = tell(self.read(self.recording))
-            doubts = self._checked(recording)
-            recording = without_repeats(recording) if moving else recording
-            recording = self._reconstructed(recording) if self.reconstruct else recording
-            found, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
-            words = describe(found)  # the doubts are on the terminal already
-            found = dataclasses.replace(found, notes=(*doubts, *found.notes))
+            recording, checked, doubts = self._recorded(self.recording)
+            made, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
+            words = describe(made.found)  # the doubts are on the terminal already
+            found = dataclasses.replace(made.found, notes=(*doubts, *made.found.notes))
             found.save(out / "camera.npz")
             facts = {**found.as_dict(), "recording": str(self.recording),
                      "protocol": self.protocol,
@@ -141,7 +140,8 @@ class Estimate(Compiling, Reading):
             if self.plots:
                 plots.camera_maps(found, out / f"maps.{self.figures}")
                 plots.camera_histograms(found, out / f"histograms.{self.figures}")
-            tested = self._report(out, found, recording) if self.report else {}
+            tested = self._report(
+                out, found, recording, made.first, checked) if self.report else {}
             facts |= {key: tested[key] for key in ("grade", "verdict", "simulators")
                       if key in tested}
             write_json(out / "camera.json", facts)
@@ -168,11 +168,18 @@ class Estimate(Compiling, Reading):
                 f"{'s' if self.more else ''}.", "Give one of each, in the same order: evflow "
                 "estimate A B --protocol static --lux 5 200.")
 
-    def _checked(self, recording: Recording) -> list[Note]:
-        """What `evflow check` doubts; raises its errors, unless told not to."""
+    def _recorded(self, path: Path) -> tuple[Recording, Report, list[Note]]:
+        """A recording, what `evflow check` says, and what it doubts; raises its errors, unless told
+        not to."""
+        from evflow.process.terminal import bar
         from evflow.recordings.check import check
+        from evflow.recordings.repeats import without_repeats
 
-        report = check(recording)
+        with bar("reading the recording") as progress:
+            recording = self.read(path)
+            progress(0, 1, "checking")
+            report = check(recording)
+        tell(recording)
         if self.checks:
             report.raise_if_failed()
         doubts = [finding.note() for finding in (*report.errors, *report.warnings)
@@ -180,7 +187,9 @@ class Estimate(Compiling, Reading):
                                           (*SAID_BELOW, "EV028"))]
         for doubt in doubts:
             print(f"warning: {doubt}", file=sys.stderr)
-        return doubts
+        recording = without_repeats(recording) if self.protocol == "motion" else recording
+        recording = self._reconstructed(recording) if self.reconstruct else recording
+        return recording, report, doubts
 
     def _reconstructed(self, recording: Recording) -> Recording:
         """The recording with frames made from its events; EV020 where it has frames."""
@@ -194,34 +203,29 @@ class Estimate(Compiling, Reading):
             return with_reconstructed_frames(
                 recording, self.reconstruct_weights, progress=progress)
 
-    def _estimated(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
-        from evflow.estimation.pipeline import estimate_camera
+    def _estimated(self, recording: Recording) -> tuple[Measured, dict[str, Any]]:
+        from evflow.estimation.pipeline import measure
         from evflow.network.weights import load_weights, model_card, trained_steps, weights_hash
-        from evflow.process.terminal import bar
+        from evflow.process.terminal import Stages, bar
 
         params = load_weights(self.weights)
         began = time.monotonic()
         with self._interrupted() as asked, bar("estimating", compiles=True) as progress:
-            done = (0, 1)
-
-            def advance(*counts: int) -> None:
-                nonlocal done
-                done = counts[0], counts[1]
-                progress(*done)
+            stages = Stages(progress)
 
             def enough(summary: Summary, std: Summary) -> bool:
-                progress(*done, f"estimating: {so_far(summary, std)}")
+                stages.know(so_far(summary, std))
                 late = self.budget_s is not None and time.monotonic() - began >= self.budget_s
                 return late or bool(asked)
 
-            found = estimate_camera(
-                recording, params, effort=self.effort, progress=advance, until=enough,
-                min_window_us=round(self.window_ms * 1000))
+            made = measure(
+                recording, params, effort=self.effort, progress=stages.count, until=enough,
+                min_window_us=round(self.window_ms * 1000), stage=stages.stage)
         if recording.frames_were_made:
             from evflow.downstream.video import doubted
 
-            found = doubted(found)
-        return found, {"weights": self.weights, "weights_sha256": weights_hash(self.weights),
+            made = dataclasses.replace(made, found=doubted(made.found))
+        return made, {"weights": self.weights, "weights_sha256": weights_hash(self.weights),
                        "weights_steps": trained_steps(model_card(self.weights))}
 
     def _interrupted(self) -> contextlib.AbstractContextManager[list[int]]:
@@ -230,29 +234,30 @@ class Estimate(Compiling, Reading):
 
         return stop_requests() if self.on_interrupt == "save" else contextlib.nullcontext([])
 
-    def _on_the_bench(self, recording: Recording) -> tuple[CameraEstimate, dict[str, Any]]:
+    def _on_the_bench(self, recording: Recording) -> tuple[Measured, dict[str, Any]]:
         from evflow.estimation.bench.calibration import calibrate_step
         from evflow.estimation.joined import with_thresholds
+        from evflow.estimation.pipeline import Measured
         from evflow.estimation.static import estimate_noise, noise_over_light
 
         if self.protocol == "step":
-            return calibrate_step(recording, lux=self.lux), {}
+            return Measured(calibrate_step(recording, lux=self.lux)), {}
         found = estimate_noise(recording, lux=self.lux[0] if self.lux else None)
         if self.more:
             others = []
             for path, lux in zip(self.more, self.lux[1:], strict=True):
-                other = tell(self.read(path))
-                self._checked(other)
-                others.append(estimate_noise(other, lux=lux))
+                others.append(estimate_noise(self._recorded(path)[0], lux=lux))
             found = noise_over_light([found, *others])
         facts = {"recordings": [str(p) for p in (self.recording, *self.more)]} if self.more else {}
-        return with_thresholds(found, self.thresholds) if self.thresholds else found, facts
+        found = with_thresholds(found, self.thresholds) if self.thresholds else found
+        return Measured(found), facts
 
     def _report(
-        self, out: Path, found: CameraEstimate, recording: Recording
+        self, out: Path, found: CameraEstimate, recording: Recording, first: First | None,
+        checked: Report,
     ) -> dict[str, Any]:
         """report.html, and its numbers."""
-        from evflow.process.terminal import bar
+        from evflow.process.terminal import Stages, bar
         from evflow.report.bench import Source, write_bench_report
         from evflow.report.camera import write_report
 
@@ -260,12 +265,13 @@ class Estimate(Compiling, Reading):
         if self.protocol != "motion":
             return write_bench_report(out / "report.html", found, recording, source=Source(
                 (self.recording, *self.more), command))
-        with bar("reporting", compiles=True) as progress:
+        with bar("report", compiles=True) as progress:
+            stages = Stages(progress)
             return write_report(
                 out / "report.html", found, recording, weights=self.weights,
                 source=self.recording, command=command,
-                min_window_us=round(self.window_ms * 1000), progress=progress,
-                simulators=self.simulators)
+                min_window_us=round(self.window_ms * 1000), first=first, checked=checked,
+                progress=stages.count, stage=stages.stage, simulators=self.simulators)
 
 
 def so_far(summary: Summary, std: Summary) -> str:

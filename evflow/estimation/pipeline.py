@@ -11,6 +11,7 @@ Of a long recording a part is read (reading.py).
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -21,10 +22,11 @@ from evflow import io
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent
+from evflow.estimation.halves import First, divided
 from evflow.estimation.reading import BATCH, BUDGETS, EFFORTS, Effort, Order, gain, ordered
 from evflow.estimation.refine import Stretch, cut, pixel_posterior
 from evflow.estimation.result import CameraEstimate
-from evflow.estimation.state import State, add, estimate, glance, looked_through
+from evflow.estimation.state import Stage, State, add, estimate, glance, look, looked_through
 from evflow.estimation.static import estimate_noise
 from evflow.network import api
 from evflow.network.weights import load_weights
@@ -73,28 +75,55 @@ def estimate_camera(
     Example:
         >>> ef.estimate_camera("flight.h5").save("camera.npz")
     """
+    return measure(recording_or_path, params, refine=refine, pixel=pixel, effort=effort,
+                   min_window_us=min_window_us, progress=progress, until=until).found
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Measured:
+    """found: the camera. first: what was made of the recording's first part, to be tried on the
+    rest; None where nothing was read of it, or the recording is too short to be divided."""
+
+    found: CameraEstimate
+    first: First | None = None
+
+
+def measure(
+    recording_or_path: Recording | str | os.PathLike, params: api.Params | None = None, *,
+    refine: Literal["auto", "off"] = "auto", pixel: Literal["measured", "ideal"] = "measured",
+    effort: Effort = "normal", min_window_us: int = 40_000, progress: Progress | None = None,
+    until: Until | None = None, stage: Stage = lambda _: None,
+) -> Measured:
+    """`estimate_camera`, with what a report takes up. stage(name) is called when one begins."""
     check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")),
                   effort=(effort, EFFORTS))
     recording = recording_or_path
     if not isinstance(recording, Recording):
+        stage("reading the file")
         recording = io.read_recording(recording)
     recording = without_repeats(recording)
     if not recording.has_frames or stands_still(recording):
-        return estimate_noise(recording)
+        stage("counting noise")
+        return Measured(estimate_noise(recording))
     params = load_weights() if params is None else params
     plan = plan_windows(recording, min_window_us)
     iter_windows(recording, min_window_us, plan)  # EV017 where there is none
     stretches = cut(recording, plan, path=refine == "auto")
     order = ordered(stretches, effort)
     used = [stretches[i] for i in sorted(order.numbers)]
+    stage("looking for the photoreceptor")
     state = State(params, looked_through(used, measured=pixel == "measured"))
     steps = Steps(used, progress)
-    state, extent = _read(state, stretches, order, effort, until, steps)
+    stage("reading stretches")
+    division = divided(stretches)
+    state, early, extent = _read(state, stretches, order, effort, until, steps,
+                                 division.first if division else range(0))
     repeated = [note for note in recording.notes if note.code == "frames.repeated"]
     found = estimate(state, extent=extent, before=condensed(plan.skipped), after=repeated,
-                     advance=steps.advance)
+                     advance=steps.advance, stage=stage)
     steps.finish()
-    return found
+    first = First(early, tuple(used), division.rest) if division and early.read else None
+    return Measured(found, first)
 
 
 def read_whole(recording: Recording, params: api.Params) -> State:
@@ -138,16 +167,18 @@ class Steps:
 
 def _read(
     state: State, stretches: Sequence[Stretch], order: Order, effort: Effort,
-    until: Until | None, steps: Steps,
-) -> tuple[State, Extent]:
-    """The state with the stretches of the order, and how much they are."""
-    partial = len(order.numbers) < len(stretches)
+    until: Until | None, steps: Steps, first: range,
+) -> tuple[State, State, Extent]:
+    """The state with the stretches of the order, that with those of them in the first part, and
+    how much they are."""
+    partial, early = len(order.numbers) < len(stretches), state
     history: list[tuple[int, float]] = []
     read: list[int] = []
     ended = False
     for i in order.numbers:
-        state = add(state, stretches[i], simulate=i in order.simulated, every=order.every,
+        seen = look(state, stretches[i], simulate=i in order.simulated, every=order.every,
                     advance=steps.advance)
+        state, early = state + seen, early + seen if i in first else early
         read.append(i)
         ended = until is not None and until(*glance(state))
         if ended:
@@ -160,8 +191,9 @@ def _read(
         history.append((len(read), _variance(state)))
     spans = np.array([s.span_us for s in stretches])
     seconds = np.diff(spans, axis=1)[:, 0] * 1e-6
-    return state, Extent(float(seconds[read].sum()), float(seconds.sum()), len(read),
-                         len(stretches), gain(history), ended and len(read) < len(order.numbers))
+    return state, early, Extent(float(seconds[read].sum()), float(seconds.sum()), len(read),
+                                len(stretches), gain(history),
+                                ended and len(read) < len(order.numbers))
 
 
 def _variance(state: State) -> float:

@@ -33,7 +33,7 @@ from evflow.estimation.refine import (
     simulated_part,
 )
 from evflow.estimation.refine.doubt import doubted, signs
-from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.path import STEPS, without_evidence
 from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, measured_noise, measured_shot, scatter
@@ -43,10 +43,11 @@ from evflow.recordings.check.contents import VALID_EVENTS
 from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels
 from evflow.recordings.windows import window_at
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
-from evflow.types import Window
+from evflow.types import Events, Window, release
 
 Array = np.ndarray
 Advance = Callable[[], None]
+Stage = Callable[[str], None]
 
 MOST_EVENTS = 16_000_000  # in which the dead time is looked for, the first
 SIGNAL_ERROR = 0.1  # relative, of noise rates where something moves: what is left of the signal
@@ -83,13 +84,19 @@ class State:
     seconds: float = 0.0
     parts: tuple[drift.Part, ...] = ()
 
+    def __add__(self, more: State) -> State:
+        """This and what was read after it, by the same eyes."""
+        def total(one: Any, other: Any) -> Any:
+            return other if one is None else one if other is None else one + other
+
+        return dataclasses.replace(self, **{
+            field.name: total(getattr(self, field.name), getattr(more, field.name))
+            for field in dataclasses.fields(self) if field.name not in ("params", "eyes")})
+
 
 def looked_through(stretches: Sequence[Stretch], *, measured: bool) -> Eyes:
     """The eyes of a camera, from some of its stretches. measured: False takes pixels for ideal."""
-    events = max((s.recording.events for s in stretches), key=len)
-    if len(events) > MOST_EVENTS:
-        events = events.slice(int(events.t[0]), int(events.t[MOST_EVENTS]))
-    dead = dead_time(events)
+    dead = dead_time(first_events(max((s.recording.events for s in stretches), key=len)))
     runs = [(s.recording, s.run) for s in stretches if s.run]
     if not runs:
         return Eyes(dead=dead)
@@ -99,30 +106,46 @@ def looked_through(stretches: Sequence[Stretch], *, measured: bool) -> Eyes:
                 dead)
 
 
+def first_events(events: Events) -> Events:
+    """The first MOST_EVENTS of them."""
+    if len(events) <= MOST_EVENTS:
+        return events
+    return events.slice(int(events.t[0]), int(events.t[MOST_EVENTS]))
+
+
 def add(
     state: State, stretch: Stretch, *, simulate: bool, every: int = 1,
     advance: Advance = lambda: None,
 ) -> State:
-    """The state with one more stretch. simulate: whether it is one of those that the refinement
-    simulates; every: which of its windows are pooled, each one, or each second; advance() is called
-    after every window, and after the stretch."""
-    stats, n_events, n_shown = state.stats, state.n_events, state.n_shown
+    """The state with one more stretch; `look` says of what."""
+    return state + look(state, stretch, simulate=simulate, every=every, advance=advance)
+
+
+def look(
+    state: State, stretch: Stretch, *, simulate: bool, every: int = 1,
+    advance: Advance = lambda: None,
+) -> State:
+    """What a stretch alone says, seen by a state's eyes. simulate: whether it is one of those that
+    the refinement simulates; every: which of its windows are pooled, each one, or each second;
+    advance() is called after every window, and after the stretch."""
+    stats, n_events, n_shown = None, np.zeros(()), np.zeros(())
     for number, window in enumerate(_windows([stretch])):
-        if number % every == 0 or stats is None:
+        if number % every == 0:
             said = window_stats(state.params, window, state.eyes.seen_by)
             stats = said if stats is None else stats + said
         counts, shown = window_counts(window)
         n_events, n_shown = n_events + counts, n_shown + shown
         advance()
-    state = dataclasses.replace(
-        state, stats=stats, n_events=n_events, n_shown=n_shown, read=(*state.read, stretch),
-        windows=state.windows + len(stretch.windows),
-        seconds=state.seconds + 1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
+    seen = State(
+        state.params, state.eyes, stats, n_events, n_shown, read=(stretch,),
+        windows=len(stretch.windows),
+        seconds=1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
     if not stretch.run:
-        return state
-    state = add_path(state, stretch, simulate=simulate)
+        return seen
+    seen = add_path(seen, stretch, simulate=simulate)
+    release(stretch.recording)
     advance()
-    return state
+    return seen
 
 
 def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
@@ -132,10 +155,10 @@ def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
     shape = chunk.bright.shape
     evidence = state.evidence if state.evidence is not None else PixelEvidence.nothing(shape)
     quiet = state.quiet if state.quiet is not None else np.zeros((4, *shape))
-    kept = (simulated_part(chunk, place, seen_by),) if simulate else ()
+    kept = simulated_part(chunk, place, seen_by) if simulate else None
     return dataclasses.replace(
         state, evidence=evidence + chunk.evidence, quiet=quiet + chunk.quiet,
-        chunks=(*state.chunks, *kept),
+        chunks=(*state.chunks, *((without_evidence(kept),) if kept else ())),
         parts=(*state.parts, drift.part(stretch.span_us, chunk.evidence)))
 
 
@@ -181,12 +204,14 @@ def refine(state: State) -> Refined:
 
 def estimate(
     state: State, *, extent: Extent | None = None, before: Sequence[Note] = (),
-    after: Sequence[Note] = (), advance: Advance = lambda: None,
+    after: Sequence[Note] = (), advance: Advance = lambda: None, stage: Stage = lambda _: None,
 ) -> CameraEstimate:
     """The camera, of all that was read. extent: how much that is; before, after: notes on how it
-    was read, beside its own; advance() is called after every window that is read again."""
+    was read, beside its own; advance() is called after every window that is read again, stage()
+    with the name of what begins."""
     assert state.stats is not None
     need_shown(state.n_events, state.n_shown)
+    stage("refining")
     eyes, stats = state.eyes, state.stats
     n_events = state.n_events.astype(np.uint32)
     refined = refine(state)
@@ -196,6 +221,7 @@ def estimate(
         summary, std = without(unknown, list(refined.chunks), summary, std)
     elif doubt is not None and refined.signs is not None:
         std = doubted(doubt, refined.signs, summary, std)
+    stage("noise rates and maps")
     quiet = quiet_times(_told(_windows(state.read), advance), summary, hot, eyes.seen_by)
     if state.evidence is not None:
         camera, error = maps.by_regression(state.evidence, summary, std)

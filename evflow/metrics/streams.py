@@ -83,8 +83,7 @@ def compare(
             p: _ratio(rates["synthetic"][p], rates["real"][p]) for p in ("on", "off", "both")}},
         "on_off": {name: _ratio(r["on"], r["off"]) for name, r in rates.items()},
         "curve": _curves(sides, t0, t1, pixels),
-        "counts": {"r": {p: _correlation(_side(counts["real"], p), _side(counts["synthetic"], p))
-                         for p in ("on", "off", "both")}},
+        "counts": {"r": correlations(counts["real"], counts["synthetic"])},
         "net_r": _correlation(*(_net(side, t0, t1) for side in sides.values())),
         "space_time_r": space_time_r(sides["real"], sides["synthetic"], t0, t1),
         "active": _active(counts["real"].sum(0) > 0, counts["synthetic"].sum(0) > 0),
@@ -130,6 +129,11 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float | None:
     a, b = a.ravel() - a.mean(), b.ravel() - b.mean()
     scale = np.sqrt((a @ a) * (b @ b))
     return float(np.clip(a @ b / scale, -1.0, 1.0)) if scale > 0 else None
+
+
+def correlations(one: np.ndarray, other: np.ndarray) -> dict[str, float | None]:
+    """Pearson's r of events per pixel (2, H, W), ON and OFF: of "on", "off" and "both"."""
+    return {p: _correlation(_side(one, p), _side(other, p)) for p in ("on", "off", "both")}
 
 
 def _curves(sides: dict[str, Events], t0: int, t1: int, pixels: int) -> dict[str, Any]:
@@ -187,6 +191,7 @@ def _neighbour_delays(events: Events) -> np.ndarray:
     width, height = events.size
     keys = np.sort(_pixels(events) * n + np.arange(n))  # by pixel, then by time
     asked = np.linspace(0, n - 1, min(n, ASKED_EVENTS)).astype(np.int64)
+    asked = asked[np.argsort(_pixels(events)[asked], kind="stable")]  # found in order: in the cache
     x, y = events.x[asked].astype(np.int64), events.y[asked].astype(np.int64)
     latest = np.full(len(asked), -1)
     for dx, dy in NEIGHBOURS:

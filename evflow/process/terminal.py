@@ -34,6 +34,31 @@ class Report(Protocol):
     def __call__(self, done: int, total: int, title: str | None = None) -> None: ...
 
 
+class Stages:
+    """A bar's title that names the stage under way, and what is known so far."""
+
+    def __init__(self, report: Report) -> None:
+        self._report, self._at, self._known, self._done = report, "", "", (0, 1)
+
+    def stage(self, name: str) -> None:
+        """Another stage begins."""
+        self._at = name
+        self._show()
+
+    def count(self, done: int, total: int) -> None:
+        """So far the work is."""
+        self._done = done, total
+        self._show()
+
+    def know(self, text: str) -> None:
+        """So much is known."""
+        self._known = f": {text}"
+        self._show()
+
+    def _show(self) -> None:
+        self._report(*self._done, f"{self._at}{self._known}")
+
+
 @contextlib.contextmanager
 def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[Report]:
     """Yield progress(done, total). shown: False where another process shows the bar; compiles:

@@ -16,21 +16,23 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.estimation.halves import First
 from evflow.estimation.pipeline import Progress
 from evflow.estimation.result import CameraEstimate
+from evflow.estimation.state import Stage
 from evflow.network.weights import load_weights, weights_hash
 from evflow.notes import texts
 from evflow.process.provenance import sha256, told
-from evflow.recordings.check import check
+from evflow.recordings.check import Report, check
 from evflow.recordings.check.agreement import frame_steps
 from evflow.report import page
 from evflow.report.extent import extent_panel
+from evflow.report.held import NAMES, held_panel
 from evflow.report.maps import fault_panel, map_panel, scatter_panel
-from evflow.report.page import Panel, bullets, number, paragraph, plural, spread, table
+from evflow.report.page import Panel, bullets, paragraph, plural, spread, table
 from evflow.report.plots import require
 from evflow.report.receptor import receptor_panel
 from evflow.report.resimulate import (
-    LEARNT_SECONDS,
     PIXELS,
     SECONDS,
     Trial,
@@ -41,7 +43,6 @@ from evflow.report.resimulate import (
 )
 from evflow.report.simulators import as_dicts, simulators_panel, try_simulators
 from evflow.report.streams import (
-    Names,
     count_panel,
     image_panel,
     rate_panel,
@@ -63,7 +64,6 @@ from evflow.report.verdict import (
 from evflow.simulator.photoreceptor import Photoreceptor
 from evflow.types import Recording
 
-NAMES: Names = ("recorded", "re-simulated")
 STAGES = 4
 
 
@@ -85,13 +85,14 @@ def write_report(
     path: str | os.PathLike, found: CameraEstimate, recording: Recording, *,
     weights: str | os.PathLike = "default", source: str | os.PathLike | None = None,
     command: str = "", min_window_us: int = 40_000, seed: int = 0, overwrite: bool = False,
-    progress: Progress | None = None, simulators: bool = False,
+    progress: Progress | None = None, simulators: bool = False, first: First | None = None,
+    checked: Report | None = None, stage: Stage = lambda _: None,
 ) -> dict[str, Any]:
     """Write a self-contained HTML report on an estimated camera, and return its numbers.
 
     The camera is put to the test: the recording's own frames are simulated with it (at most 3 s,
-    the busiest) and compared with what was recorded, and an estimate from the first half (at most
-    its last 5 s) is tried on the second.
+    the busiest) and compared with what was recorded, and an estimate from the first half is tried
+    on the second.
 
     Args:
         path: of the HTML file.
@@ -106,6 +107,10 @@ def write_report(
         progress: progress(done, total) is called after each stage.
         simulators: also try the pixels of v2e, ESIM and DVS-Voltmeter, each with its own best
             constants of the first half, on the second; takes about as long as the rest.
+        first: what the estimate has made of the first half (`measure`); None makes it again, of at
+            most its last 5 s.
+        checked: of `check(recording)`; None looks again.
+        stage: stage(name) is called when one begins.
 
     Returns:
         JSON-ready numbers, which also lie in the page: "grade" ("good", "fair", "poor"),
@@ -127,14 +132,18 @@ def write_report(
     def step() -> None:
         (progress or (lambda *_: None))(next(done), STAGES)
 
-    evidence = gather(found, recording, weights, min_window_us, seed, step)
+    evidence = gather(found, recording, weights, min_window_us, seed, step, first, stage)
+    stage("drawing")
     judged = judge_estimate(found, evidence.trial, evidence.held)
     panels = [_verdict(found, evidence, judged), map_panel(found), scatter_panel(found),
               *_trial_panels(recording, evidence), receptor_panel(found, evidence.foretold),
-              fault_panel(found), extent_panel(found), _held_panel(found, evidence),
-              _assumptions(found, recording, weights, source, command)]
+              fault_panel(found), extent_panel(found),
+              held_panel(found, evidence.half, evidence.held, evidence.why_not_held),
+              _assumptions(
+                  found, recording, checked or check(recording), weights, source, command)]
     rivals: dict[str, Any] = {}
     if simulators:
+        stage("other simulators")
         tried, why_not = try_simulators(recording, evidence.half, evidence.held, seed)
         panels.insert(-1, simulators_panel(tried, why_not or evidence.why_not_held))
         rivals = {"simulators": as_dicts(tried)}
@@ -150,9 +159,11 @@ def write_report(
 
 def gather(
     found: CameraEstimate, recording: Recording, weights: str | os.PathLike, min_window_us: int,
-    seed: int, step: Callable[[], None],
+    seed: int, step: Callable[[], None], first: First | None = None,
+    stage: Stage = lambda _: None,
 ) -> Evidence:
     """Put the estimate to the test; step() is called twice."""
+    stage("re-simulating")
     trial = half = held = shares = None
     why = why_held = ""
     try:
@@ -167,8 +178,9 @@ def gather(
     step()
     if trial:
         try:
-            params = load_weights(weights)
-            half, held, shares = held_out(recording, params, runs, min_window_us, seed)
+            stage("the held-out half")
+            params = load_weights(weights) if first is None else None
+            half, held, shares = held_out(recording, params, runs, min_window_us, seed, first)
         except EvflowDataError as error:
             why_held = error.seen
     step()
@@ -236,7 +248,8 @@ def _stretch(recording: Recording, trial: Trial) -> str:
     t0, t1 = (int(recording.frame_times[i]) for i in trial.frames)
     words = (f"The recording's frames {trial.frames[0]} to {trial.frames[1]} "
              f"({(t0 - zero) / 1e6:.3f} to {(t1 - zero) / 1e6:.3f} s after its first event), "
-             "interpolated by optical flow to one pixel of motion, seen by the estimated camera. ")
+             "interpolated by optical flow to half a pixel of motion, seen by the estimated "
+             "camera. ")
     if trial.span_us[0] > t0:
         words += (f"The first {(trial.span_us[0] - t0) / 1e3:.0f} ms are left out: there the "
                   "simulation still remembers its first frame. ")
@@ -244,38 +257,11 @@ def _stretch(recording: Recording, trial: Trial) -> str:
         text[0].upper() + text[1:] for text in texts(trial.notes))
 
 
-def _held_panel(found: CameraEstimate, evidence: Evidence) -> Panel:
-    title = "Held out: estimated on the first half, tried on the second"
-    half, held = evidence.half, evidence.held
-    if half is None or held is None:
-        return Panel("held-out", title, paragraph(f"Absent: {evidence.why_not_held}", "note"))
-    rates, r = held.numbers["rate_hz"], held.numbers["counts"]["r"]
-    rows = [[f"events / pixel / s, {p.upper()}", number(rates["real"][p]),
-             number(rates["synthetic"][p]), number(rates["ratio"][p])] for p in ("on", "off")]
-    estimates = [[label, *(
-        spread(float(getattr(f.summary, n)), float(getattr(f.summary_std, n)))
-        for f in (half, found))]
-                 for n, label in (("theta_on", "θ ON"), ("theta_off", "θ OFF"),
-                                  ("eta_on", "η ON [Hz]"), ("eta_off", "η OFF [Hz]"))]
-    counts = [["r, recorded against re-simulated", *(number(r[k], 3)
-                                                     for k in ("on", "off", "both"))],
-              ["r of two re-simulations, the ceiling", *(number(held.ceiling[k], 3)
-                                                         for k in ("on", "off", "both"))]]
-    return Panel("held-out", title, paragraph(
-        "The longest stretch without a gap is halved. The camera is estimated from its first half "
-        f"(at most the last {LEARNT_SECONDS:g} s of it, {plural(half.windows, 'window')}) and has "
-        f"not seen the second, of which {held.numbers['duration_s']:.3f} s are simulated.")
-        + table(["second half", *NAMES, "ratio"], rows)
-        + table(["events per pixel", "ON", "OFF", "both"], counts)
-        + table(["estimate", "first half", "all"], estimates))
-
-
 def _assumptions(
-    found: CameraEstimate, recording: Recording, weights: str | os.PathLike,
+    found: CameraEstimate, recording: Recording, report: Report, weights: str | os.PathLike,
     source: str | os.PathLike | None, command: str,
 ) -> Panel:
     events = recording.events
-    report = check(recording)
     facts = {
         "Units": "θ in natural-log units of brightness; η in Hz per pixel and polarity, at the "
                  "recording's mean intensity; times in microseconds.",

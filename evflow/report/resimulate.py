@@ -8,6 +8,7 @@ held-out half an estimate from the seconds before its middle. Host side.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import jax
@@ -16,12 +17,13 @@ import numpy as np
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
+from evflow.estimation.halves import First
 from evflow.estimation.pipeline import estimate_camera
 from evflow.estimation.refine import frame_noise, receptor_sample
 from evflow.estimation.refine.receptor_search import explained
 from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.result import CameraEstimate
-from evflow.metrics.streams import compare
+from evflow.metrics.streams import compare, correlations
 from evflow.notes import Note
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
@@ -100,18 +102,18 @@ def resimulate(
     pixels see them by, and compare. dead_s: the pixels' dead time in seconds."""
     notes: list[Note] = []
     model = SensorModel(refractory_s=dead_s, noise_resets_memory=True)
-
-    def seen(key: jax.Array) -> Events:
-        pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
-                 for i in range(run[0], run[1] + 1))
-        frames, times = unzip(seen_frames(upsample(pairs, warn=notes.append), seen_by))
-        return Events.concatenate(list(simulate_stream(key, frames, times, camera, model=model)))
-
+    pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
+             for i in range(run[0], run[1] + 1))
+    streams = [
+        simulate_stream(key, *unzip(shown), camera, model=model) for key, shown in zip(
+            jax.random.split(jax.random.key(seed)),
+            itertools.tee(seen_frames(upsample(pairs, warn=notes.append), seen_by)), strict=True)]
+    parts = list(zip(*streams, strict=True))  # in step, so that few frames are kept for the other
     begin = run[0] + 1 if run[1] - run[0] >= SETTLING else run[0]
     span = (int(recording.frame_times[begin]), int(recording.frame_times[run[1]]))
-    made, again = (seen(key).slice(*span) for key in jax.random.split(jax.random.key(seed)))
+    made, again = (Events.concatenate(p).slice(*span) for p in zip(*parts, strict=True))
     real = recording.events.slice(*span)
-    ceiling = compare(made, again, span_us=span)["counts"]["r"]
+    ceiling = correlations(*(e.count_map().astype(np.float64) for e in (made, again)))
     return Trial(real, made, span, run, compare(real, made, span_us=span), ceiling,
                  busiest_instant(real, span), tuple(dict.fromkeys(notes)))
 
@@ -125,11 +127,25 @@ def busiest_instant(events: Events, span_us: tuple[int, int], length_us: int = I
 
 
 def held_out(
-    recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int
+    recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int,
+    first: First | None = None,
 ) -> tuple[CameraEstimate, Trial, tuple[float, float] | None]:
-    """An estimate from the first half of the longest run (its last LEARNT_SECONDS), tried on the
-    second half, and what it foretells of that (`foretold`). Raises EV017 where a half is too short
-    to estimate from."""
+    """An estimate from the first part of a recording, tried on the rest, and what it foretells of
+    that (`foretold`). first: of what an estimate has read; without it that is the first half of
+    the longest run, its last LEARNT_SECONDS. Raises EV017 where a half is too short to estimate
+    from."""
+    if first is not None:
+        found, rest = first.estimate(), first.rest
+    else:
+        half, rest = _halved(recording, runs)
+        found = estimate_camera(half, params, min_window_us=min_window_us)
+    trial = resimulate(recording, found.camera, busiest(recording, [rest]), seed,
+                       Photoreceptor.of(found.sensor, found.optics), found.sensor.refractory_s)
+    return found, trial, foretold(recording, found, rest)
+
+
+def _halved(recording: Recording, runs: list[Run]) -> tuple[Recording, Run]:
+    """The first half of the longest run, or its end, and the frames of the second half."""
     first, last = max(runs, key=lambda r: r[1] - r[0])
     times = recording.frame_times
     middle = int(np.searchsorted(times, (int(times[first]) + int(times[last])) // 2))
@@ -137,13 +153,8 @@ def held_out(
         raise EvflowDataError("EV017", f"the frames {first} to {last} cannot be halved.",
                               "Record longer.")
     begin = max(first, int(np.searchsorted(times, times[middle] - LEARNT_SECONDS * 1e6)))
-    half = Recording(recording.events.slice(int(times[begin]), int(times[middle])),
-                     recording.frames[begin:middle + 1], times[begin:middle + 1])
-    found = estimate_camera(half, params, min_window_us=min_window_us)
-    seen_by = Photoreceptor.of(found.sensor, found.optics)
-    trial = resimulate(recording, found.camera, busiest(recording, [(middle, last)]), seed,
-                       seen_by, found.sensor.refractory_s)
-    return found, trial, foretold(recording, found, (middle, last))
+    return Recording(recording.events.slice(int(times[begin]), int(times[middle])),
+                     recording.frames[begin:middle + 1], times[begin:middle + 1]), (middle, last)
 
 
 def foretold(recording: Recording, found: CameraEstimate, run: Run) -> tuple[float, float] | None:

@@ -111,7 +111,7 @@ def test_how_much_is_read(
         asked.append((given["effort"], given["until"](so_far, so_far)))
         raise EvflowDataError("EV017", "read.")
 
-    monkeypatch.setattr(pipeline, "estimate_camera", estimated)
+    monkeypatch.setattr(pipeline, "measure", estimated)
     assert main(["estimate", str(flight), "-o", str(tmp_path / "cam"), *options]) == 1
     assert asked == [(effort, ends)]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -13,6 +13,7 @@ from helpers.networks import hidden
 from evflow import CameraEstimator, Recording, estimate_camera
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
+from evflow.estimation.halves import divided
 from evflow.estimation.refine import cut
 from evflow.estimation.refine import stretches as cutting
 from evflow.estimation.state import Eyes, State, thinned
@@ -170,6 +171,51 @@ def test_a_stretch_s_regression_is_that_of_its_pixels_together() -> None:
     np.testing.assert_allclose(told.theta, [0.3, 0.2])
     few = SimpleNamespace(equations=np.stack(sums).reshape(7, 10, 20) * 0.1)
     assert np.isnan(drift.part((0, 10), few).theta).all()
+
+
+@pytest.mark.parametrize(("runs", "first", "rest"), [
+    (((0, 8), (8, 16), (16, 24)), range(0, 1), (8, 24)),  # of two that are as near, the earlier
+    (((0, 8), (8, 12)), range(0, 1), (8, 12)),
+    (((0, 8), (9, 17), (17, 25), (25, 29)), range(1, 2), (17, 29)),  # behind a gap there is more
+    (((0, 8), (9, 17)), None, None),
+    (((0, 8),), None, None),
+    (((0, 0),), None, None),  # no path
+])
+def test_a_recording_is_divided_near_the_middle_of_its_longest_part(
+    runs: tuple[tuple[int, int], ...], first: range | None, rest: tuple[int, int] | None
+) -> None:
+    found = divided([SimpleNamespace(run=tuple(range(*run))) for run in runs])
+    assert (found and found.first, found and found.rest) == (first, rest)
+
+
+@pytest.mark.parametrize(("change", "said", "windows"), [
+    ("the events end", "windows.skipped", 3),
+    ("the camera rests", None, 12),
+])
+def test_what_ends_in_the_middle_is_estimated_from_its_beginning(
+    change: str, said: str | None, windows: int
+) -> None:
+    """Events that end before the frames do, and a camera that stops moving: nothing is lost."""
+    recording, camera = hidden(3)
+    events, frames, times = recording.events, recording.frames, recording.frame_times
+    middle = int(times[3])
+    if change == "the events end":
+        recording = Recording(events.slice(int(events.t[0]), middle), frames, times)
+    else:  # noise alone, and frames of which no two are equal
+        rng = np.random.default_rng(0)
+        still = np.clip(frames[-1] + rng.integers(-1, 2, (6, *frames.shape[1:])), 0, 255)
+        t = np.sort(rng.integers(events.t[-1] + 1, events.t[-1] + 240_000, 600))
+        y, x = (rng.integers(0, n, 600) for n in frames.shape[1:])
+        recording = Recording(
+            Events.concatenate([events, Events(x, y, t, rng.random(600) < 0.5, events.size)]),
+            np.concatenate([frames, still.astype(frames.dtype)]),
+            np.concatenate([times, times[-1] + 40_000 * np.arange(1, 7)]))
+    found = estimate_camera(recording)
+    assert found.windows == windows
+    assert said is None or any(
+        note.code == said and "not covered by the events" in note.text for note in found.notes)
+    theta = float(np.median(camera.theta_on))
+    assert abs(float(found.summary.theta_on) - theta) < 3 * float(found.summary_std.theta_on)
 
 
 def test_until_ends_reading_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,10 +21,12 @@ from PIL import Image
 
 import evflow
 from evflow import CameraEstimate, EvflowDataError, Recording
+from evflow.estimation import pipeline
 from evflow.estimation.drift import Third
 from evflow.estimation.extent import Extent
+from evflow.estimation.refine import stretches
 from evflow.notes import Note
-from evflow.report import camera, page
+from evflow.report import camera, page, resimulate
 from evflow.report.extent import extent_panel
 from evflow.report.resimulate import busiest, usable_runs
 from evflow.report.verdict import judge_estimate, judge_stream, known, poorer, worst
@@ -138,6 +140,26 @@ def test_without_frames_it_says_why(
     assert text.count("Undetermined: the recording does not tell.") == 2
     assert "Not all of the camera is known." in text
     assert "of a static scene" in text
+
+
+def test_what_the_estimate_has_made_of_the_first_half_is_shared(
+    measured: tuple[CameraEstimate, Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second stretch is left out, and the first says what it says when estimated alone."""
+    alone, recording = measured
+    monkeypatch.setattr(stretches, "INTERVALS", 5)
+    made = pipeline.measure(recording)
+    assert made.first is not None
+    assert made.first.rest == (5, 10)
+    monkeypatch.setattr(resimulate, "estimate_camera", None)  # nothing is estimated again
+    numbers = evflow.write_report(
+        tmp_path / "shared.html", made.found, recording, first=made.first)
+    assert numbers["held_out"]["span_us"][1] == recording.frame_times[10]
+    text = (tmp_path / "shared.html").read_text()
+    assert "from 5 windows of its first part" in text
+    first = made.first.estimate()
+    np.testing.assert_allclose(first.camera.theta_on, alone.camera.theta_on, rtol=1e-3)
+    np.testing.assert_allclose(first.std.theta_off, alone.std.theta_off, rtol=1e-3)
 
 
 def test_too_short_for_halves_says_so(

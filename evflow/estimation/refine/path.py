@@ -123,6 +123,11 @@ def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -
                  sight(events, times, path, steps, seen), box)
 
 
+def without_evidence(chunk: Chunk) -> Chunk:
+    """A chunk that is kept to be simulated: what it says of its pixels is in the sums."""
+    return dataclasses.replace(chunk, evidence=PixelEvidence.nothing((0, 0)))
+
+
 def _inside(events: Events, x: int, y: int, width: int, height: int) -> Events:
     """The events of a rectangle of pixels, counted from its first."""
     kept = (events.x >= x) & (events.x < x + width) & (events.y >= y) & (events.y < y + height)
@@ -174,21 +179,24 @@ def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
 _seen, _log = jax.jit(seen_path), jax.jit(lin_log)  # one program each, not one an operation
 
 
+def telling(places: Sequence[Place]) -> list[Place]:
+    """Those of the runs of intervals, each of a recording, that tell the photoreceptor."""
+    if not places:
+        return []
+    told = spread([len(run) for _, run in places], most_simulated(places[0][0].events.size))
+    chosen = np.unique(np.linspace(0, len(told) - 1, min(STRETCHES, len(told))).round())
+    return [places[told[k]] for k in chosen.astype(int)]
+
+
 def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | None:
     """What a few of the runs of intervals, each of a recording, say of the photoreceptor; None
     where too little happens."""
-    if not places:
-        return None
-    size = places[0][0].events.size
-    told = spread([len(run) for _, run in places], most_simulated(size))
-    chosen = np.unique(np.linspace(0, len(told) - 1, min(STRETCHES, len(told))).round())
     parts = []
-    for k in chosen.astype(int):
-        recording, run = places[told[k]]
+    for recording, run in telling(places):
         film = interpolated(recording, run, STEPS, noise_dn)
         s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
         parts.append((film.dn, np.repeat(film.dt_s / STEPS, STEPS), s))
-    return sample(parts)
+    return sample(parts) if parts else None
 
 
 def find_photoreceptor(places: Sequence[Place], noise_dn: float = 0.0) -> Found | None:

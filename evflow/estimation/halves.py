@@ -1,0 +1,87 @@
+"""A recording divided in two, to try what its first part tells on the second.
+
+The stretches of the longest time without a gap are divided where two of them meet, near the
+middle. What was read of the first part is a `State` of its own: sums over stretches, so that
+nothing is read again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from evflow.estimation.dead_time import dead_time
+from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
+from evflow.estimation.refine.path import STEPS, telling
+from evflow.estimation.refine.stretches import spread
+from evflow.estimation.result import CameraEstimate
+from evflow.estimation.state import Eyes, State, add, estimate, first_events
+from evflow.simulator.photoreceptor import IDEAL
+
+
+@dataclasses.dataclass(frozen=True)
+class Division:
+    """first: numbers of the stretches of the first part; rest: (first, last) frame of the second,
+    which begins where the first part ends."""
+
+    first: range
+    rest: tuple[int, int]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class First:
+    """What an estimate has made of a recording's first part. state: of what was read of it; told:
+    the stretches that the photoreceptor of the state's eyes was looked for in; rest: (first, last)
+    frame of what comes after it."""
+
+    state: State
+    told: tuple[Stretch, ...]
+    rest: tuple[int, int]
+
+    def estimate(self) -> CameraEstimate:
+        """The camera as the first part alone tells it."""
+        return estimate(_on_its_own(self))
+
+
+def divided(stretches: Sequence[Stretch]) -> Division | None:
+    """Where a recording's stretches, in time order, are divided; None where no two meet, or there
+    is no path."""
+    groups: list[range] = []
+    for i, stretch in enumerate(stretches):
+        if not stretch.run:
+            return None
+        if groups and stretches[i - 1].run[-1] + 1 == stretch.run[0]:
+            groups[-1] = range(groups[-1].start, i + 1)
+        else:
+            groups.append(range(i, i + 1))
+    group = max(groups, key=lambda g: stretches[g[-1]].run[-1] - stretches[g[0]].run[0])
+    if len(group) < 2:
+        return None
+    begin, end = stretches[group[0]].run[0], stretches[group[-1]].run[-1] + 1
+    cut = min(group[1:], key=lambda i: abs(2 * stretches[i].run[0] - begin - end))
+    return Division(range(group[0], cut), (stretches[cut].run[0], end))
+
+
+def _on_its_own(first: First) -> State:
+    """The state with the photoreceptor and the dead time that the first part tells by itself."""
+    state, eyes = first.state, first.state.eyes
+    runs, told = ([(s.recording, s.run) for s in part] for part in (state.read, first.told))
+    found = eyes.found
+    if found is not None and telling(runs) != telling(told):
+        found = find_photoreceptor(runs, eyes.noise_dn)
+    seen_by = found.seen if found is not None and found.needed else IDEAL
+    events = state.read[0].recording.events
+    end = int(state.read[0].recording.frame_times[first.rest[0]])
+    own = Eyes(seen_by, eyes.noise_dn, found,
+               dead_time(first_events(events.slice(int(events.t[0]), end))))
+    simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
+    if seen_by != eyes.seen_by:
+        state = State(state.params, own)
+        for i, stretch in enumerate(first.state.read):
+            state = add(state, stretch, simulate=i in simulated)
+    elif not state.chunks:
+        stretch = state.read[simulated[0]]
+        place = stretch.recording, stretch.run
+        chunk = make_chunk(*place, STEPS, seen_by, eyes.noise_dn, first=stretch.first)
+        state = dataclasses.replace(state, chunks=(simulated_part(chunk, place, seen_by),))
+    return dataclasses.replace(state, eyes=own)
