@@ -8,6 +8,7 @@ the words, unless these are those of another (`evt_words`).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from evflow.notes import Note
 MAX_HEADER = 1 << 16  # bytes; real ones have 200 to 600
 TEXT = re.compile(rb"%[ \t][\x20-\x7e\t]*\r?\n|%\r?\n")
 ANY = re.compile(rb"%[^\r\n]*\r?\n")  # where a line `% end` says where the header ends
-END = re.compile(rb"^% *end[ \t]*\r?$", re.MULTILINE | re.IGNORECASE)
+END = re.compile(rb"%[ \t]*end\s*", re.IGNORECASE)
 
 SIDE = re.compile(r"\d{1,5}")  # pixels
 
@@ -85,9 +86,12 @@ def parse(head: bytes) -> Header:
 def _ends(head: bytes) -> bool:
     """Does a line `% end` end a header whose lines all begin with `%`? Then names in them may have
     any letters."""
-    end = END.search(head)
-    return end is not None and all(
-        line.startswith(b"%") for line in head[: end.start()].splitlines())
+    at = 0
+    while line := ANY.match(head, at):
+        if END.fullmatch(line[0]):
+            return True
+        at = line.end()
+    return False
 
 
 def read_header(path: Path) -> Header:
@@ -98,11 +102,16 @@ def read_header(path: Path) -> Header:
 def sniffed(path: Path, head: bytes) -> str:
     """The encoding of a RAW file that begins so, "" of what is none: what the header declares,
     unless the words are those of another, and of that alone."""
+    return _sniffed(path.suffix.lower() == ".raw", head)
+
+
+@functools.lru_cache(maxsize=2)  # of one file, all formats ask
+def _sniffed(is_raw: bool, head: bytes) -> str:
     header = parse(head)
     declared = header.encoding
     if declared not in ("", *evt_words.NAMES) or "version" in header.fields:
         return declared
-    if not header.fields and path.suffix.lower() != ".raw":
+    if not header.fields and not is_raw:
         return ""
     found = evt_words.fitting(head[header.start :], header.order)
     return found[0] if declared not in found and len(found) == 1 else declared

@@ -22,6 +22,7 @@ from evflow.io.decode.units import check_text_seconds
 BLANKS = bytes.maketrans(b",;\"", b"   ")  # what else stands between numbers
 HEAD = 1 << 14  # bytes by which a file is recognised, and the order of its columns told
 BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
+BINARY = 512  # bytes that tell text from other data, which has zeros among them
 MAX_LINE = 1000  # a longer one is not text
 WORD = re.compile(rb"\b(?:true|false|on|off|pos|neg|positive|negative)\b", re.IGNORECASE)
 ON = (b"true", b"on", b"pos", b"positive")
@@ -131,6 +132,11 @@ def _before_damage(
                                       f"({' or '.join(map(str, widths))} numbers)")
         at += len(content) + 1
     return block, Damage(byte + at, "what stands before is not plain text")
+
+
+def is_binary(head: bytes) -> bool:
+    """Is what begins so no text?"""
+    return b"\0" in head[:BINARY]
 
 
 def is_number(field: bytes) -> bool:

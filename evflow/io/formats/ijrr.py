@@ -48,6 +48,8 @@ def sniff(path: Path, head: bytes) -> bool:
                 return any(_is_events(name) for name in archive.namelist())
         except DAMAGE:
             return path.suffix.lower() == ".zip"  # cut off: the extension decides
+    if text.is_binary(head):
+        return False
     lines = [line for line in text.plain(head, 0).split(b"\n")
              if line.strip() and not line.startswith(b"#")]
     if path.name == EVENTS:  # any numbers may be events; `text` says what is wrong with them

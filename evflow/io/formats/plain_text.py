@@ -37,6 +37,7 @@ COMMAS = str.maketrans(",;", "  ")
 COMMA = re.compile(  # within a number: quoted, or where something else stands between numbers
     rb'"-?\d{1,3}(?:,\d{3})+(?:\.\d+)?"|'
     rb"(?=.*\d,\d)-?[\d.]+(?:,\d+)*(?:[;\t ]+-?[\d.]+(?:,\d+)*)+$")
+OTHERS = (b"#!AER-DAT", b"#ROSBAG")  # data behind lines that look like comments
 MOST = 12  # columns of a header
 TOOL = re.compile(r"^geometry:|@\d", re.MULTILINE)  # by headers of OpenEB and faery: us
 
@@ -88,6 +89,8 @@ def layout(head: bytes) -> Layout | None:
     rows: list[list[float]] = []
     headers: list[str] = []
     told, said, odd, byte, begin = "", "", b"", 0, 0
+    if text.is_binary(head) or head.startswith(OTHERS):
+        return None
     if b"\r" in head.strip() and b"\n" not in head:
         return None  # `unread_text` says why
     whole = head if len(head) < text.HEAD else head[: head.rfind(b"\n") + 1]
