@@ -36,6 +36,7 @@ class Aps:
 
     def _clear(self) -> None:
         self.reads: list[_Reads] = [_Reads(), _Reads()]
+        self.orphaned = False  # were there signals before the resets?
 
     def add(
         self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
@@ -72,13 +73,21 @@ class Aps:
     def _put(
         self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
     ) -> None:
+        if not self.reads[RESET].count:  # signals come of resets that are lost: of another frame
+            first = int(np.argmax(kind == RESET)) if (kind == RESET).any() else len(kind)
+            self.incomplete += first > 0 and not self.orphaned
+            self.orphaned |= first > 0
+            kind, x, y, t, value = (column[first:] for column in (kind, x, y, t, value))
+        pixels = self.size[0] * self.size[1]
+        over = False
         for which, reads in enumerate(self.reads):
             of = np.flatnonzero(kind == which)
+            over |= len(of) > pixels - reads.count
+            of = of[: pixels - reads.count]  # what is more, is of a frame whose resets are lost
             if len(of):
                 reads.add(x[of], y[of], t[of], value[of])
-        counts = [reads.count for reads in self.reads]
-        pixels = self.size[0] * self.size[1]
-        if min(counts) >= pixels or max(counts) > 2 * pixels:  # complete, or without a beginning
+        self.incomplete += over
+        if min(reads.count for reads in self.reads) >= pixels:
             self.finish()
 
     def finish(self) -> None:

@@ -148,6 +148,22 @@ def test_frames_across_the_turn_of_the_clock_and_cut_off(tmp_path: Path) -> None
     assert texts(got.notes)[1] == "1 frames of which samples are missing were left out"
 
 
+@pytest.mark.parametrize("lost", [slice(0, 100), slice(0, 36 * 48), slice(0, 36 * 48 + 100),
+                                  slice(5000, 5100), slice(36 * 48 * 2, 36 * 48 * 3)])
+def test_signals_are_not_joined_with_resets_of_another_frame(tmp_path: Path, lost: slice) -> None:
+    """A recording that begins amid a frame, or lacks a part: some resets, all, or signals too."""
+    light = np.random.default_rng(0).integers(0, 800, (3, 36, 48))
+    words = [word for i, frame in enumerate(light)
+             for word in aps(frame, 2000 + 50_000 * i, exposure=10_000)]
+    at = lost.start // (36 * 48 * 2)  # the frame that is not whole
+    del words[lost]
+    got = read_recording(davis(tmp_path, [(EVENT, 0), *words]), size=SMALL)
+    whole = [i for i in range(3) if i != at]
+    assert got.frame_times.tolist() == [7235 + 50_000 * i for i in whole]
+    np.testing.assert_allclose(got.frames, light[whole] * 255 / 1023, rtol=1e-6)
+    assert texts(got.notes)[1] == "1 frames of which samples are missing were left out"
+
+
 def test_aedat1_of_a_dvs128(tmp_path: Path) -> None:
     path = tmp_path / "a.dat"
     path.write_bytes(b"#!AER-DAT1.0\r\n# a remark\r\n" + struct.pack(
