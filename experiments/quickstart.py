@@ -23,6 +23,7 @@ from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_p
 from evflow.camera.sensors import SensorModel
 from evflow.process.terminal import bar
 from evflow.report import plots
+from evflow.report.page import spread
 from evflow.report.text import LABELS, describe
 from evflow.scenes import SceneConfig, make_bank, render, sample_scene
 from evflow.simulator import simulate_stream
@@ -90,10 +91,10 @@ def rates(events: Events, span_us: tuple[int, int]) -> dict[str, float]:
 
 def truth_table(truth: Summary, found: CameraEstimate) -> str:
     """Truth beside estimate ± std, a line per parameter."""
-    lines = [f"{'':22} {'truth':>7} {'estimate':>9}"]
+    lines = [f"{'':22} {'truth':>7} {'estimate':>19}"]
     for name, label in LABELS.items():
         value, std = (float(getattr(s, name)) for s in (found.summary, found.summary_std))
-        lines.append(f"{label:22} {float(getattr(truth, name)):7.3f} {value:9.3f} ± {std:.3f}")
+        lines.append(f"{label:22} {float(getattr(truth, name)):7.3f} {spread(value, std):>19}")
     return "\n".join(lines)
 
 

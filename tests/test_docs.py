@@ -38,6 +38,7 @@ from experiments import (
     coverage,
     curves,
     evaluate,
+    gallery,
     integrate,
     limits,
     make_dataset,
@@ -193,6 +194,14 @@ def test_the_readme_is_one_page() -> None:
     assert len(text.split()) <= 750
 
 
+def test_the_gallery_is_small_and_whole() -> None:
+    shown = re.findall(r"!\[[^]]+\]\((pictures/gallery/[^)]+)\)",
+                       (ROOT / "docs/gallery.md").read_text("utf-8"))
+    assert sorted(Path(path).stem for path in shown) == sorted(gallery.PICTURES)
+    for path in shown:
+        assert 2_000 < (ROOT / "docs" / path).stat().st_size <= 150_000, path
+
+
 @pytest.mark.slow
 def test_the_readmes_python_runs_from_a_fresh_checkout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -262,6 +271,6 @@ def test_what_is_said_of_the_experiments_presets_is_so() -> None:
                if "preset" not in {field.name for field in dataclasses.fields(kind)}}
     making = {"calibrate", "combine", "doubt", "fuse", "tell_apart"}
     assert without == {
-        "quickstart", "evaluate_network", "guessed_frames", "long_recordings", *making}
+        "quickstart", "gallery", "evaluate_network", "guessed_frames", "long_recordings", *making}
     text = (ROOT / "docs/experiments.md").read_text("utf-8")
     assert all(f"`{name}`" in text.partition("| script")[0] for name in without - making)

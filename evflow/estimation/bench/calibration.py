@@ -115,10 +115,12 @@ def calibrate_step(
     found = _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
                       n_events, ~kept, len(steps.counts), _notes(steps, untold, valid, ~kept),
                       tuple(untold))
-    return dataclasses.replace(found, bench=measured_bench(
+    shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.quiet, steps.light,
-        np.median(steps.levels, (1, 2)), steps.rests, clean, kept,
-        np.where(sound, theta, np.nan)))
+        np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan))
+    return dataclasses.replace(
+        found, bench=shown, sensor_std={"refractory_s": shown.dead.std_s},
+        sensor=dataclasses.replace(found.sensor, refractory_s=shown.dead.seconds))
 
 
 def _notes(
