@@ -95,7 +95,7 @@ class Checkpoints:
         for step in self._found():
             try:
                 with ocp.StandardCheckpointer() as reader:
-                    state = reader.restore(self.steps / str(step) / "default", abstract)
+                    state = reader.restore(_sound(self.steps / str(step)) / "default", abstract)
             except MemoryError:
                 raise
             except Exception as e:  # of orbax, tensorstore and json: a dozen kinds
@@ -147,7 +147,7 @@ class Checkpoints:
         """Whether the arrays of a step are of other shapes, as far as it can be read."""
         try:
             with ocp.StandardCheckpointer() as reader:
-                found = reader.metadata(self.steps / str(step) / "default").item_metadata
+                found = reader.metadata(_sound(self.steps / str(step)) / "default").item_metadata
             shapes = sorted(array.shape for array in jax.tree.leaves(found.tree))
         except Exception:  # it is damaged
             return False
@@ -179,6 +179,18 @@ class Checkpoints:
         """Save the configuration beside the steps."""
         atomic_text(self.folder / "config.json", json.dumps(_as_json(config), indent=2) + "\n",
                     overwrite=True)
+
+
+def _sound(step: Path) -> Path:
+    """The folder of a step, of files that end: orbax reads those of metadata whole, whatever they
+    are. ValueError where one is a link to a device or a pipe, or has no end in reason."""
+    for place, _, names in os.walk(step):
+        for path in map(Path(place).joinpath, names):
+            if path.exists() and not path.is_file():
+                raise ValueError(f"{path.name} is a pipe, a device or a socket")
+            if path.name.startswith("_") and path.exists() and path.stat().st_size > FREE:
+                raise ValueError(f"{path.name} has {path.stat().st_size:,} bytes")
+    return step
 
 
 def _stored_shape(leaf: Any) -> tuple[int, ...]:

@@ -69,7 +69,19 @@ def replaced(by: Callable[[Path], object]) -> Damage:
     return damage
 
 
+def endless(step: Path) -> None:
+    for path in step.rglob("_METADATA"):
+        path.unlink()
+        path.symlink_to("/dev/zero")
+
+
+def sparse(step: Path) -> None:
+    for path in step.rglob("_METADATA"):
+        os.truncate(path, 1 << 36)
+
+
 DAMAGE: dict[str, Damage] = {
+    "endless": endless, "sparse": sparse,
     "truncated": every(lambda data: data[: len(data) // 2]), "emptied": every(lambda _: b""),
     "garbage": every(lambda _: os.urandom(50)), "deep": every(lambda _: b"[" * 100_000, "_*"),
     "flipped": every(lambda data: data[:-20] + bytes(20), "[0-9a-f]*"),
