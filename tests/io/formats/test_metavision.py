@@ -91,7 +91,9 @@ def test_filters_and_fields_that_are_not_known(tmp_path: Path) -> None:
         made = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         made.set_chunk((5,))
         made.set_filter(ecf.FILTER, h5py.h5z.FLAG_OPTIONAL)
-        h5py.h5d.create(group.id, b"x", h5py.h5t.NATIVE_UINT16, h5py.h5s.create_simple((5,)), made)
+        x = h5py.h5d.create(
+            group.id, b"x", h5py.h5t.NATIVE_UINT16, h5py.h5s.create_simple((5,)), made)
+        x.write_direct_chunk((0,), bytes(9))
     error = refused(path, size=(64, 48))
     assert (error.code, "filter 36559" in error.seen, "h5repack" in error.fix) == (
         "EV010", True, True)
