@@ -8,6 +8,7 @@ calib.txt, imu.txt and poses are not read.
 
 from __future__ import annotations
 
+import codecs
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
@@ -35,6 +36,9 @@ EXTENSIONS: tuple[str, ...] = (".zip", ".txt", "")
 EVENTS, IMAGES = "events.txt", "images.txt"
 CLOCK = Note("frames.clock", "frame times are those of images.txt")
 ROW = re.compile(rb"\d+\.\d+[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?")
+
+BETWEEN = re.compile(rb"[\s,;]+")  # the time of an image and its name
+HEADER = re.compile(rb"[a-z_\s,;\[\]]+", re.IGNORECASE)  # words alone
 
 Root = Path | zipfile.Path
 
@@ -138,16 +142,18 @@ def _some(
 def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
     """Times (T,) as written, seconds by the format, and names of the images."""
     seconds, names = [], []
-    for number, content in enumerate(read_whole(index, FREE).split(b"\n"), 1):
-        fields = content.partition(b"#")[0].split()
-        if not fields:
+    whole = read_whole(index, FREE).removeprefix(codecs.BOM_UTF8)
+    for number, content in enumerate(whole.split(b"\n"), 1):
+        line = content.partition(b"#")[0].strip()
+        fields = BETWEEN.split(line, maxsplit=1)
+        if not line or (not seconds and HEADER.fullmatch(line)):
             continue
         if len(fields) != 2 or not text.is_number(fields[0]):
             raise EvflowDataError(
                 "EV009", f"{index}, line {number:,} is {content[:60]!r}; expected t[s] path.",
                 where=index)
         seconds.append(float(fields[0]))
-        names.append(fields[1].decode("utf-8"))
+        names.append(fields[1].decode("utf-8").strip('"').replace("\\", "/"))
     back = np.flatnonzero(np.diff(seconds) <= 0)
     if len(back):
         raise EvflowDataError(

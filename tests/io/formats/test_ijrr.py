@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -81,6 +82,20 @@ def test_ijrr_with_bad_images(tmp_path: Path, index: str, code: str) -> None:
     assert cv2.imwrite(str(tmp_path / "images/small.png"), np.zeros((2, 2), np.uint8))
     (tmp_path / "images.txt").write_text(index)
     assert refused(tmp_path).code == code
+
+
+@pytest.mark.parametrize("change", [
+    lambda text: text.replace("/", "\\"), lambda text: "\ufeff" + text,
+    lambda text: text.replace(" ", ","), lambda text: text.replace(" ", ";\t"),
+    lambda text: "timestamp, filename\n" + text, lambda text: text.replace("\n", "\r\n"),
+    lambda text: re.sub(r"(images.*png)", r'"\1"', text)])
+def test_ijrr_index_as_other_tools_write_it(
+    tmp_path: Path, change: Callable[[str], str]
+) -> None:
+    want = make(20, count=2)
+    index = write_ijrr(tmp_path, want) / "images.txt"
+    index.write_bytes(change(index.read_text()).encode())
+    np.testing.assert_array_equal(read_recording(tmp_path).frames, want.frames)
 
 
 def test_ijrr_images_keep_16_bits_and_colour_is_noted(tmp_path: Path) -> None:
