@@ -216,6 +216,7 @@ def test_the_readmes_python_runs_from_a_fresh_checkout(
         true = float(np.median(getattr(names["hidden"], name)))
         assert abs(float(getattr(names["found"].summary, name)) - true) < 0.1 * true
     assert names["camera"].theta_on.shape == SHAPE
+    assert not names["found"].hot.any()  # .4 s of steady motion, seen by a camera without
 
 
 @pytest.mark.parametrize("document", DOCUMENTS[1:], ids=lambda d: d.name)
