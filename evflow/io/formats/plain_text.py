@@ -12,6 +12,7 @@ that writes those: Prophesee's order or geometry, faery's header. Other whole on
 from __future__ import annotations
 
 import codecs
+import functools
 import itertools
 import re
 from collections.abc import Iterator
@@ -83,6 +84,7 @@ def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str
     return text.in_seconds(path, chunks) if native == "s" else chunks, native, found
 
 
+@functools.lru_cache(maxsize=2)  # it is recognised by it, then read
 def layout(head: bytes) -> Layout | None:
     """What a file that begins so holds; None where it is no text of events. EV008 where a header
     names some of the columns, but not which is which."""
@@ -95,12 +97,13 @@ def layout(head: bytes) -> Layout | None:
         return None  # `unread_text` says why
     whole = head if len(head) < text.HEAD else head[: head.rfind(b"\n") + 1]
     for line in whole.splitlines(keepends=True):
-        words, comment = _decoded(line), line.lstrip().startswith((b"#", b"%"))
+        words, comment = "" if rows else _decoded(line), line.lstrip().startswith((b"#", b"%"))
         fields = text.plain(line, byte).partition(b"#")[0].split()
         byte += len(line)
         if not comment and (found := COMMA.match(line.strip())):
             raise _commas(found[0])
-        header = not told and not any(map(text.is_float, _fields(words.replace('"', " "))))
+        header = not (rows or told) and not any(
+            map(text.is_float, _fields(words.replace('"', " "))))
         if not rows and (comment or header):
             told = words if words and not comment else told  # it must name what there is
             headers += [words] if _order(words) else []
