@@ -141,7 +141,8 @@ def _some(
 
 def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
     """Times (T,) as written, seconds by the format, and names of the images."""
-    seconds, names = [], []
+    seconds: list[float] = []
+    names: list[str] = []
     whole = read_whole(index, FREE).removeprefix(codecs.BOM_UTF8)
     for number, content in enumerate(whole.split(b"\n"), 1):
         line = content.partition(b"#")[0].strip()
