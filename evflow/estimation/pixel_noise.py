@@ -22,6 +22,7 @@ LAW_ODDS = 3.0  # log odds that it takes to let rates follow the thresholds
 SIGNAL = 0.25  # of the events of quiet pixels may be what is left of the signal
 
 AROUND = 9  # pixels: side of the neighbourhood in which events are company
+CHANCE = 4.0  # standard deviations of the noise around a pixel, that it may have
 STILL = 0.05  # log units: of 3x3 pixels from frame to frame; less than any threshold of use
 DRIFT = 0.1  # log units per second, of 5x5 pixels: slower than a frame's noise, yet it sends events
 
@@ -108,14 +109,35 @@ def quiet_time(
     are no company, nor are those of hot (H, W) pixels. A pixel's own events do not enter the
     choice, so that what it sends is a fair sample.
     """
-    change = np.ascontiguousarray(np.abs(dlog), np.float32)
-    still = seen & (cv2.dilate(change, np.ones((3, 3), np.uint8)) < STILL)
-    still &= np.abs(cv2.blur(np.ascontiguousarray(dlog, np.float32), (5, 5))) < DRIFT * seconds
+    still = _still(dlog, seen, seconds)
     found = []
     for own, rate in zip(counts, rates, strict=True):
-        others = np.where(hot, 0, own).astype(np.float32)
-        near = cv2.boxFilter(others, -1, (AROUND, AROUND), normalize=False,
-                             borderType=cv2.BORDER_CONSTANT) - others
+        near = _company(own, hot)
         alone = still & (near < max(0.5, rate * seconds * AROUND**2))
         found.append([own * alone, seconds * alone])
     return np.array(found, np.float32)
+
+
+def calm(
+    counts: Array, dlog: Array, seen: Array, hot: Array, seconds: float, rates: Array
+) -> Array:
+    """(H, W) bool: pixels around which no more happens in a window than noise may send. Arguments
+    as of `quiet_time`, which takes those with less than usual: of many windows in a row none is."""
+    expected = float(np.sum(rates)) * seconds * AROUND**2
+    near = _company(counts.sum(0), hot)
+    return _still(dlog, seen, seconds) & ~hot & (near < expected + CHANCE * np.sqrt(expected) + 1.5)
+
+
+def _still(dlog: Array, seen: Array, seconds: float) -> Array:
+    """(H, W) bool: where the frames show no change."""
+    change = np.ascontiguousarray(np.abs(dlog), np.float32)
+    still = seen & (cv2.dilate(change, np.ones((3, 3), np.uint8)) < STILL)
+    drift = np.abs(cv2.blur(np.ascontiguousarray(dlog, np.float32), (5, 5)))
+    return np.asarray(still & (drift < DRIFT * seconds))
+
+
+def _company(own: Array, hot: Array) -> Array:
+    """Events (H, W) around each pixel, its own and those of hot ones left out."""
+    others = np.where(hot, 0, own).astype(np.float32)
+    return cv2.boxFilter(others, -1, (AROUND, AROUND), normalize=False,
+                         borderType=cv2.BORDER_CONSTANT) - others

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.intervals import QuietWaits, Waits
-from evflow.estimation.pixel_noise import quiet_time
+from evflow.estimation.pixel_noise import calm, quiet_time
 from evflow.estimation.shot import LIGHTS, by_light
 from evflow.light.log_maps import lin_log
 from evflow.network import api
@@ -129,11 +129,12 @@ def quiet_times(
         frames = window.frame0, window.frame1
         seen = [_light(f, seen_by) for f in frames]
         _, change = _mean_and_change(*seen)
-        found = quiet_time(window.events.count_map(), np.asarray(change),
-                           exposed(*frames), hot, window.window_s, noise)
+        place = (window.events.count_map(), np.asarray(change), exposed(*frames), hot,
+                 window.window_s, noise)
+        found = quiet_time(*place)
         total += found
         # As `seen_frames`: darker by one factor where light is added.
         shown = 255.0 / (255.0 + max(seen_by.offset_dn, 0.0))
         light += by_light(found, 0.5 * shown * (seen[0].astype(np.float32) + seen[1]), hot)
-        waits.add(window.events, (window.t0_us, window.t1_us), (found[:, 1] > 0).all(0) & ~hot)
+        waits.add(window.events, (window.t0_us, window.t1_us), calm(*place))
     return Quiet(total, light, waits.table())

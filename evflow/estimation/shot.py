@@ -70,8 +70,10 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     if noise.sum() < LEAST_EVENTS:
         return Shot()
     odds = 0.0
-    for n, other, sent, shapes in zip(events, leaked, noise, zip(falling, seconds, strict=True),
-                                      strict=True):
+    for side, (n, other, sent, shapes) in enumerate(zip(
+            events, leaked, noise, zip(falling, seconds, strict=True), strict=True)):
+        if side == 0 and not leak_hz:
+            continue  # there may be leak among ON noise, which is as much in any light
         likely = []
         for shape in shapes:
             expected = np.maximum(sent * shape / shape.sum() + other, 1e-12)
@@ -79,6 +81,9 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
         odds += (likely[0] - likely[1]) / scattered
     if odds < -ODDS:
         return Shot(even=True)
-    hz = float((noise / falling.sum(1)).sum())
-    relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2)
+    halves = noise / np.maximum(falling.sum(1), 1e-9)
+    excess = 0.0 if leak_hz else max(float(halves[0] - halves[1]), 0.0)  # of ON: leak, or not
+    hz = float(halves.sum()) - excess
+    relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2
+                       + (0.5 * excess / max(hz, 1e-9)) ** 2)
     return Shot(hz, hz * float(relative))

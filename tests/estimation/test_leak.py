@@ -10,6 +10,7 @@ import pytest
 from evflow import Camera, Events, Recording, SensorModel, simulate
 from evflow.estimation.intervals import EDGES, QuietWaits, life_table, waits_at_rest
 from evflow.estimation.leak import measured_leak
+from evflow.estimation.pixel_noise import calm, quiet_time
 from evflow.estimation.shot import by_light, measured_shot, scatter
 from evflow.estimation.static import estimate_noise
 
@@ -103,9 +104,9 @@ def test_what_happens_near_by_ends_a_wait() -> None:
     quiet, still = QuietWaits(SHAPE), ~NONE_HOT
     events = Events(np.array([3, 3]), np.array([2, 2]), np.array([10_000, 260_000]),
                     np.array([True, False]), SHAPE[::-1])
-    for begin, calm in ((0, True), (100_000, False), (200_000, True)):
+    for begin, rests in ((0, True), (100_000, False), (200_000, True)):
         span = begin, begin + 100_000
-        quiet.add(events.slice(*span), span, still if calm else NONE_HOT)
+        quiet.add(events.slice(*span), span, still if rests else NONE_HOT)
     seconds, on, off = quiet.table().own
     assert seconds.sum() == pytest.approx(0.09 + 0.04)
     assert on.sum() == off.sum() == 0
@@ -129,6 +130,25 @@ def test_shot_noise_is_that_of_the_dark_if_it_falls_with_light() -> None:
     assert found.hz == 0
     few = measured_shot(0.01 * by_light(quiet, dn, NONE_HOT), 0.0, 1.0)
     assert (few.hz, few.even) == (0.0, False)
+
+
+def test_leak_that_is_not_told_apart_is_not_taken_for_shot_noise() -> None:
+    dn, quiet = light(lambda i01: 0.5 * 3.0 * (1.0 - 0.75 * i01))
+    quiet[0, 0] += np.random.default_rng(1).poisson(4.0, SHAPE)  # 1 Hz of ON, in any light
+    found = measured_shot(by_light(quiet, dn, NONE_HOT), 0.0, scatter(quiet, NONE_HOT))
+    assert not found.even
+    assert found.hz == pytest.approx(3.0, rel=0.05)
+    assert 0.1 < found.std_hz / found.hz < 0.5
+
+
+def test_calm_pixels_have_no_more_company_than_noise_sends() -> None:
+    counts = np.random.default_rng(0).poisson(0.01, (2, *SHAPE))
+    counts[0, 20, 20:40] += 3
+    place = np.zeros(SHAPE, np.float32), ~NONE_HOT, NONE_HOT, 0.04, np.array([0.25, 0.25])
+    found = calm(counts, *place)
+    assert not found[20, 22:38].any()
+    assert found[30:].mean() > 0.99  # where quiet_time takes about half
+    assert (quiet_time(counts, *place)[:, 1] > 0).all(0)[30:].mean() < 0.6
 
 
 def test_the_simulator_s_leak_and_shot_noise_are_found() -> None:
