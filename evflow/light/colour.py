@@ -163,10 +163,11 @@ def mosaic_note(pattern: str) -> Note:
         f"the events come from behind it too (a colour DAVIS), pass --colour {pattern.lower()}")
 
 
-def seen_note(pattern: str) -> Note:
-    """What is said of frames that are what pixels see under a mosaic."""
-    return Note("frames.raw", "each pixel of the frames has its own colour alone, of a mosaic that "
-                f"begins {pattern.upper()}")
+def seen_note(pattern: str, colour: bool) -> Note:
+    """What is said of frames, grey or colour, that are what pixels see under a mosaic."""
+    return Note("frames.raw", f"colour frames were laid under a {pattern} mosaic: each pixel has "
+                "its own colour alone." if colour else
+                f"frames have one channel: taken as a {pattern} mosaic as they are.")
 
 
 def are_luma(notes: Iterable[Note]) -> bool:

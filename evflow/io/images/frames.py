@@ -25,6 +25,7 @@ from evflow.light.colour import (
     mosaic_luma,
     mosaic_note,
     parse_pattern,
+    seen_note,
 )
 from evflow.notes import Note
 
@@ -146,8 +147,9 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
         if first is None:
             first = frame, depth
             said = {note.code for note in notes}  # of the response already, where it was left open
+            said |= {"frames.linearised"} if "frames.response" in said else set()
             notes += [n for n in _seen_first(image, frame, hints) if n not in notes and not (
-                n.code == "frames.linearised" and "frames.response" in said)]
+                n.code in ("frames.linearised", "frames.raw") and n.code in said)]
         elif image.time_us <= last:
             raise EvflowDataError(
                 "EV004", f"{image.where} is at {image.time_us} us, the frame before at {last} us.",
@@ -201,8 +203,7 @@ def _seen_first(image: Image, frame: np.ndarray, hints: FrameHints) -> list[Note
     if hints.flip != "none":
         notes.append(response.flipped(hints.flip))
     if hints.colour != "luma" and frame.ndim == 2:
-        notes.append(Note("frames.raw", f"frames have one channel: taken as a {hints.colour} "
-                          "mosaic as they are."))
+        notes.append(seen_note(hints.colour, colour=False))
     peak = int(image.pixels.max()) if image.pixels.dtype == np.uint16 else 0
     if hints.full_scale is None and 0 < peak < 2**14:
         notes.append(Note("frames.depth", f"16-bit frames, white at 65535, but the first reaches "

@@ -74,7 +74,7 @@ class FrameStack:
             return Recording.of_events(events, notes)
         frames = self._spool.array().reshape(-1, *self.size[::-1])
         if self.seen != "luma":
-            notes = (*notes, seen_note(self.seen))
+            notes = (*notes, seen_note(self.seen, self.colour))
         elif self.colour:
             notes = (*notes, CONVERTED)
         order, told = in_order(times, hints)

@@ -54,6 +54,7 @@ def test_bags(tmp_path: Path, encoding: str, frames: np.ndarray) -> None:
     assert ("--colour rggb" in note) == (encoding == "bayer_rggb8")
     source = open_frames(path, colour="rggb")  # to be simulated
     np.testing.assert_array_equal([frame for frame, _ in source.open()], SEEN)
+    assert [n.code for n in source.notes].count("frames.raw") == 1
 
 
 @needs_rosbags
