@@ -207,7 +207,8 @@ def describe_streams(numbers: dict[str, Any]) -> str:
 
 def sentences(judged: list[Judged]) -> list[str]:
     """What was seen, and what to do."""
-    return [*(j.seen[0].upper() + j.seen[1:] for j in judged), *advice(judged)]
+    return [*(j.seen if j.seen[0] in "θη" else j.seen[0].upper() + j.seen[1:] for j in judged),
+            *advice(judged)]
 
 
 def how_compared(numbers: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ from evflow import Events, EvflowDataError, Recording, read_recording, write_eve
 from evflow.cli import main
 from evflow.metrics.streams import distances
 from evflow.report.page import write_page
-from evflow.report.verdict import describe_streams, judge_streams, worst
+from evflow.report.verdict import Judged, describe_streams, judge_streams, sentences, worst
 
 SIZE = (32, 24)
 
@@ -244,3 +244,9 @@ def test_swapped_polarity_is_told() -> None:
     assert worst(judge_streams(numbers)) == "poor"
     assert "swapped" in describe_streams(numbers)
     assert "swapped" not in describe_streams(evflow.compare(events, events))
+
+
+def test_sentences_begin_with_a_capital_but_symbols_stay() -> None:
+    seen = ("θ ON is known to 3%.", "η is.", "intervals differ.")
+    assert sentences([Judged("good", "", 0.0, words) for words in seen]) == [
+        "θ ON is known to 3%.", "η is.", "Intervals differ."]
