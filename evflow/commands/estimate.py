@@ -171,12 +171,14 @@ class Estimate(Compiling, Reading):
     def _recorded(self, path: Path) -> tuple[Recording, Report, list[Note]]:
         """A recording, what `evflow check` says, and what it doubts; raises its errors, unless told
         not to."""
+        from evflow.files.spool import SOME, on_disk
         from evflow.process.terminal import bar
         from evflow.recordings.check import check
         from evflow.recordings.repeats import without_repeats
 
         with bar("reading the recording") as progress:
-            recording = self.read(path)
+            with on_disk(SOME):
+                recording = self.read(path)
             progress(0, 1, "checking")
             report = check(recording)
         tell(recording)

@@ -28,6 +28,7 @@ from evflow.estimation.refine import Stretch, cut, pixel_posterior
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import Stage, State, add, estimate, glance, look, looked_through
 from evflow.estimation.static import estimate_noise
+from evflow.files.spool import SOME, on_disk
 from evflow.network import api
 from evflow.network.weights import load_weights
 from evflow.recordings.repeats import without_repeats
@@ -100,7 +101,8 @@ def measure(
     recording = recording_or_path
     if not isinstance(recording, Recording):
         stage("reading the file")
-        recording = io.read_recording(recording)
+        with on_disk(SOME):
+            recording = io.read_recording(recording)
     recording = without_repeats(recording)
     if not recording.has_frames or stands_still(recording):
         stage("counting noise")

@@ -20,7 +20,8 @@ import numpy as np
 from evflow.errors import EvflowDataError
 
 LIMIT = 1 << 29  # bytes of a column in memory: 67 million int64 times
-LITTLE = 1 << 24  # the same, where columns are read once
+SOME = 1 << 27  # the same, where little of a column is looked at again: 17 million times
+LITTLE = 1 << 24  # and where columns are read once
 JOINED = 1 << 25  # bytes of parts; malloc gives smaller arrays memory that is warm
 
 
