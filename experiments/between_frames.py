@@ -42,9 +42,10 @@ Scene = tuple[str, str, float, tuple[int, int]]  # motion, picture, speed, size
 
 FRAMES = {"debug": 4, "full": 7}
 SMALL, LARGE = (346, 260), (640, 480)
-PICTURES = ("coffee", "discs", "000000000785", "waves")
-FEWER = 2  # pictures, in large frames and of what is hard
+PICTURES = ("coffee", "discs")
+FEWER = 1  # pictures, in large frames and of what is hard
 SPEEDS = (5.0, 10.0, 20.0, 30.0)  # pixels per frame
+EASY = ("pan", "hand", "turn", "object")
 HARD = {"crossing": SPEEDS, "rotation": (5.0, 10.0, 15.0, 20.0), "zoom": (2.0, 5.0, 10.0, 15.0)}
 UNITS = {"rotation": "°", "zoom": " %"}
 DENSE, STEP_PX = 32, 0.6  # of the dense video: times the frame rate, and what moves in a step
@@ -69,13 +70,12 @@ def scenes(preset: str) -> Iterator[Scene]:
         yield from itertools.product(("pan", "hand"), ("camera",), (10.0,), (SMALL,))
         return
     there = [name for name in PICTURES if name in pictures()]
-    for motion, size, speed, picture in itertools.product(
-            ("pan", "hand", "turn", "object"), (SMALL, LARGE), SPEEDS, there):
-        if size == SMALL or picture in there[:FEWER]:
-            yield motion, picture, speed, size
-    for motion, speeds in HARD.items():
-        for speed, picture in itertools.product(speeds, there[:FEWER]):
+    for motion, speeds in {**dict.fromkeys(EASY, SPEEDS), **HARD}.items():
+        some = there if motion in EASY else there[:FEWER]
+        for speed, picture in itertools.product(speeds, some):
             yield motion, picture, speed, SMALL
+    for motion, speed, picture in itertools.product(EASY, SPEEDS, there[:FEWER]):
+        yield motion, picture, speed, LARGE
 
 
 def measured(scene: Scene, frames: int, seed: int) -> dict[str, Any]:
