@@ -179,6 +179,23 @@ def test_constant_velocity_changes_brightness_at_a_constant_rate() -> None:
     assert changes.std() < 0.05 * changes.mean()
 
 
+@pytest.mark.parametrize("speed", [5, 10, 20, 30])
+def test_light_changes_as_much_as_in_the_dense_truth(speed: int) -> None:
+    """What events count: the way of log intensity at each pixel. A fade leaves most of it out."""
+    noise = np.random.default_rng(0).uniform(0, 255, (96, 260)).astype(np.float32)
+    texture = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    film = [texture[:, x:x + 160] for x in range(3 * speed + 1)]
+    given = film[::speed]
+    made = [f for f, _ in upsample(zip(given, range(0, 4_000, 1_000), strict=True))]
+
+    def way(film: list[np.ndarray]) -> float:
+        seen = np.log(np.stack(film)[:, 12:-12, 36:-36])
+        return float(np.abs(np.diff(seen, axis=0)).sum())
+
+    assert 0.9 < way(made) / way(film) < 1.07
+    assert way(given) / way(film) < 0.8
+
+
 @pytest.mark.parametrize("dx", [20, -30])
 def test_fast_pans_of_fine_textures_are_followed(dx: int) -> None:
     noise = np.random.default_rng(0).uniform(0, 255, (120, 260)).astype(np.float32)
