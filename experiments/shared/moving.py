@@ -224,8 +224,8 @@ WAYS = {"fade": faded, "bilinear": bilinear}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Seen:
-    """What `scores` asks of events. counts (H, W); rate by phase over its mean, after the first
-    frame; waves: amplitudes at the frame rate and its double."""
+    """What `scores` asks of events. counts (2, H, W) by polarity; rate by phase over its mean, from
+    the second frame on; waves: amplitudes at the frame rate and its double."""
 
     number: int
     counts: np.ndarray
@@ -250,4 +250,4 @@ def scores(made: Seen, truth: Seen, swept: np.ndarray | None = None) -> dict[str
              "most": float(ratio.max()), "at_rate": float(comb[0]), "at_double": float(comb[1]),
              "r": float(np.corrcoef(made.counts.ravel(), truth.counts.ravel())[0, 1])}
     return found if swept is None else {
-        **found, "swept": float(made.counts[swept].sum() / truth.counts[swept].sum())}
+        **found, "swept": float(made.counts[:, swept].sum() / truth.counts[:, swept].sum())}
