@@ -32,10 +32,10 @@ def upsample(
     """Yield (frame, time) with at most ~max_motion_px of motion between neighbours.
 
     pairs: (frame (H, W) in DN 0..255, time in us). Yields float32 frames; the given ones come
-    out unchanged, those between lie evenly in time. What lies between two comes after the frame
-    that follows them was read. `warn` is told, at the end, where motion needs more than MAX_STEPS
-    steps, where optical flow fails and where the scene is cut. Raises EV002 (frames too small or of
-    changing size), EV020.
+    out unchanged, those between lie evenly in time. What lies between two comes after the two
+    frames that follow them were read. `warn` is told, at the end, where motion needs more than
+    MAX_STEPS steps, where optical flow fails and where the scene is cut. Raises EV002 (frames too
+    small or of changing size), EV020.
     """
     if not max_motion_px > 0:
         raise EvflowDataError("EV020", f"max_motion_px={max_motion_px}.", "It must be > 0.")

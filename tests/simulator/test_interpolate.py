@@ -110,17 +110,17 @@ def test_tells_at_the_end_where_motion_is_too_fast() -> None:
     assert len(told) == 1
 
 
-def test_one_frame_is_read_ahead() -> None:
-    """A video is a stream: what lies between two frames needs the one after them, and no other."""
+def test_two_frames_are_read_ahead() -> None:
+    """A video is a stream: what lies between two frames needs the two after them, and no other."""
     asked: list[int] = []
 
     def video() -> Iterator[tuple[np.ndarray, int]]:
-        for i in range(5):
+        for i in range(6):
             asked.append(i)
             yield shifted(3.0 * i), 1000 * i
 
     for _, t in upsample(video()):
-        assert asked[-1] == min(4, t // 1000 + 2)
+        assert asked[-1] == min(5, t // 1000 + 3)
 
 
 def test_empty_and_single() -> None:
@@ -161,6 +161,24 @@ def test_paths_are_smooth(
     made = at_middle([shifted(x) for x in places], 1, times)[INNER]
     errors = [np.abs(made - shifted(x)[INNER]).mean() for x in (wanted - 0.2, wanted, wanted + 0.2)]
     assert np.argmin(errors) == 1
+
+
+def test_what_swings_keeps_its_speed() -> None:
+    """A hand's swing of five frames: through four frames alone it would be slower at each."""
+    def place(u: float) -> float:
+        return 5.0 * float(np.sin(1.2 * u))
+
+    film = [(shifted(place(k)), 1_000 * k) for k in range(6)]
+    for jerk, most in ((True, 0.1), (False, 1.0)):
+        interval = list(intervals(film, jerk=jerk))[2]
+        speeds = []
+        for begin, end in ((0.001, 0.1), (0.45, 0.55), (0.9, 0.999)):
+            pictures = list(interval.at((begin, end)))
+            way = np.abs(pictures[1] - pictures[0])[INNER].mean()
+            truth = np.abs(shifted(place(2 + end)) - shifted(place(2 + begin)))[INNER].mean()
+            speeds.append(way / truth)
+        assert np.abs(np.array(speeds) - 1).max() < most
+        assert jerk or np.abs(np.array(speeds) - 1).max() > 0.12
 
 
 def test_paths_begin_and_end_at_the_frames() -> None:

@@ -157,7 +157,7 @@ def interpolated(
     times = recording.frame_times[run[0]:run[-1] + 2]
     clean = [denoised(frame, noise_dn) for frame in frames]
     dn, motion = [clean[0]], []
-    for interval in intervals(zip(clean, times.tolist(), strict=True)):
+    for interval in intervals(zip(clean, times.tolist(), strict=True), jerk=False):
         # not sharp: the fusion network was trained on that contrast, another shifts its thresholds
         dn += [*interval.at(np.arange(1, steps) / steps, sharp=False), interval.b.dn]
         motion.append(speed(interval.motion.there))
