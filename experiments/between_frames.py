@@ -40,7 +40,7 @@ from experiments.shared.moving import WAYS, Pairs, Seen, moving, pictures, score
 
 Scene = tuple[str, str, float, tuple[int, int]]  # motion, picture, speed, size
 
-FRAMES = {"debug": 4, "full": 7}
+FRAMES = {"debug": 4, "full": 12}
 SMALL, LARGE = (346, 260), (640, 480)
 PICTURES = ("coffee", "discs")
 FEWER = 1  # pictures, in large frames and of what is hard
