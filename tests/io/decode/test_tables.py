@@ -112,7 +112,7 @@ def test_claims_beyond_the_file(tmp_path: Path, kind: str) -> None:
 
     path = write(tmp_path, kind, 10)
     assert "claims" in str(refused(edited(path, lambda f: claim(f, 10**9, 1000))))
-    assert "claims blocks" in str(refused(edited(path, lambda f: claim(f, 10, 10**8))))
+    assert "a block of" in str(refused(edited(path, lambda f: claim(f, 10, 10**8))))
 
 
 def test_blocks_of_hdf5_are_each_read_once(tmp_path: Path) -> None:
