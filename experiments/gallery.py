@@ -38,9 +38,8 @@ from evflow.report.caption import captioned
 from evflow.report.flow import flow_image
 from evflow.report.movie import Film, write_sheet
 from evflow.report.video import enlarged
-from experiments.quickstart import Options as Scene
-from experiments.quickstart import hidden_camera, simulate_again
 from experiments.shared.common import run_script
+from experiments.shared.hidden_scene import hidden_camera, simulate_again
 
 SPAN_US = 30_000
 COLOURS = 64  # of a picture: files stay small
@@ -64,7 +63,7 @@ class Material:
 
     @cached_property
     def hidden(self) -> tuple[Recording, Camera, Summary]:
-        return hidden_camera(Scene(seed=self.options.seed, width=160, height=120))
+        return hidden_camera(self.options.seed, 160, 120, 300)
 
     @property
     def recording(self) -> Recording:

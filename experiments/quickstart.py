@@ -13,24 +13,17 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from evflow import CameraEstimate, Events, Recording, estimate_camera, read_recording, simulate
-from evflow.camera import Camera, CameraPrior, Summary, sample_nominal, sample_pixels
-from evflow.camera.sensors import SensorModel
+from evflow import CameraEstimate, Events, estimate_camera, read_recording
+from evflow.camera import Summary
 from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.report.page import spread
 from evflow.report.text import LABELS, describe
-from evflow.scenes import SceneConfig, make_bank, render, sample_scene
-from evflow.simulator import simulate_stream
-from evflow.simulator.interpolate import unzip, upsample
 from experiments.shared.common import at_least, run_script, write_result
-
-FPS, FRAME_EVERY = 1000, 25  # rendered frames per second; one in 25 is given to the estimator
+from experiments.shared.hidden_scene import FRAME_EVERY, hidden_camera, simulate_again
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,40 +38,6 @@ class Options:
     height: int = 180
     milliseconds: int = 300
     """Length of the rendered recording."""
-
-
-def hidden_camera(options: Options) -> tuple[Recording, Camera, Summary]:
-    """A recording of a rendered scene by a random camera, frames every 25 ms and 8 bit; the
-    camera's maps; its nominal values (the truth of the table)."""
-    k_bank, k_scene, k_nominal, k_pixels, k_noise = jax.random.split(
-        jax.random.key(options.seed), 5)
-    shape = (options.height, options.width)
-    bank = make_bank(k_bank, 48)
-    config = SceneConfig(speed_px_s=(60.0, 200.0), static_fraction=0.0, contrast=(0.6, 1.0),
-                         gamma=(0.8, 1.2), foreground_probability=1.0)
-    scene = sample_scene(k_scene, bank, config, shape)
-    frame = jax.jit(lambda t: render(scene, t, shape))
-    times = np.arange(options.milliseconds + 1)
-    frames = np.concatenate([np.asarray(frame(jnp.asarray(t / FPS, jnp.float32)))
-                             for t in np.array_split(times, max(1, len(times) // 50))])
-    nominal = sample_nominal(k_nominal, (), CameraPrior(theta=(0.15, 0.4), mismatch=(0.03, 0.06)))
-    truth = sample_pixels(k_pixels, nominal, shape)
-    model = SensorModel(noise_resets_memory=True)
-    events = simulate(k_noise, frames, times * 1000, truth, model=model)
-    kept = slice(None, None, FRAME_EVERY)
-    recording = Recording(events, np.clip(np.rint(frames[kept]), 0, 255).astype(np.uint8),
-                          times[kept] * 1000)
-    return recording, truth, nominal
-
-
-def simulate_again(recording: Recording, found: CameraEstimate, seed: int) -> Events:
-    """The recording's frames, interpolated to <= .5 px of motion, seen by the estimated camera."""
-    pairs = ((recording.frame_dn(i), int(t)) for i, t in enumerate(recording.frame_times)
-             if recording.events.t[0] - 1000 <= t <= recording.events.t[-1] + 1000)
-    frames, times = unzip(upsample(pairs))
-    model = SensorModel(noise_resets_memory=True)
-    key = jax.random.key(seed + 1)
-    return Events.concatenate(list(simulate_stream(key, frames, times, found.camera, model=model)))
 
 
 def rates(events: Events, span_us: tuple[int, int]) -> dict[str, float]:
@@ -104,7 +63,8 @@ def main(options: Options) -> dict[str, Any]:
     plots.require()
     truth = nominal = None
     if options.recording is None:
-        recording, truth, nominal = hidden_camera(options)
+        recording, truth, nominal = hidden_camera(
+            options.seed, options.width, options.height, options.milliseconds)
     else:
         recording = read_recording(options.recording)
     print(recording)

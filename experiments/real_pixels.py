@@ -21,8 +21,8 @@ from evflow import estimate_camera, read_recording
 from evflow.estimation.refine import frame_noise, plan_runs, receptor_sample
 from evflow.estimation.refine.receptor_search import explained, find
 from evflow.recordings.windows import plan_windows
-from evflow.report.plots import new_figure, save_figure
 from evflow.simulator.photoreceptor import IDEAL
+from experiments.shared import pages
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
 from experiments.shared.many import Setup, study
@@ -85,29 +85,6 @@ def halves(path: Path) -> list[str] | None:
         f"{found.seen.offset_dn:.0f} DN", f"{found.seen.cutoff_hz:.0f} Hz"]
 
 
-def draw(rows: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    """Every threshold's |error|, in per cent and over its standard deviation."""
-    figure = new_figure(11.0, 0.3 * len(rows) + 1.5)
-    axes = figure.subplots(1, 2, sharey=True)
-    looks = (("0.6", "pixels taken for ideal"), ("tab:blue", "measured"))
-    for k, (colour, label) in enumerate(looks):
-        for place, found in enumerate(rows.values()):
-            error, std = (np.stack([r[name] for r in found])[:, k].ravel()
-                          for name in ("error", "std"))
-            y = np.full(error.size, place + 0.3 * k - 0.15)
-            axes[0].plot(100 * np.abs(error) + 0.1, y, ".", color=colour, label=label)
-            axes[1].plot(np.abs(error) / std, y, ".", color=colour)
-            label = ""  # once in the legend
-    axes[0].set(xscale="log", xlabel="|error| of θ [%]", yticks=range(len(rows)),
-                yticklabels=list(rows))
-    axes[0].invert_yaxis()
-    axes[0].legend(fontsize=8)
-    axes[1].set(xlim=(0, 8), xlabel="|error| / std (beyond 8: off the scale)")
-    for at in (1.0, 1.96):
-        axes[1].axvline(at, color="0.3", lw=0.8)
-    save_figure(figure, path)
-
-
 def main(options: Options) -> dict[str, Any]:
     begin(options, "real_pixels")
     count = options.count(options.recordings, debug=1, full=40)
@@ -123,7 +100,7 @@ def main(options: Options) -> dict[str, Any]:
     result = {"conditions": {n: [{k: np.asarray(v).tolist() for k, v in r.items()} for r in found]
                              for n, found in rows.items()}, "real": real}
     conclude(options, "real_pixels", result, text)
-    draw(rows, options.out / "real_pixels.png")
+    pages.slow_pixels(options.out / "real_pixels.png", rows)
     return result
 
 

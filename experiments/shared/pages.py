@@ -1,4 +1,4 @@
-"""Pages of the simulator's experiments: noise against its laws, noise sources, sensor models.
+"""Pages of experiments: noise against its laws, noise sources, sensor models, slow pixels.
 
 Each function draws what an experiment has measured and writes one PNG. As in the paper, ON is red
 and OFF is blue here.
@@ -242,3 +242,26 @@ def _bars(axis: Any, figures: dict[str, Any]) -> None:
     axis.grid(axis="x", color="0.85")
     axis.set_axisbelow(True)
     axis.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def slow_pixels(path: str | os.PathLike, rows: dict[str, list[dict[str, Any]]]) -> None:
+    """Every threshold's |error|, in per cent and over its standard deviation."""
+    figure = new_figure(11.0, 0.3 * len(rows) + 1.5)
+    axes = figure.subplots(1, 2, sharey=True)
+    looks = (("0.6", "pixels taken for ideal"), ("tab:blue", "measured"))
+    for k, (colour, label) in enumerate(looks):
+        for place, found in enumerate(rows.values()):
+            error, std = (np.stack([r[name] for r in found])[:, k].ravel()
+                          for name in ("error", "std"))
+            y = np.full(error.size, place + 0.3 * k - 0.15)
+            axes[0].plot(100 * np.abs(error) + 0.1, y, ".", color=colour, label=label)
+            axes[1].plot(np.abs(error) / std, y, ".", color=colour)
+            label = ""  # once in the legend
+    axes[0].set(xscale="log", xlabel="|error| of θ [%]", yticks=range(len(rows)),
+                yticklabels=list(rows))
+    axes[0].invert_yaxis()
+    axes[0].legend(fontsize=8)
+    axes[1].set(xlim=(0, 8), xlabel="|error| / std (beyond 8: off the scale)")
+    for at in (1.0, 1.96):
+        axes[1].axvline(at, color="0.3", lw=0.8)
+    save_figure(figure, path)

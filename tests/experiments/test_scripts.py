@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import experiments
+from evflow.training.config import PRESETS
 from experiments import evaluate, template
 from experiments.shared.cameras import Protocol
 from experiments.shared.common import StudyOptions, markdown
@@ -20,15 +21,16 @@ FOLDER = Path(next(iter(experiments.__path__)))
 SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem != "__init__")
 LINES = 120
 # Whose measure, drawing or fit is their own, and reads best beside its use.
-LONG = {"ablate", "changes", "compare_systems", "coverage", "curves", "evaluate_network", "fuse",
-        "long_recordings",
-        "generate", "integrate", "limits", "models", "noise", "noise_rates", "quickstart",
-        "see_better", "tell_apart", "train_eventgan", "train_network"}
+LONG = {"ablate", "between_frames", "changes", "compare_systems", "coverage", "curves",
+        "evaluate_network", "fuse", "gallery", "generate", "integrate", "limits",
+        "long_recordings", "models", "noise", "noise_rates", "see_better", "tell_apart",
+        "train_eventgan", "train_network"}
 NO_DEBUG = {
     "quickstart": "one small recording, whose size is asked for",
     "evaluate_network": "as long as the recordings it is given",
     "guessed_frames": "as many cameras as are asked for",
     "combine": "computes next to nothing",
+    "gallery": "as many pictures as are asked for",
     "calibrate": "as many steps as are asked for",
     "long_recordings": "as long as is asked for",
     "doubt": "as many recordings as are asked for",
@@ -72,8 +74,10 @@ def test_a_script_has_options_a_main_and_few_lines(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_script_has_a_debug_preset_or_a_reason(name: str) -> None:
-    hints = typing.get_type_hints(importlib.import_module(f"experiments.{name}").Options)
-    assert ("debug" in typing.get_args(hints.get("preset"))) == (name not in NO_DEBUG)
+    script = importlib.import_module(f"experiments.{name}")
+    hint = typing.get_type_hints(script.Options).get("preset")
+    choices = PRESETS if hint is str else typing.get_args(hint)
+    assert ("debug" in choices) == (name not in NO_DEBUG)
 
 
 def test_reasons_are_of_scripts() -> None:
