@@ -60,16 +60,16 @@ class Decoder:
         return typed(source, self.reserved, self.decode)
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
-        rows, t, early = self.timed(table, kind)
+        rows, sent, t, early = self.timed(table, kind)
         self.timeless += len(early)
-        x, y, p = fields(table[rows])
+        x, y, p = fields(sent)
         return Chunk(x, y, t, p, lambda i: byte + 4 * int(rows[i]))
 
     def timed(
         self, table: np.ndarray, kind: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Indices (n,) of the words of events, their times (n,) int64 us, and indices of those
-        that come before the first time."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Indices (n,) of the words of events, these words (n,), their times (n,) int64 us, and
+        indices of those that come before the first time."""
         marks = np.flatnonzero(kind == TIME)
         rows = np.flatnonzero(kind < 2)
         before = self.clock.value
@@ -82,8 +82,9 @@ class Decoder:
         self.triggers += int(np.count_nonzero(kind == TRIGGER))
         early, rows = rows[:lost], rows[lost:]
         t = np.repeat(high << 6, np.diff(edges, prepend=0, append=len(rows)))
-        t += (table[rows] >> 22) & 63
-        return rows, t, early
+        sent = table[rows]
+        t += (sent >> 22) & 63
+        return rows, sent, t, early
 
     def notes(self) -> tuple[Note, ...]:
         return (*self.reserved.notes(), *leftovers(self.timeless, self.triggers))

@@ -57,9 +57,9 @@ class Decoder(evt2.Decoder):
 
     def decode(self, table: np.ndarray, kind: np.ndarray, byte: int) -> Chunk:
         upper, mask = (table >> HALF).astype(np.uint32), table.astype(np.uint32)
-        rows, t, early = self.timed(upper, kind)
+        rows, sent, t, early = self.timed(upper, kind)
         self.timeless += int(np.bitwise_count(mask[early]).sum())
-        x, y, p = evt2.fields(upper[rows])
+        x, y, p = evt2.fields(sent)
         of, place = _bits_set(mask[rows])
         return Chunk(x[of] + place, y[of], t[of], p[of], lambda i: byte + 8 * int(rows[of[i]]))
 
