@@ -199,10 +199,17 @@ def _stored_shape(leaf: Any) -> tuple[int, ...]:
     return tuple((jax.random.key_data(leaf) if keys else leaf).shape)
 
 
+DEEPER = b"[" * 100  # than any configuration is
+
+
 def _read(path: Path) -> dict[str, Any]:
     """A configuration; EV009 where it is damaged."""
     try:
-        saved = json.loads(read_whole(path, FREE))
+        text = read_whole(path, FREE)
+        # Not left to the interpreter's own limit: collected amid it, other objects fail to close.
+        if DEEPER in text:
+            raise ValueError("brackets within brackets without end")
+        saved = json.loads(text)
         if not isinstance(saved, dict):
             raise ValueError("it is no configuration")
     except (OSError, ValueError, RecursionError) as e:

@@ -31,6 +31,7 @@ from experiments import (
     one_polarity,
     quickstart,
 )
+from experiments.shared import hidden_scene
 from experiments.shared.common import slug
 
 
@@ -38,7 +39,7 @@ def test_quickstart_draws_truth_beside_estimate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bank = make_bank(jax.random.key(0), 8, photos=False)
-    monkeypatch.setattr(quickstart, "make_bank", lambda *_: bank)
+    monkeypatch.setattr(hidden_scene, "make_bank", lambda *_: bank)
     options = quickstart.Options(out=tmp_path, width=64, height=48, milliseconds=150)
     result = quickstart.main(options)
     text = capsys.readouterr().out
