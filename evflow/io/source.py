@@ -100,8 +100,9 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
         raise EvflowDataError(
             "EV020", f"{path} is a recording, whose frames have their own times.",
             "Leave out --fps and --timestamps, or pass its images alone.", where=path)
+    # Of the recording only the frames are seen: order among its events stands in nobody's way.
     recording = read_recording(path, time_unit=told.time_unit, partial=told.partial,
-                               start_s=told.start_s, stop_s=told.stop_s,
+                               start_s=told.start_s, stop_s=told.stop_s, late="drop",
                                frames_topic=told.frames_topic, colour=told.colour)
     if not recording.has_frames:
         raise EvflowDataError(
@@ -117,7 +118,8 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
 
     return dataclasses.replace(
         _source(recording.events.size, len(recording.frames), images, told,
-                [*recording.notes, *notes]), recorded=True)
+                [*(n for n in recording.notes if n.code != "events.late"), *notes]),
+        recorded=True)
 
 
 def _responding(told: FrameHints, usual: str, what: str) -> tuple[FrameHints, tuple[Note, ...]]:

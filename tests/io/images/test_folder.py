@@ -276,6 +276,22 @@ def test_the_frames_of_a_recording(tmp_path: Path) -> None:
     assert code_of(lambda: open_frames(tmp_path / "bare.h5")) == "EV011"
 
 
+def test_a_late_event_does_not_stand_between_a_recording_and_its_frames(tmp_path: Path) -> None:
+    frames = drifting(4, SIZE[::-1]).astype(np.uint8)
+    (tmp_path / "images").mkdir()
+    for i, frame in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), frame)
+    times = "".join(f"{0.04 * i:.6f} images/{i}.png\n" for i in range(4))
+    (tmp_path / "images.txt").write_text(times)
+    rows = [f"{t:.6f} {k % SIZE[0]} 0 {k % 2}" for k, t in enumerate(np.linspace(0, 0.12, 200))]
+    rows[100] = "0.010000 0 0 1"
+    (tmp_path / "events.txt").write_text("\n".join(rows) + "\n")
+    seen, at, notes = read(tmp_path)
+    np.testing.assert_array_equal(seen, frames)
+    assert at == [0, 40_000, 80_000, 120_000]
+    assert not any(note.code == "events.late" for note in notes)
+
+
 def test_a_real_folder(data_file: Callable[[str], Path]) -> None:
     root = data_file("data/recordings/ijrr_slider_depth")
     frames, times, notes = read(root / "images", timestamps=root / "images.txt")
