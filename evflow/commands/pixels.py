@@ -73,14 +73,12 @@ class Pixels:
     def model(self) -> SensorModel:
         """The pixels' circuit; EV020 where it has no such part."""
         from evflow.camera.sensors import known_sensor
+        from evflow.simulator.photoreceptor import as_measured
 
-        model = known_sensor(self.sensor).model
-        circuit = self._circuit()[0]
-        if circuit.refractory_s:
-            model = dataclasses.replace(model, refractory_s=circuit.refractory_s)
-        if self.leak_hz is None and self.shot_hz is None and (circuit.leak_hz or circuit.shot_hz):
-            model = dataclasses.replace(model, leak_hz=circuit.leak_hz, shot_hz=circuit.shot_hz,
-                                        eta_is_all=True)
+        model = (as_measured(*self._circuit())[1] if self._is_measured
+                 else known_sensor(self.sensor).model)
+        if self._is_measured and (self.leak_hz, self.shot_hz) != (None, None):
+            model = dataclasses.replace(model, leak_hz=0.0, shot_hz=0.0, eta_is_all=False)
         told: dict[str, Any] = {name: number for name in CIRCUIT
                                 if (number := getattr(self, name)) is not None}
         if model.kind == "v2e":
@@ -117,9 +115,14 @@ class Pixels:
         from evflow.camera.optics import Optics, read_sensor
         from evflow.camera.sensors import SensorModel
 
-        if self.camera is None or self.sensor != "clean":
+        if self.camera is None or not self._is_measured:
             return SensorModel(), Optics()
         return read_sensor(self.camera)
+
+    @property
+    def _is_measured(self) -> bool:
+        """Whether the circuit is that of --camera."""
+        return self.camera is not None and self.sensor == "clean"
 
     def pixels(self, size: tuple[int, int]) -> Camera:
         """The camera asked for; EV015 where its size is not (width, height) of the video."""

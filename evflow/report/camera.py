@@ -61,7 +61,6 @@ from evflow.report.verdict import (
     sentences,
     worst,
 )
-from evflow.simulator.photoreceptor import Photoreceptor
 from evflow.types import Recording
 
 STAGES = 4
@@ -170,9 +169,7 @@ def gather(
         if not (known(found, "on") and known(found, "off")):
             raise EvflowDataError("EV017", "the thresholds are undetermined.")
         runs = usable_runs(recording)
-        trial = resimulate(recording, found.camera, busiest(recording, runs), seed,
-                           Photoreceptor.of(found.sensor, found.optics),
-                           found.sensor.refractory_s)
+        trial = resimulate(recording, found, busiest(recording, runs), seed)
     except EvflowDataError as error:
         why = why_held = error.seen
     step()

@@ -14,8 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.halves import First
 from evflow.estimation.pipeline import estimate_camera
@@ -28,7 +26,7 @@ from evflow.notes import Note
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
-from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, seen_frames
+from evflow.simulator.photoreceptor import IDEAL, as_measured, seen_frames
 from evflow.types import Events, Recording
 
 SECONDS = 3.0  # of recording at most that are simulated
@@ -94,18 +92,15 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
     return found
 
 
-def resimulate(
-    recording: Recording, camera: Camera, run: Run, seed: int, seen_by: Photoreceptor = IDEAL,
-    dead_s: float = 0.0,
-) -> Trial:
-    """Simulate the frames of `run` twice, interpolated by `upsample` and put through what its
-    pixels see them by, and compare. dead_s: the pixels' dead time in seconds."""
+def resimulate(recording: Recording, found: CameraEstimate, run: Run, seed: int) -> Trial:
+    """Simulate the frames of `run` twice, interpolated by `upsample` and seen by the camera as it
+    was measured, and compare."""
     notes: list[Note] = []
-    model = SensorModel(refractory_s=dead_s, noise_resets_memory=True)
+    seen_by, model = as_measured(found.sensor, found.optics)
     pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
              for i in range(run[0], run[1] + 1))
     streams = [
-        simulate_stream(key, *unzip(shown), camera, model=model) for key, shown in zip(
+        simulate_stream(key, *unzip(shown), found.camera, model=model) for key, shown in zip(
             jax.random.split(jax.random.key(seed)),
             itertools.tee(seen_frames(upsample(pairs, warn=notes.append), seen_by)), strict=True)]
     parts = list(zip(*streams, strict=True))  # in step, so that few frames are kept for the other
@@ -139,8 +134,7 @@ def held_out(
     else:
         half, rest = _halved(recording, runs)
         found = estimate_camera(half, params, min_window_us=min_window_us)
-    trial = resimulate(recording, found.camera, busiest(recording, [rest]), seed,
-                       Photoreceptor.of(found.sensor, found.optics), found.sensor.refractory_s)
+    trial = resimulate(recording, found, busiest(recording, [rest]), seed)
     return found, trial, foretold(recording, found, rest)
 
 

@@ -31,7 +31,7 @@ from evflow.report.page import Panel, number, paragraph, table
 from evflow.report.resimulate import LEARNT_SECONDS, Trial, usable_runs
 from evflow.simulator import simulate
 from evflow.simulator.interpolate import upsample
-from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, seen_frames
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, as_measured, seen_frames
 from evflow.types import Events, Recording
 
 Array = np.ndarray
@@ -115,8 +115,7 @@ def which_simulator(
         raise EvflowDataError("EV017", "too little happens to tell simulators apart.",
                               "Record more motion.")
     key, shape = jax.random.key(seed), found.n_events.shape
-    seen_by = Photoreceptor.of(found.sensor, found.optics)
-    own = dataclasses.replace(found.sensor, cutoff_hz=0.0)  # which the frames went through
+    seen_by, own = as_measured(found.sensor, found.optics)
 
     def scaled(scale: Array) -> tuple[Camera, SensorModel]:
         return dataclasses.replace(

@@ -62,6 +62,13 @@ class Photoreceptor:
 IDEAL = Photoreceptor()
 
 
+def as_measured(sensor: SensorModel, optics: Optics) -> tuple[Photoreceptor, SensorModel]:
+    """How a measured camera is simulated: what its frames are put through by `seen_frames`, and the
+    circuit behind it, with its dead time and its noise."""
+    behind = dataclasses.replace(sensor, cutoff_hz=0.0, cutoff_by_light=True)
+    return Photoreceptor.of(sensor, optics), behind
+
+
 def lin_log_dn(dn: ArrayLike) -> Array:
     """v2e's lin-log of DN >= 0, beyond 255 too, without its rounding."""
     dn = jnp.asarray(dn)

@@ -20,7 +20,8 @@ from helpers.networks import hidden
 from PIL import Image
 
 import evflow
-from evflow import CameraEstimate, EvflowDataError, Recording
+from evflow import CameraEstimate, EvflowDataError, Recording, SensorModel
+from evflow.commands.pixels import Pixels
 from evflow.estimation import pipeline
 from evflow.estimation.drift import Third
 from evflow.estimation.extent import Extent
@@ -160,6 +161,37 @@ def test_what_the_estimate_has_made_of_the_first_half_is_shared(
     first = made.first.estimate()
     np.testing.assert_allclose(first.camera.theta_on, alone.camera.theta_on, rtol=1e-3)
     np.testing.assert_allclose(first.std.theta_off, alone.std.theta_off, rtol=1e-3)
+
+
+def test_it_is_simulated_as_the_command_simulates_it(
+    measured: tuple[CameraEstimate, Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With leak and shot noise as parts of eta, and the dead time; the low-pass is in the frames.
+    Noise of the options is added to all of eta."""
+    found, recording = measured
+    sensor = SensorModel(cutoff_hz=40.0, cutoff_by_light=False, refractory_s=2e-3, leak_hz=0.1,
+                         shot_hz=1.5, eta_is_all=True, noise_resets_memory=True)
+    found = dataclasses.replace(found, sensor=sensor)
+    path = found.save(tmp_path / "camera.npz")
+    models = []
+
+    def watched(key: Any, frames: Any, times: Any, camera: Any, *, model: SensorModel) -> Any:
+        models.append(model)
+        return iter([recording.events])
+
+    monkeypatch.setattr(resimulate, "simulate_stream", watched)
+    resimulate.resimulate(recording, found, (0, 2), 0)
+    told = Pixels(camera=path)
+    behind = told.model()
+    assert models == [behind, behind]
+    assert (behind.leak_hz, behind.shot_hz, behind.refractory_s, behind.cutoff_hz) == (
+        0.1, 1.5, 2e-3, 0.0)
+    assert behind.eta_is_all
+    assert told.seen_by(recorded=True).cutoff_hz == pytest.approx(40.0)
+    assert not told.seen_by(recorded=True).by_light
+    added = Pixels(camera=path, shot_hz=2.0).model()
+    assert (added.leak_hz, added.shot_hz, added.eta_is_all) == (0.0, 2.0, False)
+    assert Pixels(camera=path, sensor="v2e").model().leak_hz == 0.01
 
 
 def test_too_short_for_halves_says_so(
