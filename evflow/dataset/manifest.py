@@ -19,6 +19,7 @@ from evflow.dataset.sequence import EventSequence, sequence_names
 from evflow.dataset.store import SUFFIXES, Format
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_text
+from evflow.files.json_text import parse_json
 from evflow.files.limits import FREE, read_whole
 from evflow.files.regular import need_regular
 from evflow.process.provenance import sha256
@@ -215,11 +216,11 @@ def _fault(folder: Path, entry: Record, *, deep: bool) -> str | None:
 def _read(path: Path) -> dict[str, Any]:
     """One manifest; EV009 where it is cut off or is none."""
     try:
-        content = json.loads(read_whole(need_regular(path), FREE))
+        content = parse_json(read_whole(need_regular(path), FREE))
         shapes = {"dataset": dict, "sequences": dict, "made_by": list}
         if not all(isinstance(content[k], kind) for k, kind in shapes.items()):
             raise TypeError("not a manifest")
-    except (ValueError, TypeError, KeyError, RecursionError) as e:
+    except (ValueError, TypeError, KeyError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is cut off or no manifest ({type(e).__name__}: {e}).",
             "--only-missing removes it and makes what no other manifest records.") from e

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import math
 from collections.abc import Mapping
 from pathlib import PurePosixPath
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.files.json_text import parse_json
 
 MOST_HEADER = 1 << 24  # bytes; ours have 25,000
 MOST_SIDE = 1 << 31  # of an array without numbers, whose other sides nothing bounds
@@ -30,10 +30,7 @@ def read_header(data: bytes) -> tuple[dict[str, Any], int]:
     size = int.from_bytes(data[:8], "little")
     if len(data) < 8 or size > min(len(data) - 8, MOST_HEADER):
         raise ValueError(f"its header claims {size:,} of {len(data):,} bytes")
-    try:
-        header = json.loads(data[8 : 8 + size], object_pairs_hook=_once)
-    except RecursionError:
-        raise ValueError("its header is nested too deeply") from None
+    header = parse_json(data[8 : 8 + size], object_pairs_hook=_once)
     if not isinstance(header, dict):
         raise ValueError("its header is no object")
     return header, 8 + size

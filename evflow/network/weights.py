@@ -21,6 +21,7 @@ from safetensors.numpy import save
 from evflow.checks import need
 from evflow.errors import EvflowDataError, naming
 from evflow.files.atomic import atomic_text
+from evflow.files.json_text import parse_json
 from evflow.files.limits import read_whole
 from evflow.network import tensors
 from evflow.process.provenance import sha256
@@ -154,10 +155,10 @@ def _card(data: bytes) -> dict[str, Any]:
     """The model card as it is in the file; EV009."""
     try:
         told = tensors.read_header(data)[0].get(tensors.CARD, {})
-        card = json.loads(told.get("card", "{}"))
+        card = parse_json(told.get("card", "{}"))
         if not isinstance(card, dict):
             raise TypeError(f"it is no object but a {type(card).__name__}")
-    except (ValueError, TypeError, AttributeError, RecursionError) as e:
+    except (ValueError, TypeError, AttributeError) as e:
         raise EvflowDataError("EV009", f"it has no readable model card ({e}).", AGAIN) from e
     return card
 

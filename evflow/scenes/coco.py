@@ -8,7 +8,6 @@ centre of its first pixel is (.5, .5); a pixel belongs to a polygon that holds i
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.files.json_text import parse_json
 from evflow.files.limits import read_whole
 from evflow.io.images.frames import existing
 from evflow.scenes.rle import decode_rle
@@ -88,8 +88,8 @@ def read_coco(path: str | os.PathLike, images: str | os.PathLike | None = None) 
     """
     path = existing(path)
     try:
-        data = json.loads(read_whole(path))
-    except (OSError, ValueError, RecursionError) as e:
+        data = parse_json(read_whole(path))
+    except (OSError, ValueError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is not sound JSON ({e}).", "Cut off? Copy it again.") from e
     missing = [k for k in ("images", "annotations")

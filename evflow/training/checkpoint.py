@@ -19,6 +19,7 @@ import orbax.checkpoint as ocp
 
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import aside, atomic_text
+from evflow.files.json_text import parse_json
 from evflow.files.limits import FREE, read_whole
 from evflow.files.regular import is_there
 from evflow.process import devices
@@ -199,20 +200,13 @@ def _stored_shape(leaf: Any) -> tuple[int, ...]:
     return tuple((jax.random.key_data(leaf) if keys else leaf).shape)
 
 
-DEEPER = b"[" * 100  # than any configuration is
-
-
 def _read(path: Path) -> dict[str, Any]:
     """A configuration; EV009 where it is damaged."""
     try:
-        text = read_whole(path, FREE)
-        # Not left to the interpreter's own limit: collected amid it, other objects fail to close.
-        if DEEPER in text:
-            raise ValueError("brackets within brackets without end")
-        saved = json.loads(text)
+        saved = parse_json(read_whole(path, FREE))
         if not isinstance(saved, dict):
             raise ValueError("it is no configuration")
-    except (OSError, ValueError, RecursionError) as e:
+    except (OSError, ValueError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is damaged ({e}).",
             f"Restore it from a copy, or {ANEW}: without it nobody can tell what the run was."

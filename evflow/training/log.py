@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 
 from evflow.files.atomic import atomic_text
+from evflow.files.json_text import parse_json
 from evflow.files.limits import read_whole
 from evflow.files.regular import is_there
 from evflow.process import devices
@@ -89,6 +90,6 @@ def lines_until(path: Path, step: int) -> Iterator[str]:
     """The lines of a log up to `step`; none where there is no log. A line that a crash cut short
     lies beyond the last checkpoint."""
     for line in read_whole(path).decode(errors="replace").splitlines() if is_there(path) else ():
-        with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
-            if json.loads(line)["step"] <= step:
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            if parse_json(line)["step"] <= step:
                 yield line

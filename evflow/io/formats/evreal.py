@@ -17,6 +17,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.arrays import GrowingArray, mapped
 from evflow.files.folders import atomic_folder
+from evflow.files.json_text import parse_json
 from evflow.files.regular import is_there
 from evflow.files.whole import write_checked
 from evflow.io.decode import tables
@@ -91,9 +92,9 @@ def _told_size(path: Path) -> Size | None:
     if not is_there(file) or file.stat().st_size > 1 << 20:
         return None
     try:
-        height, width = json.loads(file.read_text("utf-8"))["sensor_resolution"][:2]
+        height, width = parse_json(file.read_text("utf-8"))["sensor_resolution"][:2]
         return int(width), int(height)
-    except (ValueError, KeyError, TypeError, RecursionError) as e:
+    except (ValueError, KeyError, TypeError) as e:
         raise EvflowDataError(
             "EV009", f"{file} does not tell sensor_resolution = [height, width] ({e}).",
             "Correct it, or move it away and pass size=(width, height), --size WxH.",
