@@ -36,6 +36,8 @@ class Train(TrainOptions):
 
     Example: evflow train --preset debug --loss.flow 0.1 --model.flow.steps 4 --out runs/try
 
+    Example: evflow train --preset literal --images coco/instances.json --out runs/literal
+
     Example: evflow train --out runs/default --coordinator HOST:PORT --processes 2 --process-id 0
     """
 
@@ -55,8 +57,9 @@ def with_configuration(arguments: Sequence[str]) -> type[Train]:
     hints, own = typing.get_type_hints(TrainConfig), {f.name for f in dataclasses.fields(Train)}
     preset = next(f for f in dataclasses.fields(Train) if f.name == "preset")
     explained = tyro.conf.arg(help="default: all parts; pixels: those that see pixels one by one, "
-                              "on many small scenes; paper: the paper's network and losses; debug: "
-                              "tiny, to see that it runs.")
+                              "on many small scenes; paper: the paper's network and losses; "
+                              "literal: all as it printed them; debug: tiny, to see that it "
+                              "runs.")
     fields: list[tuple[str, Any, Any]] = [
         ("preset", Annotated[Literal[tuple(PRESETS)], explained],  # type: ignore[misc]
          dataclasses.field(default=preset.default))]

@@ -45,11 +45,11 @@ def config_of(params: Params) -> ModelConfig:
             "EV018", f"params have the top-level keys {sorted(params)}.",
             f"Expected exactly one of {sorted(MODELS)}, as load_weights() returns.")
     name, net = next(iter(params.items()))
-    missing = {"encoder", "spread", "flow"} - set(net)
+    base = MODELS[name]
+    missing = {"encoder", "flow", *(("spread",) if base.spread else ())} - set(net)
     if missing:
         raise EvflowDataError("EV018", f"params[{name!r}] has no {', '.join(sorted(missing))}.",
                               "Pass what load_weights() returns, whole.")
-    base = MODELS[name]
     try:
         return _sized(base, net)
     except (KeyError, TypeError, AttributeError, IndexError) as e:
@@ -138,13 +138,14 @@ def init(key: Array, config: ModelConfig, name: str = "default") -> Params:
     voxels, dlogI = jnp.zeros((*shape, 2 * config.bins)), jnp.zeros(shape)
     context, y = jnp.zeros((*shape, 3)), jnp.zeros((*shape, 6))
     features = encoder_features(config, voxels, dlogI, context, y)
-    seen = pooling.pixel_features(voxels, dlogI, context)
-    wide = jnp.zeros((*shape, seen.shape[-1] + config.flow.condition))
     net = {
         "encoder": IntensityEncoder(config, _outputs(config)).init(k_encoder, features)["params"],
-        "spread": SpreadNet(config.flow.hidden).init(k_spread, wide)["params"],
         "flow": flow.init(k_flow, config.flow),
     }
+    if config.spread:
+        seen = pooling.pixel_features(voxels, dlogI, context)
+        wide = jnp.zeros((*shape, seen.shape[-1] + config.flow.condition))
+        net["spread"] = SpreadNet(config.flow.hidden).init(k_spread, wide)["params"]
     if config.pool:
         net["summary"] = pooling.init(k_summary, config)
     return {name: net}

@@ -37,6 +37,11 @@ class ModelConfig:
     code: Literal["changes", "feature"] = "changes"
     output: Literal["log", "tanh"] = "log"
 
+    @property
+    def spread(self) -> bool:
+        """Whether a part of the network tells how far off a pixel's parameters may be."""
+        return self.code == "changes"
+
 
 PAPER_MODEL = ModelConfig(
     flow=FlowConfig(condition=96, injector=False, asinh=False), piece=6, pool=False,

@@ -26,7 +26,8 @@ def estimate(
     config: ModelConfig, net: Params, voxels: Array, dlogI: Array, context: Array, y6: Array
 ) -> tuple[Array, Array]:
     """y and its std (..., H, W, 4) of voxels (..., H, W, 32), dlogI (..., H, W), the camera's
-    y6 (..., 6), context (..., H, W, 3) or, where it is the same everywhere, (..., 1, 1, 3)."""
+    y6 (..., 6), context (..., H, W, 3) or, where it is the same everywhere, (..., 1, 1, 3). The std
+    is NaN where the network has no part that tells it."""
     inputs, pixels = (net, voxels, dlogI, context, y6), math.prod(dlogI.shape[-2:])
     shares = chunks.executions(pixels, inputs)
     results = chunks.at_once([
@@ -93,5 +94,7 @@ def _chunk(
         full = jnp.concatenate([u.T, ys, contexts], 1)
         u = u if same else jnp.concatenate([u, contexts.T])
     residual, _ = flow.forward_columns(folded["flow"], voxels.T, u, config.flow)
-    std = architecture.spread(folded, voxels, dlogI, contexts, full)
-    return residual.T + architecture.centre(config, ys), std
+    y = residual.T + architecture.centre(config, ys)
+    if not config.spread:
+        return y, jnp.full_like(y, jnp.nan)
+    return y, architecture.spread(folded, voxels, dlogI, contexts, full)

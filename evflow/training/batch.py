@@ -22,6 +22,8 @@ from evflow.training.config import NuisanceConfig, TrainConfig
 
 Array = jax.Array
 
+FIXED = 11  # folded into the seed's key: that of the sequences which a run sees again and again
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -45,11 +47,18 @@ class Batch:
 
 def sample_batch(key: Array, bank: TextureBank, config: TrainConfig) -> Batch:
     """Render `scenes` scenes, see each with `cameras` cameras; B = scenes x cameras, the cameras
-    of one scene side by side. Under a mesh every device makes its own scenes."""
+    of one scene side by side. Under a mesh every device makes its own scenes. Of a fixed number of
+    sequences the key chooses."""
+    numbers = jnp.arange(config.scenes)
+    if config.sequences:
+        there = config.sequences // config.cameras
+        numbers = jax.random.permutation(key, there)[:config.scenes]
+        key = jax.random.fold_in(jax.random.key(config.seed), FIXED)
+
     def make(common: tuple[Array, TextureBank], numbers: Array) -> Batch:
         return _sample_scenes(*common, numbers, config)
 
-    return by_shard(make)((key, bank), jnp.arange(config.scenes))
+    return by_shard(make)((key, bank), numbers)
 
 
 def _sample_scenes(key: Array, bank: TextureBank, numbers: Array, config: TrainConfig) -> Batch:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from evflow.training.config import LossConfig
+
 Array = jax.Array
 
 EPSILON = 1e-3  # of the Charbonnier losses (Eq. 7)
@@ -56,29 +58,39 @@ def inverse_flow_loss(log_det: Array) -> Array:
     return -log_det
 
 
-def edge_weight(dL: Array, size: int, edge: float) -> Array:
+def edge_weight(strength: Array, size: int, edge: float) -> Array:
     """1 - gamma of Eq. 9 for patches of side `size`: how much a patch is moving edge, in 0..1.
 
-    dL: total log-intensity change (..., h, w). A patch counts fully where the root mean square
-    change reaches `edge` log units; where nothing changes, its events are noise.
+    strength: of edges, (..., h, w): the total log-intensity change, or `gradient` of the image. A
+    patch counts fully where its root mean square reaches `edge`; elsewhere its events are noise.
     """
-    strength = jnp.sqrt(_patches(dL[..., None] ** 2, size).mean((-3, -2, -1)) + 1e-12)
+    strength = jnp.sqrt(_patches(strength[..., None] ** 2, size).mean((-3, -2, -1)) + 1e-12)
     return jnp.clip(strength / edge, 0.0, 1.0)
 
 
-def event_loss(generated: Array, voxels: Array, dL: Array, sizes: tuple[int, ...],
-               edge: float) -> Array:
+def gradient(image: Array) -> Array:
+    """How steep an image (..., h, w) is, per pixel, by central differences: (..., h, w)."""
+    down, right = jnp.gradient(image, axis=(-2, -1))
+    return jnp.sqrt(down**2 + right**2 + 1e-12)
+
+
+def event_loss(generated: Array, voxels: Array, strength: Array, config: LossConfig) -> Array:
     """L_E (Eq. 9), (..., h, w, 2B) -> (...), averaged over patches and summed over scales.
 
-    generated: asinh of the generated voxels; voxels: the true ones. Where edges move, they
-    themselves are compared (Charbonnier on asinh: counts span three decades); elsewhere only
-    the events per patch and polarity, against a variance of as many events as were made.
+    generated: asinh of the generated voxels; voxels: the true ones; strength: of edges, (..., h,
+    w). Where edges move, they themselves are compared (Charbonnier, on asinh as counts span three
+    decades, or on ELU); elsewhere only the events per patch and polarity, against a variance of as
+    many events as were made.
     """
-    error = charbonnier(generated - jnp.arcsinh(voxels))
     events = linear(generated)
+    if config.elu:
+        events = jax.nn.elu(events)
+        error = charbonnier(events - voxels)
+    else:
+        error = charbonnier(generated - jnp.arcsinh(voxels))
     total = jnp.zeros(voxels.shape[:-3])
-    for size in sizes:
-        moving = edge_weight(dL, size, edge)
+    for size in config.patches:
+        moving = edge_weight(strength, size, config.edge)
         values = _patches(error, size).mean((-3, -2, -1))
         made = _counts(events, size)
         noise = dispersion(made, _counts(voxels, size), jax.nn.relu(made) + 1.0).mean(-1) / size**2

@@ -170,7 +170,7 @@ def _flow_losses(
         "event": (share * _event_loss(generated, block, config.loss)).mean(),
         "inverse_flow": losses.inverse_flow_loss(inverse_det).mean(),
     }
-    if c.code == "changes":
+    if c.spread:
         spread = architecture.spread(net, block.voxels, block.dlogI, block.context, u)
         nll = losses.gaussian_nll(jax.lax.stop_gradient(y) - block.y, spread).mean((1, 2, 3))
         parts["spread"] = jnp.where(even[:, 0], 0.0, 2.0 * nll).mean()
@@ -181,8 +181,10 @@ def _event_loss(generated: Array, block: Block, config: LossConfig) -> Array:
     """L_E of each block, (B,)."""
     if config.events == "rate":
         return losses.rate_loss(generated, block.voxels, _expected(block), config.patches)
-    return losses.event_loss(generated, block.voxels, block.changes.sum(-1), config.patches,
-                             config.edge)
+    # Mean log intensity of the two frames, about the middle.
+    strength = (block.changes.sum(-1) if config.edges == "change"
+                else losses.gradient(block.context[..., 1]))
+    return losses.event_loss(generated, block.voxels, strength, config)
 
 
 def _expected(block: Block) -> Array:
@@ -208,7 +210,7 @@ def _parameter_loss(y: Array, block: Block, config: TrainConfig) -> Array:
 
 def total_loss(parts: Metrics, weights: LossConfig) -> Array:
     """L_forward + L_inverse (Eq. 11). L_I enters both directions in the paper; once here, with
-    its weight. Adaptive scaling keeps each part within 0..10."""
+    its weight, 2 where it counts in both. Adaptive scaling keeps each part within 0..10."""
     total = jnp.zeros(())
     for name, part in parts.items():
         scale = losses.adaptive_weight(part) if weights.adaptive else 1.0

@@ -34,7 +34,8 @@ class TrainOptions(RunOptions):
 
     preset: str = "default"
     """default: all parts; pixels: those that see pixels one by one, on many small scenes; paper:
-    the paper's network and losses; debug: tiny, to see that it runs. Others: `PRESETS` of
+    the paper's network and losses; literal: all as it printed them; debug: tiny, to see that it
+    runs. Others: `PRESETS` of
     evflow.training.config."""
     steps: int | None = None
     """Number of steps (default: the preset's)."""

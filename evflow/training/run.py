@@ -14,7 +14,7 @@ from evflow.network.config import MODELS, ModelConfig
 from evflow.network.weights import load_weights, save_weights
 from evflow.process import devices
 from evflow.process.provenance import provenance
-from evflow.scenes import make_bank
+from evflow.scenes import TextureBank, coco_bank, folder_bank, make_bank
 from evflow.training.config import TrainConfig, as_dict, preset
 from evflow.training.log import Metrics
 from evflow.training.loop import Advance, train
@@ -31,8 +31,7 @@ def train_network(options: TrainOptions) -> Metrics:
 
     def begin() -> tuple[Advance[TrainState], TrainState]:
         tx = optimiser(config)
-        bank = make_bank(jax.random.fold_in(jax.random.key(config.seed), 7), config.textures,
-                         photos=not small)
+        bank = bank_of(config, photos=not small)
         state = init_state(config, tx, bank, network_name(config.model))
         if options.start is not None:
             state = started_from(state, options.start)
@@ -50,6 +49,15 @@ def train_network(options: TrainOptions) -> Metrics:
         save_weights(options.out / "weights.safetensors", ended.state.average, card, overwrite=True)
     devices.agree(True)  # leave together: a process that ends alone is a dead one to the others
     return ended.figures
+
+
+def bank_of(config: TrainConfig, photos: bool) -> TextureBank:
+    """What the scenes are made of: one's own images, or textures, and photographs if wanted."""
+    key = jax.random.fold_in(jax.random.key(config.seed), 7)
+    if config.images is None:
+        return make_bank(key, config.textures, photos=photos)
+    own = coco_bank if config.images.endswith(".json") else folder_bank
+    return own(key, config.images)
 
 
 def _headline(figures: Metrics) -> str:

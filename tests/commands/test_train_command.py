@@ -18,6 +18,7 @@ from evflow.cli import main
 from evflow.commands.bench import forwarded
 from evflow.commands.train import with_configuration
 from evflow.errors import EvflowDataError
+from evflow.training import run as runs
 from evflow.training.config import PRESETS, TrainConfig
 from evflow.training.run import configuration
 
@@ -108,9 +109,9 @@ def test_they_run_from_any_folder(installed: Path, tmp_path: Path) -> None:
     assert all(json.loads(line) for line in (tmp_path / "times.jsonl").read_text().splitlines())
 
 
-def parsed(*words: str) -> TrainConfig:
+def parsed(*words: str, preset: str = "debug") -> TrainConfig:
     """The configuration of a command line."""
-    arguments = ["train", "--preset", "debug", "--out", "run", *words]
+    arguments = ["train", "--preset", preset, "--out", "run", *words]
     return configuration(tyro.cli(with_configuration(arguments), args=arguments[1:]), 1)
 
 
@@ -123,6 +124,25 @@ def test_every_number_of_the_configuration_is_an_option() -> None:
         base, loss=dataclasses.replace(base.loss, flow=0.1, adaptive=False), steps=3, block=(8, 8),
         model=dataclasses.replace(base.model, flow=dataclasses.replace(base.model.flow, steps=1)),
         prior=dataclasses.replace(base.prior, theta=(0.1, 0.4)), seed=4)
+
+
+def test_scenes_are_made_of_ones_own_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in ("coco", "folder"):
+        monkeypatch.setattr(runs, f"{kind}_bank", lambda _, path, kind=kind: (kind, path))
+    for given, kind in (("instances.json", "coco"), ("pictures", "folder")):
+        assert runs.bank_of(parsed("--images", given), photos=False) == (kind, given)
+    monkeypatch.undo()
+    with pytest.raises(EvflowDataError, match="EV016"):
+        runs.bank_of(parsed("--images", "nowhere/pictures"), photos=False)
+
+
+def test_each_change_of_the_paper_is_an_option() -> None:
+    """What makes the literal preset of ours can be said on a command line."""
+    words = ("--block 64 64 --scenes 10 --cameras 1 --windows 8 --sequences 300 --steps 9000 "
+             "--warmup 300 --clip inf --ema 0 --loss.condition 2 --loss.inverse-flow 1 "
+             "--loss.dequantise 0 --loss.patches 8 16 32 --loss.edges gradient --loss.elu "
+             "--learning-rate 1e-4 --flow-rate 1e-4")
+    assert parsed(*words.split(), preset="paper") == PRESETS["literal"]
 
 
 @pytest.mark.parametrize(("words", "said"), [

@@ -13,6 +13,7 @@ from helpers.networks import small_config
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.scenes import SceneConfig, TextureBank, make_bank
+from evflow.training import batch as batches
 from evflow.training.batch import Batch
 from evflow.training.batch import sample_batch as sample_batch_eagerly
 from evflow.training.config import PRESETS, NuisanceConfig
@@ -29,6 +30,22 @@ def bank() -> TextureBank:
 def batch(bank: TextureBank) -> Batch:
     config = small_config(scene=SceneConfig(speed_px_s=(100.0, 300.0), static_fraction=0.0))
     return sample_batch(jax.random.key(1), bank, config=config)
+
+
+def test_fixed_sequences_are_the_same_in_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene depends on its key and number alone: these repeat, and each step takes some."""
+    monkeypatch.setattr(batches, "_sample_scenes", lambda key, bank, numbers, _: (key, numbers))
+    config = small_config(sequences=12)
+    drawn = [batches.sample_batch(jax.random.key(i), None, config) for i in range(20)]
+    assert len({tuple(jax.random.key_data(key).tolist()) for key, _ in drawn}) == 1
+    taken = [tuple(numbers.tolist()) for _, numbers in drawn]
+    assert all(len(set(numbers)) == config.scenes for numbers in taken)
+    assert {n for numbers in taken for n in numbers} == set(range(6))  # of two cameras each
+    other = batches.sample_batch(jax.random.key(0), None, small_config(sequences=12, seed=1))
+    assert jax.random.key_data(other[0]).tolist() != jax.random.key_data(drawn[0][0]).tolist()
+    new = [batches.sample_batch(jax.random.key(i), None, small_config()) for i in range(2)]
+    assert [numbers.tolist() for _, numbers in new] == [[0, 1]] * 2
+    assert jax.random.key_data(new[0][0]).tolist() != jax.random.key_data(new[1][0]).tolist()
 
 
 def test_shapes(batch: Batch) -> None:

@@ -45,18 +45,45 @@ def test_event_loss_sees_edges_and_noise() -> None:
     voxels = jnp.abs(jax.random.normal(jax.random.key(0), (8, 8, 32)))
     exact = jnp.arcsinh(voxels)
     moving, still = jnp.full((8, 8), 0.5), jnp.zeros((8, 8))
+    config, small = LossConfig(patches=(4, 8), edge=0.1), LossConfig(patches=(4,), edge=0.1)
     for dL in (moving, still):
-        assert float(losses.event_loss(exact, voxels, dL, (4, 8), 0.1)) < 3e-3
-        assert float(losses.event_loss(exact + 0.5, voxels, dL, (4, 8), 0.1)) > 0.02
+        assert float(losses.event_loss(exact, voxels, dL, config)) < 3e-3
+        assert float(losses.event_loss(exact + 0.5, voxels, dL, config)) > 0.02
     # In a still patch only the number of events counts: shuffled in time costs nothing.
     shuffled = jnp.arcsinh(jnp.concatenate([voxels[..., 15::-1], voxels[..., :15:-1]], -1))
-    assert float(losses.event_loss(shuffled, voxels, still, (4,), 0.1)) < 1e-5
-    assert float(losses.event_loss(shuffled, voxels, moving, (4,), 0.1)) > 0.1
+    assert float(losses.event_loss(shuffled, voxels, still, small)) < 1e-5
+    assert float(losses.event_loss(shuffled, voxels, moving, small)) > 0.1
+
+
+def test_elu_lets_counts_below_none_cost_little() -> None:
+    """sigma_3 of Eq. 9: above 0 the counts themselves are compared, below no more than -1."""
+    voxels, moving = jnp.full((4, 4, 32), 3.0), jnp.full((4, 4), 0.5)
+
+    def loss(made: float, true: jax.Array = voxels) -> float:
+        generated = jnp.arcsinh(jnp.full(true.shape, made))
+        return float(losses.event_loss(
+            generated, true, moving, LossConfig(patches=(4,), edge=0.1, elu=True)))
+
+    assert loss(3.0) == pytest.approx(1e-3, rel=1e-3)
+    assert loss(5.0) == pytest.approx(2.0, rel=1e-3)
+    assert loss(-50.0, 0.0 * voxels) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_gradient_of_the_image_is_an_edge() -> None:
+    ramp = jnp.broadcast_to(0.2 * jnp.arange(8.0), (8, 8))
+    image = jnp.concatenate([ramp, jnp.full((8, 8), 1.4)], 1)
+    steep = losses.gradient(image)
+    assert steep.shape == image.shape
+    assert float(steep[4, 3]) == pytest.approx(0.2, rel=1e-4)
+    weight = losses.edge_weight(steep, 4, 0.2)
+    assert weight.shape == (8,)
+    np.testing.assert_allclose(weight[jnp.array([0, 3])], [1.0, 0.0], atol=1e-4)
 
 
 def test_event_loss_survives_wild_flows() -> None:
     voxels = jnp.zeros((4, 4, 32))
-    grad = jax.grad(lambda g: losses.event_loss(g, voxels, voxels[..., 0], (4,), 0.1))
+    grad = jax.grad(lambda g: losses.event_loss(
+        g, voxels, voxels[..., 0], LossConfig(patches=(4,))))
     assert np.isfinite(grad(jnp.full((4, 4, 32), 200.0))).all()
 
 

@@ -156,11 +156,13 @@ def test_missing_checkpoint_is_named(tmp_path: Path, fresh: TrainState) -> None:
 
 
 @pytest.mark.slow
-def test_the_paper_preset_steps(bank: TextureBank) -> None:
+@pytest.mark.parametrize("name", ["paper", "literal"])
+def test_the_paper_preset_steps(bank: TextureBank, name: str) -> None:
     """64 steps per level set, tanh output, condition from the events: one finite update."""
+    known = configs.preset(name)
     paper = dataclasses.replace(
-        configs.preset("paper"), crop=16, scenes=2, cameras=1, block=(8, 8), warmup=1, steps=3,
-        sensors=configs.preset("paper").sensors)
+        known, crop=16, scenes=2, cameras=1, block=(8, 8), warmup=1, steps=3, windows=1,
+        sequences=min(4, known.sequences), loss=dataclasses.replace(known.loss, patches=(4, 8)))
     tx = optimiser(paper)
     state = init_state(paper, tx, bank, "paper")
     state, metrics = jax.jit(make_run_step(paper, tx))(state, bank)
@@ -176,7 +178,7 @@ def test_unknown_preset() -> None:
 @pytest.mark.parametrize("change", [
     {"parts": ("summary", "foo")}, {"parts": ()}, {"steps": -5}, {"cameras": 0}, {"cameras": 5},
     {"sensors": configs.TrainConfig.sensors[:3]}, {"sensors": ()}, {"steps_per_window": 10},
-    {"block": (4, 16)}, {"block": (8, 80)}],
+    {"block": (4, 16)}, {"block": (8, 80)}, {"sequences": 15}, {"sequences": 300}],
     ids=str)
 def test_impossible_configurations_are_refused(change: dict[str, Any]) -> None:
     name, = change
