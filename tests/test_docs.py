@@ -40,12 +40,12 @@ from experiments import (
     evaluate,
     gallery,
     integrate,
-    limits,
     make_dataset,
     see_better,
     train,
     train_eventgan,
     train_network,
+    true_video,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -223,7 +223,7 @@ def test_the_readmes_python_runs_from_a_fresh_checkout(
 def test_options_exist(document: Path) -> None:
     known = {"--help", "--xla_force_host_platform_device_count"}  # the second is XLA's
     commands = [typing.get_args(c)[0] for c in typing.get_args(offered())]
-    scripts = (coverage, curves, evaluate, integrate, limits, make_dataset, see_better, train,
+    scripts = (coverage, curves, evaluate, integrate, true_video, make_dataset, see_better, train,
                train_eventgan, train_network)
     for options in (*commands, *(script.Options for script in scripts)):
         for field in dataclasses.fields(options):

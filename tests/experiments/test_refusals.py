@@ -26,12 +26,12 @@ from experiments import (
     fuse,
     generate,
     integrate,
-    limits,
     noise_rates,
     one_polarity,
     quickstart,
     see_better,
     tell_apart,
+    true_video,
 )
 from experiments.shared.common import begin, estimator, write_result
 from experiments.shared.rows import saved_rows
@@ -42,7 +42,7 @@ FITS: list[Any] = [calibrate, doubt, fuse, tell_apart]
 @pytest.mark.parametrize(("script", "option"), [
     (ablate, "steps"), (changes, "batches"), (compare_systems, "sequences"),
     (coverage, "recordings"), (coverage, "workers"), (curves, "recordings"),
-    (evaluate, "sequences"), (generate, "scenes"), (integrate, "seeds"), (limits, "sequences"),
+    (evaluate, "sequences"), (generate, "scenes"), (integrate, "seeds"), (true_video, "sequences"),
     (noise_rates, "seeds"), (one_polarity, "recordings"), (quickstart, "width"),
     (quickstart, "milliseconds")], ids=lambda x: x if isinstance(x, str) else x.__name__)
 @pytest.mark.parametrize("count", [0, -1])

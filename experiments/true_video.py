@@ -1,14 +1,14 @@
-"""What the recordings allow: the best known estimates when the video between the frames is known.
+"""What the frames cost: the estimate beside the same method with the true video between them.
 
-    python -m experiments.limits --preset full
+    python -m experiments.true_video --preset full
 
 The recordings of `experiments.evaluate`, refined with the true 1000 frames/s video in place of
-frames 25 ms apart. What then remains for theta is the counts' own noise; no method that sees the
-frames alone can do better. The limit of a pixel's theta is its regression on the true video; that
-of eta, that every noise event is known as such (Poisson, all pixels and all of the time); beside
-it, what telling noise from signal gives with the true video and those thresholds. Every
-figure is printed beside that of `estimate_camera` and as their ratio, by number of signal events
-and by speed.
+frames 25 ms apart: what remains for theta is the counts' own noise. It is no bound: it starts from
+the camera alone, and `estimate_camera` goes on to regress each pixel. Of a pixel's theta: its
+regression on the true video; of eta: that every noise event is known as such (Poisson, all pixels
+and all of the time), and beside it, what separating noise from signal gives with the true video
+and those thresholds. Every figure is printed beside that of `estimate_camera` and as their ratio,
+by number of signal events and by speed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from experiments.shared.protocols import ENOUGH, protocols
 
 EDGES = {"signal": (200, 1000, 5000, np.inf), "speed": (0, 2, 6, np.inf)}
 NAMES = ("theta_on", "theta_off")
-HEADS = ("protocol", "figure, stratum", "recordings", "ours", "limit", "ratio")
+HEADS = ("protocol", "figure, stratum", "recordings", "ours", "true video", "ratio")
 FAR = 20.0  # times the network's std
 
 
@@ -43,7 +43,7 @@ FAR = 20.0  # times the network's std
 class Options(StudyOptions):
     """Compare the estimate with what a known video allows."""
 
-    out: Path = Path("out/limits")
+    out: Path = Path("out/true_video")
     seed: int = 1_000_003
     """The recordings of `experiments.evaluate`."""
     sequences: int | None = None
@@ -77,14 +77,14 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
         result |= {
             f"signal/{name}": float(signal[i]),
             f"ours/{name}": abs(float(getattr(found.summary, name)) - true),
-            f"limit/{name}": abs(float(getattr(best, name)) - true),
+            f"known/{name}": abs(float(getattr(best, name)) - true),
             f"ours/{name} of pixels that fired": _mean(np.abs(
                 np.asarray(getattr(found.camera, name)) - pixels)[fired]),
-            f"limit/{name} of pixels that fired": _mean(np.abs(maps[i] - pixels)[fired]),
+            f"known/{name} of pixels that fired": _mean(np.abs(maps[i] - pixels)[fired]),
             f"ours/{eta}": abs(float(getattr(found.summary, eta)) - noise),
-            f"limit/{eta}": float(np.sqrt(2 / np.pi * noise / exposure)),
+            f"known/{eta}": float(np.sqrt(2 / np.pi * noise / exposure)),
             f"ours/{eta} beside the known video": abs(float(getattr(found.summary, eta)) - noise),
-            f"limit/{eta} beside the known video": abs(float(told[i]) - noise)}
+            f"known/{eta} beside the known video": abs(float(told[i]) - noise)}
     return result
 
 
@@ -93,14 +93,14 @@ def _mean(values: Any) -> float:
 
 
 def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Ours, the limit and their ratio, per figure; all recordings with enough events, then by
-    stratum."""
+    """Ours, with the true video and their ratio, per figure; all recordings with enough events,
+    then by stratum."""
     found: dict[str, dict[str, float]] = {}
     for figure in [k.split("/")[1] for k in rows[0] if k.startswith("ours/")]:
         polarity = "off" if "off" in figure else "on"
         signal = np.array([r[f"signal/theta_{polarity}"] for r in rows])
         speed = np.array([r["speed"] for r in rows])
-        ours, limit = (np.array([r[f"{k}/{figure}"] for r in rows]) for k in ("ours", "limit"))
+        ours, known = (np.array([r[f"{k}/{figure}"] for r in rows]) for k in ("ours", "known"))
         choices = {"all": signal >= ENOUGH}
         for name, value in (("signal", signal), ("speed", speed)):
             for low, high in itertools.pairwise(EDGES[name]):
@@ -108,22 +108,22 @@ def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
                     (signal >= ENOUGH) & (value >= low) & (value < high))
         for label, used in choices.items():
             if used.any():
-                a, b = float(np.nanmean(ours[used])), float(np.nanmean(limit[used]))
+                a, b = float(np.nanmean(ours[used])), float(np.nanmean(known[used]))
                 found[f"{figure}, {label}"] = {
-                    "recordings": int(used.sum()), "ours": a, "limit": b, "ratio": a / b}
+                    "recordings": int(used.sum()), "ours": a, "known": b, "ratio": a / b}
     return found
 
 
 def main(options: Options) -> dict[str, Any]:
-    begin(options, "limits")
+    begin(options, "true_video")
     sequences = options.count(options.sequences, debug=4, full=100)
     setup = Setup(options.weights, options.seed)
     result: dict[str, Any] = {}
     for name, protocol in protocols().items():
         result[name] = strata(study(
             score, setup, [protocol] * sequences, options.workers, name))
-    conclude(options, "limits", result, markdown(HEADS, (
-        (name, k, f"{v['recordings']}", f"{v['ours']:.4f}", f"{v['limit']:.4f}",
+    conclude(options, "true_video", result, markdown(HEADS, (
+        (name, k, f"{v['recordings']}", f"{v['ours']:.4f}", f"{v['known']:.4f}",
          f"{v['ratio']:.2f}") for name, found in result.items() for k, v in found.items())))
     return result
 
