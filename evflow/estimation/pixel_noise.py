@@ -18,8 +18,9 @@ SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate over it
 SPREAD, SPREAD_ERROR = 0.05, 0.6  # expected before any data, and the std of its log
 NEGLIGIBLE = 1e-4  # probability of a spread that is left out
 LEAST_THETA = 0.01  # log units: thresholds are clamped there
-LAW_ODDS = 3.0  # log odds that it takes to let rates follow the thresholds
-SIGNAL = 0.25  # of the events of quiet pixels may be what is left of the signal
+LAW_ODDS = 5.0  # log odds that it takes to let rates follow the thresholds
+LAW_EVENTS = 100  # and events: a pixel's few also lower the threshold that is found for it
+SIGNAL = 0.5  # of the events of quiet pixels may be what is left of the signal
 
 AROUND = 9  # pixels: side of the neighbourhood in which events are company
 CHANCE = 4.0  # standard deviations of the noise around a pixel, that it may have
@@ -31,8 +32,10 @@ def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
     """Rates (2, H, W), ON and OFF, relative to the camera's: 1, or as one over the thresholds
     theta (2, H, W) where quiet (2, 2, H, W) of `quiet_time` makes that the likelier. Signal that
     is left near what moves follows the thresholds too: noise that does not, and a share of SIGNAL,
-    must be the less likely as well."""
+    must be the less likely as well, by LAW_EVENTS or more."""
     watched = quiet[:, 1] * ~hot
+    if (quiet[:, 0] * ~hot).sum() < LAW_EVENTS:
+        return np.ones(theta.shape)
     law = 1.0 / np.maximum(np.asarray(theta, np.float64), LEAST_THETA)
     law *= (watched.sum((1, 2)) / np.maximum((watched * law).sum((1, 2)), 1e-30))[:, None, None]
     even, mixed, following = (sum(
