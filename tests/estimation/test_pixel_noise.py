@@ -136,7 +136,7 @@ def test_signal_left_among_even_noise_does_not_make_it_follow_the_thresholds() -
 
 def test_a_few_events_do_not_follow_the_thresholds_that_they_have_lowered_themselves() -> None:
     """Of a pixel that has sent little else, an event of noise halves the threshold found."""
-    quiet = quiet_counts(np.full((2, *SHAPE), 0.15), 0.05)
+    quiet = quiet_counts(np.full((2, *SHAPE), 0.05), 0.05)
     theta = np.where(quiet[:, 0] > 0, 0.15, 0.3)
     assert 0 < quiet[:, 0].sum() < 100
     np.testing.assert_array_equal(threshold_law(quiet, theta, NONE_HOT), 1.0)
