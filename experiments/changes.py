@@ -15,7 +15,6 @@ log_255 (1 = the whole range of 8 bits), signed and of the magnitude. The paper'
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -36,11 +35,11 @@ from experiments.shared import change_systems as systems
 from experiments.shared.cameras import Protocol, hidden_recording
 from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.images import mean_ci
+from experiments.shared.recordings import held_recordings
 
 Array = jax.Array
 LOG_255 = float(np.log(255.0))
 ACTIVE = 0.02  # log units: least mean absolute change of a window that counts
-HELD = ("ijrr_slider_depth", "newton_cradle_davis346.aedat4")
 FRAME_MS = 32  # of simulated recordings: 16 parts of 2 frames of the 1 kHz video
 MEASURES = ("log", "log_255", "magnitude", "fired")
 TITLES = {"next": "up to the next frame", "middle": "up to the held-out middle of three frames"}
@@ -109,9 +108,7 @@ def recordings(options: Options) -> Iterator[tuple[str, Recording, np.ndarray | 
     """(name, recording, true log video between its frames): the real ones, then simulated ones of
     as many cameras. debug: the first real one."""
     full = options.preset == "full"
-    held = Path(os.environ.get("EVFLOW_DATA", "")) / "data/recordings"
-    there = [held / name for name in HELD if (held / name).exists()]
-    for path in options.recording or there[:None if full else 1]:
+    for path in options.recording or held_recordings()[:None if full else 1]:
         yield path.stem, systems.cut(read_recording(path), options.span_s), None
     if options.recording:
         return

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -37,10 +36,10 @@ from experiments.shared.cameras import Protocol, hidden_recording
 from experiments.shared.change_systems import cut
 from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.images import SCORES, mean_ci, score
+from experiments.shared.recordings import held_recordings
 
 HORIZONS = {"1 frame": 1, "5 frames": 5, "10 frames": 10, "1e5 events": 100_000,
             "5e5 events": 500_000}  # frames, or events from 1000 on
-HELD = ("ijrr_slider_depth", "newton_cradle_davis346.aedat4")
 SIZES = {"DAVIS240": (180, 240), "DAVIS346": (260, 346), "VGA": (480, 640)}
 SCENE = SceneConfig(speed_px_s=(60.0, 300.0), static_fraction=0.0, contrast=(0.6, 1.0))
 PAPER = {  # Table X: RMSE, PSNR, SSIM
@@ -98,9 +97,7 @@ def cases(options: Options) -> Iterator[Case]:
     """Real recordings, then simulated ones of cameras of each size (debug: one, and a small
     one)."""
     full = options.preset == "full"
-    held = Path(os.environ.get("EVFLOW_DATA", "")) / "data/recordings"
-    there = [held / name for name in HELD if (held / name).exists()]
-    for path in options.recording or there[:None if full else 1]:
+    for path in options.recording or held_recordings()[:None if full else 1]:
         recording = cut(read_recording(path), options.span_s)
         kind = {240: "DAVIS240", 346: "DAVIS346"}.get(recording.events.size[0], "")
         yield Case(path.stem, kind, recording)

@@ -38,6 +38,13 @@ NO_DEBUG = {
     "tell_apart": "as many recordings as are asked for"}
 
 
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_is_in_the_document(name: str) -> None:
+    rows = (FOLDER.parent / "docs" / "experiments.md").read_text().split("\n| ")
+    assert any(f"`{name}`" in row.split("|")[0] or f"`{name} " in row.split("|")[0]
+               for row in rows)
+
+
 def tree(name: str) -> ast.Module:
     return ast.parse((FOLDER / f"{name}.py").read_text())
 
