@@ -88,10 +88,13 @@ def draw(trials: dict[str, Trial], path: Path) -> None:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "real_recordings")
-    params, rows, result = load_weights(options.weights), [], {}
+    params = load_weights(options.weights)
+    rows: list[list[str]] = []
+    result: dict[str, Any] = {}
     paths = options.recordings or held_recordings()
     for path in paths[:1] if options.preset == "debug" else paths:
-        recording, trials = read_recording(path), {}
+        recording = read_recording(path)
+        trials: dict[str, Trial] = {}
         result[path.name] = found = {}
         for pixel in PIXELS:
             found[pixel], trials[pixel] = measured(recording, params, pixel, options.seed)
