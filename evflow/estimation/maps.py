@@ -13,8 +13,9 @@ from evflow.camera import PARAMETERS, THETA_MIN, Camera, Summary
 from evflow.estimation.pixel_noise import pixel_rates, threshold_law
 from evflow.estimation.pooled import window_inputs
 from evflow.estimation.refine import Chunk, Found, PixelEvidence, pixel_posterior, refine_summary
-from evflow.network import api, architecture
-from evflow.network.coordinates import SCALE, camera_std, per_channel, squash, unsquash_summary
+from evflow.network import api
+from evflow.network.coordinates import SCALE, per_channel, unsquash_summary
+from evflow.network.posterior import Evidence, evidence, posterior
 from evflow.recordings.glitches import exposed
 from evflow.types import Window
 
@@ -26,27 +27,18 @@ SLOW_ERROR = 0.15  # of the network's thresholds, relative, where pixels are not
 def by_flow(
     params: api.Params, windows: Iterable[Window], summary: Summary, summary_std: Summary
 ) -> tuple[Camera, Camera]:
-    """Product of the windows' posteriors by the flow: each is N(y, s^2) and contains the prior (the
-    summary and the mismatch) once, so the prior's precision is taken off all but one. The
-    summary's own error, which all pixels share, is added to the std at the end."""
-    y6 = unsquash_summary(summary)[None, None]
-    prior, prior_precision = y6[..., :4], architecture.base_std(y6) ** -2.0
-    precision, weighted = jnp.zeros_like(prior), jnp.zeros_like(prior)
+    """The windows' measurements by the flow together, beside the summary and the mismatch; the
+    summary's own error, which all pixels share, is added to the std."""
+    found: Evidence | None = None
     for window in windows:
         voxels, dlogI, given = window_inputs(window)
         y, s = api.estimate_y(params, voxels, dlogI, summary=summary, **given)
-        shown = exposed(window.frame0, window.frame1)
-        told = jnp.maximum(s**-2.0 - prior_precision, 0.0)
-        gained = jnp.where(jnp.asarray(shown)[..., None], told, 0.0)
-        # A posterior mean is shrunk towards the prior; (gained) (x - prior) = s^-2 (y - prior)
-        # is the window's own evidence x before shrinkage.
-        weighted += jnp.where(gained > 0, s**-2.0 * (y - prior), 0.0)
-        precision += gained
-    total = prior_precision + precision
-    y = prior + weighted / total
+        said = evidence(y, s, jnp.asarray(exposed(window.frame0, window.frame1)))
+        found = said if found is None else found + said
+    assert found is not None  # iter_windows raises EV017 rather than yield nothing
+    y6 = unsquash_summary(summary)[None, None]
     relative = [getattr(summary_std, n) / getattr(summary, n) for n in PARAMETERS]
-    shared = jnp.stack(relative, -1)[None, None] / per_channel(SCALE, y6)
-    return squash(y), camera_std(y, jnp.sqrt(1.0 / total + shared**2))
+    return posterior(found, y6, jnp.stack(relative, -1)[None, None] / per_channel(SCALE, y6))
 
 
 def by_regression(

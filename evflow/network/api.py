@@ -54,6 +54,7 @@ from evflow.network.inputs import (
     same_precision,
 )
 from evflow.network.pooling import Stats
+from evflow.network.posterior import of_window
 
 __all__ = [
     "Code", "Params", "Stats", "code_from_video", "encode", "estimate", "estimate_with_std",
@@ -234,9 +235,11 @@ def estimate(
 ) -> Camera:
     """Camera maps from one window of events and the change of intensity over it.
 
-    Jitted; compiles once per shape. One window tells a pixel's thresholds to some .1 (a mean of .08
-    and .11 off in the README's example, where the std of `estimate_with_std` is .04 and .05). Of a
-    whole recording `estimate_camera` knows more: there the camera's median to .006.
+    The flow's answer beside the summary and the mismatch, weighed by what is known of each, so that
+    the map of a camera whose pixels are alike is no worse than its summary. Jitted; compiles once
+    per shape. One window tells a camera's thresholds to some percent and little of its pixels (a
+    mean of .027 and .031 off in the README's example, where the std of `estimate_with_std` is .025
+    and .034). Of a whole recording `estimate_camera` knows more: there the median to .006.
 
     Args:
         params: of `load_weights`.
@@ -249,7 +252,7 @@ def estimate(
             this window.
 
     Returns:
-        The camera, maps (..., H, W).
+        The camera, maps (..., H, W); of the paper's network, which has no summary, the flow's own.
 
     Raises:
         EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that are no counts, no
@@ -280,28 +283,36 @@ def estimate_with_std(
             otherwise includes the summary's own.
 
     Returns:
-        The camera and its standard deviations, maps (..., H, W) in the same units.
+        The camera and its standard deviations, maps (..., H, W) in the same units; NaN of the
+        paper's network, which tells none.
 
     Raises:
         EvflowDataError: EV001, EV002, EV003, EV007, EV014, EV018, EV020 as in `estimate`.
     """
-    y, y_std = estimate_y(params, voxels, dlogI, window_s=window_s, intensity=intensity,
-                          summary=summary)
-    output = config_of(params).output
-    return coordinates.squash(y, output), camera_std(y, y_std, output)
+    y, y_std, y6, y6_std = _answer(params, voxels, dlogI, window_s, intensity, summary)
+    config = config_of(params)
+    if not config.pool:
+        return squash(y, config.output), camera_std(y, y_std, config.output)
+    return of_window(y, y_std, *(a[..., None, None, :] for a in (y6, y6_std)))
 
 
 def estimate_y(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: ArrayLike = DEFAULT_WINDOW_S,
     intensity: ArrayLike | None = None, summary: Summary | None = None,
 ) -> tuple[Array, Array]:
-    """`estimate_with_std` in the coordinates y: (..., H, W, 4) each. With a given summary the
-    std is that of a pixel in a camera so described; else it includes the summary's own."""
+    """What the flow alone makes of a window, in the coordinates y, and its std: (..., H, W, 4)
+    each, NaN where the network tells none. `posterior` puts it beside the summary."""
+    return _answer(params, voxels, dlogI, window_s, intensity, summary)[:2]
+
+
+def _answer(
+    params: Params, voxels: ArrayLike, dlogI: ArrayLike, window_s: ArrayLike,
+    intensity: ArrayLike | None, summary: Summary | None,
+) -> tuple[Array, Array, Array, Array]:
+    """`estimate_y`, and y (..., 6) of the summary and its std, 0 where it is given."""
     config, net = parts(params)
     voxels, dlogI, window_s, intensity = prepare(config, voxels, dlogI, window_s, intensity)
     y6, y6_std = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
     own = dlogI.shape if intensity is not None else (*dlogI.shape[:-2], 1, 1)
     context = pixel_context(window_s, intensity, own)
-    y, y_std = inference.estimate(config, net, voxels, dlogI, context, y6)
-    shared = y6_std[..., None, None, :4]  # an error of the summary moves all pixels alike
-    return y, jnp.sqrt(y_std**2 + shared**2)
+    return *inference.estimate(config, net, voxels, dlogI, context, y6), y6, y6_std

@@ -18,6 +18,7 @@ from evflow.errors import EvflowDataError
 from evflow.network import api, inference
 from evflow.network.config import MODELS
 from evflow.network.coordinates import camera_std, squash_summary, unsquash_summary
+from evflow.network.posterior import evidence, posterior
 from evflow.network.weights import load_weights
 
 
@@ -83,7 +84,11 @@ def test_estimate_agrees_with_forward(shipped: dict[str, Any]) -> None:
     voxels, dL, _ = seen()
     code = api.encode(shipped, voxels, dL.sum(-1))
     y, _, _ = api.forward(shipped, voxels, code)
-    camera, expected = api.estimate(shipped, voxels, dL.sum(-1)), squash(y)
+    answer, std = api.estimate_y(shipped, voxels, dL.sum(-1))
+    np.testing.assert_allclose(answer, y, rtol=1e-3, atol=1e-3)
+    camera = api.estimate(shipped, voxels, dL.sum(-1))
+    y6 = unsquash_summary(code.summary)[None, None]
+    expected, _ = posterior(evidence(y, std), y6, jnp.zeros_like(y6))
     for name in PARAMETERS:
         np.testing.assert_allclose(getattr(camera, name), getattr(expected, name), rtol=1e-3)
 
