@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.estimation.refine.receptor_noise import noise_rates
 from evflow.estimation.refine.sightings import Sightings, counted, trusted
 from evflow.estimation.refine.smear import smeared
 
@@ -20,8 +21,10 @@ ENOUGH = 200  # events of either polarity to look at
 
 
 class Sample(NamedTuple):
-    """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N):
-    pixel (0..P-1), at (in fine steps), on, off (counts so far), weight; block (C, P)."""
+    """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N) by
+    pixel and time: pixel (0..P-1), at (in fine steps), on, off (counts so far), weight, and group,
+    with whose events one shares a constant: those of its pixel, unless noise came between
+    (receptor_noise.py); block (C, P); noise_hz (C, 2): of `noise_rates`."""
 
     dn: Array
     dt_s: Array
@@ -30,7 +33,9 @@ class Sample(NamedTuple):
     on: Array
     off: Array
     weight: Array
+    group: Array
     block: Array
+    noise_hz: Array
 
 
 def sample(
@@ -82,5 +87,8 @@ def _row(
 
     light = filled(dn.reshape(len(dn), -1)[:, where], PIXELS)
     events = [filled(v[kept], EVENTS) for v in (at, on, off, weight)]
-    return (light, dt_s.astype(np.float32), filled(place[group][kept], EVENTS).astype(np.int32),
-            *events, filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32))
+    pixel = filled(place[group][kept], EVENTS).astype(np.int32)
+    interval_s = dt_s.reshape(-1, steps).sum(1)
+    return (light, dt_s.astype(np.float32), pixel, *events, pixel,
+            filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32),
+            noise_rates(s, interval_s))

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.estimation.refine.receptor_data import PIXELS, TILES, Sample
+from evflow.estimation.refine.receptor_data import EVENTS, TILES, Sample
 from evflow.simulator.photoreceptor import seen_path
 
 Array = jax.Array
@@ -103,7 +103,7 @@ def left_over(products: np.ndarray, theta: np.ndarray) -> float:
 
 def _products(phi: Array, by_light: Array, data: Sample, *, slopes: bool) -> Array:
     """(blocks, M, M): weighted products of a, b, y and, if asked for, the slopes of y, about each
-    pixel's means."""
+    group's means."""
     blocks = data.dn.shape[0] * TILES[0] * TILES[1]
 
     def one(d: Sample) -> Array:
@@ -127,11 +127,11 @@ def _products(phi: Array, by_light: Array, data: Sample, *, slopes: bool) -> Arr
             columns = [d.on, d.off, looked_up(path(phi[:2]))[0]]
 
         def total(v: Array) -> Array:
-            return jax.ops.segment_sum(v, d.pixel, PIXELS)
+            return jax.ops.segment_sum(v, d.group, EVENTS)
 
         v = jnp.stack(columns, -1)
         mass = jnp.maximum(total(d.weight), 1e-9)[:, None]
-        v = v - (total(d.weight[:, None] * v) / mass)[d.pixel]
+        v = v - (total(d.weight[:, None] * v) / mass)[d.group]
         squares = d.weight[:, None, None] * v[:, :, None] * v[:, None, :]
         return jax.ops.segment_sum(squares, d.block[d.pixel], blocks)
 

@@ -14,8 +14,10 @@ import numpy as np
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.refine.receptor_data import Sample, smeared_sample
+from evflow.estimation.refine.receptor_noise import parted
+from evflow.estimation.refine.receptor_profile import along_offset
 from evflow.estimation.refine.receptor_regression import SCALE, Regression, Slopes
-from evflow.simulator.photoreceptor import FAST, Photoreceptor
+from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor
 
 OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, where the search begins
 TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
@@ -47,8 +49,8 @@ CUTOFFS = (np.inf, 1000.0, 500.0, 300.0, 200.0, 140.0, 100.0, 70.0, 50.0, 30.0, 
 class Found:
     """seen: the most probable photoreceptor; theta, ideal_theta (2,): of the pooled
     regression, with it and with an ideal pixel; covariance
-    (3, 3) of (offset, tau, delay); slope (2, 3): how log theta_on, log theta_off of the pooled
-    regression change with the three; explained: shares of the variance that the regression
+    (3, 3) of (offset, tau, delay); theta_error (2,): relative errors of theta that not knowing the
+    three leaves; explained: shares of the variance that the regression
     explains, with an ideal pixel and as found; chance: probability that the ideal pixel is not
     enough; size: how many independent events the sample is worth; smear (2, 3): for each of SMEARS,
     by how much the memory's mean over it is explained better (log of what is left), and how the
@@ -59,7 +61,7 @@ class Found:
     theta: np.ndarray
     ideal_theta: np.ndarray
     covariance: np.ndarray
-    slope: np.ndarray
+    theta_error: np.ndarray
     explained: tuple[float, float]
     chance: float
     size: float
@@ -105,41 +107,42 @@ class Found:
         kept = float(np.clip(1 - LACKING * (1 - self.explained[1]), LEAST_KEPT, 1.0))
         return self.theta / kept, float(np.hypot(KEPT_ERROR[0], KEPT_ERROR[1] * (1 - kept)))
 
-    @property
-    def theta_error(self) -> np.ndarray:
-        """Relative error (2,) of theta that not knowing the three leaves."""
-        return np.sqrt(np.einsum("ij,jk,ik->i", self.slope, self.covariance, self.slope))
-
 
 def find(data: Sample) -> Found:
     """The photoreceptor that is most probable, and how well it is known: the curvature, and the
     scatter of the gradient from block to block."""
-    by_light = Regression(data)
-    plain = by_light.unexplained(PLAIN)
+    by_light = Regression(parted(data, IDEAL))
     phi = _start(by_light)
     for _ in range(2):
         size = _size(phi, by_light)
         phi = _descend(phi, by_light, size)
+        theta = np.abs(by_light.solved(phi)[0])
+        by_light = Regression(parted(data, _receptor(phi), theta))
+    plain = by_light.unexplained(PLAIN)
     model, phi = _with_law(phi, by_light, min(size, BELIEVED))
-    value, slopes = model.unexplained(phi), model.slopes(phi)
+    value = model.unexplained(phi)
+    covariance, open_ = _errors(phi, model, min(size, BELIEVED))
     fits, ideal_fits = (model.solved(at)[0] for at in (phi, PLAIN))
     odds = 0.5 * min(size, BELIEVED) * (plain - value) - DOUBT - _unlikely(phi)
     if fits.min() <= 0:  # brightness that falls with ON events: there is no path
         odds = -np.inf
-    seen = Photoreceptor(float(phi[0]), float(phi[1]) if phi[1] > 2 * FAST else 0.0, float(phi[2]),
-                         model.by_light)
-    return Found(seen, np.abs(fits), np.abs(ideal_fits),
-                 _covariance(slopes, model.curvature(phi)), slopes.of_theta,
+    return Found(_receptor(phi, by_light=model.by_light), np.abs(fits), np.abs(ideal_fits),
+                 covariance, open_,
                  (float(1 - np.exp(plain)), float(1 - np.exp(value))),
                  float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), size,
                  _smear(phi if odds > 0 else PLAIN, model), _curve(phi, model))
+
+
+def _receptor(phi: np.ndarray, *, by_light: bool = True) -> Photoreceptor:
+    return Photoreceptor(float(phi[0]), float(phi[1]) if phi[1] > 2 * FAST else 0.0, float(phi[2]),
+                         by_light)
 
 
 def explained(data: Sample, seen_by: Photoreceptor, theta: np.ndarray) -> float:
     """Share of the variance that thresholds (2,) explain behind a photoreceptor, both of another
     part of the recording."""
     at = np.array([seen_by.offset_dn, max(seen_by.tau_s, FAST), seen_by.delay_s])
-    return Regression(data, seen_by.by_light).explained_by(at, theta)
+    return Regression(parted(data, seen_by, theta), seen_by.by_light).explained_by(at, theta)
 
 
 def _with_law(phi: np.ndarray, by_light: Regression, size: float) -> tuple[Regression, np.ndarray]:
@@ -161,6 +164,33 @@ def _unlikely(phi: np.ndarray) -> float:
 def _value(phi: np.ndarray, model: Regression, size: float) -> float:
     """Minus the log of the posterior of phi."""
     return 0.5 * size * model.unexplained(phi) + _unlikely(phi)
+
+
+def _errors(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance (3, 3) of (offset, tau, delay), and relative errors (2,) of theta: by the slopes
+    at phi, and along the offset by the likelihood where that goes farther."""
+    slopes = model.slopes(phi)
+    near = _covariance(slopes, model.curvature(phi))
+    lead = near[:, 0] / near[0, 0]
+
+    def step(at: np.ndarray) -> np.ndarray:
+        gradient, bent = _newton(at, model, size)
+        change = np.clip(-np.linalg.solve(bent[1:, 1:], gradient[1:]), -STEP[1:], STEP[1:])
+        return np.clip(at + np.concatenate([[0.0], change]), LOW, HIGH)
+
+    offset, theta = along_offset(phi, model, near, lambda at: _value(at, model, size), step)
+    farther = max(offset - near[0, 0], 0.0)
+    others = near - near[0, 0] * np.outer(lead, lead)  # were the offset known
+    linear, rest = (np.einsum("ij,jk,ik->i", slopes.of_theta, c, slopes.of_theta)
+                    for c in (near, others))
+    return near + farther * np.outer(lead, lead), np.sqrt(np.maximum(linear, rest + theta))
+
+
+def _newton(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient and curvature of `_value`, by Gauss and Newton."""
+    slopes = model.slopes(phi)
+    return (0.5 * size * slopes.gradient + (phi - PLAIN) / PRIOR**2,
+            0.5 * size * slopes.bent + np.diag(PRIOR**-2.0))
 
 
 def _covariance(slopes: Slopes, curvature: np.ndarray) -> np.ndarray:
@@ -214,9 +244,7 @@ def _descend(phi: np.ndarray, model: Regression, size: float) -> np.ndarray:
     phi = np.clip(phi, LOW, HIGH)
     best = _value(phi, model, size)
     for _ in range(MOST_STEPS):
-        slopes = model.slopes(phi)
-        gradient = 0.5 * size * slopes.gradient + (phi - PLAIN) / PRIOR**2
-        bent = 0.5 * size * slopes.bent + np.diag(PRIOR**-2.0)
+        gradient, bent = _newton(phi, model, size)
         steps = [-np.linalg.solve(bent + np.diag(np.diag(bent)) * damping, gradient)
                  for damping in (0.02, 0.5, 5.0)]
         steps += [sign * much * SCALE * (np.arange(3) == k)

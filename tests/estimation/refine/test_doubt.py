@@ -22,7 +22,7 @@ STD = Summary(*(np.float32(v) for v in (0.01, 0.02, 0.03, 0.04, 0.005, 0.006)))
 def found(chance: float) -> Found:
     return Found(
         Photoreceptor(20.0, 1e-3, 0.0), np.array([0.19, 0.27]), np.array([0.25, 0.36]),
-        np.diag([4.0, 1e-7, 1e-7]), np.array([[0.02, 0.0, 0.0], [0.03, 0.0, 0.0]]), (0.7, 0.9),
+        np.diag([4.0, 1e-7, 1e-7]), np.array([0.04, 0.06]), (0.7, 0.9),
         chance, 400.0, np.array([[0.01, 0.02, 0.03], [0.04, 0.05, 0.06]]), np.zeros((2, 2)))
 
 

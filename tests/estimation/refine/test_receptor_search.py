@@ -53,8 +53,11 @@ def integrated(
     return np.stack(out)
 
 
-def events_of(path: np.ndarray, dt_s: float, delay_s: float, on: float, off: float) -> Events:
-    """Events of pixels that see path (T, H, W), instants dt_s apart: loops, one pixel at a time."""
+def events_of(
+    path: np.ndarray, dt_s: float, delay_s: float, on: float, off: float, noise_hz: float = 0.0
+) -> Events:
+    """Events of pixels that see path (T, H, W), instants dt_s apart: loops, one pixel at a time.
+    Noise of either polarity stores what is seen, as every event does."""
     rows = []
     rng = np.random.default_rng(1)
     for y, x in np.ndindex(path.shape[1:]):
@@ -62,6 +65,9 @@ def events_of(path: np.ndarray, dt_s: float, delay_s: float, on: float, off: flo
         memory = path[0, y, x] + rng.uniform(-a, b)
         for i in range(1, len(path)):
             before, now = path[i - 1, y, x], path[i, y, x]
+            if noise_hz and rng.random() < 2 * noise_hz * dt_s:
+                memory = now
+                rows.append((x, y, round((i * dt_s + delay_s) * 1e6), rng.random() < 0.5))
             while now - memory > a or memory - now > b:
                 up = now > memory
                 memory += a if up else -b
@@ -86,13 +92,14 @@ def test_the_path_is_that_of_a_plain_integration(
 
 
 def looked_at(
-    offset: float, cutoff_hz: float, delay_s: float = 0.0, by_light: bool = True
+    offset: float, cutoff_hz: float, delay_s: float = 0.0, by_light: bool = True,
+    noise_hz: float = 0.0,
 ) -> Sample:
     """What such pixels, of .25 and .2, show of the film."""
     dn, dt_s = film(), FRAME_S / STEPS
     tau_s = 1 / (2 * np.pi * cutoff_hz) if cutoff_hz else 0.0
     seen = integrated(dn, dt_s, offset, tau_s, SUB, by_light)
-    events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2)
+    events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2, noise_hz)
     times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
     s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
     data = sample([(dn.astype(np.float32), np.full(INTERVALS * STEPS, dt_s), s)])
@@ -134,6 +141,18 @@ def test_the_constants_are_found_again(
     assert found.explained[1] > 0.98
     if cutoff_hz:
         assert found.seen.cutoff_hz == pytest.approx(cutoff_hz, rel=0.15)
+
+
+def test_a_slow_pixel_is_found_among_noise() -> None:
+    """Which makes thresholds too small unless it parts a pixel's events."""
+    data = looked_at(0.0, 30.0, noise_hz=15.0)
+    slow = np.array([0.0, 1 / (2 * np.pi * 30.0), 0.0])
+    assert (Regression(data).solved(slow)[0] < [0.87 * 0.25, 0.87 * 0.2]).all()
+    found = find(data._replace(noise_hz=np.full((1, 2), 15.0, np.float32)))
+    assert found.needed
+    assert found.seen.cutoff_hz == pytest.approx(30.0, rel=0.15)
+    np.testing.assert_allclose(found.theta, [0.25, 0.2], rtol=0.08)
+    assert found.explained[1] > 0.97
 
 
 def test_where_little_happens_nothing_is_looked_for() -> None:

@@ -1,0 +1,102 @@
+"""Noise among the events of the pooled regression: from each on, a pixel has another constant.
+
+An event of noise stores what the pixel sees, as every event does, but counts as a whole threshold
+whatever has changed: after a few of them a pixel's counts say little of its brightness. How much
+noise a camera sends is counted where the path gives no cause for an event. An event is taken for
+noise where the path moves so slowly that noise is the likelier cause.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.estimation.refine.sightings import TYPICAL_THETA, Sightings
+from evflow.simulator.photoreceptor import FAST, Photoreceptor, seen_path
+
+if TYPE_CHECKING:
+    from evflow.estimation.refine.receptor_data import Sample
+
+Array = np.ndarray
+
+LEAST_RISE = 0.03  # log units in two frame intervals: less gives no cause for an event
+TILES = (6, 8)  # of the image, whose median is taken: where the path misses motion, events are none
+ENOUGH_S = 2.0  # pixel seconds of a tile
+MISSED_HZ = 1.0  # events of a pixel for which the path shows no cause, and yet there is one
+LIKELY = 0.15  # probability of noise from which an event is taken for noise
+REACH = 2  # fine steps before and after that of an event, whose change is looked at
+
+
+def noise_rates(s: Sightings, dt_s: Array) -> Array:
+    """(2,) float32, ON and OFF events in Hz per pixel for which the path gives no cause, 0 where
+    there is no such place. dt_s: (K,) of the intervals."""
+    intervals, pixels = s.inner.shape
+    change = np.diff(s.frames, axis=0)
+    shown = s.seen[1:] & s.seen[:-1]
+    rates = []
+    for on, back in ((True, np.minimum(change, 0.0)), (False, -np.maximum(change, 0.0))):
+        climb = _widest((s.inner + back).reshape(intervals, *s.shape)).reshape(intervals, pixels)
+        still = (climb[1:] < LEAST_RISE) & (climb[:-1] < LEAST_RISE) & shown[1:] & shown[:-1]
+        place = (s.interval * pixels + s.pixel)[s.on == on]
+        sent = np.bincount(place, minlength=intervals * pixels).reshape(intervals, pixels)[1:]
+        seconds = _tiled((still * dt_s[1:, None]).sum(0), s.shape)
+        events = _tiled((still * sent).sum(0), s.shape)
+        told = seconds >= ENOUGH_S
+        rates.append(float(np.median(events[told] / seconds[told])) if told.any() else 0.0)
+    return np.array(rates, np.float32)
+
+
+def _widest(climb: Array) -> Array:
+    kernel = np.ones((3, 3), np.uint8)
+    return np.stack([cv2.dilate(np.ascontiguousarray(c, np.float32), kernel) for c in climb])
+
+
+def _tiled(values: Array, shape: tuple[int, int]) -> Array:
+    """Sums (TILES) of values (H * W,)."""
+    y, x = (np.arange(n) * tiles // n for n, tiles in zip(shape, TILES, strict=True))
+    tile = y[:, None] * TILES[1] + x
+    return np.bincount(tile.ravel(), values, TILES[0] * TILES[1])
+
+
+def parted(data: Sample, seen_by: Photoreceptor, theta: Array | None = None) -> Sample:
+    """The sample with groups that part where an event is likely to be noise, which is the first of
+    the next. theta (2,): by which what a photoreceptor sees turns into events, else a typical one;
+    at most TYPICAL_THETA, as noise makes those of a regression small... """
+    noise_hz = np.asarray(data.noise_hz).mean(0)
+    if noise_hz.max() * (1.0 - LIKELY) <= LIKELY * MISSED_HZ:
+        return data._replace(group=data.pixel)
+    scale = np.full(2, TYPICAL_THETA) if theta is None else np.maximum(theta, TYPICAL_THETA)
+
+    def stretch(c: int) -> Sample:
+        return jax.tree.map(lambda v: np.asarray(v[c]), data)
+
+    groups = [_parted(stretch(c), seen_by, noise_hz, scale) for c in range(len(data.dn))]
+    return data._replace(group=jnp.asarray(np.stack(groups)))
+
+
+def _parted(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) -> Array:
+    """(N,) int32 groups of one stretch."""
+    step_s = float(np.mean(d.dt_s))
+    path = np.asarray(_seen(d.dn, d.dt_s, np.float32(seen_by.offset_dn),
+                            np.float32(max(seen_by.tau_s, FAST)), seen_by.by_light))
+    used = np.flatnonzero(np.asarray(d.weight) > 0)
+    at, pixel, on = (np.asarray(v)[used] for v in (d.at, d.pixel, d.on))
+    last = len(path) - 1
+    step = np.clip(at - seen_by.delay_s / step_s, 0, last - 1).astype(np.int64)
+    low, high = np.maximum(step - REACH, 0), np.minimum(step + 1 + REACH, last)
+    slope = (path[high, pixel] - path[low, pixel]) / ((high - low) * step_s)
+    new = np.diff(pixel, prepend=-1) != 0
+    rose = np.where(new, on > 0, np.diff(on, prepend=0.0) > 0)
+    side = np.where(rose, 0, 1)
+    cause_hz = np.maximum(np.where(rose, slope, -slope), 0.0) / theta[side] + MISSED_HZ
+    noise = noise_hz[side]
+    group = np.zeros(len(d.weight), np.int32)
+    group[used] = np.cumsum(new | (noise > LIKELY * (noise + cause_hz))) - 1
+    return group
+
+
+_seen = jax.jit(seen_path)
