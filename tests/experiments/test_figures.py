@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from helpers.figures import agrees, mean, printed, span, values
+from helpers.figures import mean, span, values, wrong
 
 Figures = list[float]
 ACCURACY = "docs/accuracy.md"
@@ -244,9 +244,4 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
 def test_a_table_says_what_its_experiment_found(
     where: tuple[str, str], figures: Callable[[], dict[str, Figures]]
 ) -> None:
-    wrong = []
-    for label, expected in figures().items():
-        found = printed(*where, label)
-        if len(found) != len(expected) or not all(map(agrees, found, expected)):
-            wrong.append(f"{label!r}: {found}, but {[round(v, 4) for v in expected]}")
-    assert not wrong, "\n".join(wrong)
+    assert not wrong(*where, figures())

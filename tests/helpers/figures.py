@@ -40,13 +40,13 @@ def tables(path: Path) -> list[tuple[str, list[str], list[list[str]]]]:
 def cells(source: str, rows: str, column: str | int, table: str = "") -> list[str]:
     """Of results/SOURCE/*.md: what stands under `column` (the beginning of its head, or its place
     where heads are alike) in rows whose cells, joined by "|", fit the expression `rows`, in tables
-    under a line that has `table`."""
+    under a line that has `table`, or whose first head it is."""
     path, = (RESULTS / source).glob("*.md")
     found = []
     for title, heads, lines in tables(path):
         at = [k for k, head in enumerate(heads) if column == k or
               (isinstance(column, str) and head.startswith(column))]
-        if table in title and at:
+        if (table in title or table == heads[0]) and at:
             found += [line[at[0]] for line in lines if re.match(rows, "|".join(line))]
     assert found, (source, rows, column, table)
     return found
@@ -88,3 +88,13 @@ def agrees(text: str, value: float) -> bool:
     """Is `text` what `value`, itself rounded to its fourth place, is printed as?"""
     decimals = len(text.partition(".")[2])
     return abs(float(text) - value) <= 0.5 * 10.0**-decimals + 0.51e-4 * max(1.0, abs(value))
+
+
+def wrong(document: str, heading: str, figures: dict[str, list[float]]) -> str:
+    """What rows of a document's table, by their labels, print that is not so; "" where all is."""
+    lines = []
+    for label, expected in figures.items():
+        found = printed(document, heading, label)
+        if len(found) != len(expected) or not all(map(agrees, found, expected)):
+            lines.append(f"{label!r}: {found}, but {[round(v, 4) for v in expected]}")
+    return "\n".join(lines)
