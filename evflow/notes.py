@@ -56,6 +56,8 @@ NOTES: dict[str, str] = {
     "frames.unused": "frames were left out",
     "frames.white": "what radiance is white",
     "levels.few": "all steps of light are of one size",
+    "maps.raised": "values that no camera has were raised to the least that one has",
+    "std.none": "the weights tell no error",
     "theta.joined": "the thresholds are of another estimate of this camera",
     "scene.static": "nothing moves: the noise alone was measured",
     "scene.restless": "the light moves while it should rest",

@@ -65,8 +65,9 @@ def read_summary(path: str | os.PathLike) -> tuple[dict[str, float], dict[str, f
     if any(f"summary_{name}{end}" not in held for name in names for end in ("", "_std")):
         return None
     of, std = ({n: held[f"summary_{n}{end}"] for n in names} for end in ("", "_std"))
-    if any(np.shape(v) != () or v.dtype.kind not in "fiu" or not np.isfinite(v)
-           for values in (of, std) for v in values.values()):
+    if any(np.shape(v) != () or v.dtype.kind not in "fiu"
+           for values in (of, std) for v in values.values()) or not np.isfinite(
+               [*of.values()]).all() or np.isinf([*std.values()]).any():
         raise EvflowDataError("EV009", f"{path}: its summary holds what is no finite number.",
                               "Make the file again: evflow estimate.")
     return {n: float(v) for n, v in of.items()}, {n: float(v) for n, v in std.items()}

@@ -12,6 +12,7 @@ Of a long recording a part is read (reading.py).
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -28,12 +29,14 @@ from evflow.estimation.refine import Stretch, cut, pixel_posterior
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import Stage, State, add, estimate, glance, look, looked_through
 from evflow.estimation.static import estimate_noise
+from evflow.estimation.unpooled import estimate_unpooled
 from evflow.files.spool import SOME, on_disk
 from evflow.network import api
+from evflow.network.architecture import config_of
 from evflow.network.weights import load_weights
 from evflow.recordings.repeats import without_repeats
 from evflow.recordings.stillness import stands_still
-from evflow.recordings.windows import condensed, iter_windows, plan_windows
+from evflow.recordings.windows import WindowPlan, condensed, iter_windows, plan_windows
 from evflow.types import Recording
 
 Progress = Callable[[int, int], None]
@@ -53,7 +56,8 @@ def estimate_camera(
 
     Args:
         recording_or_path: events and frames on one clock, or the path of a file that holds them.
-        params: of `load_weights`; None loads the released ones.
+        params: of `load_weights`; None loads the released ones. Of the paper's network, which sees
+            pixels alone, the maps are the mean of its windows', and standard deviations NaN.
         refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .011).
         pixel: "measured" looks for the photoreceptor and for what frames do not show; "ideal" takes
             pixels and frames at their word.
@@ -110,6 +114,8 @@ def measure(
     params = load_weights() if params is None else params
     plan = plan_windows(recording, min_window_us)
     iter_windows(recording, min_window_us, plan)  # EV017 where there is none
+    if not config_of(params).pool:
+        return Measured(_unpooled(recording, plan, params, progress, stage))
     stretches = cut(recording, plan, path=refine == "auto")
     order = ordered(stretches, effort)
     used = [stretches[i] for i in sorted(order.numbers)]
@@ -126,6 +132,22 @@ def measure(
     steps.finish()
     first = First(early, tuple(used), division.rest) if division and early.read else None
     return Measured(found, first)
+
+
+def _unpooled(
+    recording: Recording, plan: WindowPlan, params: api.Params, progress: Progress | None,
+    stage: Stage,
+) -> CameraEstimate:
+    """`estimate_unpooled`, with its progress."""
+    stage("estimating window by window")
+    done = itertools.count(1)
+
+    def advance() -> None:
+        if progress:
+            progress(next(done), len(plan.pairs))
+
+    return estimate_unpooled(recording, iter_windows(recording, plan=plan), params,
+                             before=condensed(plan.skipped), advance=advance)
 
 
 def read_whole(recording: Recording, params: api.Params) -> State:

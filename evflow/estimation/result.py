@@ -28,7 +28,7 @@ class CameraEstimate:
 
     Attributes:
         camera: maps (H, W), theta in natural-log units, eta in Hz.
-        std: their standard deviations, in the same units.
+        std: their standard deviations, in the same units; NaN of weights that tell none.
         summary: the camera's medians, noise rates and mismatch, scalars.
         summary_std: their standard deviations.
         valid: (H, W) bool, pixels that are not hot and have at least 3 events in the windows used,
@@ -74,8 +74,8 @@ class CameraEstimate:
     bench: Bench | None = None
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
-        """Write camera.npz: theta_on ..., theta_on_std ..., valid, n_events, hot, dead, and the
-        scalars of `camera.optics`: summary, circuit, frames.
+        """Write camera.npz: theta_on ..., theta_on_std ... (where told), valid, n_events, hot,
+        dead, and the scalars of `camera.optics`: summary, circuit, frames.
 
         Args:
             path: of the file; `Camera.load` reads it.
@@ -87,7 +87,9 @@ class CameraEstimate:
         Raises:
             EvflowDataError: EV013 (exists), EV014 (maps out of range), EV019 (cannot be written).
         """
-        extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
+        extra: dict[str, Any] = {}
+        if not np.isnan(np.asarray(self.std.theta_on)).all():
+            extra = {f"{name}_std": getattr(self.std, name) for name in PARAMETERS}
         extra |= as_arrays(self.sensor, self.sensor_std, self.optics)
         extra |= summary_arrays(self.summary, self.summary_std)
         extra["undetermined"] = np.array(self.undetermined, "U9")
@@ -95,9 +97,10 @@ class CameraEstimate:
                                 n_events=self.n_events, hot=self.hot, dead=self.dead)
 
     def as_dict(self) -> dict[str, Any]:
-        """Summary, std and notes as JSON-ready values."""
-        def floats(s: Summary) -> dict[str, float]:
-            return {k: float(v) for k, v in dataclasses.asdict(s).items()}
+        """Summary, std and notes as JSON-ready values; None for NaN."""
+        def floats(s: Summary) -> dict[str, float | None]:
+            return {k: float(v) if np.isfinite(v) else None
+                    for k, v in dataclasses.asdict(s).items()}
 
         def places(mask: np.ndarray) -> list[list[int]]:
             return [[int(x), int(y)] for y, x in np.argwhere(mask)]

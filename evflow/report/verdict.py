@@ -96,6 +96,10 @@ def _threshold(found: CameraEstimate, key: str) -> Judged:
                       THRESHOLD, spread(theta, std), "A threshold outside the trained "
                       "range is an extrapolation: are the frames linear in light (--response), "
                       "and dark ones without an offset?")
+    if not np.isfinite(std):
+        return Judged("fair", name, 1.5, f"How well θ {name} is known these weights do not tell.",
+                      THRESHOLD, spread(theta, std), "Measure with weights that tell errors "
+                      "(--weights default) to know how far to trust it.")
     error = std / theta
     grade = graded(error, ERROR)
     return Judged(grade, name, error / ERROR[0], f"θ {name} is known to {error:.0%}.",
@@ -106,7 +110,8 @@ def _threshold(found: CameraEstimate, key: str) -> Judged:
 def known(found: CameraEstimate, key: str) -> bool:
     """Whether the recording determined this polarity's threshold at all."""
     theta, std = (float(getattr(s, f"theta_{key}")) for s in (found.summary, found.summary_std))
-    return bool(np.isfinite(theta) and np.isfinite(std) and theta > 0
+    told = np.isfinite(std) or any(note.code == "std.none" for note in found.notes)
+    return bool(np.isfinite(theta) and told and theta > 0
                 and f"theta_{key}" not in found.undetermined)
 
 
