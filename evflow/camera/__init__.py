@@ -2,12 +2,14 @@
 
     prior.py     Summary (what a whole camera shares), and the distribution it is drawn from
     camera.py    Camera: theta and eta per pixel
+    file.py      its maps as an .npz
     sensors.py   SensorModel, the pixel circuit, and sensors by name
     perturb.py   hot and dead pixels, measured noise
     exports/     a camera as settings of other simulators
 """
 
-from evflow.camera.camera import PARAMETERS, THETA_MIN, Camera, sample_pixels
+from evflow.camera.camera import THETA_MIN, Camera, sample_pixels
+from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import CameraPrior, Summary, noise_of_threshold, sample_nominal
 
 __all__ = [

@@ -8,30 +8,23 @@ is *not* per pixel is the `SensorModel` (sensors.py); what cameras are drawn fro
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
-import zipfile
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evflow.camera import file
+from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import CameraPrior, Summary, sample_nominal
 from evflow.checks import plain
 from evflow.errors import EvflowDataError, naming
-from evflow.files.archives import load_npz
-from evflow.files.atomic import atomic_write
-from evflow.files.whole import need_members
 
 Array = jax.Array
 
 THETA_MIN = 0.01  # v2e clamps thresholds here; a pixel at the clamp is a hot pixel
-PARAMETERS = ("theta_on", "theta_off", "eta_on", "eta_off")
-EXPECTED = ("Expected the camera.npz of evflow estimate (or Camera.save): maps (H, W) "
-            f"{', '.join(PARAMETERS)}.")
 
 
 @jax.tree_util.register_dataclass
@@ -203,17 +196,8 @@ class Camera:
                 written), EV020 (an extra array has the name of a map, or "meta").
         """
         self.validate()
-        if taken := {*PARAMETERS, "meta"} & set(extra):
-            raise EvflowDataError("EV020", f"extra arrays named {', '.join(sorted(taken))}.",
-                                  "The camera's own maps have these names; choose others.")
-        units = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
-        arrays: dict[str, Any] = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
-        arrays |= {k: np.asarray(v) for k, v in extra.items()}
-        with atomic_write(path, overwrite=overwrite) as temporary:
-            with open(temporary, "wb") as f:
-                np.savez_compressed(f, meta=np.array(json.dumps(units)), **arrays)
-            need_members(temporary, {f"{name}.npy": None for name in ("meta", *arrays)})
-        return Path(path)
+        maps = {n: np.asarray(getattr(self, n), np.float32) for n in PARAMETERS}
+        return file.write_maps(path, maps, {k: np.asarray(v) for k, v in extra.items()}, overwrite)
 
     @staticmethod
     def load(path: str | os.PathLike) -> Camera:
@@ -244,54 +228,14 @@ class Camera:
         Raises:
             EvflowDataError: as `load` (EV008, ...); EV009 also for impossible deviations.
         """
-        path = Path(path)
-        _check_kind(path)
-        data = load_npz(path)
-        missing = [n for n in PARAMETERS if n not in data]
-        if missing:
-            recording = " It is a recording:" if {"t", "x", "y", "p"} <= set(data) else ""
-            raise EvflowDataError(
-                "EV008", f"{path} holds {', '.join(sorted(data)[:12])} but not "
-                f"{', '.join(missing)}.{recording}", EXPECTED if not recording else
-                f"make a camera of it, evflow estimate {path} -o cam/, and pass cam/camera.npz.")
-        errors = [f"{name}_std" for name in PARAMETERS]
+        data, errors = file.read_maps(Path(path))
         with naming(path):
-            for name in {*PARAMETERS, *errors} & set(data):
-                if data[name].dtype.kind not in "fiu":
-                    raise EvflowDataError("EV009", f"{name} has dtype {data[name].dtype}.",
-                                          "Expected float32.")
-            maps = Camera(*(jnp.asarray(data[n], jnp.float32) for n in PARAMETERS)).validate()
-            if not all(name in data for name in errors):
+            maps = Camera(*(jnp.asarray(m, jnp.float32) for m in data)).validate()
+            if errors is None:
                 return maps, None
-            std = Camera(*(jnp.asarray(data[n], jnp.float32) for n in errors))
+            std = Camera(*(jnp.asarray(e, jnp.float32) for e in errors))
             jax.tree.map(_check_std, maps, std)
             return maps, std
-
-
-def holds_camera(path: Path) -> bool:
-    """Whether a file is an .npz with a camera's maps."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {f"{name}.npy" for name in PARAMETERS} <= set(archive.namelist())
-    except (OSError, zipfile.BadZipFile):
-        return False
-
-
-def _check_kind(path: Path) -> None:
-    """EV016 where there is no file, EV008 where it is no .npz."""
-    inside = path / "camera.npz"
-    if path.is_dir() and inside.is_file():
-        raise EvflowDataError("EV016", f"{path} is a folder.", f"Pass {inside}.")
-    if not path.is_file():
-        raise EvflowDataError("EV016", f"no camera file at {path}"
-                              f"{' (a folder without camera.npz)' if path.is_dir() else ''}.",
-                              "Make one: evflow estimate RECORDING -o cam/.")
-    with open(path, "rb") as file:
-        head = file.read(6)
-    if head == np.lib.format.MAGIC_PREFIX:
-        raise EvflowDataError("EV008", f"{path} is one array (.npy), not a camera.", EXPECTED)
-    if head[:2] != b"PK" and path.suffix.lower() != ".npz":
-        raise EvflowDataError("EV008", f"{path} is no .npz: it begins with {head!r}.", EXPECTED)
 
 
 def _check_std(values: Array, std: Array) -> None:

@@ -114,7 +114,8 @@ def _short(path: Path) -> str:
 
 def _cameras(*paths: Path) -> list[tuple[Camera, Camera | None]]:
     """The cameras, if both are; none if neither is. EV020 where one is and the other is not."""
-    from evflow.camera.camera import Camera, holds_camera
+    from evflow.camera import Camera
+    from evflow.camera.file import holds_camera
 
     found = [holds_camera(path) for path in paths]
     if all(found):

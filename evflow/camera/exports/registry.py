@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from evflow.camera.camera import PARAMETERS, Camera
+from evflow.camera.camera import Camera
 from evflow.camera.exports import esim, iebcs, openeb, v2e
 from evflow.camera.exports.common import Export, Maps, Settings
+from evflow.camera.file import PARAMETERS
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.folders import atomic_folder
