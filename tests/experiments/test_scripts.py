@@ -8,11 +8,13 @@ import importlib
 import typing
 from pathlib import Path
 
+import jax
 import pytest
 
 import experiments
 from evflow.training.config import PRESETS
-from experiments import evaluate, template
+from experiments import evaluate, template, train_eventgan, train_network
+from experiments.shared import targets
 from experiments.shared.cameras import Protocol
 from experiments.shared.common import StudyOptions, markdown
 from experiments.shared.many import Setup, study
@@ -77,6 +79,26 @@ def test_a_script_has_options_a_main_and_few_lines(name: str) -> None:
     lines = len((FOLDER / f"{name}.py").read_text().splitlines())
     assert (lines > LINES) == (name in LONG)
     assert lines <= 300
+
+
+def test_held_out_means_held_out() -> None:
+    """No script scores weights on the seed that one trains them by; the targets' scenes, whose
+    keys are folded from names, are others than those of a study by the same seed."""
+    training = {"calibrate", "doubt", "fuse", "tell_apart", "train", "train_eventgan",
+                "train_network"}
+    draws_none = {"real_recordings", "guessed_frames"}  # real scenes; its seeds begin at 1000
+    seeds: dict[bool, dict[int, str]] = {True: {}, False: {}}
+    for name in set(SCRIPTS) - draws_none:
+        fields = {f.name: f.default for f in dataclasses.fields(
+            importlib.import_module(f"experiments.{name}").Options)}
+        if "seed" in fields and (name in training or "weights" in fields):
+            seeds[name in training][fields["seed"]] = name
+    assert training <= {*seeds[True].values(), "train", "train_eventgan", "train_network"}
+    assert len(seeds[False]) > 8
+    assert not seeds[True].keys() & seeds[False].keys()
+    assert not {module.HELD_OUT for module in (train_network, train_eventgan)} & seeds[True].keys()
+    study, folded = jax.random.split(jax.random.key(targets.SEED)), targets._key("textures")
+    assert jax.random.key_data(folded).tolist() not in jax.random.key_data(study).tolist()
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
