@@ -9,7 +9,7 @@ from evflow.scenes.coco import Coco, CocoObject, read_coco
 from evflow.scenes.config import SceneConfig
 from evflow.scenes.photos import load_photos
 from evflow.scenes.render import Layer, Scene, render, sample_scene
-from evflow.scenes.sources import coco_bank, folder_bank, join_banks, load_folder
+from evflow.scenes.sources import coco_bank, folder_bank, join_banks, load_folder, own_bank
 from evflow.scenes.trajectory import Trajectory
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "load_folder",
     "load_photos",
     "make_bank",
+    "own_bank",
     "read_coco",
     "render",
     "sample_scene",

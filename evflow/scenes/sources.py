@@ -185,3 +185,9 @@ def _some(key: Array | None, count: int, limit: int | None) -> list[int]:
     if limit is None or limit >= count or key is None:
         return list(range(count))[:limit]
     return sorted(np.asarray(jax.random.permutation(key, count)[:limit]).tolist())
+
+
+def own_bank(key: Array, images: str | os.PathLike) -> TextureBank:
+    """A bank of one's own images: a folder of pictures, or a COCO json of objects."""
+    make = coco_bank if os.fspath(images).endswith(".json") else folder_bank
+    return make(key, images)

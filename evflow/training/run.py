@@ -14,7 +14,7 @@ from evflow.network.config import MODELS, ModelConfig
 from evflow.network.weights import load_weights, save_weights
 from evflow.process import devices
 from evflow.process.provenance import provenance
-from evflow.scenes import TextureBank, coco_bank, folder_bank, make_bank
+from evflow.scenes import TextureBank, make_bank, own_bank
 from evflow.training.config import TrainConfig, as_dict, preset
 from evflow.training.log import Metrics
 from evflow.training.loop import Advance, train
@@ -56,8 +56,7 @@ def bank_of(config: TrainConfig, photos: bool) -> TextureBank:
     key = jax.random.fold_in(jax.random.key(config.seed), 7)
     if config.images is None:
         return make_bank(key, config.textures, photos=photos)
-    own = coco_bank if config.images.endswith(".json") else folder_bank
-    return own(key, config.images)
+    return own_bank(key, config.images)
 
 
 def _headline(figures: Metrics) -> str:

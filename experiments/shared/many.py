@@ -12,7 +12,7 @@ import jax
 from evflow import load_weights
 from evflow.process.terminal import bar
 from evflow.process.workers import worker_pool
-from evflow.scenes import make_bank
+from evflow.scenes import make_bank, own_bank
 from evflow.training.config import PRESETS
 from experiments.shared.cameras import Hidden, Protocol, hidden_recording
 
@@ -22,11 +22,13 @@ Score = Callable[[Any, Hidden, Protocol], Result]  # params, recording, what it 
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """What all recordings share. photos: whether the scenes show those of the training too."""
+    """What all recordings share. photos: whether the scenes show those of the training too;
+    images: a folder or COCO json of what they show instead."""
 
     weights: str
     seed: int
     photos: bool = False
+    images: str | None = None
 
 
 _SHARED: dict[str, Any] = {}
@@ -37,7 +39,8 @@ def prepare(setup: Setup) -> None:
     if _SHARED.get("setup") == setup:
         return
     k_bank, k_data = jax.random.split(jax.random.key(setup.seed))
-    bank = make_bank(k_bank, PRESETS["default"].textures, photos=setup.photos)
+    bank = (own_bank(k_bank, setup.images) if setup.images is not None
+            else make_bank(k_bank, PRESETS["default"].textures, photos=setup.photos))
     _SHARED.update(setup=setup, params=load_weights(setup.weights), bank=bank, key=k_data)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from evflow.camera import CameraPrior
-from evflow.camera.sensors import SensorModel
+from evflow.camera.sensors import SENSORS, SensorModel
 from experiments.shared.cameras import Protocol
 
 ENOUGH = 200  # signal events of a polarity: all but the noise expected
@@ -18,3 +18,12 @@ def protocols() -> dict[str, Protocol]:
     rows["0.03 free noise"] = Protocol(
         prior=CameraPrior(mismatch=(0.03, 0.03), noise="independent"), model=SensorModel())
     return rows
+
+
+def other_protocols() -> dict[str, Protocol]:
+    """Cameras that neither training nor fusion has drawn so: thresholds, mismatch and noise of
+    another prior, and pixels of another simulator (DVS-Voltmeter's, which have no rate of noise)."""
+    other = CameraPrior((0.06, 0.6), (0.08, 0.08), noise="independent", eta=(0.01, 3.0))
+    walk = CameraPrior((0.1, 0.4), (0.03, 0.03), noise="none")
+    return {"other prior": Protocol(prior=other, model=SensorModel()),
+            "Voltmeter": Protocol(prior=walk, model=SENSORS["dvs346"].model)}

@@ -18,6 +18,7 @@ from evflow.cli import main
 from evflow.commands.bench import forwarded
 from evflow.commands.train import with_configuration
 from evflow.errors import EvflowDataError
+from evflow.scenes import sources
 from evflow.training import run as runs
 from evflow.training.config import PRESETS, TrainConfig
 from evflow.training.run import configuration
@@ -128,7 +129,7 @@ def test_every_number_of_the_configuration_is_an_option() -> None:
 
 def test_scenes_are_made_of_ones_own_images(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in ("coco", "folder"):
-        monkeypatch.setattr(runs, f"{kind}_bank", lambda _, path, kind=kind: (kind, path))
+        monkeypatch.setattr(sources, f"{kind}_bank", lambda _, path, kind=kind: (kind, path))
     for given, kind in (("instances.json", "coco"), ("pictures", "folder")):
         assert runs.bank_of(parsed("--images", given), photos=False) == (kind, given)
     monkeypatch.undo()
