@@ -21,8 +21,8 @@ def protocols() -> dict[str, Protocol]:
 
 
 def other_protocols() -> dict[str, Protocol]:
-    """Cameras that neither training nor fusion has drawn so: thresholds, mismatch and noise of
-    another prior, and pixels of another simulator (DVS-Voltmeter's, which have no rate of noise)."""
+    """Cameras that were never trained on: thresholds, mismatch and noise of another prior; pixels
+    of another simulator (DVS-Voltmeter's, which have no rate of noise)."""
     other = CameraPrior((0.06, 0.6), (0.08, 0.08), noise="independent", eta=(0.01, 3.0))
     walk = CameraPrior((0.1, 0.4), (0.03, 0.03), noise="none")
     return {"other prior": Protocol(prior=other, model=SensorModel()),
