@@ -16,9 +16,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import operator
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -28,14 +27,13 @@ import numpy as np
 
 from evflow import Camera, Events
 from evflow.camera import CameraPrior
-from evflow.files.atomic import atomic_text
-from evflow.process.terminal import bar
 from evflow.process.workers import worker_pool
 from evflow.report import plots
 from evflow.simulator import simulate_stream
 from evflow.simulator.between import intervals
 from evflow.simulator.interpolate import FAILED, unzip, upsample
 from experiments.shared.common import begin, conclude, markdown, run_script
+from experiments.shared.kept import resumed
 from experiments.shared.moving import WAYS, Pairs, Seen, moving, pictures, scores, seen, video
 
 Scene = tuple[str, str, float, tuple[int, int]]  # motion, picture, speed, size
@@ -150,32 +148,18 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 def main(options: Options) -> dict[str, Any]:
     begin(options, "between_frames")
     frames, wanted = FRAMES[options.preset], list(scenes(options.preset))
-    done = _kept(options.rows, frames, options.seed)
-    left = [scene for scene in wanted if repr(scene) not in done]
     measure = partial(measured, frames=frames, seed=options.seed)
-    with bar("scenes") as progress, worker_pool(options.workers) as pool:
-        found = map(measure, left) if options.workers == 1 else pool.map(measure, left)
-        for scene, row in zip(left, found, strict=True):
-            done[repr(scene)] = row
-            _keep(options.rows, frames, options.seed, done)
-            progress(len(done), len(wanted))
-    rows = [done[repr(scene)] for scene in wanted]
+
+    with worker_pool(options.workers) as pool:
+        def make(left: list[int]) -> Iterable[dict[str, Any]]:
+            chosen = [wanted[i] for i in left]
+            return map(measure, chosen) if options.workers == 1 else pool.map(measure, chosen)
+
+        rows = resumed(options.rows, [frames, options.seed], [repr(s) for s in wanted], make,
+                       "scenes")
     conclude(options, "between_frames", {"rows": rows}, table(rows))
     draw(rows, options.out / "between_frames.png")
     return {"rows": rows}
-
-
-def _kept(path: Path | None, frames: int, seed: int) -> dict[str, dict[str, Any]]:
-    """Rows by scene that an interrupted run with the same options left."""
-    if path is None or not path.exists():
-        return {}
-    kept = json.loads(path.read_text())
-    return dict(kept["rows"]) if kept["of"] == [frames, seed] else {}
-
-
-def _keep(path: Path | None, frames: int, seed: int, rows: dict[str, dict[str, Any]]) -> None:
-    if path is not None:
-        atomic_text(path, json.dumps({"of": [frames, seed], "rows": rows}), overwrite=True)
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ def scores(
     """score(params, hidden, protocol) for each job (number, protocol), in order. A recording
     follows from the seed, its number and its protocol alone."""
     with bar(title) as progress:
-        for done, result in enumerate(_scores(score, setup, jobs, workers), 1):
+        for done, result in enumerate(made(score, setup, jobs, workers), 1):
             progress(done, len(jobs))
             yield result
 
@@ -68,13 +68,14 @@ def study(
 ) -> list[Result]:
     """`scores` of one recording of each protocol, numbered from 0; without those that are None,
     of recordings that tell nothing."""
-    made = scores(score, setup, list(enumerate(protocols)), workers, title)
-    return [row for row in made if row is not None]
+    rows = scores(score, setup, list(enumerate(protocols)), workers, title)
+    return [row for row in rows if row is not None]
 
 
-def _scores(
+def made(
     score: Score[Result], setup: Setup, jobs: Sequence[tuple[int, Protocol]], workers: int
 ) -> Iterator[Result]:
+    """`scores` without a bar."""
     if workers == 1:
         prepare(setup)
         yield from map(partial(one, score), jobs)

@@ -248,10 +248,10 @@ def slow_pixels(path: str | os.PathLike, rows: dict[str, list[dict[str, Any]]]) 
     """Every threshold's |error|, in per cent and over its standard deviation."""
     figure = new_figure(11.0, 0.3 * len(rows) + 1.5)
     axes = figure.subplots(1, 2, sharey=True)
-    looks = (("0.6", "pixels taken for ideal"), ("tab:blue", "measured"))
-    for k, (colour, label) in enumerate(looks):
+    looks = (("0.6", "ideal", "pixels taken for ideal"), ("tab:blue", "measured", "measured"))
+    for k, (colour, which, label) in enumerate(looks):
         for place, found in enumerate(rows.values()):
-            error, std = (np.stack([r[name] for r in found])[:, k].ravel()
+            error, std = (np.array([r[which][name] for r in found if which in r]).ravel()
                           for name in ("error", "std"))
             y = np.full(error.size, place + 0.3 * k - 0.15)
             axes[0].plot(100 * np.abs(error) + 0.1, y, ".", color=colour, label=label)

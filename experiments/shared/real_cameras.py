@@ -9,8 +9,9 @@ import numpy as np
 
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SENSORS, SensorModel
+from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.scenes.config import SceneConfig
-from experiments.shared.cameras import Protocol
+from experiments.shared.cameras import Hidden, Protocol
 
 BASE = Protocol(
     prior=CameraPrior(theta=(0.12, 0.45)), shape=(120, 160), frame_ms=40, intervals=24,
@@ -30,9 +31,29 @@ CHANGES: dict[str, dict[str, Any]] = {
     **{f"dead time {ms} ms": {"model": SensorModel(refractory_s=ms * 1e-3)} for ms in (1, 5)},
     "leak .3 Hz": {"model": SensorModel(leak_hz=0.3, leak_jitter=0.1, noise_resets_memory=True)},
     "shot noise 5 Hz": {"model": SensorModel(shot_hz=5.0, noise_resets_memory=True)},
+    "shot noise 1 Hz, mismatch .15": {
+        "model": SensorModel(shot_hz=1.0, noise_resets_memory=True),
+        "prior": dataclasses.replace(BASE.prior, mismatch=(0.15, 0.15))},
     "v2e's noisy": {"model": SENSORS["noisy"].model},
     "as a real camera": {"model": REAL, "exposure_ms": 10, "frame_noise_dn": 2.0, "black_dn": 4.0},
+    "DVS-Voltmeter's DVS346": {"model": SENSORS["dvs346"].model},
 }
+
+
+def added_light(protocol: Protocol) -> float:
+    """DN that pixels see beside the light of frames that show anything."""
+    return protocol.dark_dn - protocol.black_dn
+
+
+def shot_rates(hidden: Hidden, protocol: Protocol) -> np.ndarray:
+    """(2, H, W) the true noise rates ON and OFF in Hz: v2e's shot noise, and what is beside it but
+    for leak."""
+    frames = hidden.recording.frames.astype(np.float64) - protocol.black_dn
+    factor = noise_factor(normalised_intensity(np.clip(frames, 0.0, 255.0))).mean(0)
+    half, camera = 0.5 * protocol.model.shot_hz * np.asarray(factor), hidden.camera
+    return np.stack([
+        np.asarray(eta) + half * np.median(theta) / np.asarray(theta)
+        for eta, theta in ((camera.eta_on, camera.theta_on), (camera.eta_off, camera.theta_off))])
 
 
 def ideal(protocol: Protocol) -> bool:
