@@ -43,6 +43,6 @@ def along_offset(
             if value - best > FAR:
                 break
     offset, worse, *away = np.array(sorted(rows, key=lambda row: row[0])).T
-    weight = np.gradient(offset) * np.exp(-np.maximum(worse, 0.0))
+    weight = np.gradient(offset) * np.exp(worse.min() - worse)
     weight /= weight.sum()
     return float(weight @ offset**2), np.array([weight @ a**2 for a in away])

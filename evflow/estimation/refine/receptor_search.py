@@ -27,12 +27,14 @@ LOW, HIGH = np.array([-25.0, FAST, -4e-3]), np.array([90.0, 3e-2, 4e-3])
 PATTERN = (4.0, 1.0, 0.25)  # SCALEs that are tried, one coordinate at a time
 MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
 MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
+ALL = np.full(3, True)
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # The path is wrong in its own way everywhere. What it explains better by less than a few per cent
 # of what is left says nothing of the pixel, and so much is left open of what is found:
 BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
 FLOOR = np.array([0.5, 1e-4, 5e-4])
 DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
+BY_OFFSET = 5.0  # log odds that it takes to say that a slow pixel's frames lack light
 BY_LIGHT = 1.5  # log odds, a priori, that a low-pass goes with light
 TYPICAL = 0.4  # pace of such a low-pass, of its pace at 255 DN
 
@@ -120,10 +122,12 @@ def find(data: Sample) -> Found:
         by_light = Regression(parted(data, _receptor(phi), theta))
     plain = by_light.unexplained(PLAIN)
     model, phi = _with_law(phi, by_light, min(size, BELIEVED))
+    odds = 0.5 * min(size, BELIEVED) * (plain - model.unexplained(phi)) - DOUBT - _unlikely(phi)
+    if odds > 0:
+        phi = _without_offset(phi, model, min(size, BELIEVED))
     value = model.unexplained(phi)
     covariance, open_ = _errors(phi, model, min(size, BELIEVED))
     fits, ideal_fits = (model.solved(at)[0] for at in (phi, PLAIN))
-    odds = 0.5 * min(size, BELIEVED) * (plain - value) - DOUBT - _unlikely(phi)
     if fits.min() <= 0:  # brightness that falls with ON events: there is no path
         odds = -np.inf
     return Found(_receptor(phi, by_light=model.by_light), np.abs(fits), np.abs(ideal_fits),
@@ -153,6 +157,13 @@ def _with_law(phi: np.ndarray, by_light: Regression, size: float) -> tuple[Regre
     other = _descend(np.where(np.arange(3) == 1, phi[1] / TYPICAL, phi), even, size)
     gain = _value(phi, by_light, size) - _value(other, even, size)
     return (even, other) if gain > BY_LIGHT else (by_light, phi)
+
+
+def _without_offset(phi: np.ndarray, model: Regression, size: float) -> np.ndarray:
+    """The constants without an offset, if with it the events are not much more probable."""
+    none = _descend(np.where(np.arange(3) == 0, 0.0, phi), model, size, free=np.arange(3) > 0)
+    gain = _value(none, model, size) - _value(phi, model, size)
+    return phi if gain > BY_OFFSET else none
 
 
 def _unlikely(phi: np.ndarray) -> float:
@@ -238,17 +249,20 @@ def _start(model: Regression) -> np.ndarray:
     return phi
 
 
-def _descend(phi: np.ndarray, model: Regression, size: float) -> np.ndarray:
-    """Newton's steps, damped until they lead down, and single coordinates where none does: the
-    lin-log's bend at 20 DN bends the likelihood too."""
+def _descend(
+    phi: np.ndarray, model: Regression, size: float, free: np.ndarray = ALL
+) -> np.ndarray:
+    """Newton's steps of the constants that are free, damped until they lead down, and single
+    constants where none does: the lin-log's bend at 20 DN bends the likelihood too."""
     phi = np.clip(phi, LOW, HIGH)
     best = _value(phi, model, size)
     for _ in range(MOST_STEPS):
         gradient, bent = _newton(phi, model, size)
-        steps = [-np.linalg.solve(bent + np.diag(np.diag(bent)) * damping, gradient)
+        bent = np.where(np.outer(free, free), bent, np.diag(PRIOR**-2.0))
+        steps = [-np.linalg.solve(bent + np.diag(np.diag(bent)) * damping, gradient * free)
                  for damping in (0.02, 0.5, 5.0)]
         steps += [sign * much * SCALE * (np.arange(3) == k)
-                  for much in PATTERN for k in range(3) for sign in (1, -1)]
+                  for much in PATTERN for k in np.flatnonzero(free) for sign in (1, -1)]
         before = best
         for step in steps:
             new = np.clip(phi + np.clip(step, -STEP, STEP), LOW, HIGH)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evflow.estimation.refine import receptor_search
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_regression import Regression
@@ -141,6 +142,18 @@ def test_the_constants_are_found_again(
     assert found.explained[1] > 0.98
     if cutoff_hz:
         assert found.seen.cutoff_hz == pytest.approx(cutoff_hz, rel=0.15)
+
+
+@pytest.mark.parametrize(("asked", "kept"), [(0.0, True), (1e6, False)])
+def test_an_offset_must_explain_something(
+    monkeypatch: pytest.MonkeyPatch, asked: float, kept: bool
+) -> None:
+    data = looked_at(24.0, 200.0, 1e-3)
+    monkeypatch.setattr(receptor_search, "BY_OFFSET", asked)
+    found = find(data)
+    assert found.needed
+    assert found.seen.offset_dn == (pytest.approx(24.0, abs=4.0) if kept else 0.0)
+    assert found.covariance[0, 0] > (0.0 if kept else 15.0**2)
 
 
 def test_a_slow_pixel_is_found_among_noise() -> None:

@@ -1,0 +1,112 @@
+"""Cameras that are not ideal: what was measured of each beside what is true, and tables of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from evflow import CameraEstimate, estimate_camera
+from evflow.camera.optics import MEASURED
+from experiments.shared.cameras import Hidden, Protocol
+from experiments.shared.kept import Row
+from experiments.shared.real_cameras import added_light, shot_rates
+
+LABELS = {"cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz]",
+          "shot_hz": "shot noise [Hz]"}
+HEADS = ("condition", "cameras", "ideal: median error of θ", "68 / 95 % hold",
+         "measured: median error", "68 / 95 % hold", "median std")
+OTHER_HEADS = ("what else", "condition", "true", "found in", "median error", "68 / 95 % hold")
+
+
+def thresholds(found: CameraEstimate, truth: np.ndarray) -> Row:
+    """Relative errors of theta_on and theta_off, and their stds."""
+    theta, std = ([float(s.theta_on), float(s.theta_off)]
+                  for s in (found.summary, found.summary_std))
+    return {"error": (theta / truth - 1).tolist(), "std": (std / truth).tolist()}
+
+
+def score(params: Any, hidden: Hidden, protocol: Protocol) -> Row:
+    """What was measured of a camera, and what is true."""
+    truth = np.array([float(hidden.nominal.theta_on), float(hidden.nominal.theta_off)])
+    found = estimate_camera(hidden.recording, params)
+    sensor, optics = found.sensor, found.optics
+    row: Row = {
+        "measured": thresholds(found, truth),
+        "sensor": {name: [getattr(sensor, name), told(found.sensor_std.get(name)),
+                          getattr(protocol.model, name)] for name in MEASURED},
+        "light": [optics.offset_dn, told(optics.offset_dn_std), added_light(protocol)]}
+    if protocol.model.shot_hz:
+        maps = np.stack([found.camera.eta_on, found.camera.eta_off])
+        sides = maps, shot_rates(hidden, protocol)
+        row["noise"] = [[[float(of(m)) for m in both] for both in sides]
+                        for of in (np.mean, np.median)]
+    return row
+
+
+def told(value: float | None) -> float | None:
+    """None for NaN, which JSON does not know."""
+    return value if value is not None and np.isfinite(value) else None
+
+
+def score_both(params: Any, hidden: Hidden, protocol: Protocol) -> Row:
+    """The same, beside the estimate that takes pixels for ideal."""
+    truth = np.array([float(hidden.nominal.theta_on), float(hidden.nominal.theta_off)])
+    ideal = estimate_camera(hidden.recording, params, pixel="ideal")
+    return {**score(params, hidden, protocol), "ideal": thresholds(ideal, truth)}
+
+
+def held(error: np.ndarray, std: np.ndarray) -> str:
+    """How many per cent of errors lie within 1 and 1.96 std."""
+    z = np.abs(error) / std
+    return f"{100 * (z < 1).mean():.0f} / {100 * (z < 1.96).mean():.0f} %" if z.size else "–"
+
+
+def cells(name: str, rows: list[Row]) -> list[str]:
+    """A condition's thresholds."""
+    line = [name, str(len(rows))]
+    for which in ("ideal", "measured"):
+        error, std = (np.array([r[which][k] for r in rows if which in r]) for k in ("error", "std"))
+        line += [f"{100 * np.median(np.abs(error)):.1f} %", held(error, std)]
+    return [*line, f"{100 * np.median(std):.1f} %"]
+
+
+def sensor_lines(rows: dict[str, list[Row]]) -> list[list[str]]:
+    """What was measured of the circuit: what, condition, true value, how often found, median error
+    of those, and how often the intervals hold; last, how often it was found where there is none."""
+    lines = []
+    for name, label in LABELS.items():
+        without = []
+        for condition, found in rows.items():
+            value, std, true = np.array([r["sensor"][name] for r in found], float).T
+            there = value > 0
+            if not true[0]:
+                without += there.tolist()
+                continue
+            off = value[there] / true[there] - 1
+            lines.append([label, condition, f"{true[0]:g}", f"{there.sum()} of {len(found)}",
+                          f"{100 * np.median(np.abs(off)):.0f} %" if off.size else "–",
+                          held(off, std[there] / true[there])])
+        if name != "shot_hz":  # which all noise that falls with light is
+            lines.append([label, "all others", "0", f"{sum(without)} of {len(without)}",
+                          "", ""])
+    return lines
+
+
+def light_lines(rows: dict[str, list[Row]]) -> list[list[str]]:
+    """The same of the light that frames lack, and of noise rates over pixels."""
+    lines = []
+    for condition, found in rows.items():
+        value, std, true = np.array([r["light"] for r in found], float).T
+        there = value != 0
+        if true[0]:
+            off = (value - true)[there]
+            lines.append(["light added [DN]", condition, f"{true[0]:g}",
+                          f"{there.sum()} of {len(found)}",
+                          f"{np.median(np.abs(off)):.1f} DN" if off.size else "–",
+                          held(off, std[there])])
+        for k, what in enumerate(("mean", "median") if "noise" in found[0] else ()):
+            maps, real = np.array([r["noise"][k] for r in found]).transpose(1, 0, 2)
+            lines.append([f"η [Hz], {what} of pixels", condition, f"{np.median(real):.2f}", "all",
+                          f"{100 * np.median(np.abs(maps / real - 1)):.0f} %", ""])
+    return lines
