@@ -46,6 +46,7 @@ CODES: dict[str, str] = {
     "EV032": "colour frames",
     "EV033": "pixels far busier than their neighbours",
     "EV034": "events and frames are unrelated",
+    "EV035": "events bunch at the frames",
 }
 
 

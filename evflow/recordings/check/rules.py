@@ -11,6 +11,7 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.io.hints import Told
 from evflow.recordings.check.agreement import agreement
+from evflow.recordings.check.bunches import bunches
 from evflow.recordings.check.clocks import clocks
 from evflow.recordings.check.contents import contents
 from evflow.recordings.check.findings import Finding, Report
@@ -30,7 +31,8 @@ def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told
     window, EV021 polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned,
     EV025 gaps, EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029
     mirrored frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034
-    unrelated frames; and, of a path, whatever the reader refuses.
+    unrelated frames, EV035 events that bunch at the frames; and, of a path, whatever the reader
+    refuses.
 
     Args:
         recording_or_path: the recording, or a file or folder of any known format.
@@ -67,6 +69,7 @@ def _findings(recording: Recording) -> list[Finding]:
             check_overlap(recording)
         except EvflowDataError as error:
             return [*found, Finding.of(error)]
+        found += bunches(recording)
         if not stands_still(recording):  # else noise agrees with nothing, as it should
             try:
                 iter_windows(recording)

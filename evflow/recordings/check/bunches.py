@@ -1,0 +1,73 @@
+"""Events that bunch at the frames: the readout of a camera's frames disturbs its pixels.
+
+In `slider_depth` of a DAVIS240C pixels all over the sensor send ON events at twenty times the rate
+of before, half a millisecond before the time of each frame, and OFF events a millisecond later: a
+fifth of all ON events. As they lie at one phase of the frames' period and are short, light that
+flickers, motion by jumps and a simulator's time slots look otherwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evflow.recordings.check.findings import Finding
+from evflow.types import Recording, release
+
+BIN_US = 250
+MOST_FRAMES = 64  # looked at, evenly spread
+LEAST_FRAMES, LEAST_BINS = 3, 16
+PEAK, RAISED = 4.0, 2.0  # times the usual rate: in the middle of a bunch, and at its edges
+PRESENT = 0.8  # of the frames have it
+GAP_BINS = 4  # between a bunch and its rebound
+LONGEST_US, LONGEST_SHARE = 4_000, 0.15  # of a bunch; of the frames' period
+LEAST_SHARE, LEAST_EVENTS = 0.02, 300  # of a polarity's, too many for the rate around them
+LEAST_USUAL = 1.0  # events a bin of a frame's period, elsewhere
+
+
+def bunches(recording: Recording) -> list[Finding]:
+    """EV035 where events bunch at the frames."""
+    counts, start_us = _by_phase(recording)
+    total = counts.sum(0)
+    usual = np.median(total, 1) if len(counts) else np.zeros(2)
+    if usual.min() < LEAST_USUAL * len(counts) or not usual.all():
+        return []
+    rise = total / usual[:, None]
+    raised = np.flatnonzero((rise >= RAISED).any(0))
+    if rise.max() < PEAK or np.diff(raised).max(initial=0) > GAP_BINS + 1:
+        return []  # none, or more than one in a period
+    first, last = int(raised[0]), int(raised[-1]) + 1
+    if BIN_US * (last - first) > min(LONGEST_US, LONGEST_SHARE * BIN_US * total.shape[1]):
+        return []
+    inside = counts[:, :, first:last].sum(2)
+    excess = inside.sum(0) - usual * (last - first)
+    shares = np.maximum(excess, 0.0) / total.sum(1)
+    most = int(np.argmax(shares))
+    there = inside[:, most] > RAISED * usual[most] / len(counts) * (last - first)
+    if shares[most] < LEAST_SHARE or excess[most] < LEAST_EVENTS or there.mean() < PRESENT:
+        return []
+    begin, end = (1e-3 * (start_us + BIN_US * k) for k in (first, last))
+    return [Finding(
+        "EV035", "warning", f"between {begin:+.2f} and {end:+.2f} ms of each frame come "
+        f"{shares[0]:.0%} of the ON and {shares[1]:.0%} of the OFF events, beyond the rate around "
+        "them.",
+        "The readout of frames that disturbs the pixels (as in a DAVIS240C), or light that flashes "
+        "with them: a simulation does not make these events, so expect that many fewer.")]
+
+
+def _by_phase(recording: Recording) -> tuple[np.ndarray, int]:
+    """Events (F, 2, bins), ON and OFF, of frames whose whole period they cover, evenly spread; and
+    when the first bin begins, us after a frame. F = 0 where there are too few."""
+    times, t = recording.frame_times, recording.events.t
+    bins = int(np.median(np.diff(times))) // BIN_US if len(times) > 1 else 0
+    start = -(bins // 2) * BIN_US
+    covered = np.flatnonzero((times + start >= t[0]) & (times + start + bins * BIN_US <= t[-1]))
+    if bins < LEAST_BINS or len(covered) < LEAST_FRAMES:
+        return np.zeros((0, 2, 1)), 0
+    some = covered[np.unique(np.linspace(0, len(covered) - 1, MOST_FRAMES).astype(int))]
+    counts = np.zeros((len(some), 2, bins), np.int64)
+    for of_frame, begin in zip(counts, times[some] + start, strict=True):
+        part = recording.events.slice(int(begin), int(begin) + bins * BIN_US)
+        at = (part.t - begin) // BIN_US + bins * ~part.p
+        of_frame[:] = np.bincount(at, minlength=2 * bins).reshape(2, bins)
+    release(recording)
+    return counts, start
