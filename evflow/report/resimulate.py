@@ -23,6 +23,7 @@ from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.result import CameraEstimate
 from evflow.metrics.streams import compare, correlations
 from evflow.notes import Note
+from evflow.recordings.check.bunches import beside, bunch
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
@@ -94,7 +95,8 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
 
 def resimulate(recording: Recording, found: CameraEstimate, run: Run, seed: int) -> Trial:
     """Simulate the frames of `run` twice, interpolated by `upsample` and seen by the camera as it
-    was measured, and compare."""
+    was measured, and compare; beside the bunches of events that come with frames, as no camera
+    makes those."""
     notes: list[Note] = []
     seen_by, model = as_measured(found.sensor, found.optics)
     pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
@@ -108,6 +110,10 @@ def resimulate(recording: Recording, found: CameraEstimate, run: Run, seed: int)
     span = (int(recording.frame_times[begin]), int(recording.frame_times[run[1]]))
     made, again = (Events.concatenate(p).slice(*span) for p in zip(*parts, strict=True))
     real = recording.events.slice(*span)
+    disturbed = bunch(recording)
+    if disturbed is not None:
+        real, made, again = (beside(e, recording.frame_times, disturbed)
+                             for e in (real, made, again))
     ceiling = correlations(*(e.count_map().astype(np.float64) for e in (made, again)))
     return Trial(real, made, span, run, compare(real, made, span_us=span), ceiling,
                  busiest_instant(real, span), tuple(dict.fromkeys(notes)))

@@ -27,6 +27,7 @@ from evflow.estimation.drift import Third
 from evflow.estimation.extent import Extent
 from evflow.estimation.refine import stretches
 from evflow.notes import Note
+from evflow.recordings.check.bunches import Bunch
 from evflow.report import camera, page, resimulate
 from evflow.report.extent import extent_panel
 from evflow.report.resimulate import busiest, usable_runs
@@ -192,6 +193,21 @@ def test_it_is_simulated_as_the_command_simulates_it(
     added = Pixels(camera=path, shot_hz=2.0).model()
     assert (added.leak_hz, added.shot_hz, added.eta_is_all) == (0.0, 2.0, False)
     assert Pixels(camera=path, sensor="v2e").model().leak_hz == 0.01
+
+
+def test_what_comes_with_the_frames_is_not_compared(
+    measured: tuple[CameraEstimate, Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, recording = measured
+    monkeypatch.setattr(resimulate, "simulate_stream", lambda *_, **__: iter([recording.events]))
+    monkeypatch.setattr(resimulate, "bunch", lambda _: Bunch(-2_000, 1_000, 0.2, 0.0))
+    trial = resimulate.resimulate(recording, found, (0, 2), 0)
+    inside = recording.events.slice(*trial.span_us)
+    near = (inside.t[:, None] - recording.frame_times >= -2_000) & (
+        inside.t[:, None] - recording.frame_times < 1_000)
+    assert near.any()
+    for events in (trial.real, trial.made):
+        np.testing.assert_array_equal(events.t, inside.t[~near.any(1)])
 
 
 def test_too_short_for_halves_says_so(

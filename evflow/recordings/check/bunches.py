@@ -8,10 +8,12 @@ flickers, motion by jumps and a simulator's time slots look otherwise.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from evflow.recordings.check.findings import Finding
-from evflow.types import Recording, release
+from evflow.types import Events, Recording, release
 
 BIN_US = 250
 MOST_FRAMES = 64  # looked at, evenly spread
@@ -24,34 +26,60 @@ LEAST_SHARE, LEAST_EVENTS = 0.02, 300  # of a polarity's, too many for the rate 
 LEAST_USUAL = 1.0  # events a bin of a frame's period, elsewhere
 
 
+class Bunch(NamedTuple):
+    """When it comes, us after a frame (below 0: before); the shares of the ON and OFF events that
+    are beyond the rate around it."""
+
+    begin_us: int
+    end_us: int
+    on: float
+    off: float
+
+
 def bunches(recording: Recording) -> list[Finding]:
     """EV035 where events bunch at the frames."""
+    found = bunch(recording)
+    return [] if found is None else [Finding(
+        "EV035", "warning", f"between {found.begin_us / 1e3:+.2f} and {found.end_us / 1e3:+.2f} ms "
+        f"of each frame come {found.on:.0%} of the ON and {found.off:.0%} of the OFF events, "
+        "beyond the rate around them.",
+        "The readout of frames that disturbs the pixels (as in a DAVIS240C), or light that flashes "
+        "with them: a simulation does not make these events, so expect that many fewer.")]
+
+
+def beside(events: Events, frame_times: np.ndarray, found: Bunch) -> Events:
+    """The events outside of the bunch of each frame."""
+    kept = np.ones(len(events), bool)
+    ends = np.searchsorted(events.t, [frame_times + found.begin_us, frame_times + found.end_us])
+    for first, last in ends.T:
+        kept[first:last] = False
+    return Events.unchecked(events.x[kept], events.y[kept], events.t[kept], events.p[kept],
+                            events.size)
+
+
+def bunch(recording: Recording) -> Bunch | None:
+    """The bunch of events that comes with each frame; None where there is none."""
     counts, start_us = _by_phase(recording)
     total = counts.sum(0)
     usual = np.median(total, 1) if len(counts) else np.zeros(2)
     if usual.min() < LEAST_USUAL * len(counts) or not usual.all():
-        return []
+        return None
     rise = total / usual[:, None]
     raised = np.flatnonzero((rise >= RAISED).any(0))
     if rise.max() < PEAK or np.diff(raised).max(initial=0) > GAP_BINS + 1:
-        return []  # none, or more than one in a period
+        return None  # none, or more than one in a period
     first, last = int(raised[0]), int(raised[-1]) + 1
     if BIN_US * (last - first) > min(LONGEST_US, LONGEST_SHARE * BIN_US * total.shape[1]):
-        return []
+        return None
     inside = counts[:, :, first:last].sum(2)
     excess = inside.sum(0) - usual * (last - first)
     shares = np.maximum(excess, 0.0) / total.sum(1)
     most = int(np.argmax(shares))
     there = inside[:, most] > RAISED * usual[most] / len(counts) * (last - first)
     if shares[most] < LEAST_SHARE or excess[most] < LEAST_EVENTS or there.mean() < PRESENT:
-        return []
-    begin, end = (1e-3 * (start_us + BIN_US * k) for k in (first, last))
-    return [Finding(
-        "EV035", "warning", f"between {begin:+.2f} and {end:+.2f} ms of each frame come "
-        f"{shares[0]:.0%} of the ON and {shares[1]:.0%} of the OFF events, beyond the rate around "
-        "them.",
-        "The readout of frames that disturbs the pixels (as in a DAVIS240C), or light that flashes "
-        "with them: a simulation does not make these events, so expect that many fewer.")]
+        return None
+    return Bunch(start_us + BIN_US * first, start_us + BIN_US * last, float(shares[0]),
+                 float(shares[1]))
 
 
 def _by_phase(recording: Recording) -> tuple[np.ndarray, int]:

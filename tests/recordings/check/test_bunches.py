@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evflow.recordings.check.bunches import bunches
+from evflow.recordings.check.bunches import beside, bunch, bunches
 from evflow.types import Events, Recording
 
 SIZE, PERIOD_US, FRAMES = (64, 48), 40_000, 12
@@ -58,3 +58,14 @@ def test_a_readout_is_found_with_its_time_and_shares() -> None:
 }.items(), ids=lambda v: v if isinstance(v, str) else "")
 def test_what_is_no_readout(what: str, seen: Recording) -> None:
     assert bunches(seen) == [], what
+
+
+def test_beside_a_bunch_are_the_other_events() -> None:
+    seen = with_pulses((-500,), 500, 600)
+    found = bunch(seen)
+    assert found is not None
+    assert found[:2] == (-500, 0)
+    phase = (seen.events.t - 20_000 + PERIOD_US // 2) % PERIOD_US - PERIOD_US // 2
+    other = beside(seen.events, seen.frame_times, found)
+    np.testing.assert_array_equal(other.t, seen.events.t[(phase < -500) | (phase >= 0)])
+    assert other.size == SIZE
