@@ -3,7 +3,7 @@
     python -m experiments.real_pixels --preset full --rows rows.json --recordings-at flight.aedat4
 
 Hidden cameras, one condition a row: the relative error of theta, how often its 68 and 95 %
-intervals hold the truth; of the first ten of a row also with `estimate_camera(pixel="ideal")`,
+intervals hold the truth; of the first five of a row also with `estimate_camera(pixel="ideal")`,
 which takes pixels for ideal. Then what else was measured: cutoff, dead time, leak, shot noise,
 light added, and noise rates over pixels, where a condition has them. Then real recordings: the
 share of variance that the pooled regression of one half explains of the other, with an ideal pixel
@@ -41,7 +41,7 @@ from experiments.shared.real_scores import (
 )
 
 FEW = ("ideal", "cutoff 30.0 Hz", "black level +16 DN")
-BESIDE = 10  # cameras of a row that are also taken for ideal
+BESIDE = 5  # cameras of a row that are also taken for ideal
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
