@@ -15,6 +15,8 @@ so that an interrupted run (--rows) can be ended with fewer (--recordings). Writ
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import operator
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,7 +38,7 @@ from experiments.shared.real_scores import (
     cells,
     light_lines,
     score,
-    score_both,
+    score_ideal,
     sensor_lines,
 )
 
@@ -59,19 +61,24 @@ class Options(StudyOptions):
 
 
 def measured(options: Options, names: Sequence[str], count: int) -> dict[str, list[Row]]:
-    """The rows of each condition; the first camera of all before the second of any."""
+    """The rows of each condition; the first camera of all before the second of any, and what takes
+    pixels for ideal last."""
     setup = Setup(options.weights, options.seed, photos=True)
-    jobs = [(i, name) for i in range(count) for name in names]
+    cameras = [(i, name) for i in range(count) for name in names]
+    beside = [(i, name) for i, name in cameras if i < BESIDE]
+    jobs = [(score, *job) for job in cameras] + [(score_ideal, *job) for job in beside]
 
     def make(left: list[int]) -> Iterable[Row]:
-        for first, scored in ((True, score_both), (False, score)):
-            chosen = [jobs[k] for k in left if (jobs[k][0] < BESIDE) == first]
+        for scored, some in itertools.groupby((jobs[k] for k in left), operator.itemgetter(0)):
             yield from made(scored, setup, [(i, dataclasses.replace(BASE, **CHANGES[name]))
-                                            for i, name in chosen], options.workers)
+                                            for _, i, name in some], options.workers)
 
-    rows = resumed(options.rows, [weights_hash(options.weights), options.seed],
-                   [f"{name} {i}" for i, name in jobs], make, "cameras")
-    return {name: rows[k::len(names)] for k, name in enumerate(names)}
+    keys = [f"{name} {i}{' ideal' * (scored is score_ideal)}" for scored, i, name in jobs]
+    rows = resumed(options.rows, [weights_hash(options.weights), options.seed], keys, make,
+                   "cameras")
+    for (i, name), row in zip(beside, rows[len(cameras):], strict=True):
+        rows[cameras.index((i, name))] |= {"ideal": row}
+    return {name: rows[k:len(cameras):len(names)] for k, name in enumerate(names)}
 
 
 def halves(path: Path) -> list[str] | None:

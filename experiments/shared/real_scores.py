@@ -49,11 +49,10 @@ def told(value: float | None) -> float | None:
     return value if value is not None and np.isfinite(value) else None
 
 
-def score_both(params: Any, hidden: Hidden, protocol: Protocol) -> Row:
-    """The same, beside the estimate that takes pixels for ideal."""
+def score_ideal(params: Any, hidden: Hidden, _protocol: Protocol) -> Row:
+    """Thresholds of the estimate that takes pixels for ideal."""
     truth = np.array([float(hidden.nominal.theta_on), float(hidden.nominal.theta_off)])
-    ideal = estimate_camera(hidden.recording, params, pixel="ideal")
-    return {**score(params, hidden, protocol), "ideal": thresholds(ideal, truth)}
+    return thresholds(estimate_camera(hidden.recording, params, pixel="ideal"), truth)
 
 
 def held(error: np.ndarray, std: np.ndarray) -> str:
