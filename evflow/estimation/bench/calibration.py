@@ -95,7 +95,8 @@ def calibrate_step(
     hz, kept = camera_rate(rest, steps.rest_s)
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
-    theta, error = (ratio if literal else regression)(steps.levels, clean, strays, fresh)
+    theta, error = (ratio if literal else regression)(
+        steps.levels, clean, strays, fresh, steps.rests.max(1) > 0)
     events = steps.counts.sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN

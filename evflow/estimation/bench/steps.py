@@ -8,7 +8,9 @@ all. At a rest k, with a_k and b_k the ON and OFF events until then,
 
 where the remainder r_k is uniform in [0, theta_ON) if light came up, in (-theta_OFF, 0] if it came
 down: mean half a threshold, variance theta²/12. Each pixel is a linear regression with these means
-and variances, its unknown r_0 among the unknowns. NumPy, float64: 3x3 systems of sums of squares.
+and variances, its unknown r_0 among the unknowns. An event of noise at a rest stores the light, in
+most sensors: from there on the pixel starts anew, with a remainder of 0. Whether it does is what
+the steps after rests with events say (`storing`). NumPy, float64: 3x3 systems of sums of squares.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ BIAS = 0.015  # of the threshold: medians of eight simulated benches came out 1.
 
 
 def ratio(
-    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """dlogI / events (2, H, W) over the steps of each direction; std of one event more or less.
     Takes what `regression` takes."""
@@ -38,23 +40,65 @@ def ratio(
 
 
 def regression(
-    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """theta and std (2, H, W): weighted least squares for (theta_ON, theta_OFF, r_0), the weights
     from the thresholds of the pass before. levels (K+1, H, W) at the rests; n (K, 2, H, W) events
-    of the steps, less the noise; strays (K, 2) how much that was; fresh: r_0 is 0."""
-    rise = (levels - levels[0])[1:]
+    of the steps, less the noise; strays (K, 2) how much that was; fresh: r_0 is 0; noisy (K+1, H,
+    W) bool: rests with events."""
+    theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy))
+    up = np.median(np.diff(levels, axis=0), (1, 2)) > 0
+    if storing(n, up, noisy, np.median(theta, (1, 2))) > 0.5:
+        # An event of noise amid a step takes what half an event of the step would have gone on to.
+        lost = 0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1)
+        return _regression(levels, n + lost[..., None, None], strays, fresh, noisy)
+    return theta, std
+
+
+def storing(n: np.ndarray, up: np.ndarray, noisy: np.ndarray, theta: np.ndarray) -> float:
+    """1 where noise at a rest stores the light, 0 where it does not, and a little about it.
+
+    Of a step (up (K,) or down) pixels that start from the light itself send half an event less than
+    those that may have gone up to a threshold ahead in its direction already, or as many more as
+    half of theta (2,) of the other side is, which the others have to go back first."""
+    excess, expected, weight = [], [], []
+    for k in range(1, len(n)):
+        side = 0 if up[k] else 1
+        anew = noisy[k]
+        if not 0 < anew.sum() < anew.size:
+            continue
+        sent = n[k, side]
+        excess.append(sent[anew].mean() - sent[~anew].mean())
+        expected.append(-0.5 if up[k - 1] == up[k] else 0.5 * theta[1 - side] / theta[side])
+        weight.append(1.0 / (1.0 / anew.sum() + 1.0 / (~anew).sum()))
+    w, x, y = map(np.array, (weight, expected, excess))
+    return float((w * x) @ y / ((w * x) @ x)) if len(w) else 0.0
+
+
+def _regression(
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, stored: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same, of pixels whose memory is the light at rests (K+1, H, W) in which it was stored."""
+    number = np.arange(len(n))[:, None, None]
+    last = np.maximum.accumulate(np.where(stored[:-1], number, -1), 0)  # rest, of each step
+    known, base = last >= 0, np.maximum(last, 0)
+
+    def since(total: np.ndarray) -> np.ndarray:
+        return total[1:] - np.take_along_axis(total, base, 0)
+
+    rise = since(levels)
     up = np.diff(levels, axis=0) > 0
-    a = np.cumsum(n[:, 0], 0) + 0.5 * up
-    b = np.cumsum(n[:, 1], 0) + 0.5 * ~up
-    design = np.stack([a, -b, -np.ones_like(a)], -1)  # (K, H, W, 3)
-    extra = np.cumsum(strays, 0)  # variance of the noise events, in events
+    before = np.zeros((1, *n.shape[1:]))
+    a, b = (since(sums) for sums in np.moveaxis(np.cumsum(np.concatenate([before, n]), 0), 1, 0))
+    design = np.stack([a + 0.5 * up, -(b + 0.5 * ~up), known - 1.0], -1)  # (K, H, W, 3)
+    sent = np.cumsum(np.concatenate([np.zeros((1, 2)), strays]), 0)
+    extra = sent[1:, :, None, None] - np.moveaxis(sent[base], -1, 1)  # noise: variance, in events
     theta = np.stack([np.full(a.shape[1:], THETA_PRIOR)] * 2)
     covariance = np.zeros((*a.shape[1:], 3, 3))
     for _ in range(PASSES):
         each = theta**2
-        noise = np.where(up, each[0], each[1]) / 12.0 + np.einsum("kp,phw->khw", extra, each)
-        weight = 1.0 / noise
+        remainder = np.where(up, each[0], each[1]) / 12.0
+        weight = 1.0 / (remainder + np.einsum("kphw,phw->khw", extra, each))
         normal = np.einsum("khwi,khw,khwj->hwij", design, weight, design)
         right = np.einsum("khwi,khw,khw->hwi", design, weight, rise)
         # r_0 is 0 in a fresh memory, else uniform in (-theta_OFF, theta_ON).
@@ -68,8 +112,22 @@ def regression(
         covariance = np.linalg.inv(normal)
         found = np.einsum("hwij,hwj->hwi", covariance, right)
         theta = np.clip(np.moveaxis(found[..., :2], -1, 0), THETA_MIN, THETA_TOP)
+    pulled = design * weight[..., None]
+    scatter = normal - np.einsum("khwi,khw,khwj->hwij", pulled, 1.0 / weight - remainder, pulled)
+    scatter += _walked(pulled, np.einsum("kp,phw->khw", strays, each), stored)
+    covariance = covariance @ scatter @ covariance
     std = np.sqrt(np.stack([covariance[..., 0, 0], covariance[..., 1, 1]]))
     return theta, std
+
+
+def _walked(pulled: np.ndarray, variance: np.ndarray, stored: np.ndarray) -> np.ndarray:
+    """(H, W, 3, 3) scatter of what noise of a variance (K, H, W) in each step does to all later
+    rests, pulled (K, H, W, 3) by each, until one of the rests (K+1, H, W) stores the light."""
+    scatter, after = np.zeros((*pulled.shape[1:], 3)), np.zeros(pulled.shape[1:])
+    for k in reversed(range(len(pulled))):
+        after = pulled[k] + np.where(stored[k + 1][..., None], 0.0, after)
+        scatter += variance[k][..., None, None] * after[..., None] * after[..., None, :]
+    return scatter
 
 
 def camera_wide(theta: np.ndarray, error: np.ndarray) -> tuple[float, float, float]:

@@ -15,15 +15,17 @@ import pytest
 
 from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
 from evflow.estimation.bench.levels import few_sizes
 from evflow.estimation.bench.rests import find_rests
+from evflow.estimation.bench.steps import storing
 from evflow.io import write_recording
 from evflow.notes import texts
 from evflow.types import Events
 
-SHAPE = (24, 32)
+IDEAL, SHAPE = SensorModel(), (24, 32)
 CYCLES = [25, 225, 25, 225, 25, 225, 25]
 STAIRS = [25, 40, 64, 100, 160, 225, 160, 100, 64, 40, 25]
 
@@ -36,12 +38,15 @@ def screen(levels: list[float], rest: int = 100, ramp: int = 20) -> np.ndarray:
     return np.exp(np.concatenate(logs)).astype(np.float32)
 
 
-def bench(camera: Camera, levels: list[float], before: tuple[float, ...] = ()) -> Recording:
+def bench(
+    camera: Camera, levels: list[float], before: tuple[float, ...] = (),
+    model: SensorModel = IDEAL,
+) -> Recording:
     """Events of a screen and its frames every 10 ms. before: levels that the camera saw first."""
     lead = len(screen([*before, levels[0]])) - 100 if before else 0
     dn = screen([*before, *levels])
     frames, times = np.broadcast_to(dn[:, None, None], (len(dn), *SHAPE)), 1000 * np.arange(len(dn))
-    events = simulate(jax.random.key(0), frames, times, camera)
+    events = simulate(jax.random.key(0), frames, times, camera, model=model)
     kept = np.arange(lead, len(dn), 10)
     events = events.slice(int(times[lead]) + 1, int(times[-1]) + 1)
     return Recording(events, np.ascontiguousarray(frames[kept]), times[kept])
@@ -115,6 +120,39 @@ def test_noise_is_taken_off_and_measured() -> None:
         true = float(np.mean(getattr(camera, name)))
         seen = float(getattr(found.summary, name))
         assert abs(seen - true) < 3.5 * np.sqrt(true / rest)
+
+
+@pytest.mark.parametrize("stores", [True, False])
+@pytest.mark.parametrize("levels", [CYCLES, STAIRS], ids=["cycles", "stairs"])
+def test_noise_that_stores_the_light_is_told_from_noise_that_does_not(
+    levels: list[float], stores: bool
+) -> None:
+    """A pixel that starts anew at the light of a rest need not go back first."""
+    camera = cameras(0.03)
+    model = SensorModel(shot_hz=2.0, noise_resets_memory=stores)
+    found = calibrate_step(bench(camera, levels, model=model), fresh=True)
+    for name in ("theta_on", "theta_off"):
+        off, sigmas = errors(found, camera, name)
+        assert abs(off.mean()) < 0.007
+        assert 0.7 < np.sqrt((sigmas**2).mean()) < 1.25
+
+
+@pytest.mark.parametrize(("sent", "expected"), [((3.0, 2.5), 1.0), ((3.0, 3.0), 0.0)])
+def test_counts_after_noise_tell_whether_it_stores_the_light(
+    sent: tuple[float, float], expected: float
+) -> None:
+    """Of two steps up, pixels with noise between send half an event less the second time."""
+    noisy = np.zeros((3, 4, 4), bool)
+    noisy[1, :2] = True
+    n = np.zeros((2, 2, 4, 4))
+    n[:, 0] = np.where(noisy[1], sent[1], sent[0])
+    up = np.array([True, True])
+    assert storing(n, up, noisy, np.array([0.2, 0.3])) == pytest.approx(expected)
+    assert storing(n, up, np.zeros_like(noisy), np.array([0.2, 0.3])) == 0.0
+    back = np.where(noisy[1], 3.0 + 0.5 * 0.2 / 0.3 * expected, 3.0)
+    n[:, 1] = back
+    turned = storing(n, np.array([True, False]), noisy, np.array([0.2, 0.3]))
+    assert turned == pytest.approx(expected)
 
 
 def test_light_may_be_given_instead_of_frames() -> None:
