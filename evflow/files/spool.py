@@ -20,7 +20,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 
 LIMIT = 1 << 29  # bytes of a column in memory: 67 million int64 times
-SOME = 1 << 27  # the same, where little of a column is looked at again: 17 million times
+SOME = 1 << 25  # the same, where little of a column is looked at again: 4 million times
 LITTLE = 1 << 24  # and where columns are read once
 JOINED = 1 << 25  # bytes of parts; malloc gives smaller arrays memory that is warm
 

@@ -8,7 +8,7 @@ the refinement: its pixels start anew, so chunks are independent and memory stay
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import cv2
 import jax
@@ -37,6 +37,7 @@ from evflow.types import Events, Recording
 
 STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 px a step
 STRETCHES = 3  # that tell the photoreceptor
+BANDS = 3  # of a large sensor, to as many pixels as are a small one's most
 
 Box = tuple[slice, slice]
 Place = tuple[Recording, Sequence[int]]  # a recording and a run of its frame intervals
@@ -88,7 +89,7 @@ def make_chunk(
     the first frame."""
     film = interpolated(recording, run, steps, noise_dn)
     times = film.times_us + round(seen_by.delay_s * 1e6)
-    fine = as_seen(film, seen_by)
+    fine = as_seen(film, seen_by, out=film.dn)
     dark, light = film.frames.min(0) + seen_by.offset_dn, film.frames.max(0)
     bright = (dark >= DARK_DN) & (light <= SATURATED_DN)
     trace = trace_of_events(recording.events, times, steps)
@@ -118,8 +119,9 @@ def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -
     seen = chunk.sightings.seen.reshape(-1, height, width)[:, *box]
     sums = chunk.evidence
     evidence = PixelEvidence(*(a[:, *box] for a in (sums.equations, sums.bounds, sums.start)))
-    return Chunk(path, chunk.bright[box], chunk.dt_s, chunk.motion_px,
-                 trace_of_events(events, times, steps), evidence, chunk.quiet[:, *box],
+    # Copies: a part that is kept would keep the whole.
+    return Chunk(path, chunk.bright[box].copy(), chunk.dt_s, chunk.motion_px,
+                 trace_of_events(events, times, steps), evidence, chunk.quiet[:, *box].copy(),
                  sight(events, times, path, steps, seen), box)
 
 
@@ -156,24 +158,40 @@ def interpolated(
     frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
     times = recording.frame_times[run[0]:run[-1] + 2]
     clean = [denoised(frame, noise_dn) for frame in frames]
-    dn, motion = [clean[0]], []
-    for interval in intervals(zip(clean, times.tolist(), strict=True), jerk=False):
+    dn, motion = np.empty((len(run) * steps + 1, *clean[0].shape), np.float32), []
+    dn[::steps] = clean
+    for k, interval in enumerate(intervals(zip(clean, times.tolist(), strict=True), jerk=False)):
         # not sharp: the fusion network was trained on that contrast, another shifts its thresholds
-        dn += [*interval.at(np.arange(1, steps) / steps, sharp=False), interval.b.dn]
+        between = interval.at(np.arange(1, steps) / steps, sharp=False)
+        for row, picture in zip(dn[k * steps + 1:], between, strict=False):
+            row[:] = picture
         motion.append(speed(interval.motion.there))
     return Film(
-        np.stack(frames), np.stack(dn), times, np.diff(times).astype(np.float32) * 1e-6,
+        np.stack(frames), dn, times, np.diff(times).astype(np.float32) * 1e-6,
         np.array(motion, np.float32), np.stack([exposed(frame) for frame in frames]))
 
 
-def as_seen(film: Film, seen_by: Photoreceptor) -> np.ndarray:
-    """The path (K * steps + 1, H, W) in log units that a photoreceptor makes of a film."""
-    if not seen_by.offset_dn and not seen_by.tau_s:
-        return np.asarray(_log(film.dn))
+def as_seen(film: Film, seen_by: Photoreceptor, out: np.ndarray | None = None) -> np.ndarray:
+    """The path (K * steps + 1, H, W) in log units that a photoreceptor makes of a film. out: where
+    it is put, film.dn itself where that is of no more use. Large sensors go band by band."""
     steps = (len(film.dn) - 1) // len(film.dt_s)
     dt_s = np.repeat(film.dt_s / steps, steps).astype(np.float32)
-    values = (np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST)))
-    return np.asarray(_seen(film.dn, dt_s, *values, seen_by.by_light))
+    values = [np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST))]
+
+    def seen(dn: np.ndarray) -> jax.Array:
+        if not seen_by.offset_dn and not seen_by.tau_s:
+            return _log(dn)
+        return _seen(dn, dt_s, *values, seen_by.by_light)
+
+    _, height, width = film.dn.shape
+    bands = -(-height * width // LARGE)
+    if bands == 1:
+        return np.asarray(seen(film.dn))
+    out = np.empty_like(film.dn) if out is None else out
+    for rows in np.array_split(np.arange(height), BANDS * bands):
+        band = slice(rows[0], rows[-1] + 1)
+        out[:, band] = seen(np.ascontiguousarray(film.dn[:, band]))
+    return out
 
 
 _seen, _log = jax.jit(seen_path), jax.jit(lin_log)  # one program each, not one an operation
@@ -191,12 +209,13 @@ def telling(places: Sequence[Place]) -> list[Place]:
 def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | None:
     """What a few of the runs of intervals, each of a recording, say of the photoreceptor; None
     where too little happens."""
-    parts = []
-    for recording, run in telling(places):
-        film = interpolated(recording, run, STEPS, noise_dn)
-        s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
-        parts.append((film.dn, np.repeat(film.dt_s / STEPS, STEPS), s))
-    return sample(parts) if parts else None
+    def parts() -> Iterator[tuple[np.ndarray, np.ndarray, Sightings]]:
+        for recording, run in telling(places):
+            film = interpolated(recording, run, STEPS, noise_dn)
+            s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
+            yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s
+
+    return sample(parts())
 
 
 def find_photoreceptor(places: Sequence[Place], noise_dn: float = 0.0) -> Found | None:

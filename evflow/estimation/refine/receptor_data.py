@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -39,16 +40,19 @@ class Sample(NamedTuple):
 
 
 def sample(
-    parts: list[tuple[np.ndarray, np.ndarray, Sightings]], seed: int = 0
+    parts: Iterable[tuple[np.ndarray, np.ndarray, Sightings]], seed: int = 0
 ) -> Sample | None:
     """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
-    its fine steps, and its sightings; None where too little happens."""
-    length = max((len(dn) for dn, *_ in parts), default=0)
-    used = [part for part in parts if len(part[0]) == length and len(part[2].pixel)]
-    if any(sum(int((s.on == on).sum()) for *_, s in used) < ENOUGH for on in (True, False)):
+    its fine steps, and its sightings, all of one length; None where too little happens. One is
+    looked at at a time."""
+    rng, count = np.random.default_rng(seed), np.zeros(2, int)
+    rows: list[tuple[np.ndarray, ...]] = []
+    for dn, dt_s, s in parts:
+        if len(s.pixel):
+            rows.append(_row(dn, dt_s, s, rng, len(rows)))
+            count += int(s.on.sum()), int((~s.on).sum())
+    if count.min() < ENOUGH:
         return None
-    rng = np.random.default_rng(seed)
-    rows = [_row(*part, rng, number) for number, part in enumerate(used)]
     return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
 
 
