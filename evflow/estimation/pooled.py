@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Iterable
 
 import jax
@@ -14,10 +16,12 @@ from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.intervals import QuietWaits, Waits
 from evflow.estimation.pixel_noise import calm, quiet_time
+from evflow.estimation.refine.stretches import BAND, LARGE
 from evflow.estimation.shot import LIGHTS, by_light
 from evflow.light.log_maps import lin_log
 from evflow.network import api
 from evflow.recordings.glitches import exposed
+from evflow.recordings.region import bands, rows_of
 from evflow.recordings.windows import iter_windows
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 from evflow.types import Recording, Window
@@ -84,7 +88,16 @@ def window_stats(
     params: api.Params, window: Window, seen_by: Photoreceptor = IDEAL
 ) -> api.Stats:
     """Stats of the pixels that a window's frames show. The others are replaced by random ones of
-    them and the sums scaled down to their number: arrays of one shape are compiled once."""
+    them and the sums scaled down to their number: arrays of one shape are compiled once. Large
+    sensors go band by band, whose sums add."""
+    shape = window.frame0.shape
+    if shape[0] * shape[1] <= LARGE:
+        return _stats(params, window, seen_by)
+    return functools.reduce(operator.add, (
+        _stats(params, rows_of(window, rows), seen_by) for rows in bands(shape, BAND)))
+
+
+def _stats(params: api.Params, window: Window, seen_by: Photoreceptor) -> api.Stats:
     voxels, dlogI, given = window_inputs(window, seen_by)
     shown = exposed(window.frame0, window.frame1)
     share = float(shown.mean())

@@ -39,6 +39,7 @@ from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, measured_noise, measured_shot, scatter
 from evflow.network import api
 from evflow.notes import Note
+from evflow.process.memory import give_back
 from evflow.recordings.check.contents import VALID_EVENTS
 from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels
 from evflow.recordings.windows import window_at
@@ -142,8 +143,10 @@ def look(
         seconds=1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
     if not stretch.run:
         return seen
+    give_back()
     seen = add_path(seen, stretch, simulate=simulate)
     release(stretch.recording)
+    give_back()
     advance()
     return seen
 
@@ -152,14 +155,12 @@ def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
     """The state with what the path between a stretch's frames tells, and no windows."""
     place, seen_by = (stretch.recording, stretch.run), state.eyes.seen_by
     chunk = make_chunk(*place, STEPS, seen_by, state.eyes.noise_dn, first=stretch.first)
-    shape = chunk.bright.shape
-    evidence = state.evidence if state.evidence is not None else PixelEvidence.nothing(shape)
-    quiet = state.quiet if state.quiet is not None else np.zeros((4, *shape))
     kept = simulated_part(chunk, place, seen_by) if simulate else None
-    return dataclasses.replace(
-        state, evidence=evidence + chunk.evidence, quiet=quiet + chunk.quiet,
-        chunks=(*state.chunks, *((without_evidence(kept),) if kept else ())),
-        parts=(*state.parts, drift.part(stretch.span_us, chunk.evidence)))
+    told = State(state.params, state.eyes, evidence=chunk.evidence, quiet=chunk.quiet,
+                 chunks=(without_evidence(kept),) if kept else (),
+                 parts=(drift.part(stretch.span_us, chunk.evidence),))
+    del chunk  # a film of the whole sensor
+    return state + told
 
 
 def glance(state: State) -> tuple[Summary, Summary]:

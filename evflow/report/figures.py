@@ -6,14 +6,13 @@ solid, what was simulated dashed. A figure's size is in inches of 96 CSS pixels.
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from evflow.report.plots import OFF_COLOUR, ON_COLOUR, new_figure, robust_range
+from evflow.report.plots import OFF_COLOUR, ON_COLOUR, new_figure, printed, robust_range
 
 INK = "#1d2129"
 SIDES = {"on": ("ON", ON_COLOUR), "off": ("OFF", OFF_COLOUR)}
@@ -40,10 +39,7 @@ def svg(draw: Callable[[Any], None], width: float, height: float) -> bytes:
     with matplotlib.rc_context(LOOK):
         figure = new_figure(width, height)
         draw(figure.subplots())
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", dpi=150, metadata={
-            "Date": None, "Creator": None, "Format": None, "Type": None})
-    drawn = buffer.getvalue().decode()
+        drawn = printed(figure, "svg", 150).decode()
     return re.sub(r"(?<=[ :])'?DejaVu Sans'?(?=[;\"',])[^;\"]*", FONTS, drawn).encode()
 
 
@@ -52,7 +48,7 @@ def histogram(values: np.ndarray, summary: float, colour: Any, unit: str) -> byt
     def draw(axis: Any) -> None:
         low, high = robust_range(values)
         axis.hist(np.clip(values, low, high), bins=np.linspace(low, high, BINS), color=colour,
-                  alpha=0.75)
+                  alpha=0.75, histtype="stepfilled")
         axis.axvline(np.median(values), color=INK, lw=1.2)
         if np.isfinite(summary) and low <= summary <= high:
             axis.axvline(summary, color=INK, lw=1.2, ls=(0, (2, 2)))

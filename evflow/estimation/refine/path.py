@@ -20,6 +20,7 @@ from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_search import Found, find
 from evflow.estimation.refine.sightings import Sightings, sight
 from evflow.estimation.refine.stretches import (
+    BAND,
     LARGE,
     PART,
     most_simulated,
@@ -29,7 +30,9 @@ from evflow.estimation.refine.stretches import (
 )
 from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.light.log_maps import lin_log
+from evflow.process.memory import give_back
 from evflow.recordings.glitches import SATURATED_DN, exposed
+from evflow.recordings.region import bands, inside
 from evflow.simulator.between import intervals
 from evflow.simulator.motion import speed
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
@@ -37,7 +40,6 @@ from evflow.types import Events, Recording
 
 STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 px a step
 STRETCHES = 3  # that tell the photoreceptor
-BANDS = 3  # of a large sensor, to as many pixels as are a small one's most
 
 Box = tuple[slice, slice]
 Place = tuple[Recording, Sequence[int]]  # a recording and a run of its frame intervals
@@ -52,8 +54,8 @@ class Chunk:
     interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
     evidence: about each pixel's thresholds; quiet: (4, H, W) events in intervals in which the
     pixel's path stays within QUIET, the seconds and number of these, and how many had events.
-    Intervals with a saturated or black frame are in none. sightings: the events beside the path.
-    box: rows and columns of the sensor.
+    Intervals with a saturated or black frame are in none. sightings: the events beside the path; of
+    large sensors there are none before a part is taken. box: rows and columns of the sensor.
     """
 
     path: np.ndarray
@@ -92,12 +94,33 @@ def make_chunk(
     fine = as_seen(film, seen_by, out=film.dn)
     dark, light = film.frames.min(0) + seen_by.offset_dn, film.frames.max(0)
     bright = (dark >= DARK_DN) & (light <= SATURATED_DN)
-    trace = trace_of_events(recording.events, times, steps)
-    sightings = sight(recording.events, times, fine, steps, film.shown)
-    return Chunk(
-        fine, bright, film.dt_s, film.motion_px, trace,
-        evidence_of(sightings, first=run[0] == 0 if first is None else first),
-        _quiet(fine, trace, film.dt_s, film.shown[1:] & film.shown[:-1]), sightings)
+    events = recording.events.slice(int(times[0]), int(times[-1]) + 1)
+    trace = trace_of_events(events, times, steps)
+    quiet = _quiet(fine, trace, film.dt_s, film.shown[1:] & film.shown[:-1])
+    first = run[0] == 0 if first is None else first
+    if bright.size <= LARGE:
+        sightings = sight(events, times, fine, steps, film.shown)
+        evidence = evidence_of(sightings, first=first)
+    else:
+        sightings = sight(events.slice(0, 0), times, fine, steps, film.shown)
+        evidence = _evidence_by_bands(events, times, fine, film.shown, steps, first=first)
+    return Chunk(fine, bright, film.dt_s, film.motion_px, trace, evidence, quiet, sightings)
+
+
+def _evidence_by_bands(
+    events: Events, times: np.ndarray, path: np.ndarray, shown: np.ndarray, steps: int, *,
+    first: bool,
+) -> PixelEvidence:
+    """`evidence_of` all events, of a few rows at a time: what is made on the way is large."""
+    whole = PixelEvidence.nothing(path.shape[1:])
+    for rows in bands(path.shape[1:], BAND):
+        s = sight(inside(events, rows, slice(0, path.shape[2])), times, path[:, rows], steps,
+                  shown[:, rows])
+        part = evidence_of(s, first=first)
+        for kept, found in zip((whole.equations, whole.bounds, whole.start),
+                               (part.equations, part.bounds, part.start), strict=True):
+            kept[:, rows] = found
+    return whole
 
 
 def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -> Chunk:
@@ -108,17 +131,17 @@ def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -
         return chunk
     h, w = min(height, PART[0]), min(width, PART[1])
     busy = cv2.integral(np.asarray(chunk.recorded.counts).sum((0, 1)))
-    inside = busy[h:, w:] - busy[:-h, w:] - busy[h:, :-w] + busy[:-h, :-w]
-    y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)
-    box = slice(y, y + h), slice(x, x + w)
+    sums = busy[h:, w:] - busy[:-h, w:] - busy[h:, :-w] + busy[:-h, :-w]
+    y, x = np.unravel_index(int(np.argmax(sums)), sums.shape)
+    box = slice(int(y), int(y) + h), slice(int(x), int(x) + w)
     (recording, run), steps = place, (len(chunk.path) - 1) // len(chunk.dt_s)
     times = recording.frame_times[run[0]:run[-1] + 2] + round(seen_by.delay_s * 1e6)
     events = recording.events.slice(int(times[0]), int(times[-1]) + 1)
-    events = _inside(events, int(x), int(y), w, h)
+    events = inside(events, *box)
     path = np.ascontiguousarray(chunk.path[:, *box])
     seen = chunk.sightings.seen.reshape(-1, height, width)[:, *box]
-    sums = chunk.evidence
-    evidence = PixelEvidence(*(a[:, *box] for a in (sums.equations, sums.bounds, sums.start)))
+    whole = chunk.evidence
+    evidence = PixelEvidence(*(a[:, *box] for a in (whole.equations, whole.bounds, whole.start)))
     # Copies: a part that is kept would keep the whole.
     return Chunk(path, chunk.bright[box].copy(), chunk.dt_s, chunk.motion_px,
                  trace_of_events(events, times, steps), evidence, chunk.quiet[:, *box].copy(),
@@ -128,13 +151,6 @@ def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -
 def without_evidence(chunk: Chunk) -> Chunk:
     """A chunk that is kept to be simulated: what it says of its pixels is in the sums."""
     return dataclasses.replace(chunk, evidence=PixelEvidence.nothing((0, 0)))
-
-
-def _inside(events: Events, x: int, y: int, width: int, height: int) -> Events:
-    """The events of a rectangle of pixels, counted from its first."""
-    kept = (events.x >= x) & (events.x < x + width) & (events.y >= y) & (events.y < y + height)
-    return Events.unchecked(events.x[kept] - np.uint16(x), events.y[kept] - np.uint16(y),
-                            events.t[kept], events.p[kept], (width, height))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -183,14 +199,11 @@ def as_seen(film: Film, seen_by: Photoreceptor, out: np.ndarray | None = None) -
             return _log(dn)
         return _seen(dn, dt_s, *values, seen_by.by_light)
 
-    _, height, width = film.dn.shape
-    bands = -(-height * width // LARGE)
-    if bands == 1:
+    if film.dn[0].size <= LARGE:
         return np.asarray(seen(film.dn))
     out = np.empty_like(film.dn) if out is None else out
-    for rows in np.array_split(np.arange(height), BANDS * bands):
-        band = slice(rows[0], rows[-1] + 1)
-        out[:, band] = seen(np.ascontiguousarray(film.dn[:, band]))
+    for rows in bands(film.dn.shape[1:], BAND):
+        out[:, rows] = seen(np.ascontiguousarray(film.dn[:, rows]))
     return out
 
 
@@ -214,6 +227,7 @@ def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | 
             film = interpolated(recording, run, STEPS, noise_dn)
             s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
             yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s
+            give_back()
 
     return sample(parts())
 

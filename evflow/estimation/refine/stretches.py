@@ -18,6 +18,7 @@ INTERVALS, FEW_INTERVALS = 8, 4  # frame intervals per stretch: 200 ms at 40 Hz;
 PART = (260, 346)  # rows and columns that are simulated of a large sensor
 CHUNK_PIXELS = 8 * 346 * 260  # pixels of all stretches simulated, of a long recording
 LARGE = CHUNK_PIXELS // 2  # pixels of a sensor of which two stretches cannot be simulated whole
+BAND = PART[0] * PART[1]  # pixels of it that are gone through at once
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
