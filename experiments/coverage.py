@@ -30,7 +30,7 @@ from experiments.shared.many import Setup, study
 
 LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
 EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf),
-         "seconds": (0, 0.15, 0.25, 0.5, 2.0, np.inf)}
+         "seconds": (0, 0.15, 0.25, 0.5, 2.0, 10.0, np.inf)}
 Rows = list[dict[str, Any]]
 
 
@@ -46,6 +46,8 @@ class Options(StudyOptions):
     """Whether scenes show the photographs of the training, too."""
     intervals: int | None = None
     """Frame intervals of every recording (default: 8 to 24, of 10 to 40 ms)."""
+    seconds: float | None = None
+    """Length of every recording, in place of a number of intervals."""
     eta_spread: float | None = None
     """Standard deviation of log noise rates over pixels (default: 0 or .1, as in training)."""
 
@@ -55,6 +57,9 @@ def drawn(rng: np.random.Generator, options: Options) -> Protocol:
     protocol = draw_protocol(rng)
     if options.intervals is not None:
         protocol = dataclasses.replace(protocol, intervals=options.intervals)
+    if options.seconds is not None:
+        count = max(1, round(1000 * options.seconds / protocol.frame_ms))
+        protocol = dataclasses.replace(protocol, intervals=count)
     if options.eta_spread is not None:
         prior = dataclasses.replace(protocol.prior, eta_spread=options.eta_spread)
         protocol = dataclasses.replace(protocol, prior=prior)

@@ -37,7 +37,7 @@ from evflow.network.weights import load_weights
 from evflow.recordings.repeats import without_repeats
 from evflow.recordings.stillness import stands_still
 from evflow.recordings.windows import WindowPlan, condensed, iter_windows, plan_windows
-from evflow.types import Recording
+from evflow.types import Recording, release
 
 Progress = Callable[[int, int], None]
 Until = Callable[[Summary, Summary], bool]
@@ -119,6 +119,7 @@ def measure(
     stretches = cut(recording, plan, path=refine == "auto")
     order = ordered(stretches, effort)
     used = [stretches[i] for i in sorted(order.numbers)]
+    release(recording)
     stage("looking for the photoreceptor")
     state = State(params, looked_through(used, measured=pixel == "measured"))
     steps = Steps(used, progress)
@@ -203,6 +204,7 @@ def _read(
         seen = look(state, stretches[i], simulate=i in order.simulated, every=order.every,
                     advance=steps.advance)
         state, early = state + seen, early + seen if i in first else early
+        del seen  # maps of the whole sensor
         read.append(i)
         ended = until is not None and until(*glance(state))
         if ended:

@@ -103,12 +103,14 @@ def _stats(params: api.Params, window: Window, seen_by: Photoreceptor) -> api.St
     share = float(shown.mean())
     if 0 < share < 1:
         rng = np.random.default_rng(window.index)
-        source = np.arange(shown.size)
-        source[~shown.ravel()] = rng.choice(np.flatnonzero(shown), int((~shown).sum()))
+        hidden = np.flatnonzero(~shown)
+        source = rng.choice(np.flatnonzero(shown), hidden.size)
 
         def filled(values: ArrayLike) -> np.ndarray:
-            pixels = np.asarray(values).reshape(shown.size, -1)
-            return pixels[source].reshape(np.shape(values))
+            pixels = np.array(values)
+            flat = pixels.reshape(shown.size, -1)
+            flat[hidden] = flat[source]
+            return pixels
 
         voxels, dlogI = filled(voxels), filled(dlogI)
         given["intensity"] = filled(given["intensity"])

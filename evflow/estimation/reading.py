@@ -105,7 +105,7 @@ def _cells(stretch: Stretch) -> Array:
     part = events.slice(*stretch.span_us)
     columns, rows = -(-width // CELL), -(-height // CELL)
     cell = part.y[::SAMPLE].astype(np.int64) // CELL * columns + part.x[::SAMPLE] // CELL
-    forget(events.x, events.y)
+    forget(events.x, events.y, events.t)
     return np.bincount(cell, minlength=columns * rows) * (SAMPLE / CELL**2)
 
 

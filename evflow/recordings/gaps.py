@@ -22,14 +22,24 @@ def event_gaps(t: Array) -> Array:
     missing; none where there are too few to tell."""
     if len(t) < 4 * PACKET:
         return np.zeros(0, np.int64)
-    stride = len(t) // SAMPLES + 1
-    packet = float(np.median(t[PACKET::stride] - t[:-PACKET:stride]))
+    packet = float(np.median(_packets(t)))
     long = max(GAP_PACKETS * packet, GAP_US)
     longest = np.concatenate([first + np.flatnonzero(d > long) for first, d in _pauses(t)])
     if not len(longest):
         return longest
     usual = _usual_pause(t)
     return longest[t[longest + 1] - t[longest] > TICKS * usual]
+
+
+def _packets(t: Array) -> Array:
+    """How long SAMPLES packets took, block by block: the times may lie on the disk."""
+    stride = len(t) // SAMPLES + 1
+    some = []
+    for first in range(0, len(t) - PACKET, BLOCK // stride * stride):
+        end = min(first + BLOCK // stride * stride, len(t) - PACKET)
+        some.append(t[first + PACKET : end + PACKET : stride] - t[first:end:stride])
+        forget(t)
+    return np.concatenate(some)
 
 
 def _pauses(t: Array) -> Iterator[tuple[int, Array]]:

@@ -41,7 +41,6 @@ from evflow.report.resimulate import (
     resimulate,
     usable_runs,
 )
-from evflow.report.simulators import as_dicts, simulators_panel, try_simulators
 from evflow.report.streams import (
     count_panel,
     image_panel,
@@ -142,6 +141,8 @@ def write_report(
                   found, recording, checked or check(recording), weights, source, command)]
     rivals: dict[str, Any] = {}
     if simulators:
+        from evflow.report.simulators import as_dicts, simulators_panel, try_simulators
+
         stage("other simulators")
         tried, why_not = try_simulators(recording, evidence.half, evidence.held, seed)
         panels.insert(-1, simulators_panel(tried, why_not or evidence.why_not_held))

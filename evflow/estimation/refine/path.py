@@ -113,13 +113,15 @@ def _evidence_by_bands(
 ) -> PixelEvidence:
     """`evidence_of` all events, of a few rows at a time: what is made on the way is large."""
     whole = PixelEvidence.nothing(path.shape[1:])
+    if first:
+        whole = dataclasses.replace(whole, start=whole.start.copy())
     for rows in bands(path.shape[1:], BAND):
         s = sight(inside(events, rows, slice(0, path.shape[2])), times, path[:, rows], steps,
                   shown[:, rows])
         part = evidence_of(s, first=first)
-        for kept, found in zip((whole.equations, whole.bounds, whole.start),
-                               (part.equations, part.bounds, part.start), strict=True):
-            kept[:, rows] = found
+        whole.equations[:, rows], whole.bounds[:, rows] = part.equations, part.bounds
+        if first:
+            whole.start[:, rows] = part.start
     return whole
 
 
@@ -227,6 +229,7 @@ def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | 
             film = interpolated(recording, run, STEPS, noise_dn)
             s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
             yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s
+            del film, s
             give_back()
 
     return sample(parts())

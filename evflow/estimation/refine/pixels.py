@@ -57,7 +57,9 @@ class PixelEvidence:
 
 
 def _no_start(shape: tuple[int, int]) -> Array:
-    return np.concatenate([np.zeros((4, *shape)), np.full((2, *shape), NOTHING)])
+    """What says nothing of a start, of no memory: to be read only."""
+    values = np.array([0.0, 0.0, 0.0, 0.0, NOTHING, NOTHING])
+    return np.broadcast_to(values[:, None, None], (6, *shape))
 
 
 def pixel_evidence(

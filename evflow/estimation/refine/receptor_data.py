@@ -19,6 +19,7 @@ PIXELS, EVENTS = 2048, 1 << 14  # of a stretch that are looked at
 SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
 TILES = (6, 8)  # blocks of the image whose errors are independent
 ENOUGH = 200  # events of either polarity to look at
+LEAST = 20  # of these, that are used: frames may hide what most of the pixels saw
 
 
 class Sample(NamedTuple):
@@ -45,15 +46,23 @@ def sample(
     """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
     its fine steps, and its sightings, all of one length; None where too little happens. One is
     looked at at a time."""
-    rng, count = np.random.default_rng(seed), np.zeros(2, int)
+    rng, count, told = np.random.default_rng(seed), np.zeros(2, int), np.zeros(2, int)
     rows: list[tuple[np.ndarray, ...]] = []
     for dn, dt_s, s in parts:
         if len(s.pixel):
-            rows.append(_row(dn, dt_s, s, rng, len(rows)))
-            count += int(s.on.sum()), int((~s.on).sum())
-    if count.min() < ENOUGH:
+            row, used = _row(dn, dt_s, s, rng, len(rows))
+            rows.append(row)
+            count += _of_both(s.on)
+            told += _of_both(used)
+        del dn, s  # before the next is made
+    if count.min() < ENOUGH or told.min() < LEAST:
         return None
-    return Sample(*(jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True)))
+    return Sample(*(jax.device_put(np.stack(column)) for column in zip(*rows, strict=True)))
+
+
+def _of_both(on: np.ndarray) -> np.ndarray:
+    """How many ON and how many OFF events."""
+    return np.array([on.sum(), (~on).sum()])
 
 
 def smeared_sample(data: Sample, seconds: float) -> Sample:
@@ -69,8 +78,8 @@ def smeared_sample(data: Sample, seconds: float) -> Sample:
 
 def _row(
     dn: np.ndarray, dt_s: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
-) -> tuple[np.ndarray, ...]:
-    """The fields of a Sample, of one stretch."""
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """The fields of a Sample, of one stretch, and which of the events in it are ON."""
     steps = len(dt_s) // (len(s.frames) - 1)
     at = (s.interval + s.fraction) * steps
     group, on, off = counted(s)
@@ -93,6 +102,7 @@ def _row(
     events = [filled(v[kept], EVENTS) for v in (at, on, off, weight)]
     pixel = filled(place[group][kept], EVENTS).astype(np.int32)
     interval_s = dt_s.reshape(-1, steps).sum(1)
-    return (light, dt_s.astype(np.float32), pixel, *events, pixel,
-            filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32),
-            noise_rates(s, interval_s))
+    row = (light, dt_s.astype(np.float32), pixel, *events, pixel,
+           filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32),
+           noise_rates(s, interval_s))
+    return row, s.on[kept]

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.files.spool import forget
 from evflow.io.decode.units import too_few
 from evflow.recordings.check.findings import Finding
 from evflow.recordings.windows import plan_windows
@@ -56,6 +57,7 @@ class Steps:
         sums = np.zeros((6, len(offsets_us)))
         for change, (t0, t1) in zip(self.changes[flip], self.bounds, strict=True):
             known = np.isfinite(change)
+            forget(self.events.x, self.events.y, self.events.t, self.events.p)
             near = self.events.slice(int(t0 + offsets_us.min()), int(t1 + offsets_us.max()))
             code = _codes(near, self.cell)
             edges = np.searchsorted(near.t, np.stack([t0 + offsets_us, t1 + offsets_us]))

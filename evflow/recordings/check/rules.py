@@ -18,7 +18,7 @@ from evflow.recordings.check.findings import Finding, Report
 from evflow.recordings.check.images import images
 from evflow.recordings.stillness import stands_still
 from evflow.recordings.windows import check_overlap, iter_windows
-from evflow.types import Recording
+from evflow.types import Recording, release
 
 
 def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told]) -> Report:
@@ -75,5 +75,7 @@ def _findings(recording: Recording) -> list[Finding]:
                 iter_windows(recording)
             except EvflowDataError as error:
                 found.append(Finding.of(error))
+            release(recording)
             found += agreement(recording)
+    release(recording)
     return sorted(found, key=lambda f: ("error", "warning", "note").index(f.severity))
