@@ -263,6 +263,7 @@ def _windows(stretches: Sequence[Stretch]) -> Iterator[Window]:
     for stretch in stretches:
         for number, pair in stretch.windows:
             yield window_at(stretch.recording, pair, number)
+        release(stretch.recording)
 
 
 def _told(windows: Iterator[Window], advance: Advance) -> Iterator[Window]:

@@ -90,6 +90,7 @@ def make_chunk(
     and count its events. first: whether the camera's recording begins there, if that is not with
     the first frame."""
     film = interpolated(recording, run, steps, noise_dn)
+    give_back()
     times = film.times_us + round(seen_by.delay_s * 1e6)
     fine = as_seen(film, seen_by, out=film.dn)
     dark, light = film.frames.min(0) + seen_by.offset_dn, film.frames.max(0)
