@@ -78,6 +78,7 @@ NOTES: dict[str, str] = {
     "pixels.slow": "the photoreceptor's low-pass was measured",
     "pixels.unsure": "most pixels have no events of their own",
     "noise.even": "the noise does not fall with light",
+    "windows.beyond": "events come before the first frame or after the last",
     "windows.skipped": "windows between frames were left out",
     "truth.none": "no pixel has both events and known flow",
 }

@@ -36,7 +36,7 @@ from evflow.network.architecture import config_of
 from evflow.network.weights import load_weights
 from evflow.recordings.repeats import without_repeats
 from evflow.recordings.stillness import stands_still
-from evflow.recordings.windows import WindowPlan, condensed, iter_windows, plan_windows
+from evflow.recordings.windows import WindowPlan, iter_windows, left_out, plan_windows
 from evflow.types import Recording, release
 
 Progress = Callable[[int, int], None]
@@ -128,7 +128,7 @@ def measure(
     state, early, extent = _read(state, stretches, order, effort, until, steps,
                                  division.first if division else range(0))
     repeated = [note for note in recording.notes if note.code == "frames.repeated"]
-    found = estimate(state, extent=extent, before=condensed(plan.skipped), after=repeated,
+    found = estimate(state, extent=extent, before=left_out(recording, plan), after=repeated,
                      advance=steps.advance, stage=stage)
     steps.finish()
     first = First(early, tuple(used), division.rest) if division and early.read else None
@@ -148,7 +148,7 @@ def _unpooled(
             progress(next(done), len(plan.pairs))
 
     return estimate_unpooled(recording, iter_windows(recording, plan=plan), params,
-                             before=condensed(plan.skipped), advance=advance)
+                             before=left_out(recording, plan), advance=advance)
 
 
 def read_whole(recording: Recording, params: api.Params) -> State:

@@ -24,6 +24,7 @@ MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
 EDGE_US = 5_000  # the events may begin or end this much inside the first or last frame: of a camera
 # that starts at the first frame the first one comes when brightness has changed by a threshold
 EDGE_EVENTS = 10  # or this many of the intervals at which events come there
+BEYOND = 0.1  # of the recording's time, events without frames at its beginning or end
 DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
 
 
@@ -174,6 +175,19 @@ def condensed(skipped: tuple[Skipped, ...]) -> tuple[Note, ...]:
         "windows.skipped", f"{frames[0]} skipped: {why}" if len(frames) == 1 else
         f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {why}")
         for why, frames in reasons.items())
+
+
+def left_out(recording: Recording, plan: WindowPlan) -> tuple[Note, ...]:
+    """What of a recording no window holds: those skipped, and events before the first frame or
+    after the last, where they are many."""
+    t, times = recording.events.t, recording.frame_times
+    whole = max(int(t[-1]) - int(t[0]), 1)
+    sides = ((int(times[0]) - int(t[0]), "before the first frame"),
+             (int(t[-1]) - int(times[-1]), "after the last frame"))
+    return (*condensed(plan.skipped), *(Note(
+        "windows.beyond", f"{us * 1e-6:.2f} of {whole * 1e-6:.2f} s of events come {where}, and "
+        "are not used: no frame shows what moved then") for us, where in sides
+        if us > BEYOND * whole))
 
 
 def window_at(recording: Recording, pair: tuple[int, int], index: int) -> Window:

@@ -14,7 +14,7 @@ from evflow import CameraEstimator, Recording, estimate_camera
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
 from evflow.estimation.halves import divided
-from evflow.estimation.refine import cut
+from evflow.estimation.refine import cut, make_chunk, path
 from evflow.estimation.refine import stretches as cutting
 from evflow.estimation.state import Eyes, State, thinned
 from evflow.recordings.windows import plan_windows
@@ -115,6 +115,21 @@ def test_of_a_long_one_a_spread_and_lively_part(
     assert effort == "full" or first[0] < 15 < 30 < first[-1]  # any beginning is spread
     if effort == "quick":  # each of 8 stretches, in which one or two lively ones lie
         assert np.mean([i % 5 == 4 for i in order.numbers]) > 0.8
+
+
+def test_a_large_sensor_goes_band_by_band_as_a_small_one_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recording = film(0.2)
+    whole = make_chunk(recording, range(2), steps=4)
+    monkeypatch.setattr(path, "LARGE", 100)
+    monkeypatch.setattr(path, "BAND", 200)
+    parts = make_chunk(recording, range(2), steps=4)
+    np.testing.assert_allclose(parts.path, whole.path, rtol=1e-6)
+    for name in ("equations", "bounds", "start"):
+        np.testing.assert_allclose(getattr(parts.evidence, name), getattr(whole.evidence, name),
+                                   rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(parts.quiet, whole.quiet)
 
 
 def test_longer_and_larger_recordings_get_a_little_more(stretches: tuple) -> None:

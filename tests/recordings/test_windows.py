@@ -13,7 +13,7 @@ from evflow.errors import EvflowDataError
 from evflow.io import read_recording
 from evflow.notes import Note
 from evflow.recordings import condensed, iter_windows, plan_windows
-from evflow.recordings.windows import Skipped
+from evflow.recordings.windows import Skipped, WindowPlan, left_out
 from evflow.types import Events, Recording
 
 
@@ -178,3 +178,19 @@ def test_exposure_changes_are_left_out_and_changes_of_light_are_not() -> None:
     assert "+20%" in plan.skipped[0].why
     assert "auto-exposure" in plan.skipped[0].why
     assert len(plan_windows(filmed(frames, share=0.8)).pairs) == 5
+
+
+@pytest.mark.parametrize(("first", "last", "said"), [
+    (0, 10, []), (0, 6, ["0.40 of 1.00 s of events come after the last frame"]),
+    (3, 8, ["0.30 of 1.00 s of events come before the first frame",
+            "0.20 of 1.00 s of events come after the last frame"])])
+def test_events_without_frames_at_either_end_are_named(
+    first: int, last: int, said: list[str]
+) -> None:
+    t = np.arange(0, 1_000_001, 10_000)
+    zeros = np.zeros(len(t), int)
+    times = 100_000 * np.arange(first, last + 1)
+    recording = Recording(Events(zeros, zeros, t, zeros > 0, (4, 4)),
+                          np.zeros((len(times), 4, 4), np.uint8), times)
+    notes = left_out(recording, WindowPlan((), ()))
+    assert [note.text.partition(", and")[0] for note in notes] == said
