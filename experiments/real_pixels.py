@@ -4,11 +4,11 @@
 
 Hidden cameras, one condition a row: the relative error of theta, how often its 68 and 95 %
 intervals hold the truth; of the first five of a row also with `estimate_camera(pixel="ideal")`,
-which takes pixels for ideal. Then what else was measured: cutoff, dead time, leak, shot noise,
-light added, and noise rates over pixels, where a condition has them. Then real recordings: the
+which takes pixels for ideal. Then what else was measured: cutoff, dead time, leak, light
+added, and noise rates over pixels, where a condition has them. Then real recordings: the
 share of variance that the pooled regression of one half explains of the other, with an ideal pixel
 and with that of the first half. The first camera of all rows is measured before the second of any,
-so that an interrupted run (--rows) can be ended with fewer (--recordings). Writes real_pixels.json,
+so that an interrupted run (--rows) can be ended with fewer (--as-it-is). Writes real_pixels.json,
 .md and .png. The paper knows ideal pixels alone.
 """
 
@@ -28,19 +28,11 @@ from evflow.network.weights import weights_hash
 from evflow.recordings.windows import plan_windows
 from evflow.simulator.photoreceptor import IDEAL
 from experiments.shared import pages
+from experiments.shared import real_scores as scores
 from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
-from experiments.shared.kept import Row, resumed
+from experiments.shared.kept import Row, kept, resumed
 from experiments.shared.many import Setup, made
 from experiments.shared.real_cameras import BASE, CHANGES
-from experiments.shared.real_scores import (
-    HEADS,
-    OTHER_HEADS,
-    cells,
-    light_lines,
-    score,
-    score_ideal,
-    sensor_lines,
-)
 
 FEW = ("ideal", "cutoff 30.0 Hz", "black level +16 DN")
 BESIDE = 5  # cameras of a row that are also taken for ideal
@@ -58,27 +50,32 @@ class Options(StudyOptions):
     """Real recordings with frames."""
     rows: Path | None = None
     """Where to keep the rows, to resume an interrupted run from."""
+    conditions: tuple[str, ...] = ()
+    """Only these conditions (default: the preset's)."""
+    as_it_is: bool = False
+    """Measure nothing more: tables of the rows that --rows holds, however many of a condition."""
 
 
 def measured(options: Options, names: Sequence[str], count: int) -> dict[str, list[Row]]:
     """The rows of each condition; the first camera of all before the second of any, and what takes
     pixels for ideal last."""
     setup = Setup(options.weights, options.seed, photos=True)
+    origin = [weights_hash(options.weights), options.seed]
+    if options.as_it_is:
+        return scores.gathered(kept(options.rows, origin), names)
     cameras = [(i, name) for i in range(count) for name in names]
     beside = [(i, name) for i, name in cameras if i < BESIDE]
-    jobs = [(score, *job) for job in cameras] + [(score_ideal, *job) for job in beside]
+    jobs: list[tuple[Any, int, str]] = [(scores.score, *job) for job in cameras]
+    jobs += [(scores.score_ideal, *job) for job in beside]
 
     def make(left: list[int]) -> Iterable[Row]:
         for scored, some in itertools.groupby((jobs[k] for k in left), operator.itemgetter(0)):
             yield from made(scored, setup, [(i, dataclasses.replace(BASE, **CHANGES[name]))
                                             for _, i, name in some], options.workers)
 
-    keys = [f"{name} {i}{' ideal' * (scored is score_ideal)}" for scored, i, name in jobs]
-    rows = resumed(options.rows, [weights_hash(options.weights), options.seed], keys, make,
-                   "cameras")
-    for (i, name), row in zip(beside, rows[len(cameras):], strict=True):
-        rows[cameras.index((i, name))] |= {"ideal": row}
-    return {name: rows[k:len(cameras):len(names)] for k, name in enumerate(names)}
+    keys = [scores.key(name, i, ideal=of is scores.score_ideal) for of, i, name in jobs]
+    rows = resumed(options.rows, origin, keys, make, "cameras")
+    return scores.gathered(dict(zip(keys, rows, strict=True)), names)
 
 
 def halves(path: Path) -> list[str] | None:
@@ -100,11 +97,13 @@ def halves(path: Path) -> list[str] | None:
 def main(options: Options) -> dict[str, Any]:
     begin(options, "real_pixels")
     count = options.count(options.recordings, debug=1, full=40)
-    rows = measured(options, FEW if options.preset == "debug" else tuple(CHANGES), count)
+    names = options.conditions or (FEW if options.preset == "debug" else tuple(CHANGES))
+    rows = measured(options, names, count)
     real = [line for path in options.recordings_at if (line := halves(path))]
     text = "\n\n".join((
-        markdown(HEADS, (cells(n, r) for n, r in rows.items())),
-        markdown(OTHER_HEADS, sensor_lines(rows) + light_lines(rows)),
+        markdown(scores.HEADS, (scores.cells(n, r) for n, r in rows.items())),
+        markdown(scores.OTHER_HEADS,
+                 scores.sensor_lines(rows) + scores.light_lines(rows)),
         markdown(("recording", "R2 held out, ideal", "measured", "light added", "cutoff"), real)))
     result = {"conditions": rows, "real": real}
     conclude(options, "real_pixels", result, text)

@@ -18,7 +18,7 @@ from evflow.estimation.intervals import QuietWaits, Waits
 from evflow.estimation.pixel_noise import calm, quiet_time
 from evflow.estimation.refine.stretches import BAND, LARGE
 from evflow.estimation.shot import LIGHTS, by_light
-from evflow.light.log_maps import lin_log
+from evflow.light.log_maps import lin_log, noise_factor, normalised_intensity
 from evflow.network import api
 from evflow.recordings.glitches import exposed
 from evflow.recordings.region import bands, rows_of
@@ -126,11 +126,19 @@ def _scaled(stats: api.Stats, share: ArrayLike) -> api.Stats:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Quiet:
     """What quiet pixels did: maps (2, 2, H, W), ON and OFF, events and seconds; light: the same by
-    the light that they saw, of `by_light`; waits: for an event."""
+    the light that they saw, of `by_light`; waits: for an event; falling: (2, H, W) the seconds
+    times what `noise_factor` was of the pixel's light; factor: its mean over pixels and time."""
 
     maps: np.ndarray
     light: np.ndarray
     waits: Waits
+    falling: np.ndarray
+    factor: float
+
+    def at_mean_light(self) -> np.ndarray:
+        """The maps, with seconds in which as much noise comes at the mean light as came in theirs,
+        if it falls with light."""
+        return np.stack([self.maps[:, 0], self.falling / self.factor], 1)
 
 
 def quiet_times(
@@ -140,6 +148,7 @@ def quiet_times(
     noise = np.array([summary.eta_on, summary.eta_off])
     total = np.zeros((2, 2, *hot.shape))
     light, waits = np.zeros((2, 3, LIGHTS)), QuietWaits(hot.shape)
+    falling, factor, seconds = np.zeros((2, *hot.shape)), 0.0, 1e-9
     for window in windows:
         frames = window.frame0, window.frame1
         seen = [_light(f, seen_by) for f in frames]
@@ -150,6 +159,11 @@ def quiet_times(
         total += found
         # As `seen_frames`: darker by one factor where light is added.
         shown = 255.0 / (255.0 + max(seen_by.offset_dn, 0.0))
-        light += by_light(found, 0.5 * shown * (seen[0].astype(np.float32) + seen[1]), hot)
+        dn = 0.5 * shown * (seen[0].astype(np.float32) + seen[1])
+        light += by_light(found, dn, hot)
+        share = np.asarray(noise_factor(normalised_intensity(np.clip(dn, 0.0, 255.0))))
+        falling += found[:, 1] * share
+        factor += window.window_s * float(share.mean())
+        seconds += window.window_s
         waits.add(window.events, (window.t0_us, window.t1_us), calm(*place))
-    return Quiet(total, light, waits.table())
+    return Quiet(total, light, waits.table(), falling, factor / seconds)

@@ -26,11 +26,12 @@ UNSURE = 0.25  # relative error of shot_hz where neither is said
 @dataclasses.dataclass(frozen=True)
 class Shot:
     """hz, std_hz: v2e's rate in the dark, both polarities; 0 and NaN where it is not told. even:
-    enough events say that the noise does not fall with light as v2e's does."""
+    enough events say that the noise does not fall with light as v2e's does; falls: that it does."""
 
     hz: float = 0.0
     std_hz: float = float("nan")
     even: bool = False
+    falls: bool = False
 
 
 def by_light(quiet: Array, dn: Array, hot: Array) -> Array:
@@ -86,4 +87,22 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     hz = float(halves.sum()) - excess
     relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2
                        + (0.5 * excess / max(hz, 1e-9)) ** 2)
-    return Shot(hz, hz * float(relative))
+    return Shot(hz, hz * float(relative), falls=odds > ODDS)
+
+
+def at_mean_light(
+    eta: Array, std: Array, light: Array, leak_hz: float, factor: float, error: float
+) -> tuple[Array, Array]:
+    """Noise rates (2,) in Hz of a camera whose shot noise falls with light, and their std: events
+    of quiet places, which may be darker or brighter than others, at the light of all.
+
+    eta, std (2,): rates that were found without; light (2, 3, LIGHTS), leak_hz, error: as in
+    `measured_shot`; factor: mean of `noise_factor` over pixels and time."""
+    events, seconds, falling = np.maximum(light.sum(-1), 1e-9).T
+    leaked = leak_hz * np.array([1.0, 0.0])
+    shot = np.maximum(events - leaked * seconds, 0.1) / falling
+    there = shot * factor + leaked
+    own = np.hypot(std / eta, np.log(factor * seconds / falling)) ** -2.0
+    told = 1.0 / (1.0 / events + error**2)
+    rates = np.exp((own * np.log(eta) + told * np.log(there)) / (own + told))
+    return rates, rates * (own + told) ** -0.5

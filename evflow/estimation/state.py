@@ -12,6 +12,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Summary
@@ -21,7 +22,7 @@ from evflow.estimation.dead_time import DeadTime, dead_time
 from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.leak import Leak, measured_leak
 from evflow.estimation.one_polarity import untold, without
-from evflow.estimation.pooled import need_shown, quiet_times, window_counts, window_stats
+from evflow.estimation.pooled import Quiet, need_shown, quiet_times, window_counts, window_stats
 from evflow.estimation.refine import (
     Chunk,
     Found,
@@ -36,7 +37,7 @@ from evflow.estimation.refine.doubt import doubted, signs
 from evflow.estimation.refine.path import STEPS, without_evidence
 from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
-from evflow.estimation.shot import Shot, measured_noise, measured_shot, scatter
+from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
 from evflow.network import api
 from evflow.notes import Note
 from evflow.process.memory import give_back
@@ -224,14 +225,18 @@ def estimate(
         std = doubted(doubt, refined.signs, summary, std)
     stage("noise rates and maps")
     quiet = quiet_times(_told(_windows(state.read), advance), summary, hot, eyes.seen_by)
+    leak = measured_leak(quiet.waits)
+    shot = measured_shot(quiet.light, leak.rate_hz, scatter(quiet.maps, hot), SIGNAL_ERROR)
+    sent = quiet.maps
+    if shot.falls:
+        sent = quiet.at_mean_light()
+        summary, std = _at_mean_light(summary, std, quiet, leak)
     if state.evidence is not None:
         camera, error = maps.by_regression(state.evidence, summary, std)
     else:
         again = _told(_windows(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
-    camera, error = maps.with_rates(camera, error, quiet.maps, hot, summary, std)
-    leak = measured_leak(quiet.waits)
-    shot = measured_shot(quiet.light, leak.rate_hz, scatter(quiet.maps, hot), SIGNAL_ERROR)
+    camera, error = maps.with_rates(camera, error, sent, hot, summary, std)
     dead = dead_pixels(n_events)
     extent = extent or EVERYTHING
     thirds = drift.thirds(state.parts)
@@ -243,6 +248,18 @@ def estimate(
          *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in unknown), **_measured(eyes, leak, shot),
         extent=extent, thirds=thirds)
+
+
+def _at_mean_light(
+    summary: Summary, std: Summary, quiet: Quiet, leak: Leak
+) -> tuple[Summary, Summary]:
+    """The summary with noise rates at the recording's mean light."""
+    eta, error = (np.array([float(s.eta_on), float(s.eta_off)]) for s in (summary, std))
+    eta, error = at_mean_light(
+        eta, error, quiet.light, leak.rate_hz, quiet.factor, SIGNAL_ERROR)
+    names = ("eta_on", "eta_off")
+    return (dataclasses.replace(summary, **dict(zip(names, map(jnp.float32, eta), strict=True))),
+            dataclasses.replace(std, **dict(zip(names, map(jnp.float32, error), strict=True))))
 
 
 def _measured(eyes: Eyes, leak: Leak, shot: Shot) -> dict[str, Any]:

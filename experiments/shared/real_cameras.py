@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evflow.camera import CameraPrior
-from evflow.camera.sensors import SENSORS, SensorModel
+from evflow.camera.sensors import SENSORS, SecondOrder, SensorModel
 from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.scenes.config import SceneConfig
 from experiments.shared.cameras import Hidden, Protocol
@@ -24,6 +24,8 @@ CHANGES: dict[str, dict[str, Any]] = {
        for hz in (300.0, 100.0, 30.0)},
     "cutoff 40 Hz in any light": {"model": SensorModel(
         cutoff_hz=40.0, cutoff_by_light=False, noise_resets_memory=True)},
+    "second order, 100 Hz": {"model": SensorModel(
+        photoreceptor=SecondOrder().at(100.0), noise_resets_memory=True)},
     **{f"exposed {ms} ms": {"exposure_ms": ms} for ms in (10, 20)},
     **{f"frame noise {dn} DN": {"frame_noise_dn": dn} for dn in (1.0, 3.0)},
     **{f"black level {dn:+.0f} DN": {"black_dn": dn} for dn in (-8.0, 8.0, 16.0)},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,7 @@ from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.kept import Row
 from experiments.shared.real_cameras import added_light, shot_rates
 
-LABELS = {"cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz]",
-          "shot_hz": "shot noise [Hz]"}
+LABELS = {"cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz]"}
 HEADS = ("condition", "cameras", "ideal: median error of θ", "68 / 95 % hold",
          "measured: median error", "68 / 95 % hold", "median std")
 OTHER_HEADS = ("what else", "condition", "true", "found in", "median error", "68 / 95 % hold")
@@ -55,6 +55,25 @@ def score_ideal(params: Any, hidden: Hidden, _protocol: Protocol) -> Row:
     return thresholds(estimate_camera(hidden.recording, params, pixel="ideal"), truth)
 
 
+def key(name: str, number: int, *, ideal: bool = False) -> str:
+    """Of a row: a condition's camera, taken for ideal or not."""
+    return f"{name} {number}{' ideal' * ideal}"
+
+
+def gathered(rows: dict[str, Row], names: Sequence[str]) -> dict[str, list[Row]]:
+    """The rows by key -> those of each condition that has some, with what takes a camera for ideal
+    as "ideal" of its row."""
+    found: dict[str, list[Row]] = {}
+    for name in names:
+        some: list[Row] = []
+        while (of := key(name, len(some))) in rows:
+            beside = rows.get(key(name, len(some), ideal=True))
+            some.append(rows[of] | ({"ideal": beside} if beside else {}))
+        if some:
+            found[name] = some
+    return found
+
+
 def held(error: np.ndarray, std: np.ndarray) -> str:
     """How many per cent of errors lie within 1 and 1.96 std."""
     z = np.abs(error) / std
@@ -66,7 +85,8 @@ def cells(name: str, rows: list[Row]) -> list[str]:
     line = [name, str(len(rows))]
     for which in ("ideal", "measured"):
         error, std = (np.array([r[which][k] for r in rows if which in r]) for k in ("error", "std"))
-        line += [f"{100 * np.median(np.abs(error)):.1f} %", held(error, std)]
+        line += [f"{100 * np.median(np.abs(error)):.1f} %" if error.size else "–",
+                 held(error, std)]
     return [*line, f"{100 * np.median(std):.1f} %"]
 
 
@@ -86,9 +106,7 @@ def sensor_lines(rows: dict[str, list[Row]]) -> list[list[str]]:
             lines.append([label, condition, f"{true[0]:g}", f"{there.sum()} of {len(found)}",
                           f"{100 * np.median(np.abs(off)):.0f} %" if off.size else "–",
                           held(off, std[there] / true[there])])
-        if name != "shot_hz":  # which all noise that falls with light is
-            lines.append([label, "all others", "0", f"{sum(without)} of {len(without)}",
-                          "", ""])
+        lines.append([label, "all others", "0", f"{sum(without)} of {len(without)}", "", ""])
     return lines
 
 

@@ -11,7 +11,7 @@ from evflow import Camera, Events, Recording, SensorModel, simulate
 from evflow.estimation.intervals import EDGES, QuietWaits, life_table, waits_at_rest
 from evflow.estimation.leak import measured_leak
 from evflow.estimation.pixel_noise import calm, quiet_time
-from evflow.estimation.shot import by_light, measured_shot, scatter
+from evflow.estimation.shot import at_mean_light, by_light, measured_shot, scatter
 from evflow.estimation.static import estimate_noise
 
 SHAPE = (48, 64)
@@ -123,10 +123,12 @@ def test_shot_noise_is_that_of_the_dark_if_it_falls_with_light() -> None:
     dn, quiet = light(lambda i01: 0.5 * 3.0 * (1.0 - 0.75 * i01))
     found = measured_shot(by_light(quiet, dn, NONE_HOT), 0.0, scatter(quiet, NONE_HOT))
     assert abs(found.hz - 3.0) < 2.5 * found.std_hz < 0.25
+    assert found.falls
     assert not found.even
     dn, quiet = light(lambda i01: 0.5 + 0.0 * i01)
     found = measured_shot(by_light(quiet, dn, NONE_HOT), 0.0, scatter(quiet, NONE_HOT))
     assert found.even
+    assert not found.falls
     assert found.hz == 0
     few = measured_shot(0.01 * by_light(quiet, dn, NONE_HOT), 0.0, 1.0)
     assert (few.hz, few.even) == (0.0, False)
@@ -163,3 +165,21 @@ def test_the_simulator_s_leak_and_shot_noise_are_found() -> None:
         assert value == pytest.approx(truth, rel=0.1)
         assert abs(value - truth) < 2.5 * found.sensor_std[name] < 0.25 * truth
     assert {"sensor_leak_hz", "sensor_shot_hz_std"} <= set(found.as_dict())
+
+
+@pytest.mark.parametrize("leak_hz", [0.0, 0.2])
+def test_noise_of_bright_places_is_that_of_the_mean_light_once_it_falls(leak_hz: float) -> None:
+    """Where all is dark but what rests, its own rate would be half of what the camera sends."""
+    dn, quiet = light(lambda i01: 0.5 * 3.0 * (1.0 - 0.75 * i01) + leak_hz, seconds=40.0)
+    quiet[:, :, dn < 128] = 0.0
+    histogram = by_light(quiet, dn, NONE_HOT)
+    own = histogram[:, 0].sum(-1) / histogram[:, 1].sum(-1)
+    factor = 0.9
+    eta, std = at_mean_light(own, 0.05 * own, histogram, leak_hz, factor, 0.02)
+    expected = 0.5 * 3.0 * factor + leak_hz
+    assert own[0] < 0.65 * expected
+    assert eta[0] == pytest.approx(expected, rel=0.05)
+    assert abs(eta[0] - expected) < 3.0 * std[0] < 0.15
+    certain, _ = at_mean_light(own, 1e-4 * own, histogram, leak_hz, float(
+        histogram[0, 2].sum() / histogram[0, 1].sum()), 0.02)
+    assert certain[0] == pytest.approx(own[0], rel=1e-3)  # as bright as all: nothing changes
