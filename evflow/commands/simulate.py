@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -72,7 +73,7 @@ class Simulate(Pixels, Footage, Compiling):
 
         from evflow import io
         from evflow.process.terminal import bar
-        from evflow.process.threads import ahead, behind
+        from evflow.process.threads import ahead, behind, prompt
         from evflow.simulator import simulate_stream
         from evflow.simulator.interpolate import unzip
 
@@ -87,7 +88,9 @@ class Simulate(Pixels, Footage, Compiling):
             frames = done
             progress(done, total)
 
-        with bar("simulating") as progress, ahead(self._frames(source, shown), DEPTH) as made:
+        with prompt(), bar("simulating") as progress, ahead(
+            self._frames(source, shown), DEPTH
+        ) as made:
             camera, sensor = self.pixels(source.size), self.model()
             with io.open_writer(
                 self.out, source.size, format, overwrite=self.overwrite
@@ -112,14 +115,14 @@ class Simulate(Pixels, Footage, Compiling):
 
     def _check(self, writer: type[EventWriter]) -> None:
         """EV013, EV020 before any long work."""
-        from evflow.report.movie import Film
-
         if not self.interpolate:
             refuse(self, ("max_motion_px",), "nothing is filled in with --no-interpolate")
         if self.labels and not writer.LABELS:
             refuse(self, ("labels",), f"{writer.NAME} has no place for them; dsec (.h5) and npz do")
         if self.preview is None:
             return
+        from evflow.report.movie import Film  # which takes as long to load as all else
+
         if self.preview.suffix.lower() == ".png":
             raise EvflowDataError("EV020", f"--preview {self.preview}.",
                                   "It is a film: .mp4 or .gif.")
@@ -129,26 +132,33 @@ class Simulate(Pixels, Footage, Compiling):
     def _frames(
         self, source: FrameSource, shown: Callable[[int, int], None]
     ) -> Iterator[tuple[Pair, list[Pair]]]:
-        """The frames that the pixels are shown; and beside each those that have come since the one
-        before, to be written, if they are."""
+        """The frames that the pixels are shown; and beside each those of the video up to it, to be
+        written, if they are."""
         from evflow.light.colour import as_seen
         from evflow.simulator.interpolate import upsample
         from evflow.simulator.photoreceptor import seen_frames
 
         fills = self.interpolate and self.saccades is None  # which move in small steps
         limit = self.max_motion_px if fills else 0.0
-        video, came = source.watched(shown), list[Pair]()
+        video, came, shown_us = source.watched(shown), deque[Pair](), deque[int]()
         if self.frames_too:
             video = _kept(video, self.colour, came)
         pairs = as_seen(
             video, self.colour, None if limit == 0 else lambda slow, pixel:
             upsample(slow, max_motion_px=pixel * limit, warn=source.notes.append))
-        for pair in seen_frames(pairs, self.seen_by(source.recorded)):
-            yield pair, came.copy()
-            came.clear()
+        for pair in seen_frames(_timed(pairs, shown_us), self.seen_by(source.recorded)):
+            now = shown_us.popleft()
+            yield pair, [came.popleft() for _ in range(len(came)) if came[0][1] <= now]
 
 
-def _kept(video: Frames, colour: str, came: list[Pair]) -> Frames:
+def _timed(pairs: Frames, times: deque[int]) -> Frames:
+    """The frames on their way, their times added to `times`."""
+    for frame, time in pairs:
+        times.append(time)
+        yield frame, time
+
+
+def _kept(video: Frames, colour: str, came: deque[Pair]) -> Frames:
     """The frames on their way, each added to `came` as the pixels see it."""
     from evflow.light.colour import as_seen
 

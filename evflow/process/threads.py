@@ -8,6 +8,7 @@ queues are those that no signal can leave locked, and each block ends with its t
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -15,6 +16,8 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+SWITCH_S = 5e-4
 
 
 @contextlib.contextmanager
@@ -96,6 +99,18 @@ def behind(depth: int) -> Iterator[Callable[..., None]]:
         thread.join()
     if failed:
         raise failed[0]
+
+
+@contextlib.contextmanager
+def prompt() -> Iterator[None]:
+    """Threads that come back to Python from a short call of OpenCV or HDF5 wait no longer than such
+    a call takes; as Python begins, ten times as long."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 def _room(depth: int) -> SimpleQueue[None]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Iterable, Iterator
 
 import cv2
@@ -86,6 +87,7 @@ class Interval:
         most = max(float(self.a.dn.max()), float(self.b.dn.max()))
         along, to_a, to_b = (np.empty_like(apart) for _ in range(3))  # new memory costs more
         seen_a, seen_b = np.empty_like(self.a.dn), np.empty_like(self.a.dn)
+        edges = list(_edges(self.a.dn.shape, self._reach()))
         for s in fractions:
             # flow from the new picture: the quadratic blend of the two measured ones, which is
             # exact for constant velocity, and what acceleration moves it by
@@ -96,11 +98,29 @@ class Interval:
             cv2.subtract(to_a, along, to_b)
             looked_up(a, to_a, how, seen_a)
             looked_up(b, to_b, how, seen_b)
-            in_a, in_b = inside(to_a, a.shape), inside(to_b, b.shape)
             picture = cv2.addWeighted(seen_a, 1 - s, seen_b, s, 0)
-            cv2.copyTo(seen_a, cv2.compare(in_a, in_b, cv2.CMP_GT), picture)
-            cv2.copyTo(seen_b, cv2.compare(in_b, in_a, cv2.CMP_GT), picture)
+            for edge in edges:
+                in_a, in_b = inside(to_a[edge], a.shape), inside(to_b[edge], b.shape)
+                cv2.copyTo(seen_a[edge], cv2.compare(in_a, in_b, cv2.CMP_GT), picture[edge])
+                cv2.copyTo(seen_b[edge], cv2.compare(in_b, in_a, cv2.CMP_GT), picture[edge])
             yield np.clip(picture, least, most, out=picture)
+
+    def _reach(self) -> int:
+        """Pixels beyond which nothing is looked up, from any fraction of the interval."""
+        bent = sum(cv2.norm(bend, cv2.NORM_INF) for bend in self.bends or ())
+        flows = (cv2.norm(flow, cv2.NORM_INF) for flow in (self.motion.there, self.motion.back))
+        return math.ceil(max(flows) + bent) + 1
+
+
+def _edges(shape: tuple[int, ...], reach: int) -> Iterator[tuple[slice, slice]]:
+    """Parts of a frame (H, W) that hold all that lies within `reach` of its edge; none twice."""
+    height, width = shape
+    if 2 * reach >= min(height, width):
+        yield slice(None), slice(None)
+        return
+    yield from ((rows, slice(None)) for rows in (slice(reach), slice(height - reach, None)))
+    rows = slice(reach, height - reach)
+    yield from ((rows, columns) for columns in (slice(reach), slice(width - reach, None)))
 
 
 def intervals(

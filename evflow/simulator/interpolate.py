@@ -16,12 +16,14 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.notes import Note
+from evflow.process.threads import ahead
 from evflow.simulator.between import intervals
 
 MIN_SIDE = 12  # pixels on the longer side: smaller frames show no motion
 STEP_PX = 0.5  # of motion: at one pixel a step, fine textures lose 5 to 15 % of their events
 MAX_STEPS = 128  # frames per pair; beyond it the motion is too fast to trust the flow anyway
 GOLDEN, NEAREST = 0.6180339887, 0.3
+AHEAD = 1  # interval that is found while another is filled
 FAILED = 0.3  # of the pixels that change: flow fails in so many where much is covered, and more
 
 
@@ -47,16 +49,17 @@ def upsample(
             yield pair
 
     seen: list[_Seen] = []
-    for number, interval in enumerate(intervals(watched())):
-        wanted = math.ceil(interval.speed_px / max_motion_px)
-        t0, t1 = interval.a.time, interval.b.time
-        seen.append(_Seen(t0, t1, interval.speed_px, wanted, interval.motion.failed,
-                          interval.motion.lost))
-        yield interval.a.dn, t0
-        times = _times(t0, t1, min(MAX_STEPS, wanted), number)
-        fractions = [(t - t0) / (t1 - t0) for t in times]
-        if fractions:
-            yield from zip(interval.at(fractions), times, strict=True)
+    with ahead(intervals(watched()), AHEAD) as found:
+        for number, interval in enumerate(found):
+            wanted = math.ceil(interval.speed_px / max_motion_px)
+            t0, t1 = interval.a.time, interval.b.time
+            seen.append(_Seen(t0, t1, interval.speed_px, wanted, interval.motion.failed,
+                              interval.motion.lost))
+            yield interval.a.dn, t0
+            times = _times(t0, t1, min(MAX_STEPS, wanted), number)
+            fractions = [(t - t0) / (t1 - t0) for t in times]
+            if fractions:
+                yield from zip(interval.at(fractions), times, strict=True)
     yield from last
     if warn is not None:
         for note in _notes(seen):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 import threading
 from collections.abc import Iterator
 
 import pytest
 
-from evflow.process.threads import ahead, behind
+from evflow.process.threads import SWITCH_S, ahead, behind, prompt
 
 
 @pytest.fixture(autouse=True)
@@ -105,3 +107,11 @@ def test_calls_that_wait_are_dropped_where_the_block_raises() -> None:
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert done == [0]  # what was under way was finished
+
+
+def test_threads_are_prompt_in_a_block_and_as_before_after_it() -> None:
+    before = sys.getswitchinterval()
+    with contextlib.suppress(KeyError), prompt():
+        assert sys.getswitchinterval() == pytest.approx(SWITCH_S) != before
+        raise KeyError
+    assert sys.getswitchinterval() == before

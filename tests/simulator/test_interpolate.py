@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import threading
 from collections.abc import Iterator
 
 import cv2
@@ -13,8 +14,9 @@ from helpers.videos import code_of
 
 from evflow.errors import EvflowDataError
 from evflow.notes import Note
-from evflow.simulator.between import intervals
-from evflow.simulator.interpolate import MAX_STEPS, unzip, upsample
+from evflow.simulator.between import _edges, intervals
+from evflow.simulator.interpolate import AHEAD, MAX_STEPS, unzip, upsample
+from evflow.simulator.motion import length
 
 SIZE = 96
 
@@ -110,17 +112,47 @@ def test_tells_at_the_end_where_motion_is_too_fast() -> None:
     assert len(told) == 1
 
 
-def test_two_frames_are_read_ahead() -> None:
+def test_two_frames_ahead_are_enough_and_few_more_are_read() -> None:
     """A video is a stream: what lies between two frames needs the two after them, and no other."""
     asked: list[int] = []
+    released = [threading.Event() for _ in range(10)]
 
     def video() -> Iterator[tuple[np.ndarray, int]]:
-        for i in range(6):
+        for i in range(10):
+            assert i <= 3 or released[i - 4].wait(10.0)
             asked.append(i)
             yield shifted(3.0 * i), 1000 * i
 
     for _, t in upsample(video()):
-        assert asked[-1] == min(5, t // 1000 + 3)
+        released[t // 1000].set()
+
+    asked.clear()
+    for event in released:
+        event.set()
+    for _, t in upsample(video()):
+        assert asked[-1] <= t // 1000 + 3 + AHEAD + 2
+
+
+def test_lengths_of_flow_do_not_depend_on_where_they_lie_in_memory() -> None:
+    """Or two runs would differ in the last bit of some pixels."""
+    rng = np.random.default_rng(0)
+    for shape in [(45, 61), (30, 40), (9, 9)] * 4:
+        flow = rng.normal(size=(*shape, 2)).astype(np.float32)
+        kept = [length(flow) for _ in range(16)]
+        assert len({found.ctypes.data % 64 for found in kept}) > 1
+        assert len({found.tobytes() for found in kept}) == 1
+
+
+@pytest.mark.parametrize("shape", [(20, 30), (20, 31), (7, 40)])
+@pytest.mark.parametrize("reach", [1, 3, 9, 10, 400])
+def test_edges_hold_all_that_is_near_the_border_once(shape: tuple[int, int], reach: int) -> None:
+    seen = np.zeros(shape, int)
+    for edge in _edges(shape, reach):
+        seen[edge] += 1
+    y, x = np.indices(shape)
+    near = np.minimum(np.minimum(y, shape[0] - 1 - y), np.minimum(x, shape[1] - 1 - x)) < reach
+    assert seen.max() == 1
+    assert (seen[near] == 1).all()
 
 
 def test_empty_and_single() -> None:
