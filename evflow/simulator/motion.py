@@ -13,8 +13,6 @@ import cv2
 import numpy as np
 
 PATCHES = 16  # pixels: two of DIS' patches
-PATCHES_APART, STEPS = 4, 60  # pixels between DIS' patches, steps of each at most: of those that
-# turn by 10 degrees, 25 (OpenCV's) leave some on their way
 SMOOTHING = 2  # iterations of DIS' variational refinement: more are slower and no better
 MOTION_QUANTILE = 99.5  # per cent of pixels that are slower than a `speed`
 LEAST_SIDE, SHIFTED_SIDE = 8, 160  # on the shorter side: of halved frames that show a shift; at
@@ -49,8 +47,6 @@ class MotionFinder:
     def __init__(self) -> None:
         self._dis: Any = cv2.DISOpticalFlow_create(  # type: ignore[attr-defined]
             cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        self._dis.setPatchStride(PATCHES_APART)
-        self._dis.setGradientDescentIterations(STEPS)
         self._dis.setVariationalRefinementIterations(SMOOTHING)
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> Motion:
