@@ -6,8 +6,9 @@
 The held-out recordings of `experiments.evaluate` (64x64, 8-bit frames every 25 ms), .2 s as there
 and 1 s, at both mismatches: the first `sequences` of them with 200 signal events of each polarity.
 Every system of `evflow.baselines.SYSTEMS` (LGAN, which learns from each recording for a minute, on
-six of them; in debug for 20 iterations), `estimate_camera`, the constant .3, and MATCH with the
-true 1000 frames/s video (no method that sees the frames alone can do as well). Scored per
+six of them; in debug for 20 iterations), `estimate_camera` and its parts by themselves (the set
+network, the flow, the summary in every pixel, and the paper's flow), the constant .3, and MATCH
+with the true 1000 frames/s video (no method that sees the frames alone can do as well). Scored per
 polarity: `mae_sequence` (map against the sequence's value: the paper's footnote 1), `mae_pixel`
 (map against each pixel's own), and |median - θ|. What a system cannot tell counts with the value
 it gives; `told` is the share of recordings where it told both.
@@ -36,6 +37,7 @@ from evflow.baselines.base import intervals, usable
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
 from evflow.report import plots
+from experiments.shared import alone
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.many import Setup, scores
@@ -86,17 +88,19 @@ def systems_of(options: Options) -> dict[str, System]:
 
 def all_fits(params: Any, recording: Recording, systems: dict[str, System]) -> dict[str, Fitted]:
     """Every system and ours on one recording."""
-    return {name: s.fit(recording) for name, s in systems.items()} | {
-        OURS: ours(params, recording)}
+    return {name: s.fit(recording) for name, s in systems.items()} | ours(params, recording)
 
 
-def ours(params: Any, recording: Recording) -> Fitted:
-    """`estimate_camera` as one of the systems: its thresholds are those of the summary."""
+def ours(params: Any, recording: Recording) -> dict[str, Fitted]:
+    """`estimate_camera` as one of the systems, whose thresholds are those of the summary, after
+    what is in it by itself."""
     start = time.perf_counter()
-    span = int(recording.frame_times[-1] - recording.frame_times[0])
-    found = estimate_camera(recording, params, min_window_us=min(40_000, span))
+    span = min(40_000, int(recording.frame_times[-1] - recording.frame_times[0]))
+    found = estimate_camera(recording, params, min_window_us=span)
+    seconds = time.perf_counter() - start
     theta = np.array([float(found.summary.theta_on), float(found.summary.theta_off)])
-    return Fitted(found.camera, np.stack([found.valid] * 2), theta, time.perf_counter() - start)
+    return alone.fitted(params, recording, found, span) | {
+        OURS: Fitted(found.camera, np.stack([found.valid] * 2), theta, seconds)}
 
 
 def flat(recording: Recording, theta: float) -> Fitted:

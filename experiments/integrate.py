@@ -8,8 +8,9 @@ A frame plus the contrast of the events after it predicts a later frame: the bet
 the better the image. Scored at 1, 5 and 10 frames and after 1e5 and 5e5 events (the first frame
 after them): RMSE and PSNR on 0..255, windowed SSIM (Gaussian, sigma 1.5) and ECC's SSIM of one
 window, averaged over images. Thresholds are those of the first half of a recording, images are of
-the second; a system's log map is that of its calibration. "no events" is the old frame itself. The
-paper averages over recordings that it names only in part.
+the second; a system's log map is that of its calibration. "ours, maps" is the whole estimate; the
+set network, the flow and the paper's flow stand beside it by themselves. "no events" is the old
+frame itself. The paper averages over recordings that it names only in part.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from evflow.errors import EvflowDataError
 from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
+from experiments.shared import alone
 from experiments.shared.cameras import Protocol, hidden_recording
 from experiments.shared.change_systems import cut
 from experiments.shared.common import begin, conclude, run_script
@@ -147,6 +149,8 @@ def thresholds(
         found[name] = Thresholds(fitted.camera, getattr(SYSTEMS[name], "offset_dn", 0.0),
                                  fitted.seconds)
     ours = estimate_camera(part, params)
+    found |= {name: Thresholds(fitted.camera)
+              for name, fitted in alone.fitted(params, part, ours).items() if name != alone.SUMMARY}
     found["ours, summary"] = Thresholds(constant(shape, ours.summary))
     found["ours, maps"] = Thresholds(ours.camera)
     if case.truth is not None and case.nominal is not None:

@@ -14,6 +14,7 @@ from evflow.baselines import SYSTEMS
 from evflow.types import Events
 from experiments import compare_systems
 from experiments.compare_systems import CONSTANT, KNOWN, OURS, Options, halves
+from experiments.shared import alone
 
 
 def test_halves_share_a_frame_and_no_event() -> None:
@@ -34,7 +35,8 @@ def test_every_system_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     result = compare_systems.main(Options(out=tmp_path, sequences=1))
     text = capsys.readouterr().out
     for systems in result["simulated"].values():
-        assert set(systems) == {*SYSTEMS, OURS, CONSTANT, KNOWN}
+        assert set(systems) == {*SYSTEMS, OURS, CONSTANT, KNOWN, alone.PAPER_FLOW, alone.FLOW,
+                                alone.NETWORK, alone.SUMMARY}
         for row in systems.values():
             assert row["recordings"] == 1
             assert np.isfinite([v for v in row.values()]).all()

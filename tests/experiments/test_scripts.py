@@ -24,7 +24,7 @@ SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem != "__init__")
 LINES = 120
 # Whose measure, drawing or fit is their own, and reads best beside its use.
 LONG = {"ablate", "between_frames", "changes", "compare_systems", "coverage", "curves",
-        "evaluate_network", "fuse", "gallery", "generate", "integrate", "true_video",
+        "evaluate", "evaluate_network", "fuse", "gallery", "generate", "integrate", "true_video",
         "long_recordings", "models", "noise", "noise_rates", "see_better", "tell_apart",
         "train_eventgan", "train_network"}
 NO_DEBUG = {

@@ -1,0 +1,118 @@
+"""Who says it: the flow by itself, the set network by itself, and the whole estimate, each named.
+
+Footnote 1 of the paper averages |map - value of the sequence| over the pixels of every window: so
+do the rows "one window". A map that is right about its pixels cannot make that small: with a
+mismatch of .15 the truth itself scores .114, as its pixels lie that far from the sequence's value.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow import CameraEstimate, Recording, estimate, estimate_camera, finish, load_weights
+from evflow.baselines import Fitted
+from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.estimation.pooled import pool_recording, window_inputs
+from evflow.network.architecture import config_of
+from evflow.recordings.windows import iter_windows
+
+Maps = list[np.ndarray]  # (4, H, W) by PARAMETERS each: one, or one a window
+
+WINDOW, FLOW = "flow, one window", "flow, all windows"
+PAPER_WINDOW, PAPER_FLOW = "paper's flow, one window", "paper's flow, all windows"
+NETWORK, SUMMARY, WHOLE = "set network alone", "summary everywhere", "whole estimate"
+ESTIMATORS = (PAPER_WINDOW, PAPER_FLOW, WINDOW, FLOW, NETWORK, SUMMARY, WHOLE)
+SAID = ("One window in one call is the paper's estimator, and `mae_sequence` its footnote 1: |map "
+        "− θ| over pixels and windows. A map that is right about its pixels cannot have it small: "
+        "the truth's own is the mean |pixel − θ|, .024 at a mismatch of .03 and .114 at .15.")
+
+
+@functools.cache
+def paper_weights() -> Any:
+    """The released weights of the paper's network."""
+    return load_weights("paper")
+
+
+def pools(params: Any) -> bool:
+    """Whether the network has a summary of the camera, and tells errors."""
+    return config_of(params).pool
+
+
+def stacked(camera: Camera) -> np.ndarray:
+    """(4, H, W)."""
+    return np.stack([np.asarray(getattr(camera, name)) for name in PARAMETERS])
+
+
+def everywhere(summary: Summary, shape: tuple[int, ...]) -> np.ndarray:
+    """A map (4, H, W) that is the summary in every pixel."""
+    values = np.array([float(getattr(summary, name)) for name in PARAMETERS])
+    return np.broadcast_to(values[:, None, None], (4, *shape))
+
+
+def windows(
+    params: Any, recording: Recording, min_window_us: int, summary: Summary | None
+) -> Maps:
+    """What the flow says of each window alone, knowing the camera's summary if there is one."""
+    found = []
+    for window in iter_windows(recording, min_window_us):
+        voxels, dlogI, given = window_inputs(window)
+        found.append(stacked(estimate(params, voxels, dlogI, summary=summary, **given)))
+    return found
+
+
+def said(
+    params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
+) -> dict[str, Maps]:
+    """Maps by ESTIMATORS, of a recording whose whole estimate is `found`: those of the given
+    weights, and of the paper's. None of a scene at rest, whose thresholds nobody tells."""
+    if not found.windows:
+        return {}
+
+    def flow(weights: Any) -> np.ndarray:
+        return stacked(estimate_camera(recording, weights, refine="off",
+                                       min_window_us=min_window_us).camera)
+
+    paper = paper_weights() if pools(params) else params
+    said = {PAPER_WINDOW: windows(paper, recording, min_window_us, None),
+            PAPER_FLOW: [flow(paper)]}
+    if not pools(params):
+        return said
+    shape = recording.events.size[::-1]
+    known, _ = finish(params, pool_recording(params, recording, min_window_us)[0])
+    return said | {
+        WINDOW: windows(params, recording, min_window_us, known), FLOW: [flow(params)],
+        NETWORK: [everywhere(known, shape)], SUMMARY: [everywhere(found.summary, shape)],
+        WHOLE: [stacked(found.camera)]}
+
+
+def fitted(
+    params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
+) -> dict[str, Fitted]:
+    """The estimators of `said` that give one map, but for the whole estimate, as systems that are
+    compared: their thresholds are the medians of their maps."""
+    rows = {}
+    for name, maps in said(params, recording, found, min_window_us).items():
+        if name in (PAPER_FLOW, FLOW, NETWORK, SUMMARY):
+            camera = Camera(*(jnp.asarray(m, jnp.float32) for m in maps[0]))
+            rows[name] = Fitted(camera, np.stack([found.valid] * 2),
+                                np.median(maps[0][:2], (1, 2)), 0.0)
+    return rows
+
+
+def errors(
+    maps: Maps, truth: np.ndarray, nominal: np.ndarray, fired: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Mean errors (4,) of a recording's maps. truth (4, H, W) of the pixels; nominal (4,) of the
+    sequence; fired (4, H, W) bool, pixels that sent events of the parameter's polarity."""
+    seen = np.stack(maps)
+    off = np.abs(seen - truth)
+    counts = fired.sum((1, 2))
+    return {"mae_sequence": np.abs(seen - nominal[:, None, None]).mean((0, 2, 3)),
+            "mae_pixel": off.mean((0, 2, 3)),
+            "mae_fired": np.where(counts > 0, (off.mean(0) * fired).sum((1, 2))
+                                  / np.maximum(counts, 1), np.nan),
+            "median": np.abs(np.median(seen, (2, 3)) - nominal).mean(0)}

@@ -1,0 +1,59 @@
+"""Each estimator by itself: its errors by hand, and rows that say whose they are."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import evaluate
+from experiments.shared import alone
+
+SHAPE = (4, 6)
+
+
+def test_errors_by_hand() -> None:
+    nominal = np.array([0.2, 0.3, 0.1, 0.1])
+    truth = np.broadcast_to(nominal[:, None, None], (4, *SHAPE)).copy()
+    truth[0, :, :3] += 0.1
+    fired = np.zeros((4, *SHAPE), bool)
+    fired[0, :, 0] = True
+    flat = np.broadcast_to(nominal[:, None, None], truth.shape)
+    found = alone.errors([flat, flat + 0.02], truth, nominal, fired)
+    np.testing.assert_allclose(found["mae_sequence"], 0.01)  # of windows that are 0 and .02 off
+    np.testing.assert_allclose(found["mae_pixel"], [0.5 * (0.09 + 0.01), *[0.01] * 3])
+    assert found["mae_fired"][0] == pytest.approx(0.09)
+    assert np.isnan(found["mae_fired"][1:]).all()
+    np.testing.assert_allclose(found["median"], 0.01)
+    # A map that is right about its pixels: its error is none, its mae_sequence is not.
+    right = alone.errors([truth], truth, nominal, fired)
+    assert right["mae_pixel"][0] == 0
+    assert right["mae_sequence"][0] == pytest.approx(0.05)
+
+
+def test_a_scene_at_rest_has_no_rows() -> None:
+    found: Any = SimpleNamespace(windows=0)
+    assert alone.fitted({}, None, found) == {}  # type: ignore[arg-type]
+
+
+def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:
+    rows = [{f"{k}/{name}": 0.5 for name in evaluate.PAPER for k in (
+        "summary", "mae_sequence", "mae_pixel", "mae_fired", "constant", "constant_truth",
+        "map_gain", *(f"{alone.PAPER_FLOW}: {metric}" for metric in evaluate.METRICS))}
+        | {f"{k}/{name}": np.nan for name in evaluate.PAPER
+           for k in ("network", "inside_68", "inside_95")}
+        | {f"signal/{name}": 1e3 for name in evaluate.PAPER} for _ in range(3)]
+    text = evaluate.table({"0.03": evaluate.averages(rows)})
+    assert f"| 0.03 | theta_on | {alone.PAPER_FLOW} | 0.5000 |" in text
+    assert f"| {alone.FLOW} |" not in text
+    first = text.splitlines()[2].split(" | ")
+    assert first[3] == "–"  # no network pools
+    assert first[-1].startswith("–")  # no interval was told
+
+
+@pytest.mark.parametrize(("error", "width", "within"), [(0.1, 0.2, 1.0), (-0.3, 0.2, 0.0)])
+def test_within(error: float, width: float, within: float) -> None:
+    assert evaluate.inside(error, width) == within
+    assert np.isnan(evaluate.inside(error, float("nan")))
