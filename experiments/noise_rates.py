@@ -29,6 +29,7 @@ from evflow.camera.sensors import SENSORS, SensorModel
 from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.process.terminal import bar
 from evflow.report import plots
+from experiments.shared import alone
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.images import mean_ci
 from experiments.shared.measured_noise import SIDES, Rates, measured, measured_page, ours
@@ -36,7 +37,8 @@ from experiments.shared.table_two import LUX, MIDDLE, SCP, TABLE_TWO
 
 MODELS = {"eq12": SensorModel(eta_intensity=True), "dvs346": SENSORS["dvs346"].model}
 SCENES = ("flat", "still", "moving")
-SYSTEMS = ("v2e, r = 1", "v2e", "evolt", "evolt, θ", "constant", "counting", "ours")
+SYSTEMS = ("v2e, r = 1", "v2e", "evolt", "evolt, θ", "constant", "counting",
+           *alone.RATES, "ours")
 THETA = np.stack([TABLE_TWO[p][:, 0] for p in ("on", "off")], -1)  # (6, 2)
 SIGMA = 0.03  # mismatch, log units: v2e's default
 DN = LUX / 20.0  # 4000 lx are 200 DN: a texture about them is not saturated
@@ -167,7 +169,8 @@ def table_of(params: Any, sensor: str, scene: str, options: Options) -> dict[str
             recording, truth = record(
                 jax.random.fold_in(key, place), sensor, scene, theta, dn, options.size)
             found.append({"truth": truth, **closed_forms(theta, dn, bench),
-                          "counting": counting(recording), **ours(params, recording)})
+                          "counting": counting(recording), **alone.rates(params, recording),
+                          **ours(params, recording)})
             progress(number, options.repeats * len(rows) * len(columns))
     shape = (options.repeats, len(rows), len(columns), 2)
     rates = {name: np.array([f[name] for f in found]).reshape(shape) for name in found[0]}

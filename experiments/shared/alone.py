@@ -7,6 +7,7 @@ mismatch of .15 the truth itself scores .114, as its pixels lie that far from th
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from evflow import CameraEstimate, Recording, estimate, estimate_camera, finish, load_weights
 from evflow.baselines import Fitted
 from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.errors import EvflowDataError
 from evflow.estimation.pooled import pool_recording, window_inputs
 from evflow.network.architecture import config_of
 from evflow.recordings.windows import iter_windows
@@ -26,9 +28,12 @@ WINDOW, FLOW = "flow, one window", "flow, all windows"
 PAPER_WINDOW, PAPER_FLOW = "paper's flow, one window", "paper's flow, all windows"
 NETWORK, SUMMARY, WHOLE = "set network alone", "summary everywhere", "whole estimate"
 ESTIMATORS = (PAPER_WINDOW, PAPER_FLOW, WINDOW, FLOW, NETWORK, SUMMARY, WHOLE)
+RATES = (PAPER_WINDOW, WINDOW, NETWORK)  # whose noise rates are their own
 SAID = ("One window in one call is the paper's estimator, and `mae_sequence` its footnote 1: |map "
         "− θ| over pixels and windows. A map that is right about its pixels cannot have it small: "
-        "the truth's own is the mean |pixel − θ|, .024 at a mismatch of .03 and .114 at .15.")
+        "the truth's own is the mean |pixel − θ|, .024 at a mismatch of .03 and .114 at .15. "
+        "Noise rates of all windows together are those of the quiet time, but for the paper's "
+        "flow.")
 
 
 @functools.cache
@@ -101,6 +106,24 @@ def fitted(
             rows[name] = Fitted(camera, np.stack([found.valid] * 2),
                                 np.median(maps[0][:2], (1, 2)), 0.0)
     return rows
+
+
+def rates(params: Any, recording: Recording) -> dict[str, np.ndarray]:
+    """Noise rates (2,) of the estimators in RATES, means over pixels and windows; NaN where there
+    is no window that shows events, or nothing that pools."""
+    found = dict.fromkeys(RATES, np.full(2, np.nan))
+
+    def mean(maps: Maps) -> np.ndarray:
+        return np.stack(maps)[:, 2:].mean((0, 2, 3))
+
+    with contextlib.suppress(EvflowDataError):
+        found[PAPER_WINDOW] = mean(windows(
+            paper_weights() if pools(params) else params, recording, 40_000, None))
+        if pools(params):
+            known, _ = finish(params, pool_recording(params, recording)[0])
+            found[NETWORK] = np.array([float(known.eta_on), float(known.eta_off)])
+            found[WINDOW] = mean(windows(params, recording, 40_000, known))
+    return found
 
 
 def errors(
