@@ -123,8 +123,8 @@ def averages(rows: list[dict[str, float]]) -> dict[str, Any]:
 
 def table(results: dict[str, dict[str, Any]]) -> str:
     """Markdown: ours beside the constant prior and the paper, and each estimator by itself."""
-    heads = ("mismatch", "parameter", "estimator", *METRICS, "constant prior", "paper")
-    rows = ((preset, name, who, *(cell(r[f"{who}: {metric}"]) for metric in METRICS),
+    heads = ("estimator", "mismatch", "parameter", *METRICS, "constant prior", "paper")
+    rows = ((who, preset, name, *(cell(r[f"{who}: {metric}"]) for metric in METRICS),
              cell(r["constant"]), f"{PAPER[name]:.3f}")
             for preset, found in results.items() for name, r in found.items()
             for who in alone.ESTIMATORS if f"{who}: mae_pixel" in r)

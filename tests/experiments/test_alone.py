@@ -46,7 +46,7 @@ def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:
            for k in ("network", "inside_68", "inside_95")}
         | {f"signal/{name}": 1e3 for name in evaluate.PAPER} for _ in range(3)]
     text = evaluate.table({"0.03": evaluate.averages(rows)})
-    assert f"| 0.03 | theta_on | {alone.PAPER_FLOW} | 0.5000 |" in text
+    assert f"| {alone.PAPER_FLOW} | 0.03 | theta_on | 0.5000 |" in text
     assert f"| {alone.FLOW} |" not in text
     first = text.splitlines()[2].split(" | ")
     assert first[3] == "–"  # no network pools

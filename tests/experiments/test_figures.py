@@ -24,10 +24,11 @@ def readme() -> dict[str, Figures]:
     def of(rows: str, column: str) -> Figures:
         return [mean("evaluate", rf"{mismatch}\|{rows}", column) for mismatch in ("0.03", "0.15")]
 
-    paper = mean("evaluate", r"0.03\|theta", "paper")
     return {
         "threshold of the camera": [*of("theta", "refined"), mean(
-            "evaluate", r"0.03\|theta", "constant prior"), paper],
+            "evaluate", r"0.03\|theta", "constant prior")],
+        "the same, the paper's": [*of("theta", "mae_sequence"), *of("theta", "constant truth"), mean(
+            "evaluate", r"0.03\|theta", "paper")],
         "threshold of each pixel": [*of("theta", "mae_pixel"), *of("theta", "constant truth")],
         "noise rate (Hz)": [*of("eta", "refined"), mean("evaluate", r"0.03\|eta", "constant prior"),
                             mean("evaluate", r"0.03\|eta", "paper")],
@@ -38,8 +39,11 @@ def evaluate() -> dict[str, Figures]:
     free = [mean("evaluate", r"0.03 free noise\|eta", "refined", k) for k in range(2)]
     return {
         "threshold of the camera, ": [*columns("theta", "refined"), mean(
-            "evaluate", r"0.03\|theta", "constant prior"), mean(
-            "evaluate", r"0.03\|theta", "paper")],
+            "evaluate", r"0.03\|theta", "constant prior")],
+        "θ map against the camera's one": [
+            *columns("theta", "mae_sequence", plus_minus=False),
+            *(mean("evaluate", rf"{m}\|theta", "constant truth") for m in ("0.03", "0.15")),
+            mean("evaluate", r"0.03\|theta", "paper")],
         "the same, set network alone": columns("theta", "network", plus_minus=False),
         "noise rate that follows Eq. 12": [*columns("eta", "refined"), mean(
             "evaluate", r"0.03\|eta", "constant prior"), mean("evaluate", r"0.03\|eta", "paper")],
