@@ -229,7 +229,7 @@ def test_options_exist(document: Path) -> None:
         for field in dataclasses.fields(options):
             flag = field.name.replace("_", "-")
             known |= {f"--{flag}", f"--no-{flag}"}
-    known |= {f"--{field.name}" for field in dataclasses.fields(TrainConfig)}  # --loss.flow
+    known |= {f"--{field.name}".replace("_", "-") for field in dataclasses.fields(TrainConfig)}
     text = document.read_text("utf-8")
     assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known
 

@@ -178,7 +178,7 @@ PAPER = TrainConfig(
     scene=SceneConfig.preset("paper"),
     sensors=(SensorModel(eta_intensity=True),), nuisances=NuisanceConfig.none(),
     parts=("encoder", "flow"), window_s=(0.032, 0.032), steps_per_window=32,
-    windows=1, learning_rate=1e-4, flow_rate=1e-4)
+    windows=1)
 
 PRESETS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
@@ -201,7 +201,8 @@ PRESETS: dict[str, TrainConfig] = {
         warmup=300, clip=math.inf, ema=0.0,
         loss=dataclasses.replace(
             PAPER.loss, condition=2.0, inverse_flow=1.0, dequantise=0.0, patches=(8, 16, 32),
-            edges="gradient", elu=True)),
+            edges="gradient", elu=True),
+        learning_rate=1e-4, flow_rate=1e-4),
     "debug": TrainConfig(
         model=ModelConfig(
             flow=FlowConfig(condition=41, steps=2, hidden=16), summary_hidden=32,

@@ -27,8 +27,9 @@ def readme() -> dict[str, Figures]:
     return {
         "threshold of the camera": [*of("theta", "refined"), mean(
             "evaluate", r"0.03\|theta", "constant prior")],
-        "the same, the paper's": [*of("theta", "mae_sequence"), *of("theta", "constant truth"), mean(
-            "evaluate", r"0.03\|theta", "paper")],
+        "the same, the paper's": [
+            *of("theta", "mae_sequence"), *of("theta", "constant truth"),
+            mean("evaluate", r"0.03\|theta", "paper")],
         "threshold of each pixel": [*of("theta", "mae_pixel"), *of("theta", "constant truth")],
         "noise rate (Hz)": [*of("eta", "refined"), mean("evaluate", r"0.03\|eta", "constant prior"),
                             mean("evaluate", r"0.03\|eta", "paper")],
