@@ -65,7 +65,7 @@ def main(options: Options) -> float:
     at_least(1, steps=options.steps)
     need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
-    name, net = estimator(options.weights)
+    name, net = estimator(options.weights, "spread")
     config = dataclasses.replace(
         preset("default"), model=config_of({name: net}), block=(16, 16), windows=1)
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))

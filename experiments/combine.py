@@ -54,7 +54,8 @@ def main(options: Options) -> None:
     name, net = estimator(options.weights)
     card = cards(options.weights)
     if options.pixels:
-        given = [{part: taken(w, name)[part] for part in PIXELS} for w in options.pixels]
+        given = [{part: taken(w, name)[part] for part in PIXELS if part in net}
+                 for w in options.pixels]
         net = net | jax.tree.map(lambda *leaves: np.mean(leaves, 0), *given)
         last = model_card(options.pixels[-1])
         others = [model_card(w) for w in options.pixels[:-1]]
@@ -62,14 +63,14 @@ def main(options: Options) -> None:
         card.pop("calibration", None)  # of the pixels before
     if options.summary is not None:
         net = {part: v for part, v in net.items() if part not in AFTER_SUMMARY}
-        net |= {"summary": taken(options.summary, name)["summary"]}
+        net |= {"summary": taken(options.summary, name, "summary")["summary"]}
         card = card | {"summary": model_card(options.summary)}
     save_weights(options.out, {name: net}, card, overwrite=options.overwrite)
 
 
-def taken(weights: str, name: str) -> dict[str, Any]:
-    """The network in `weights`, of the architecture `name`."""
-    other, net = estimator(weights)
+def taken(weights: str, name: str, *parts: str) -> dict[str, Any]:
+    """The network in `weights`, of the architecture `name`, with the parts that are needed."""
+    other, net = estimator(weights, *parts)
     if other != name:
         raise EvflowDataError("EV018", f"{weights} holds a network {other!r}, not {name!r}.",
                               "Combine networks of one architecture.")

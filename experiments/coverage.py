@@ -25,7 +25,7 @@ from evflow.camera import PARAMETERS
 from evflow.report import plots
 from evflow.report.plots import TITLES
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
-from experiments.shared.common import StudyOptions, begin, conclude, run_script
+from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
 from experiments.shared.many import Setup, study
 
 LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
@@ -139,6 +139,7 @@ def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "coverage")
+    estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=12, full=1000)
     protocols = [drawn(np.random.default_rng((options.seed, i)), options) for i in range(count)]
     setup = Setup(options.weights, options.seed, options.photos)

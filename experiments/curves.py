@@ -21,7 +21,7 @@ from evflow.camera import CameraPrior
 from evflow.estimation.pooled import pool_recording
 from evflow.report import plots
 from experiments.shared.cameras import Hidden, Protocol
-from experiments.shared.common import StudyOptions, begin, conclude, run_script
+from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
 from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH
 
@@ -76,6 +76,7 @@ def point(rows: list[dict[str, np.ndarray]], key: str, low: float = ENOUGH,
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "curves")
+    estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=2, full=60)
     settings: dict[str, dict[Any, Protocol]] = {
         "frame interval [ms]": {ms: dataclasses.replace(BASE, frame_ms=ms, intervals=n)

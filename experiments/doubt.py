@@ -63,7 +63,7 @@ def main(options: Options) -> dict[str, float]:
     at_least(1, workers=options.workers)
     need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
-    name, net = estimator(options.weights)
+    name, net = estimator(options.weights, "summary")
     origin = f"{options.seed} {weights_hash(options.weights)}"
     protocols = [(draw_real if i % 3 else draw_protocol)(np.random.default_rng((options.seed, i)))
                  for i in range(options.recordings)]

@@ -141,7 +141,7 @@ def main(options: Options) -> dict[str, Any]:
     at_least(1, recordings=options.recordings, workers=options.workers)
     need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
-    name, net = estimator(options.weights)
+    name, net = estimator(options.weights, "summary")
     protocols = [draw_protocol(np.random.default_rng((options.seed, i)))
                  for i in range(options.recordings)]
     setup = Setup(str(options.weights), options.seed, photos=True)

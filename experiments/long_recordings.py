@@ -27,7 +27,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.io import open_writer
 from evflow.network.weights import load_weights
-from experiments.shared.common import begin, conclude, markdown, run_script
+from experiments.shared.common import begin, conclude, estimator, markdown, run_script
 
 SPEED = 90.0  # pixels per second
 BLUR = 0.8  # pixels: of the lens
@@ -137,6 +137,7 @@ def score(found: CameraEstimate, camera: Camera) -> dict[str, float]:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "long_recordings")
+    estimator(options.weights, "summary")
     path, camera = make(options)
     before, wall = time.process_time(), time.monotonic()
     found = estimate_camera(path, load_weights(options.weights), effort=options.effort)

@@ -22,13 +22,12 @@ from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.pooled import pool_recording
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
-from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
+from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
 from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH
 
-CASES: dict[str, dict[str, Any]] = {
-    "brighter": {}, "darker": {}, "OFF unreached": {"off": "unreached"},
-    "OFF left out": {"off": "dropped"}}
+CASES: dict[str, dict[str, Any]] = {"brighter": {}, "darker": {}, "OFF unreached": {
+    "off": "unreached"}, "OFF left out": {"off": "dropped"}}
 FADES = (1.5, 5.0)
 HEADS = ("case", "recordings", "said to be undetermined", "θ of the other: error", "std",
          "in 68 / 95 %", "η: in 68 / 95 %", "network alone: error of θ", "in 68 / 95 %")
@@ -106,6 +105,7 @@ def table(results: dict[str, dict[str, float]]) -> str:
 
 def main(options: Options) -> dict[str, dict[str, float]]:
     begin(options, "one_polarity")
+    estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=3, full=100)
     setup, results = Setup(options.weights, options.seed), {}
     for case in CASES:

@@ -29,7 +29,7 @@ from evflow.recordings.windows import plan_windows
 from evflow.simulator.photoreceptor import IDEAL
 from experiments.shared import pages
 from experiments.shared import real_scores as scores
-from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
+from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
 from experiments.shared.kept import Row, kept, resumed
 from experiments.shared.many import Setup, made
 from experiments.shared.real_cameras import BASE, CHANGES
@@ -96,6 +96,7 @@ def halves(path: Path) -> list[str] | None:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "real_pixels")
+    estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=1, full=40)
     names = options.conditions or (FEW if options.preset == "debug" else tuple(CHANGES))
     rows = measured(options, names, count)

@@ -28,7 +28,7 @@ from evflow.estimation.pooled import pool_recording
 from evflow.estimation.refine import pixel_posterior, refine_summary, refinement_chunks
 from evflow.recordings.windows import plan_windows
 from experiments.shared.cameras import Hidden, Protocol
-from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
+from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
 from experiments.shared.known_video import known_path, noise_told
 from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH, protocols
@@ -116,6 +116,7 @@ def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "true_video")
+    estimator(options.weights, "summary")
     sequences = options.count(options.sequences, debug=4, full=100)
     setup = Setup(options.weights, options.seed)
     result: dict[str, Any] = {}

@@ -96,12 +96,16 @@ def begin(options: Any, name: str) -> None:
                               f"({', '.join(differ)}).", "Choose another --out.")
 
 
-def estimator(weights: str | Path) -> tuple[str, dict[str, Any]]:
+def estimator(weights: str | Path, *parts: str) -> tuple[str, dict[str, Any]]:
     """The name of the architecture in `weights`, and its network; EV018 for weights of anything
-    but an estimator."""
+    but an estimator, or of one without the parts that are needed."""
     params = load_weights(weights)
     config_of(params)
     (name, net), = params.items()
+    if missing := [part for part in parts if part not in net]:
+        raise EvflowDataError(
+            "EV018", f"{weights} has no part {' and '.join(missing)}: its network ({name}) sees "
+            "every pixel alone, and tells no errors.", "Take weights of the default network.")
     return name, net
 
 

@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.networks import random_params
 
 from evflow.errors import EvflowDataError
+from evflow.network.config import MODELS
+from evflow.network.weights import save_weights
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.run import started_from
 from experiments import (
@@ -53,6 +56,18 @@ def test_counts_below_one(script: Any, option: str, count: int, tmp_path: Path) 
     with pytest.raises(EvflowDataError, match=rf"EV020.*--{option} {count}"):
         script.main(script.Options(**given))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("script", [*FITS, coverage, curves, one_polarity, true_video],
+                         ids=lambda x: x.__name__)
+def test_weights_without_a_summary_or_errors(script: Any, tmp_path: Path) -> None:
+    """As those of the paper's network: what is fitted to errors, or scores them, has nothing."""
+    paper = MODELS["paper"]
+    small = dataclasses.replace(paper, flow=dataclasses.replace(paper.flow, steps=1, hidden=8))
+    path = save_weights(tmp_path / "small.safetensors", random_params(small, "paper"), {})
+    given = {"weights": str(path), "out": tmp_path / ("a.safetensors" if script in FITS else "out")}
+    with pytest.raises(EvflowDataError, match=r"EV018.*no part .*sees every pixel alone"):
+        script.main(script.Options(**given))
 
 
 def test_a_result_of_other_options_is_not_replaced(tmp_path: Path) -> None:
