@@ -29,7 +29,7 @@ from evflow.estimation.refine import Stretch, cut, pixel_posterior
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import Stage, State, add, estimate, glance, look, looked_through
 from evflow.estimation.static import estimate_noise
-from evflow.estimation.unpooled import estimate_unpooled
+from evflow.estimation.unpooled import WINDOW_US, estimate_unpooled
 from evflow.files.spool import SOME, on_disk
 from evflow.network import api
 from evflow.network.architecture import config_of
@@ -57,7 +57,8 @@ def estimate_camera(
     Args:
         recording_or_path: events and frames on one clock, or the path of a file that holds them.
         params: of `load_weights`; None loads the released ones. Of the paper's network, which sees
-            pixels alone, the maps are the mean of its windows', and standard deviations NaN.
+            pixels alone, the maps are the mean of its windows', which are shorter (25 ms at least),
+            and standard deviations NaN.
         refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .011).
         pixel: "measured" looks for the photoreceptor and for what frames do not show; "ideal" takes
             pixels and frames at their word.
@@ -112,9 +113,11 @@ def measure(
         stage("counting noise")
         return Measured(estimate_noise(recording))
     params = load_weights() if params is None else params
+    pools = config_of(params).pool
+    min_window_us = min_window_us if pools else min(min_window_us, WINDOW_US)
     plan = plan_windows(recording, min_window_us)
     iter_windows(recording, min_window_us, plan)  # EV017 where there is none
-    if not config_of(params).pool:
+    if not pools:
         return Measured(_unpooled(recording, plan, params, progress, stage))
     stretches = cut(recording, plan, path=refine == "auto")
     order = ordered(stretches, effort)

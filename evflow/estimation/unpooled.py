@@ -26,6 +26,8 @@ from evflow.types import Recording, Window
 
 Array = np.ndarray
 
+WINDOW_US = 25_000  # at least: the paper's network was trained on windows of 32 ms, and no others
+
 
 def window_map(params: api.Params, window: Window) -> tuple[Array, Array]:
     """What the flow says of one window, (4, H, W) by PARAMETERS, and where its frames show the

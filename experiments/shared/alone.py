@@ -19,6 +19,7 @@ from evflow.baselines import Fitted
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.pooled import pool_recording, window_inputs
+from evflow.estimation.unpooled import WINDOW_US
 from evflow.network.architecture import config_of
 from evflow.recordings.windows import iter_windows
 
@@ -73,7 +74,8 @@ def said(
     params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
 ) -> dict[str, Maps]:
     """Maps by ESTIMATORS, of a recording whose whole estimate is `found`: those of the given
-    weights, and of the paper's. None of a scene at rest, whose thresholds nobody tells."""
+    weights, and of the paper's, in windows as short as it was trained on. None of a scene at rest,
+    whose thresholds nobody tells."""
     if not found.windows:
         return {}
 
@@ -82,7 +84,8 @@ def said(
                                        min_window_us=min_window_us).camera)
 
     paper = paper_weights() if pools(params) else params
-    said = {PAPER_WINDOW: windows(paper, recording, min_window_us, None),
+    short = min(min_window_us, WINDOW_US)
+    said = {PAPER_WINDOW: windows(paper, recording, short, None),
             PAPER_FLOW: [flow(paper)]}
     if not pools(params):
         return said
@@ -118,7 +121,7 @@ def rates(params: Any, recording: Recording) -> dict[str, np.ndarray]:
 
     with contextlib.suppress(EvflowDataError):
         found[PAPER_WINDOW] = mean(windows(
-            paper_weights() if pools(params) else params, recording, 40_000, None))
+            paper_weights() if pools(params) else params, recording, WINDOW_US, None))
         if pools(params):
             known, _ = finish(params, pool_recording(params, recording)[0])
             found[NETWORK] = np.array([float(known.eta_on), float(known.eta_off)])
