@@ -55,7 +55,8 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
     """Parameters of the network, for `estimate` and the rest of the API.
 
     Args:
-        name_or_path: a released name ("default" ships with the package), or a .safetensors file.
+        name_or_path: a released name ("default", or "paper", the paper's network, trained on one
+            core), or a .safetensors file.
 
     Returns:
         A nested dict of float32 arrays under one key, the architecture's name.

@@ -12,6 +12,8 @@ from safetensors.numpy import save
 
 from evflow.errors import EvflowDataError
 from evflow.network import weights
+from evflow.network.architecture import config_of
+from evflow.network.config import MODELS
 from evflow.network.weights import (
     load_weights,
     model_card,
@@ -95,6 +97,19 @@ def test_names_and_cards_by_which_weights_can_be_read_again(tmp_path: Path) -> N
         path.write_bytes(save({"a": np.zeros(3, np.float32)}, metadata={"card": card}))
         with pytest.raises(EvflowDataError, match=r"EV009.*no object"):
             model_card(path)
+
+
+def test_the_papers_weights_are_whole_and_tell_no_error() -> None:
+    params, card = load_weights("paper"), model_card("paper")
+    assert weights_path("paper").stat().st_size <= 6e6
+    config = config_of(params)
+    assert not config.pool
+    assert config == MODELS["paper"]
+    assert set(params["paper"]) == {"encoder", "flow"}  # nothing that was never trained
+    assert card["preset"] == "paper"
+    assert card["steps"] > 1000
+    assert {"config", "seed", "training_figures", "versions", "source"} <= set(card)
+    assert np.isfinite(list(card["training_figures"].values())).all()
 
 
 def test_shipped_weights_are_small_finite_and_explained() -> None:
