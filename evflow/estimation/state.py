@@ -130,6 +130,7 @@ def look(
     """What a stretch alone says, seen by a state's eyes. simulate: whether it is one of those that
     the refinement simulates; every: which of its windows are pooled, each one, or each second;
     advance() is called after every window, and after the stretch."""
+    give_back()
     stats, n_events, n_shown = None, np.zeros(()), np.zeros(())
     for number, window in enumerate(_windows([stretch])):
         if number % every == 0:

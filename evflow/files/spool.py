@@ -52,6 +52,15 @@ def forget(*arrays: np.ndarray) -> None:
             base = base.base
 
 
+def put_aside(array: np.ndarray) -> np.ndarray:
+    """The array, on the disk until it is looked at; EV019 where that is full."""
+    spool = Spool(array.dtype, 0)
+    spool.append(array.ravel())
+    aside = np.asarray(spool.array()).reshape(array.shape)
+    forget(aside)
+    return aside
+
+
 class Spool:
     """Parts (n,) of one dtype, joined by `array`. Memory: the rows below the limit, an eighth of
     them that is not filled, and `JOINED` bytes of parts."""

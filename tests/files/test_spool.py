@@ -17,7 +17,7 @@ from helpers.recordings import equal, make
 from evflow import io
 from evflow.errors import EvflowDataError
 from evflow.files import spool
-from evflow.files.spool import Spool
+from evflow.files.spool import Spool, put_aside
 from evflow.io import writer
 from evflow.types import Events, Recording
 
@@ -164,3 +164,11 @@ def test_a_copy_never_holds_all_events(monkeypatch: pytest.MonkeyPatch) -> None:
     writer.copy(recording, out)  # type: ignore[arg-type]
     assert max(map(len, out.parts)) == 64
     equal(Events.concatenate(out.parts), recording.events)
+
+
+def test_an_array_that_is_put_aside_is_the_same_on_the_disk() -> None:
+    array = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    aside = put_aside(array)
+    np.testing.assert_array_equal(aside, array)
+    assert (aside.shape, aside.dtype) == (array.shape, array.dtype)
+    assert isinstance(aside.base.base if aside.base.base is not None else aside.base, np.memmap)

@@ -29,6 +29,7 @@ from evflow.estimation.refine.stretches import (
     spread,
 )
 from evflow.estimation.refine.trace import Trace, trace_of_events
+from evflow.files.spool import put_aside
 from evflow.light.log_maps import lin_log
 from evflow.process.memory import give_back
 from evflow.recordings.glitches import SATURATED_DN, exposed
@@ -42,6 +43,7 @@ STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 
 STRETCHES = 3  # that tell the photoreceptor
 
 Box = tuple[slice, slice]
+WHOLE: Box = (slice(None), slice(None))
 Place = tuple[Recording, Sequence[int]]  # a recording and a run of its frame intervals
 
 
@@ -66,7 +68,7 @@ class Chunk:
     evidence: PixelEvidence
     quiet: np.ndarray
     sightings: Sightings
-    box: Box = (slice(None), slice(None))
+    box: Box = WHOLE
 
 
 QUIET = 0.05  # log units: less than the smallest threshold of any use
@@ -152,8 +154,11 @@ def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -
 
 
 def without_evidence(chunk: Chunk) -> Chunk:
-    """A chunk that is kept to be simulated: what it says of its pixels is in the sums."""
-    return dataclasses.replace(chunk, evidence=PixelEvidence.nothing((0, 0)))
+    """A chunk that is kept to be simulated: what it says of its pixels is in the sums. Of a large
+    sensor, whose maps take most of the memory, the path is put aside meanwhile."""
+    large = chunk.box != WHOLE
+    return dataclasses.replace(chunk, evidence=PixelEvidence.nothing((0, 0)),
+                               path=put_aside(chunk.path) if large else chunk.path)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

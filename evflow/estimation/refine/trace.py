@@ -42,8 +42,11 @@ def trace_of_events(events: Events, times_us: np.ndarray, steps: int) -> Trace:
     pixel = used.y.astype(np.int64) * width + used.x
     interval = np.searchsorted(times_us, used.t, side="left") - 1
     n, k = height * width, len(times_us) - 1
-    where = (interval * 2 + np.where(used.p, 0, 1)) * n + pixel
-    counts = np.bincount(where, minlength=2 * k * n).astype(np.float32)
+    where = np.where(used.p, 0, n) + pixel
+    ends = np.searchsorted(interval, np.arange(k + 1))
+    counts = np.empty((k, 2 * n), np.float32)  # row by row: of all at once int64 is too large
+    for row, first, last in zip(counts, ends[:-1], ends[1:], strict=True):
+        row[:] = np.bincount(where[first:last], minlength=2 * n)
     pixels, first = np.unique(pixel, return_index=True)
     at = interval[first]
     position = (used.t[first] - times_us[at]) / np.diff(times_us)[at] * steps
