@@ -38,6 +38,7 @@ from evflow.estimation.refine.path import STEPS, without_evidence
 from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
+from evflow.files.spool import forget
 from evflow.network import api
 from evflow.notes import Note
 from evflow.process.memory import give_back
@@ -198,6 +199,7 @@ def refine(state: State) -> Refined:
         state.quiet, float(summary.eta_on + summary.eta_off), state.n_events, state.seconds)
     chunks = tuple(_without_hot(c, hot) for c in state.chunks)
     summary, std = maps.refined(state.params, list(chunks), summary, std)
+    forget(*(c.path for c in chunks))
     if found is None:
         return Refined(hot, chunks, summary, std)
     if not state.eyes.seen_by.ideal:

@@ -18,7 +18,7 @@ from evflow.estimation.refine.denoise import denoised
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_search import Found, find
-from evflow.estimation.refine.sightings import Sightings, sight
+from evflow.estimation.refine.sightings import Sightings, no_sightings, sight
 from evflow.estimation.refine.stretches import (
     BAND,
     LARGE,
@@ -105,7 +105,7 @@ def make_chunk(
         sightings = sight(events, times, fine, steps, film.shown)
         evidence = evidence_of(sightings, first=first)
     else:
-        sightings = sight(events.slice(0, 0), times, fine, steps, film.shown)
+        sightings = no_sightings(film.shown)
         evidence = _evidence_by_bands(events, times, fine, film.shown, steps, first=first)
     return Chunk(fine, bright, film.dt_s, film.motion_px, trace, evidence, quiet, sightings)
 

@@ -75,6 +75,14 @@ def sight(
         flat[::steps], parts.max(1) - parts.min(1), everything.reshape(k + 1, -1), (height, width))
 
 
+def no_sightings(seen: Array) -> Sightings:
+    """Those of no events, beside no path. seen: (K + 1, H, W) bool."""
+    none, shape = np.zeros(0, np.int64), seen.shape[1:]
+    path = np.zeros((0, seen[0].size), np.float32)
+    return Sightings(none, none, none, none.astype(float), none > 0, none.astype(float), none,
+                     path, path, seen.reshape(len(seen), -1), shape)
+
+
 def trusted(s: Sightings) -> Array:
     """(N,) weights of the path at the events, 1 at a frame: PATH_ERROR² over its variance."""
     span = np.maximum(s.inner[s.interval, s.pixel], TYPICAL_THETA * _net_range(s))

@@ -175,3 +175,17 @@ def test_where_little_happens_nothing_is_looked_for() -> None:
     s = sight(events, times, lin_log(dn), STEPS)
     assert sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s)]) is None
     assert sample([]) is None
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_events_that_no_frame_shows_tell_nothing(shown: bool) -> None:
+    """Of black or saturated frames: thousands of events, and no brightness beside them."""
+    rng, n = np.random.default_rng(0), 4000
+    dn = np.full((INTERVALS * STEPS + 1, *SHAPE), 100.0, np.float32)
+    t = np.sort(rng.integers(10_001, 10_000 + INTERVALS * 20_000, n))
+    y, x = (rng.integers(0, side, n) for side in SHAPE)
+    events = Events(x, y, t, rng.random(n) < 0.5, SHAPE[::-1])
+    times = 10_000 + 20_000 * np.arange(INTERVALS + 1)
+    s = sight(events, times, lin_log(dn), STEPS, np.full((INTERVALS + 1, *SHAPE), shown))
+    found = sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s)])
+    assert (found is not None) == shown
