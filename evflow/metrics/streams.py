@@ -167,12 +167,14 @@ def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:
 def _company(sides: dict[str, Events]) -> dict[str, Any]:
     """What the events of a pixel have to do with those before and around it."""
     found = {name: _own_intervals(events) for name, events in sides.items()}
-    own = {name: intervals for name, (intervals, _) in found.items()}
+    intervals = _times_alike({name: own for name, (own, _) in found.items()})
+    same = {name: share for name, (_, share) in found.items()}
+    del found  # as large as the events
     around = {name: _neighbour_delays(events) for name, events in sides.items()}
     alone = {name: float((d > ALONE_US).mean()) if d.size else None for name, d in around.items()}
     near = {name: d[np.isfinite(d)] for name, d in around.items()}
-    return {"intervals": _times_alike(own), "neighbours": {**_times_alike(near), "alone": alone},
-            "same_polarity": {name: same for name, (_, same) in found.items()}}
+    return {"intervals": intervals, "neighbours": {**_times_alike(near), "alone": alone},
+            "same_polarity": same}
 
 
 def _own_intervals(events: Events) -> tuple[np.ndarray, float | None]:
@@ -189,7 +191,9 @@ def _neighbour_delays(events: Events) -> np.ndarray:
     M <= ASKED_EVENTS events, evenly taken."""
     n = len(events)
     width, height = events.size
-    keys = np.sort(_pixels(events) * n + np.arange(n))  # by pixel, then by time
+    keys = _pixels(events) * n
+    keys += np.arange(n)
+    keys.sort()  # by pixel, then by time
     asked = np.linspace(0, n - 1, min(n, ASKED_EVENTS)).astype(np.int64)
     asked = asked[np.argsort(_pixels(events)[asked], kind="stable")]  # found in order: in the cache
     x, y = events.x[asked].astype(np.int64), events.y[asked].astype(np.int64)
@@ -226,6 +230,7 @@ def distances(a: np.ndarray, b: np.ndarray) -> tuple[float | None, float | None]
     if not (a.size and b.size):
         return None, None
     at = np.sort(np.concatenate([a, b]))
-    apart = np.abs(np.searchsorted(a, at, side="right") / a.size
-                   - np.searchsorted(b, at, side="right") / b.size)
+    apart = np.searchsorted(a, at, side="right") / a.size
+    apart -= np.searchsorted(b, at, side="right") / b.size
+    np.abs(apart, out=apart)
     return float(apart.max()), float(apart[:-1] @ np.diff(at))

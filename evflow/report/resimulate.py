@@ -23,12 +23,13 @@ from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.result import CameraEstimate
 from evflow.metrics.streams import compare, correlations
 from evflow.notes import Note
+from evflow.process.memory import give_back
 from evflow.recordings.check.bunches import beside, bunch
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
 from evflow.simulator.photoreceptor import IDEAL, as_measured, seen_frames
-from evflow.types import Events, Recording
+from evflow.types import Events, Recording, release
 
 SECONDS = 3.0  # of recording at most that are simulated
 PIXELS = 100 * 346 * 260  # of frames at most: 100 frames of a DAVIS346
@@ -115,6 +116,9 @@ def resimulate(recording: Recording, found: CameraEstimate, run: Run, seed: int)
         real, made, again = (beside(e, recording.frame_times, disturbed)
                              for e in (real, made, again))
     ceiling = correlations(*(e.count_map().astype(np.float64) for e in (made, again)))
+    del parts, again
+    release(recording)
+    give_back()
     return Trial(real, made, span, run, compare(real, made, span_us=span), ceiling,
                  busiest_instant(real, span), tuple(dict.fromkeys(notes)))
 
