@@ -76,6 +76,8 @@ def intervals() -> dict[str, Figures]:
         "the same, grouped": of("coverage_photos", r"theta_\w+, s[ie]", r"eta_\w+, s[ie]"),
         "the same without": of("coverage", *whole[:2]),
         "40 recordings of 2 to 8 s": of("coverage_long", *whole),
+        "30 recordings of .2 s": of("coverage_0.2s", *whole),
+        "30 recordings of 1 s": of("coverage_1s", *whole),
         "the held-out recordings": [*theta, 12, *eta, *free],  # 12: Eq. 12
     }
 
