@@ -2,6 +2,7 @@
 
     python -m experiments.evaluate --preset debug
     python -m experiments.evaluate --preset full
+    python -m experiments.evaluate --preset full --cameras other --images photographs/
 
 Protocol: 64x64 pixels, 200 ms rendered at 1000 fps, procedural textures never trained on, 8-bit
 frames every 25 ms, θ ~ U(.1, .5) per polarity. `estimate_camera` sees events and frames. Scored
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from experiments.shared import alone
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
 from experiments.shared.many import Setup, study
-from experiments.shared.protocols import ENOUGH, protocols
+from experiments.shared.protocols import ENOUGH, other_protocols, protocols
 
 PAPER = {"theta_on": 0.023, "theta_off": 0.022, "eta_on": 0.045, "eta_off": 0.027}
 HEADS = ("mismatch", "parameter", "recordings", "network", r"refined \|summary - true\|", "median",
@@ -46,6 +47,10 @@ class Options(StudyOptions):
     """Far from any training seed: other textures, scenes and cameras."""
     sequences: int | None = None
     """Recordings per row (default: the preset's)."""
+    cameras: Literal["known", "other"] = "known"
+    """The table's; or such as were never trained on: of another prior, of another simulator."""
+    images: str | None = None
+    """Scenes of one's own pictures: a folder, or a COCO json of objects."""
 
 
 def by_whom(params: Any, hidden: Hidden, found: CameraEstimate) -> dict[str, float]:
@@ -77,6 +82,7 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
         fired = counts[i % 2] > 0
         off = np.abs(seen - pixels)
         errors |= {
+            f"true/{name}": true,
             f"signal/{name}": float(signal[i % 2]),
             f"network/{name}": abs(float(getattr(network, name)) - true) if network else np.nan,
             f"summary/{name}": abs(guess - true),
@@ -110,6 +116,8 @@ def averages(rows: list[dict[str, float]]) -> dict[str, Any]:
         def column(key: str, parameter: str = parameter) -> np.ndarray:
             return np.array([r[f"{key}/{parameter}"] for r in rows])
 
+        if not column("true").any():  # pixels that have no such parameter
+            continue
         used = column("signal") >= ENOUGH
         keys = sorted(k.split("/")[0] for k in rows[0] if k.endswith(parameter))
         result[parameter] = {k: mean(column(k)[used]) for k in keys}
@@ -152,11 +160,12 @@ def whole(results: dict[str, dict[str, Any]]) -> str:
 
 def main(options: Options) -> dict[str, dict[str, Any]]:
     begin(options, "evaluate")
-    setup = Setup(options.weights, options.seed)
+    setup = Setup(options.weights, options.seed, images=options.images)
+    rows = protocols() if options.cameras == "known" else other_protocols()
     count = options.count(options.sequences, debug=6, full=320)
     results = {name: averages(study(
         score, setup, [protocol] * count, options.workers, f"mismatch {name}"))
-        for name, protocol in protocols().items()}
+        for name, protocol in rows.items()}
     conclude(options, "evaluate", results, table(results))
     return results
 
