@@ -11,9 +11,11 @@ from evflow import CameraEstimate, estimate_camera
 from evflow.camera.optics import MEASURED
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.kept import Row
-from experiments.shared.real_cameras import added_light, shot_rates
+from experiments.shared.real_cameras import CHANGES, added_light, shot_rates
 
 LABELS = {"cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz]"}
+SLOW = [name for name, change in CHANGES.items()
+        if "model" in change and change["model"].photoreceptor is not None]  # without a cutoff_hz
 HEADS = ("condition", "cameras", "ideal: median error of θ", "68 / 95 % hold",
          "measured: median error", "68 / 95 % hold", "median std")
 OTHER_HEADS = ("what else", "condition", "true", "found in", "median error", "68 / 95 % hold")
@@ -100,7 +102,8 @@ def sensor_lines(rows: dict[str, list[Row]]) -> list[list[str]]:
             value, std, true = np.array([r["sensor"][name] for r in found], float).T
             there = value > 0
             if not true[0]:
-                without += there.tolist()
+                if condition not in SLOW or name != "cutoff_hz":
+                    without += there.tolist()
                 continue
             off = value[there] / true[there] - 1
             lines.append([label, condition, f"{true[0]:g}", f"{there.sum()} of {len(found)}",
