@@ -83,6 +83,7 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
     width, height = recording.events.size
     most = max(2, PIXELS // (width * height))
     before = np.searchsorted(recording.events.t, times)
+    release(recording)
     best, found = -1, runs[0]
     for first, end in runs:
         for start in range(first, end):

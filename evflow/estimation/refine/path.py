@@ -105,6 +105,7 @@ def make_chunk(
         sightings = sight(events, times, fine, steps, film.shown)
         evidence = evidence_of(sightings, first=first)
     else:
+        give_back()
         sightings = no_sightings(film.shown)
         evidence = _evidence_by_bands(events, times, fine, film.shown, steps, first=first)
     return Chunk(fine, bright, film.dt_s, film.motion_px, trace, evidence, quiet, sightings)
