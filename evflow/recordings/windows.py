@@ -187,7 +187,7 @@ def left_out(recording: Recording, plan: WindowPlan) -> tuple[Note, ...]:
     return (*condensed(plan.skipped), *(Note(
         "windows.beyond", f"{us * 1e-6:.2f} of {whole * 1e-6:.2f} s of events come {where}, and "
         "are not used: no frame shows what moved then") for us, where in sides
-        if us > BEYOND * whole))
+        if us > max(BEYOND * whole, 1.5 * float(np.median(np.diff(times))))))
 
 
 def window_at(recording: Recording, pair: tuple[int, int], index: int) -> Window:
