@@ -33,8 +33,9 @@ def crossed(theta_on: float, theta_off: float, k2: float, pixels: int = 48) -> S
             counts[side] += fires
             rows += [(p, t, counts[0, p], -counts[1, p]) for p in np.flatnonzero(fires)]
     pixel, at, on, off = np.array(rows, np.float64).T
-    return Sample(*(v[None] for v in (dn, np.full(steps, 1e-3), pixel.astype(int), at, on, off,
-                                      np.ones(len(pixel)), np.zeros(pixels, int))))
+    own = pixel.astype(int)
+    return Sample(*(v[None] for v in (dn, np.full(steps, 1e-3), own, at, on, off,
+                                      np.ones(len(pixel)), own, np.zeros(pixels, int), np.zeros(2))))
 
 
 def rested(constants: Voltmeter, seconds: float) -> np.ndarray:

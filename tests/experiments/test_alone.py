@@ -40,7 +40,7 @@ def test_a_scene_at_rest_has_no_rows() -> None:
 
 def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:
     rows = [{f"{k}/{name}": 0.5 for name in evaluate.PAPER for k in (
-        "summary", "mae_sequence", "mae_pixel", "mae_fired", "constant", "constant_truth",
+        "true", "summary", "mae_sequence", "mae_pixel", "mae_fired", "constant", "constant_truth",
         "map_gain", *(f"{alone.PAPER_FLOW}: {metric}" for metric in evaluate.METRICS))}
         | {f"{k}/{name}": np.nan for name in evaluate.PAPER
            for k in ("network", "inside_68", "inside_95")}
