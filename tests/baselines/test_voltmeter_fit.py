@@ -34,8 +34,9 @@ def crossed(theta_on: float, theta_off: float, k2: float, pixels: int = 48) -> S
             rows += [(p, t, counts[0, p], -counts[1, p]) for p in np.flatnonzero(fires)]
     pixel, at, on, off = np.array(rows, np.float64).T
     own = pixel.astype(int)
-    return Sample(*(v[None] for v in (dn, np.full(steps, 1e-3), own, at, on, off,
-                                      np.ones(len(pixel)), own, np.zeros(pixels, int), np.zeros(2))))
+    fields = (dn, np.full(steps, 1e-3), own, at, on, off, np.ones(len(pixel)), own,
+              np.zeros(pixels, int), np.zeros(2))
+    return Sample(*(v[None] for v in fields))
 
 
 def rested(constants: Voltmeter, seconds: float) -> np.ndarray:
