@@ -51,7 +51,8 @@ def measured(
     made = measure(recording, params, pixel=pixel, min_window_us=MIN_WINDOW_US)
     found, runs = made.found, usable_runs(recording)
     trial = resimulate(recording, found, busiest(recording, runs), seed)
-    explained = held_out(recording, params, runs, MIN_WINDOW_US, seed, made.first)[2]
+    explained = held_out(recording, params, runs, MIN_WINDOW_US, seed, made.first)[2] if (
+        pixel == "measured") else None
     numbers = trial.numbers
     theta = {f"{part}theta_{side}": float(getattr(summary, f"theta_{side}")) for part, summary in (
         ("", found.summary), ("std_", found.summary_std)) for side in SIDES}
@@ -59,7 +60,7 @@ def measured(
             "cutoff_hz": found.sensor.cutoff_hz, "by_light": found.sensor.cutoff_by_light,
             "r": numbers["counts"]["r"], "ceiling": trial.ceiling,
             "space_time_r": numbers["space_time_r"], "events": numbers["rate_hz"]["ratio"],
-            "explained": None if explained is None else explained[pixel == "measured"]}, trial
+            "explained": explained}, trial
 
 
 def cells(name: str, pixel: str, row: dict[str, Any]) -> list[str]:
@@ -98,6 +99,9 @@ def main(options: Options) -> dict[str, Any]:
         result[path.name] = found = {}
         for pixel in PIXELS:
             found[pixel], trials[pixel] = measured(recording, params, pixel, options.seed)
+        ideal, own = found["measured"].pop("explained") or (None, None)
+        found["measured"]["explained"], found["ideal"]["explained"] = own, ideal
+        for pixel in PIXELS:
             rows.append(cells(path.name, pixel, found[pixel]))
         draw(trials, options.out / f"{slug(path.stem)}.png")
     conclude(options, "real_recordings", result, markdown(HEADS, rows))
