@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from helpers.figures import mean, span, values, wrong
+from helpers.figures import cells, mean, numbers, span, values, wrong
 
 Figures = list[float]
 ACCURACY = "docs/accuracy.md"
@@ -124,6 +124,18 @@ def noise_rates() -> dict[str, Figures]:
             "moving disc |": of("moving", "ours", "v2e", "counting")}
 
 
+def real_recordings() -> dict[str, Figures]:
+    rows = {"DAVIS346, Newton's cradle": "newton", "DAVIS240C, slider_depth": "ijrr"}
+
+    def of(name: str, pixel: str) -> Figures:
+        found = [cells("real_recordings", rf"{name}.*?\|{pixel}\|", column)[0] for column in (
+            "θ ON", "light", "r of", "r in", "events", "explained")]
+        return [float(number) for cell in found for number in numbers(cell)]
+
+    return {f"{label}, {pixel} ": of(name, pixel)
+            for label, name in rows.items() for pixel in ("measured", "ideal")}
+
+
 def compare_systems() -> dict[str, Figures]:
     names = {"`estimate_camera` |": "ours", "simulating the scene": "match",
              "the same with the true": "match, true video", "least squares (ECC)": "ecc median",
@@ -235,6 +247,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "### How the error falls"): curves,
     (ACCURACY, "### When one polarity"): one_polarity,
     (ACCURACY, "### Noise rates"): noise_rates,
+    (ACCURACY, "### Real recordings"): real_recordings,
     (ACCURACY, "beside the compared systems"): compare_systems,
     (ACCURACY, "That measure asks for a map"): sequences,
     (ACCURACY, "### Ablations"): ablations,
