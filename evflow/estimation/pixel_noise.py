@@ -21,6 +21,7 @@ LEAST_THETA = 0.01  # log units: thresholds are clamped there
 LAW_ODDS = 5.0  # log odds that it takes to let rates follow the thresholds
 LAW_EVENTS = 100  # and events: a pixel's few also lower the threshold that is found for it
 SIGNAL = 0.5  # of the events of quiet pixels may be what is left of the signal
+PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it alone
 
 AROUND = 9  # pixels: side of the neighbourhood in which events are company
 CHANCE = 4.0  # standard deviations of the noise around a pixel, that it may have
@@ -32,16 +33,22 @@ def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
     """Rates (2, H, W), ON and OFF, relative to the camera's: 1, or as one over the thresholds
     theta (2, H, W) where quiet (2, 2, H, W) of `quiet_time` makes that the likelier. Signal that
     is left near what moves follows the thresholds too: noise that does not, and a share of SIGNAL,
-    must be the less likely as well, by LAW_EVENTS or more."""
+    must be the less likely as well, by LAW_EVENTS or more; and pixels of thresholds that no still
+    place reaches must say so too."""
     watched = quiet[:, 1] * ~hot
     if (quiet[:, 0] * ~hot).sum() < LAW_EVENTS:
         return np.ones(theta.shape)
     law = 1.0 / np.maximum(np.asarray(theta, np.float64), LEAST_THETA)
     law *= (watched.sum((1, 2)) / np.maximum((watched * law).sum((1, 2)), 1e-30))[:, None, None]
-    even, mixed, following = (sum(
-        _likelihood(n, w * (1.0 + share * (r - 1.0)), hot)
-        for n, w, r in zip(quiet[:, 0], quiet[:, 1], law, strict=True)) for share in (0, SIGNAL, 1))
-    return law if following - max(even, mixed) > LAW_ODDS else np.ones_like(law)
+
+    def log_p(share: float, left_out: Array) -> float:
+        return sum(_likelihood(n, w * (1.0 + share * (r - 1.0)), out) for n, w, r, out in zip(
+            quiet[:, 0], quiet[:, 1], law, left_out, strict=True))
+
+    every, low = np.stack([hot] * 2), hot | (np.asarray(theta) < PLAIN_THETA)
+    odds = log_p(1.0, every) - max(log_p(0.0, every), log_p(SIGNAL, every))
+    follows = odds > LAW_ODDS and log_p(1.0, low) - log_p(0.0, low) > PLAIN_ODDS
+    return law if follows else np.ones_like(law)
 
 
 def _likelihood(events: Array, expected: Array, hot: Array) -> float:

@@ -140,3 +140,11 @@ def test_a_few_events_do_not_follow_the_thresholds_that_they_have_lowered_themse
     theta = np.where(quiet[:, 0] > 0, 0.15, 0.3)
     assert 0 < quiet[:, 0].sum() < 100
     np.testing.assert_array_equal(threshold_law(quiet, theta, NONE_HOT), 1.0)
+
+
+def test_signal_of_the_lowest_thresholds_alone_is_no_law() -> None:
+    theta = np.maximum(np.random.default_rng(3).normal(0.25, 0.1, (2, *SHAPE)), 0.02)
+    rates = np.where(theta < 0.1, 0.5, 0.02)
+    quiet = quiet_counts(rates, 1.0)
+    assert quiet[:, 0].sum() > 200
+    np.testing.assert_array_equal(threshold_law(quiet, theta, NONE_HOT), 1.0)
