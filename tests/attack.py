@@ -273,6 +273,8 @@ def main(arguments: list[str] | None = None) -> int:
     told = parser.parse_args(arguments)
     if told.kills == 10**9 and told.minutes == float("inf"):
         parser.error("say --kills or --minutes")
+    # What a shell runs in the background ignores Ctrl-C, and so would the commands.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as folder:
         attack = Attack(told.tree.resolve(), Path(folder), told.seed)
         known = victims(Path(folder))
