@@ -83,6 +83,16 @@ def intervals() -> dict[str, Figures]:
     }
 
 
+def others() -> dict[str, Figures]:
+    def of(row: str) -> Figures:
+        errors = [values(source, rf"{row}\|theta_{side}", "refined")[0]
+                  for source in ("evaluate_other", "evaluate_images") for side in ("on", "off")]
+        return [*errors, *(end for column in ("within 68", "within 95")
+                           for end in span("evaluate_other", rf"{row}\|theta", column))]
+
+    return {"θ .06–.6": of("other prior"), "pixels of DVS-Voltmeter": of("Voltmeter")}
+
+
 def true_video() -> dict[str, Figures]:
     def errors(protocol: str) -> Figures:
         return [mean("true_video", rf"{protocol}\|theta_\w+, all", column) for column in (3, 4)]
@@ -243,6 +253,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     ("README.md", "## Accuracy"): readme,
     (ACCURACY, "## `estimate_camera` on held-out"): evaluate,
     (ACCURACY, "### Intervals"): intervals,
+    (ACCURACY, "### Cameras and scenes"): others,
     (ACCURACY, "### What the frames cost"): true_video,
     (ACCURACY, "### How the error falls"): curves,
     (ACCURACY, "### When one polarity"): one_polarity,
