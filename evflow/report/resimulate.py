@@ -24,7 +24,7 @@ from evflow.estimation.result import CameraEstimate
 from evflow.metrics.streams import compare, correlations
 from evflow.notes import Note
 from evflow.process.memory import give_back
-from evflow.recordings.check.bunches import beside, bunch
+from evflow.recordings.bunches import beside, bunch
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample

@@ -27,7 +27,7 @@ from evflow.estimation.drift import Third
 from evflow.estimation.extent import Extent
 from evflow.estimation.refine import stretches
 from evflow.notes import Note
-from evflow.recordings.check.bunches import Bunch
+from evflow.recordings.bunches import Bunch
 from evflow.report import camera, page, resimulate
 from evflow.report.extent import extent_panel
 from evflow.report.resimulate import busiest, usable_runs

@@ -65,7 +65,7 @@ def _tiled(values: Array, shape: tuple[int, int]) -> Array:
 def parted(data: Sample, seen_by: Photoreceptor, theta: Array | None = None) -> Sample:
     """The sample with groups that part where an event is likely to be noise, which is the first of
     the next. theta (2,): by which what a photoreceptor sees turns into events, else a typical one;
-    at most TYPICAL_THETA, as noise makes those of a regression small... """
+    at least TYPICAL_THETA, as noise makes the thresholds of a regression small."""
     noise_hz = np.asarray(data.noise_hz).mean(0)
     if noise_hz.max() * (1.0 - LIKELY) <= LIKELY * MISSED_HZ:
         return data._replace(group=data.pixel)

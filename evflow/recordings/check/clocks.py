@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.io.decode.units import misread
+from evflow.recordings.bunches import bunch
 from evflow.recordings.check.findings import Finding, Severity
 from evflow.recordings.gaps import event_gaps
 from evflow.recordings.windows import DROPPED
@@ -63,3 +64,14 @@ def _dropped(recording: Recording) -> list[Finding]:
         "EV030", "warning", f"about {lost} frames are missing in {places}, first after frame "
         f"{at[0]} ({between[at[0]] / 1e3:.1f} ms where {usual / 1e3:.1f} ms are usual).",
         "No window crosses them; lower the camera's frame rate or its load.")]
+
+
+def bunches(recording: Recording) -> list[Finding]:
+    """EV035 where events bunch at the frames."""
+    found = bunch(recording)
+    return [] if found is None else [Finding(
+        "EV035", "warning", f"between {found.begin_us / 1e3:+.2f} and {found.end_us / 1e3:+.2f} ms "
+        f"of each frame come {found.on:.0%} of the ON and {found.off:.0%} of the OFF events, "
+        "beyond the rate around them.",
+        "The readout of frames that disturbs the pixels (as in a DAVIS240C), or light that flashes "
+        "with them: a simulation does not make these events, so expect that many fewer.")]

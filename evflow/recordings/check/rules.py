@@ -11,8 +11,7 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.io.hints import Told
 from evflow.recordings.check.agreement import agreement
-from evflow.recordings.check.bunches import bunches
-from evflow.recordings.check.clocks import clocks
+from evflow.recordings.check.clocks import bunches, clocks
 from evflow.recordings.check.contents import contents
 from evflow.recordings.check.findings import Finding, Report
 from evflow.recordings.check.images import images

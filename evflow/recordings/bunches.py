@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evflow.recordings.check.findings import Finding
 from evflow.types import Events, Recording, release
 
 BIN_US = 250
 MOST_FRAMES = 64  # looked at, evenly spread
-LEAST_FRAMES, LEAST_BINS = 3, 16
+LEAST_FRAMES, LEAST_BINS, MOST_BINS = 3, 16, 400  # bins: of what is looked at around a frame
 PEAK, RAISED = 4.0, 2.0  # times the usual rate: in the middle of a bunch, and at its edges
 PRESENT = 0.8  # of the frames have it
 GAP_BINS = 4  # between a bunch and its rebound
@@ -34,17 +33,6 @@ class Bunch(NamedTuple):
     end_us: int
     on: float
     off: float
-
-
-def bunches(recording: Recording) -> list[Finding]:
-    """EV035 where events bunch at the frames."""
-    found = bunch(recording)
-    return [] if found is None else [Finding(
-        "EV035", "warning", f"between {found.begin_us / 1e3:+.2f} and {found.end_us / 1e3:+.2f} ms "
-        f"of each frame come {found.on:.0%} of the ON and {found.off:.0%} of the OFF events, "
-        "beyond the rate around them.",
-        "The readout of frames that disturbs the pixels (as in a DAVIS240C), or light that flashes "
-        "with them: a simulation does not make these events, so expect that many fewer.")]
 
 
 def beside(events: Events, frame_times: np.ndarray, found: Bunch) -> Events:
@@ -83,10 +71,12 @@ def bunch(recording: Recording) -> Bunch | None:
 
 
 def _by_phase(recording: Recording) -> tuple[np.ndarray, int]:
-    """Events (F, 2, bins), ON and OFF, of frames whose whole period they cover, evenly spread; and
-    when the first bin begins, us after a frame. F = 0 where there are too few."""
+    """Events (F, 2, bins), ON and OFF, of frames whose period they cover, or 100 ms of it, evenly
+    spread; and when the first bin begins, us after a frame. F = 0 where there
+    are too few."""
     times, t = recording.frame_times, recording.events.t
-    bins = int(np.median(np.diff(times))) // BIN_US if len(times) > 1 else 0
+    period_us = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    bins = min(int(period_us) // BIN_US, MOST_BINS)
     start = -(bins // 2) * BIN_US
     covered = np.flatnonzero((times + start >= t[0]) & (times + start + bins * BIN_US <= t[-1]))
     if bins < LEAST_BINS or len(covered) < LEAST_FRAMES:

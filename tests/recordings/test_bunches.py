@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evflow.recordings.check.bunches import beside, bunch, bunches
+from evflow.recordings.bunches import MOST_BINS, _by_phase, beside, bunch
+from evflow.recordings.check.clocks import bunches
 from evflow.types import Events, Recording
 
 SIZE, PERIOD_US, FRAMES = (64, 48), 40_000, 12
@@ -69,3 +70,11 @@ def test_beside_a_bunch_are_the_other_events() -> None:
     other = beside(seen.events, seen.frame_times, found)
     np.testing.assert_array_equal(other.t, seen.events.t[(phase < -500) | (phase >= 0)])
     assert other.size == SIZE
+
+
+def test_of_frames_minutes_apart_little_is_looked_at() -> None:
+    t, p = steady(20_000)
+    seen = recording(t * 3_000, p)
+    far = Recording(seen.events, seen.frames, seen.frame_times * 3_000)
+    assert _by_phase(far)[0].shape[2] == MOST_BINS
+    assert bunches(far) == []
