@@ -1,25 +1,16 @@
-"""evflow convert, voxel and export, and simulate into every format, end to end."""
+"""evflow convert and voxel, and simulate into every format, end to end."""
 
 from __future__ import annotations
 
 import json
-import sys
-import types
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
-import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.recordings import SIZE, T0, equal, make, write_ijrr
+from helpers.recordings import SIZE, equal, make, write_ijrr
 from helpers.videos import drifting
 
-from evflow.camera import Camera, CameraPrior
-from evflow.camera.exports import TARGETS, export_camera
-from evflow.camera.exports.common import NOISE
-from evflow.camera.exports.iebcs import FREQUENCIES, spectrum
 from evflow.cli import main
 from evflow.commands.writing import Format
 from evflow.io import read_events, read_recording, write_recording
@@ -248,149 +239,6 @@ def test_voxel_errors(tmp_path: Path, flight: Path, capsys: pytest.CaptureFixtur
         assert status == (2 if code == "EV020" else 1)
         assert err.splitlines()[-1].startswith(code), err
     assert not list(tmp_path.glob("*v.npz*"))
-
-
-@pytest.fixture
-def camera(tmp_path: Path) -> Path:
-    drawn = Camera.sample(jax.random.key(0), (48, 64), CameraPrior(
-        (0.2, 0.3), (0.03, 0.03), noise="independent", eta_spread=0.3))
-    return drawn.save(tmp_path / "camera.npz")
-
-
-@pytest.mark.parametrize("to", ["v2e", "esim", "openeb", "iebcs"])
-def test_export_has_maps_scripts_and_words(
-    tmp_path: Path, camera: Path, capsys: pytest.CaptureFixture[str], to: str
-) -> None:
-    out = tmp_path / "there"
-    code, text, _ = run(capsys, "export", camera, "--to", to, "-o", out)
-    assert code == 0
-    readme = (out / "README.txt").read_text()
-    assert readme in text
-    assert "cannot represent" in readme
-    assert (out / f"run_{to}.py").is_file()
-    known = Camera.load(camera)
-    with np.load(out / "maps.npz") as maps:
-        for name, values in maps.items():
-            np.testing.assert_array_equal(values, getattr(known, name))
-            assert values.dtype == np.float32
-    assert f"{np.median(known.theta_on):.4f}" in readme
-    for script in out.glob("*.py"):
-        compile(script.read_text(), str(script), "exec")
-    assert run(capsys, "export", camera, "--to", to, "-o", out)[0] == 1
-    for other in ("iebcs", to):  # what another simulator was given goes
-        assert run(capsys, "export", camera, "--to", other, "-o", out, "--overwrite")[0] == 0
-    assert (out / "noise_pos.npy").exists() == (to == "iebcs")
-
-
-def test_the_spread_is_that_of_the_camera_not_of_its_estimates() -> None:
-    """Half of what makes pixels differ is in the maps, half in their errors."""
-    true = Camera.sample(jax.random.key(0), (60, 80), CameraPrior(mismatch=(0.05, 0.05)))
-    middle = jax.tree.map(lambda m: jnp.full_like(m, jnp.median(m)), true)
-    maps = jax.tree.map(lambda m, mid: mid + (m - mid) * 0.5**0.5, true, middle)
-    std = jax.tree.map(lambda m: jnp.full_like(m, 0.05 * 0.5**0.5), true)
-    words = export_camera(maps, "v2e", std)[0].text.split()
-    assert float(words[words.index("--sigma_thres") + 1]) == pytest.approx(0.05, rel=0.05)
-
-
-def test_scalars_are_the_nearest(camera: Path) -> None:
-    export, _ = export_camera(Camera.load(camera), "v2e")
-    words = export.text.split()
-    given = {n: float(words[words.index(f"--{n}") + 1]) for n in (
-        "pos_thres", "neg_thres", "sigma_thres", "leak_rate_hz", "shot_noise_rate_hz")}
-    known = {n: np.asarray(v) for n, v in vars(Camera.load(camera)).items()}
-    assert given["sigma_thres"] == pytest.approx(0.03, rel=0.05)
-    assert given["pos_thres"] == pytest.approx(np.median(known["theta_on"]), abs=1e-4)
-    # what v2e then makes at 128 DN: shot noise by halves, and leak of ON
-    half = given["shot_noise_rate_hz"] / 2 * (1 - 0.75 * 148 / 275)
-    on, off = np.median(known["eta_on"]), np.median(known["eta_off"])
-    assert 2 * half + given["leak_rate_hz"] == pytest.approx(on + off, rel=1e-2)
-
-
-def test_v2e_script_replaces_what_v2e_draws(
-    tmp_path: Path, camera: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Run with an emulator that only remembers, in the shape of v2e's."""
-    seen: list[Any] = []
-
-    class EventEmulator:
-        def __init__(self, **options: Any) -> None:
-            seen.append(options)
-
-        def generate_events(self, frame: np.ndarray, t: float) -> np.ndarray | None:
-            seen.append((frame.shape, t, dict(vars(self))))
-            return None if t == 0 else np.ones((3, 4), np.float32)
-
-    for name, module in (("torch", types.SimpleNamespace(tensor=np.asarray)),
-                         ("v2ecore", types.ModuleType("v2ecore")),
-                         ("v2ecore.emulator", types.SimpleNamespace(EventEmulator=EventEmulator))):
-        monkeypatch.setitem(sys.modules, name, module)
-    assert run(capsys, "export", camera, "--to", "v2e", "-o", tmp_path / "x")[0] == 0
-    video = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 50, SIZE)
-    for i in range(3):
-        video.write(np.full((48, 64, 3), 60 * i, np.uint8))
-    video.release()
-    script = tmp_path / "x" / "run_v2e.py"
-    words = ["run", str(tmp_path / "a.avi"), "50", str(tmp_path / "e.npy")]
-    monkeypatch.setattr(sys, "argv", words)
-    exec(compile(script.read_text(), str(script), "exec"), {"__file__": str(script)})
-    options, first, second, _ = seen
-    known = Camera.load(camera)
-    assert first == ((48, 64), 0.0, {})
-    assert second[1] == pytest.approx(0.02)
-    for theirs, ours in (("pos_thres", "theta_on"), ("neg_thres", "theta_off"),
-                         ("pos_thres_pre_prob", "eta_on"), ("neg_thres_pre_prob", "eta_off")):
-        np.testing.assert_array_equal(second[2][theirs], getattr(known, ours))
-    assert options["shot_noise_rate_hz"] / 2 * (1 - 0.75 * 148 / 275) == pytest.approx(1, rel=1e-4)
-    assert np.load(tmp_path / "e.npy").shape == (6, 4)
-
-
-def test_noise_that_is_added_has_the_measured_rates() -> None:
-    home: dict[str, Any] = {}
-    exec(NOISE, home)
-    maps = {"eta_on": np.full((20, 30), 2.0), "eta_off": np.zeros((20, 30))}
-    maps["eta_on"][:10] = 0.5
-    x, y, t, p = home["add_noise"](
-        np.array([3, 4]), np.array([5, 6]), np.array([T0 + 10, T0 + 1000]), np.array([0, 0]), maps,
-        T0, T0 + 10_000_000)
-    assert (np.diff(t) >= 0).all()
-    assert T0 <= t[0] < t[-1] < T0 + 10_000_000
-    assert (p == 0).sum() == 2
-    assert (x[p == 0].tolist(), y[p == 0].tolist()) == ([3, 4], [5, 6])
-    for rows, rate in (((y < 10) & (p == 1), 0.5), ((y >= 10) & (p == 1), 2.0)):
-        expected = rate * 10 * 300
-        assert abs(rows.sum() - expected) < 5 * expected**0.5
-    assert x.max() < 30
-    nothing = [np.zeros(0, np.int64)] * 4  # a scene at rest sends noise alone
-    assert len(home["add_noise"](*nothing, maps, 0, 10_000_000)[2]) == pytest.approx(7500, rel=0.1)
-
-
-def test_iebcs_spectra_have_the_measured_rates() -> None:
-    """Drawn as IEBCS draws: the first bin whose cumulative share reaches a uniform number."""
-    rates = np.array([[0.02, 0.3, 5.0]], np.float32)
-    table = spectrum(rates)
-    assert table.shape == (1, 3, 72)
-    u = np.random.default_rng(0).random(20_000)
-    for rate, share in zip(rates[0], table[0], strict=True):
-        assert (share[-2:] == [1, 0]).all()
-        assert (np.diff(share[:-1]) >= 0).all()
-        interval = 1 / FREQUENCIES[np.searchsorted(share[:-1], u)]
-        assert interval.mean() == pytest.approx(1 / rate, rel=0.05)
-
-
-def test_export_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    several = Camera.constant((2, 4, 4))
-    several.save(tmp_path / "two.npz")
-    code, _, err = run(capsys, "export", tmp_path / "two.npz", "--to", "v2e", "-o", tmp_path / "x")
-    assert (code, err[:5]) == (1, "EV002")
-    code, _, err = run(capsys, "export", tmp_path / "no.npz", "--to", "v2e", "-o", tmp_path / "x")
-    assert (code, err[:5]) == (1, "EV016")
-    assert not (tmp_path / "x").exists()
-    assert set(TARGETS) == {"v2e", "esim", "openeb", "iebcs"}
-    from evflow.errors import EvflowDataError
-
-    with pytest.raises(EvflowDataError, match="EV020"):
-        export_camera(Camera.constant((4, 4)), "airsim")
 
 
 @pytest.mark.parametrize("verb", ["convert", "voxel", "export"])
