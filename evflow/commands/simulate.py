@@ -72,6 +72,7 @@ class Simulate(Pixels, Footage, Compiling):
         import jax
 
         from evflow import io
+        from evflow.process.memory import keep
         from evflow.process.terminal import bar
         from evflow.process.threads import ahead, behind, prompt
         from evflow.simulator import simulate_stream
@@ -81,6 +82,7 @@ class Simulate(Pixels, Footage, Compiling):
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
         self._check(io.registry.writer_of(self.out, format))
         source = self.source(self.video)
+        keep()
         count = frames = 0
 
         def shown(done: int, total: int) -> None:

@@ -1,23 +1,37 @@
-"""Memory that is free, and that the process still holds."""
+"""Memory that is free: what the process still holds, and what it gives back."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Callable
+from typing import Any
+
+TRIM_ABOVE, MAP_ABOVE = -1, -3  # glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD
+KEPT, LARGEST = 1 << 29, 1 << 25  # bytes; glibc keeps none larger
 
 
 def give_back() -> None:
     """Give the system back what the allocator keeps of freed arrays: after large ones of several
     sizes that is as much again. Does nothing where it cannot be asked to (other than glibc)."""
-    trim = _trim()
+    trim = _of_c("malloc_trim")
     if trim is not None:
         trim(0)
 
 
+def keep() -> None:
+    """Let the allocator keep freed arrays for the next ones, up to KEPT bytes: work that makes
+    arrays of the same sizes again and again would else wait for the system to clear them. Until the
+    process ends; does nothing where it cannot be asked to (other than glibc)."""
+    tell = _of_c("mallopt")
+    if tell is not None:
+        tell(MAP_ABOVE, LARGEST)
+        tell(TRIM_ABOVE, KEPT)
+
+
 @functools.cache
-def _trim() -> Callable[[int], int] | None:
+def _of_c(name: str) -> Any:
+    """A function of the C library, None where it has none of that name."""
     try:
-        return ctypes.CDLL(None).malloc_trim
+        return getattr(ctypes.CDLL(None), name)
     except (AttributeError, OSError, TypeError):  # macOS and musl; Windows has no library None
         return None

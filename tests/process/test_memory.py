@@ -1,0 +1,37 @@
+"""Memory that is free."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from evflow.process.memory import _of_c
+
+WORK = """
+import resource
+from evflow.process import memory
+{}
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def work():
+    for _ in range(4):
+        held = [bytearray(4 << 20) for _ in range(4)]
+        del held
+work()
+before = faults()
+work()
+print(faults() - before)
+"""
+
+
+@pytest.mark.skipif(_of_c("mallopt") is None, reason="not glibc")
+def test_freed_memory_is_kept_for_what_comes() -> None:
+    def faults(line: str) -> int:
+        return int(subprocess.run([sys.executable, "-c", WORK.format(line)], check=True,
+                                  capture_output=True, text=True).stdout)
+
+    pages = 16 * (4 << 20) // 4096
+    assert faults("") > pages // 2
+    assert faults("memory.keep()") < pages // 4
