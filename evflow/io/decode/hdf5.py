@@ -17,6 +17,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
 from evflow.files.whole import not_whole
+from evflow.io.decode.hdf5_columns import FILTERS, Column
 from evflow.io.writer import EventWriter
 from evflow.process.signals import uninterrupted
 
@@ -145,6 +146,7 @@ class Hdf5Writer(EventWriter):
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
         h5py = load_h5py()
         self._shapes: dict[str, tuple[int, ...]] = {}  # of all that was handed over
+        self._columns: dict[str, Column] = {}
         self._disk = Disk(temporary)
         self._file: Any = None
         stack.callback(self._close)
@@ -163,18 +165,31 @@ class Hdf5Writer(EventWriter):
     def _verify(self, temporary: Path) -> None:
         need_whole(temporary, self._shapes, self._disk.written)
 
+    def _finish(self) -> None:
+        for name in self._columns:
+            self._settle(name)
+
     def _create(self, name: str, item: tuple[int, ...], dtype: Any, chunk: int) -> None:
         self._shapes[name] = (0, *item)
-        self._file.create_dataset(
-            name, (0, *item), dtype, maxshape=(None, *item), chunks=(chunk, *item),
-            compression="gzip", compression_opts=1, shuffle=True)
+        data = self._file.create_dataset(
+            name, (0, *item), dtype, maxshape=(None, *item), chunks=(chunk, *item), **FILTERS)
+        if not item:
+            self._columns[name] = Column(data)
 
     def _extend(self, name: str, values: np.ndarray) -> None:
-        data = self._file[name]
         rows, *item = self._shapes[name]
         self._shapes[name] = (rows + len(values), *item)
-        data.resize(rows + len(values), axis=0)
-        data[rows:] = values
+        if name in self._columns:
+            self._columns[name].extend(values)
+        else:
+            data = self._file[name]
+            data.resize(rows + len(values), axis=0)
+            data[rows:] = values
+        self._disk.check()
+
+    def _settle(self, name: str) -> None:
+        """Write all of a column that was handed over, so that it can be read."""
+        self._columns[name].settle()
         self._disk.check()
 
     def _store(self, name: str, values: Any, **options: Any) -> Any:

@@ -109,6 +109,7 @@ class DsecWriter(Hdf5Writer):
         self._create("ms_to_idx", (), "u8", self.CHUNK)
 
     def _finish(self) -> None:
+        super()._finish()
         self._store("t_offset", np.int64(self.offset_us or 0))
 
     def _check(self, events: Events) -> None:
@@ -153,6 +154,7 @@ class DsecWriter(Hdf5Writer):
         group = self._file["events"]
         if last_us < 2**32 or group["t"].dtype == np.int64:
             return
+        self._settle("events/t")
         group.move("t", "t_u32")
         self._create("events/t", (), "i8", self.CHUNK)
         for first in range(0, self.n_events, FLUSH):

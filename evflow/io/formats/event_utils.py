@@ -19,6 +19,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import Hdf5Writer
+from evflow.io.decode.hdf5_columns import FILTERS
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
 from evflow.io.images.streams import ImageStream
@@ -136,13 +137,13 @@ class EventUtilsWriter(Hdf5Writer):
     def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
         for frame, second in zip(frames, times / 1e6, strict=True):
             image = self._store(
-                f"images/image{len(self._image_s):09d}", frame, chunks=frame.shape,
-                compression="gzip", compression_opts=1, shuffle=True)
+                f"images/image{len(self._image_s):09d}", frame, chunks=frame.shape, **FILTERS)
             image.attrs.update(size=frame.shape, timestamp=second, type="greyscale")
             self._image_s = np.append(self._image_s, second)
             self._disk.check()
 
     def _finish(self) -> None:
+        super()._finish()
         ts, count = self._file["events/ts"], len(self._image_s)
         before = np.zeros(count, np.int64)
         for first in range(0, len(ts) if count else 0, FLUSH):
