@@ -90,3 +90,16 @@ def draw_real(rng: np.random.Generator) -> Protocol:
         protocol, model=sensor, exposure_ms=int(some(0.6, 3.0, 20.0)),
         frame_noise_dn=0.5 + some(0.5, 0.3, 2.5), dark_dn=dark,
         black_dn=black if rng.random() < 0.5 else 0.0)
+
+
+def draw_other(rng: np.random.Generator) -> Protocol:
+    """What `draw_real` leaves out: DVS-Voltmeter's pixels, and else such a camera seen for 5 s."""
+    protocol = draw_real(rng)
+    if rng.random() < 0.2:
+        return dataclasses.replace(protocol, intervals=round(5e3 / protocol.frame_ms))
+    walk = SENSORS[str(rng.choice(("dvs346", "dvs240")))].model
+    seconds = float(rng.choice((0.2, 0.5, 1.0)))
+    return dataclasses.replace(
+        BASE, prior=protocol.prior, model=walk, frame_ms=protocol.frame_ms, frame_noise_dn=0.5,
+        intervals=round(1e3 * seconds / protocol.frame_ms),
+        shape=((96, 128), (64, 64))[int(rng.integers(2))])

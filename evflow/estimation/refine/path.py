@@ -16,6 +16,7 @@ import numpy as np
 
 from evflow.estimation.refine.denoise import denoised
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
+from evflow.estimation.refine.readouts import beside_readouts
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_search import Found, find
 from evflow.estimation.refine.sightings import Sightings, no_sightings, sight
@@ -32,6 +33,7 @@ from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.files.spool import put_aside
 from evflow.light.log_maps import lin_log
 from evflow.process.memory import give_back
+from evflow.recordings.bunches import bunch
 from evflow.recordings.glitches import SATURATED_DN, exposed
 from evflow.recordings.region import bands, inside
 from evflow.simulator.between import intervals
@@ -231,12 +233,13 @@ def telling(places: Sequence[Place]) -> list[Place]:
 def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | None:
     """What a few of the runs of intervals, each of a recording, say of the photoreceptor; None
     where too little happens."""
-    def parts() -> Iterator[tuple[np.ndarray, np.ndarray, Sightings]]:
+    def parts() -> Iterator[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]]:
         for recording, run in telling(places):
             film = interpolated(recording, run, STEPS, noise_dn)
             s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
-            yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s
-            del film, s
+            s, disturbed = beside_readouts(s, film.times_us, bunch(recording))
+            yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s, disturbed
+            del film, s, disturbed
             give_back()
 
     return sample(parts())

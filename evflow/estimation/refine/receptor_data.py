@@ -25,8 +25,8 @@ LEAST = 20  # of these, that are used: frames may hide what most of the pixels s
 class Sample(NamedTuple):
     """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N) by
     pixel and time: pixel (0..P-1), at (in fine steps), on, off (counts so far), weight, and group,
-    with whose events one shares a constant: those of its pixel, unless noise came between
-    (receptor_noise.py); block (C, P); noise_hz (C, 2): of `noise_rates`."""
+    with whose events one shares a constant: those of its pixel, unless a readout (readouts.py) or
+    noise (receptor_noise.py) came between; block (C, P); noise_hz (C, 2): of `noise_rates`."""
 
     dn: Array
     dt_s: Array
@@ -41,16 +41,16 @@ class Sample(NamedTuple):
 
 
 def sample(
-    parts: Iterable[tuple[np.ndarray, np.ndarray, Sightings]], seed: int = 0
+    parts: Iterable[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]], seed: int = 0
 ) -> Sample | None:
     """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
-    its fine steps, and its sightings, all of one length; None where too little happens. One is
-    looked at at a time."""
+    its fine steps, its sightings, and how often readouts disturbed the pixel before each, all of
+    one length; None where too little happens. One is looked at at a time."""
     rng, count, told = np.random.default_rng(seed), np.zeros(2, int), np.zeros(2, int)
     rows: list[tuple[np.ndarray, ...]] = []
-    for dn, dt_s, s in parts:
+    for dn, dt_s, s, disturbed in parts:
         if len(s.pixel):
-            row, used = _row(dn, dt_s, s, rng, len(rows))
+            row, used = _row(dn, dt_s, s, disturbed, rng, len(rows))
             rows.append(row)
             count += _of_both(s.on)
             told += _of_both(used)
@@ -77,7 +77,8 @@ def smeared_sample(data: Sample, seconds: float) -> Sample:
 
 
 def _row(
-    dn: np.ndarray, dt_s: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
+    dn: np.ndarray, dt_s: np.ndarray, s: Sightings, disturbed: np.ndarray,
+    rng: np.random.Generator, number: int,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
     """The fields of a Sample, of one stretch, and which of the events in it are ON."""
     steps = len(dt_s) // (len(s.frames) - 1)
@@ -102,7 +103,9 @@ def _row(
     events = [filled(v[kept], EVENTS) for v in (at, on, off, weight)]
     pixel = filled(place[group][kept], EVENTS).astype(np.int32)
     interval_s = dt_s.reshape(-1, steps).sum(1)
-    row = (light, dt_s.astype(np.float32), pixel, *events, pixel,
+    new = (np.diff(group[kept], prepend=-1) != 0) | (np.diff(disturbed[kept], prepend=-1) != 0)
+    part = filled(np.cumsum(new) - 1, EVENTS).astype(np.int32)
+    row = (light, dt_s.astype(np.float32), pixel, *events, part,
            filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32),
            noise_rates(s, interval_s))
     return row, s.on[kept]

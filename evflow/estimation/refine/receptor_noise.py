@@ -68,7 +68,7 @@ def parted(data: Sample, seen_by: Photoreceptor, theta: Array | None = None) -> 
     at least TYPICAL_THETA, as noise makes the thresholds of a regression small."""
     noise_hz = np.asarray(data.noise_hz).mean(0)
     if noise_hz.max() * (1.0 - LIKELY) <= LIKELY * MISSED_HZ:
-        return data._replace(group=data.pixel)
+        return data
     scale = np.full(2, TYPICAL_THETA) if theta is None else np.maximum(theta, TYPICAL_THETA)
 
     def stretch(c: int) -> Sample:
@@ -84,7 +84,7 @@ def _parted(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) ->
     path = np.asarray(_seen(d.dn, d.dt_s, np.float32(seen_by.offset_dn),
                             np.float32(max(seen_by.tau_s, FAST)), seen_by.by_light))
     used = np.flatnonzero(np.asarray(d.weight) > 0)
-    at, pixel, on = (np.asarray(v)[used] for v in (d.at, d.pixel, d.on))
+    at, pixel, on, part = (np.asarray(v)[used] for v in (d.at, d.pixel, d.on, d.group))
     last = len(path) - 1
     step = np.clip(at - seen_by.delay_s / step_s, 0, last - 1).astype(np.int64)
     low, high = np.maximum(step - REACH, 0), np.minimum(step + 1 + REACH, last)
@@ -95,6 +95,7 @@ def _parted(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) ->
     cause_hz = np.maximum(np.where(rose, slope, -slope), 0.0) / theta[side] + MISSED_HZ
     noise = noise_hz[side]
     group = np.zeros(len(d.weight), np.int32)
+    new |= np.diff(part, prepend=-1) != 0
     group[used] = np.cumsum(new | (noise > LIKELY * (noise + cause_hz))) - 1
     return group
 
