@@ -34,6 +34,8 @@ RULE_STREAMS = (f"Good (green): rates within a factor {RATE[0]:g}, r of at least
                 f"times less than {APART[0]:g} decades apart. Poor (red): beyond a factor "
                 f"{RATE[1]:g}, r below {SHAPE[1]:g}, more than {APART[1]:g} decades apart.")
 THRESHOLD = "threshold θ"
+TIMES = {"intervals": ("Intervals between a pixel's events", "of a pixel"),
+         "neighbours": ("Delays after a neighbour's event", "after a neighbour")}
 PLACES = {
     True: "Events fall on other pixels than recorded: slower motion, or a higher frame rate, makes "
           "the frames in between truer.",
@@ -79,8 +81,8 @@ def judge_estimate(found: CameraEstimate, trial: Trial | None, held: Trial | Non
     judged = [_threshold(found, key) for key in ("on", "off")]
     for test, where in ((trial, "re-simulated"), (held, "held out")):
         if test:
-            judged += [j for key in ("on", "off")
-                       for j in judge_stream(test.numbers, key, where, test.ceiling)]
+            judged += [j for key in ("on", "off") for j in judge_stream(
+                test.numbers, key, where, test.ceiling, _lost(test))]
     return judged + _pixels(found)
 
 
@@ -115,11 +117,18 @@ def known(found: CameraEstimate, key: str) -> bool:
                 and f"theta_{key}" not in found.undetermined)
 
 
+def _lost(test: Trial) -> bool:
+    """Whether the motion between its frames was lost somewhere."""
+    return any(note.code == "frames.flow" for note in test.notes)
+
+
 def judge_stream(
-    numbers: dict[str, Any], key: str, where: str, ceiling: dict[str, float | None] | None = None
+    numbers: dict[str, Any], key: str, where: str,
+    ceiling: dict[str, float | None] | None = None, lost: bool = False,
 ) -> list[Judged]:
     """One polarity of a synthetic stream: how many events, and in which pixels. ceiling: r of two
-    re-simulations, which r is held against; without it, 1."""
+    re-simulations, which r is held against; without it, 1; lost: the motion between the frames
+    was."""
     name, matter = key.upper(), f"rate {where} / recorded"
     ratio = numbers["rate_hz"]["ratio"][key]
     if not ratio:
@@ -131,7 +140,7 @@ def judge_stream(
     judged = [Judged(
         grade, name, float(np.log(factor) / np.log(RATE[0])),
         f"{name} has {ratio:.2f} times the recorded rate ({where}).", matter, f"{ratio:.2f} ×",
-        "" if grade == "good" else _rate_advice(ratio, tested=ceiling is not None))]
+        "" if grade == "good" else _rate_advice(ratio, tested=ceiling is not None, lost=lost))]
     r, best = numbers["counts"]["r"][key], ceiling[key] if ceiling else 1.0
     if r is not None and best is not None and best > 0:
         lost = 1 - r / best
@@ -144,15 +153,19 @@ def judge_stream(
     return judged
 
 
-def _rate_advice(ratio: float, *, tested: bool) -> str:
-    """tested: the stream is of an estimate on its own recording."""
-    many = ratio > 1
+def _rate_advice(ratio: float, *, tested: bool, lost: bool) -> str:
+    """tested: the stream is of an estimate on its own recording; lost: the motion between its
+    frames was."""
+    how = "many" if ratio > 1 else "few"
+    if tested and lost:
+        return (f"Too {how} events are simulated, and between some frames the motion is lost (see "
+                "the event rate over time): slower motion, or a higher frame rate, comes first.")
     if tested:
-        return (f"Too {'many' if many else 'few'} events are simulated: look for motion too fast "
-                "for the frames, frames with a gamma, flickering light, or clocks that are not "
-                "aligned (evflow check).")
-    return (f"Too {'many' if many else 'few'} synthetic events: {'raise' if many else 'lower'} the "
-            "thresholds of the simulation, or measure them (evflow estimate).")
+        return (f"Too {how} events are simulated: look for motion too fast for the frames, frames "
+                "with a gamma, flickering light, or clocks that are not aligned (evflow check).")
+    return (f"Too {how} synthetic events. If the thresholds of the simulation were chosen, "
+            f"{'raise' if ratio > 1 else 'lower'} them, or measure them (evflow estimate). If they "
+            "were measured on this recording, its report tells what is amiss.")
 
 
 def _pixels(found: CameraEstimate) -> list[Judged]:
@@ -178,15 +191,15 @@ def judge_streams(numbers: dict[str, Any]) -> list[Judged]:
             "poor", "", 9.0, "ON and OFF are swapped in one of them: net events of small areas "
             f"and times anti-correlate (r = {net:.2f}).",
             advice="Read one of them with --polarity invert."))
-    for kind, what in (("intervals", "Intervals between a pixel's events"),
-                       ("neighbours", "Delays after a neighbour's event")):
+    slow = [kind for kind in TIMES if graded(numbers[kind]["wasserstein_decades"] or 0.0, APART)
+            != "good"]
+    for kind, (what, _) in TIMES.items():
         apart = numbers[kind]["wasserstein_decades"]
         if apart is not None:
-            grade = graded(apart, APART)
             judged.append(Judged(
-                grade, "", apart / APART[0], f"{what} differ by {apart:.2f} decades (KS "
-                f"{numbers[kind]['ks']:.2f}).",
-                advice="" if grade == "good" else _timing(numbers, kind)))
+                graded(apart, APART), "", apart / APART[0], f"{what} differ by {apart:.2f} decades "
+                f"(KS {numbers[kind]['ks']:.2f}).",
+                advice=_timing(numbers, slow) if kind in slow else ""))
     real, made = (numbers["neighbours"]["alone"][s] or 0.0 for s in ("real", "synthetic"))
     gap = abs(real - made)
     judged.append(Judged(
@@ -196,12 +209,22 @@ def judge_streams(numbers: dict[str, Any]) -> list[Judged]:
     return judged
 
 
-def _timing(numbers: dict[str, Any], kind: str) -> str:
-    median = numbers[kind]["median_s"]
-    slow = median["synthetic"] > median["real"]
-    return (f"Synthetic events follow each other too {'slowly' if slow else 'quickly'} (median "
-            f"{1e3 * median['synthetic']:.2f} against {1e3 * median['real']:.2f} ms): look at the "
-            "refractory period, the thresholds and the frame rate of the simulation.")
+def _timing(numbers: dict[str, Any], kinds: list[str]) -> str:
+    """One sentence on all the times that differ: what follows from the rates needs no advice of its
+    own."""
+    medians = {kind: numbers[kind]["median_s"] for kind in kinds}
+    slower = {median["synthetic"] > median["real"] for median in medians.values()}
+    how = ("otherwise" if len(slower) > 1 else "more slowly" if True in slower else "more quickly")
+    seen = ", ".join(
+        f"{TIMES[kind][1]} {1e3 * median['synthetic']:.2f} against {1e3 * median['real']:.2f} ms"
+        for kind, median in medians.items())
+    ratios = [numbers["rate_hz"]["ratio"][side] for side in ("on", "off")]
+    off = [ratio for ratio in ratios if ratio and max(ratio, 1.0 / ratio) > RATE[0]]
+    if off and slower == {all(ratio < 1 for ratio in off)}:
+        return (f"Synthetic events follow each other {how} (medians: {seen}), as there are too "
+                f"{'few' if off[0] < 1 else 'many'}: judge times again once the rates agree.")
+    return (f"Synthetic events follow each other {how} (medians: {seen}): look at the refractory "
+            "period, the cutoff and the frame rate of the simulation.")
 
 
 def describe_streams(numbers: dict[str, Any]) -> str:

@@ -258,6 +258,14 @@ def test_r_is_held_against_what_is_possible() -> None:
     assert [j.grade for j in judged] == ["good", "good"]
 
 
+def test_motion_that_is_lost_comes_before_all_other_reasons() -> None:
+    ceiling = {"on": 1.0, "off": 1.0}
+    told, lost = (judge_stream(stream(0.7, 0.9), "on", "re-simulated", ceiling, gone)[0].advice
+                  for gone in (False, True))
+    assert "clocks" in told
+    assert "higher frame rate, comes first" in lost
+
+
 def test_the_poorer_polarity_is_named(measured: tuple[CameraEstimate, Recording]) -> None:
     found = measured[0]
     loose = dataclasses.replace(found, summary_std=dataclasses.replace(

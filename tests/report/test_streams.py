@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,14 @@ from evflow import Events, EvflowDataError, Recording, read_recording, write_eve
 from evflow.cli import main
 from evflow.metrics.streams import distances
 from evflow.report.page import write_page
-from evflow.report.verdict import Judged, describe_streams, judge_streams, sentences, worst
+from evflow.report.verdict import (
+    Judged,
+    advice,
+    describe_streams,
+    judge_streams,
+    sentences,
+    worst,
+)
 
 SIZE = (32, 24)
 
@@ -81,6 +89,33 @@ def test_twice_the_rate() -> None:
     assert numbers["rate_hz"]["ratio"]["both"] == pytest.approx(2.0, rel=0.01)
     assert numbers["counts"]["r"]["both"] > 0.999
     assert numbers["intervals"]["wasserstein_decades"] == pytest.approx(np.log10(2), abs=0.03)
+
+
+def numbers_of(rate: float, own: float, around: float) -> dict[str, Any]:
+    """Numbers of streams whose rates and median times have these ratios, 1 s and 10 ms recorded."""
+    times = {kind: {"wasserstein_decades": abs(float(np.log10(ratio))), "ks": 0.5,
+                    "median_s": {"real": 0.01, "synthetic": 0.01 * ratio}}
+             for kind, ratio in (("intervals", own), ("neighbours", around))}
+    times["neighbours"]["alone"] = {"real": 0.1, "synthetic": 0.1}
+    return {"rate_hz": {"ratio": {"on": rate, "off": rate}}, "net_r": 0.9,
+            "counts": {"r": {"on": 0.9, "off": 0.9}}, **times}
+
+
+@pytest.mark.parametrize(("ratios", "said"), [
+    ((3.0, 0.3, 0.3), ["Too many synthetic events. If", "quickly (medians: of a pixel 3.00 against "
+                       "10.00 ms, after a neighbour 3.00 against 10.00 ms), as there are too many"
+                       ]),
+    ((0.3, 3.0, 1.0), ["Too few synthetic events. If", "slowly (medians: of a pixel 30.00 against "
+                       "10.00 ms), as there are too few"]),
+    ((1.0, 0.3, 0.3), ["quickly (medians: of a pixel 3.00 against 10.00 ms, after a neighbour 3.00 "
+                       "against 10.00 ms): look at the refractory period"]),
+    ((3.0, 3.0, 1.0), ["Too many", "slowly (medians: of a pixel 30.00 against 10.00 ms): look"]),
+    ((1.0, 3.0, 0.3), ["otherwise (medians"]), ((1.0, 1.0, 1.0), [])])
+def test_each_advice_is_given_once(ratios: tuple[float, float, float], said: list[str]) -> None:
+    told = advice(judge_streams(numbers_of(*ratios)))
+    assert len(told) == len(said)
+    for words, expected in zip(told, said, strict=True):
+        assert expected in words
 
 
 def test_polarities_are_counted_apart() -> None:
