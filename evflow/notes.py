@@ -60,6 +60,7 @@ NOTES: dict[str, str] = {
     "std.none": "the weights tell no error",
     "theta.joined": "the thresholds are of another estimate of this camera",
     "scene.static": "nothing moves: the noise alone was measured",
+    "scene.steps": "the light of the whole view steps",
     "scene.restless": "the light moves while it should rest",
     "theta.guessed": "thresholds scale with a network's guess of contrast",
     "reading.ended": "reading was ended before all was read",

@@ -184,14 +184,25 @@ class Estimate(Compiling, Reading):
         tell(recording)
         if self.checks:
             report.raise_if_failed()
-        doubts = [finding.note() for finding in (*report.errors, *report.warnings)
-                  if finding.code not in (SAID_BELOW if self.protocol == "motion" else
-                                          (*SAID_BELOW, "EV028"))]
+        stepping = self.protocol == "motion" and self._stepping(recording)
+        beside = () if self.protocol == "motion" and not stepping else ("EV028",)
+        doubts = [*([stepping] if stepping else []), *(
+            finding.note() for finding in (*report.errors, *report.warnings)
+            if finding.code not in (*SAID_BELOW, *beside))]
         for doubt in doubts:
             print(f"warning: {doubt}", file=sys.stderr)
         recording = without_repeats(recording) if self.protocol == "motion" else recording
         recording = self._reconstructed(recording) if self.reconstruct else recording
         return recording, report, doubts
+
+    def _stepping(self, recording: Recording) -> Note | None:
+        """What to do with a recording of a bench, if it is one."""
+        from evflow.estimation.bench.rests import steps_of_light
+
+        steps = steps_of_light(recording)
+        return Note("scene.steps", f"the light of the whole view steps, {steps} times in the first "
+                    "frames, and rests in between: --protocol step measures such a recording "
+                    "better, without a path between frames.") if steps else None
 
     def _reconstructed(self, recording: Recording) -> Recording:
         """The recording with frames made from its events; EV020 where it has frames."""

@@ -19,6 +19,7 @@ from evflow.types import Recording, release
 
 Array = np.ndarray
 
+NOTED = "frames.repeated"
 LONGEST = 4  # showings of a frame; more often, and the scene stands still
 FIRING_SHARE = 0.01  # of the pixels have events where a frame should have changed
 STRIDE = 4  # every 4th pixel of every 4th row is compared first
@@ -38,7 +39,9 @@ def repeated_frames(recording: Recording) -> Array:
 
 def without_repeats(recording: Recording) -> Recording:
     """The recording without frames shown up to LONGEST times, and a note; itself where there is
-    none."""
+    none, or its notes say that it was done."""
+    if any(note.code == NOTED for note in recording.notes):
+        return recording
     found = repeated_frames(recording)
     runs = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
     at = np.concatenate([run for run in runs if len(run) < LONGEST] or [found[:0]])
@@ -47,7 +50,7 @@ def without_repeats(recording: Recording) -> Recording:
     kept = np.delete(np.arange(len(recording.frames)), at)
     times = recording.frame_times[kept]
     even = _evenly(recording, kept)
-    note = Note("frames.repeated", f"{len(at)} of {len(recording.frames)} frames repeat the one "
+    note = Note(NOTED, f"{len(at)} of {len(recording.frames)} frames repeat the one "
                 "before while pixels fire, and are left out"
                 + ("" if even is None else "; the others are evenly spaced again") + ".")
     return dataclasses.replace(

@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 from helpers.networks import hidden
 
-from evflow import EvflowDataError, Summary, write_events
+from evflow import (
+    Events,
+    EvflowDataError,
+    Recording,
+    Summary,
+    write_events,
+    write_recording,
+)
 from evflow.cli import main
 from evflow.estimation import pipeline
 
@@ -122,3 +129,25 @@ def test_a_budget_below_nothing(flight: Path, tmp_path: Path) -> None:
     assert main([*command, "--budget-s", "-1"]) == 2
     assert main([*command, "--budget-s", "nan"]) == 2
     assert main([*command, "--protocol", "static", "--effort", "full"]) == 2
+
+
+def test_a_bench_is_told_to_say_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And nothing else is said of frames that are alike while the light rests."""
+    def ended(*_: Any, **__: Any) -> None:
+        raise EvflowDataError("EV017", "so far.")
+
+    monkeypatch.setattr(pipeline, "measure", ended)
+    path, out = tmp_path / "screen.npz", tmp_path / "cam"
+    light = np.repeat([30, 90, 30, 90, 200, 30], 10).astype(np.uint8)
+    frames = np.broadcast_to(light[:, None, None], (60, 24, 32))
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, 600_000, 40_000))
+    events = Events(rng.integers(0, 32, t.size), rng.integers(0, 24, t.size), t,
+                    rng.random(t.size) < 0.5, (32, 24))
+    write_recording(path, Recording(events, np.ascontiguousarray(frames), 10_000 * np.arange(60)))
+    assert main(["estimate", str(path), "-o", str(out), "--no-checks"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("--protocol step") == 1
+    assert "EV028" not in said

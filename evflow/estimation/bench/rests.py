@@ -19,6 +19,8 @@ STILL = 0.01  # log units between two frames: the screen rests
 LEAST_STEP = 0.1  # log units between two rests
 MOVING, MOST_MOVING = 0.1, 0.1  # log units, beside the others; of the pixels, within a rest
 LEAST_TOGETHER = 0.5  # of the pixels: those that step by half to twice what the median pixel does
+LOOKED, ROWS = 400, 32  # frames, and rows of them, that tell a bench at a glance
+LEAST_RESTS, LEAST_RESTING = 3, 0.7  # of a bench: rests, and the share of its frames in them
 FILL_THE_VIEW = ("Steps of light need a screen, or a card, that fills the view, all of it at one "
                  "level and then at another. For a scene that moves leave --protocol out.")
 
@@ -31,7 +33,41 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
     if len(recording.frames) < 4:
         raise EvflowDataError("EV011", f"the recording has {len(recording.frames)} frames.",
                               "Record frames too; in Python, rests_us and light take their place.")
-    level = np.array([_level(recording.frame_dn(i)) for i in range(len(recording.frames))])
+    found = _rests(np.array([
+        _level(recording.frame_dn(i)) for i in range(len(recording.frames))]))
+    if len(found) < 2:
+        raise EvflowDataError("EV017", f"the light rests at {len(found)} levels.",
+                              "A step needs two, of two frames each and 10 % apart.")
+    for first, last in found:
+        _check_rest(recording, first, last)
+    return found
+
+
+def steps_of_light(recording: Recording) -> int:
+    """How many times the light of the whole view steps in the first LOOKED frames, as on a bench;
+    0 in an ordinary scene. Looks at few pixels."""
+    scale, stride = np.float32(255 / recording.full_scale), max(1, recording.events.size[1] // ROWS)
+    some = [frame.astype(np.float32) * scale
+            for frame in recording.frames[:LOOKED, ::stride, ::stride]]
+    light = np.array([np.median(dn) for dn in some])
+    if len(light) < 4 or light.max() <= light.min() * np.exp(LEAST_STEP):
+        return 0
+    found = _rests(np.array([_level(dn) for dn in some]))
+    resting = sum(last - first + 1 for first, last in found)
+    if len(found) < LEAST_RESTS or resting < LEAST_RESTING * len(some):
+        return 0
+    try:
+        check_steps(np.stack([np.asarray(lin_log(np.mean(some[first:last + 1], 0)))
+                              for first, last in found]))
+    except EvflowDataError:
+        return 0
+    moves = max(_moving(smooth(some[first]), some[last]) for first, last in found) > MOST_MOVING
+    return 0 if moves else len(found) - 1
+
+
+def _rests(level: np.ndarray) -> list[tuple[int, int]]:
+    """(first, last) frame of each stretch in which the levels (T,) rest, those of one light
+    joined."""
     still = np.abs(np.diff(level)) < STILL
     found: list[tuple[int, int]] = []
     for resting, group in itertools.groupby(range(len(still)), key=lambda i: bool(still[i])):
@@ -44,11 +80,6 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
             found[-1] = (found[-1][0], last)
         else:
             found.append((first, last))
-    if len(found) < 2:
-        raise EvflowDataError("EV017", f"the light rests at {len(found)} levels.",
-                              "A step needs two, of two frames each and 10 % apart.")
-    for first, last in found:
-        _check_rest(recording, first, last)
     return found
 
 
@@ -61,16 +92,18 @@ def _level(dn: np.ndarray) -> float:
 
 def _check_rest(recording: Recording, first: int, last: int) -> None:
     begin = smooth(recording.frame_dn(first))
-
-    def moving(i: int) -> float:
-        off = smooth(recording.frame_dn(i)) - begin
-        return float((np.abs(off - np.median(off)) > MOVING).mean())  # a lamp may settle
-
-    share = max(moving(i) for i in range(first + 1, last + 1))
+    share = max(_moving(begin, recording.frame_dn(i)) for i in range(first + 1, last + 1))
     if share > MOST_MOVING:
         raise EvflowDataError(
             "EV017", f"the scene moves while the light rests (frames {first} to {last}): "
             f"{share:.0%} of the pixels change.", FILL_THE_VIEW)
+
+
+def _moving(begin: np.ndarray, dn: np.ndarray) -> float:
+    """The share of the pixels that change from a smoothed frame to one in DN, (H, W) both, beside
+    the others: a lamp may settle."""
+    off = smooth(dn) - begin
+    return float((np.abs(off - np.median(off)) > MOVING).mean())
 
 
 def check_steps(levels: np.ndarray) -> None:

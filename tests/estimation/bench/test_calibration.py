@@ -19,7 +19,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
 from evflow.estimation.bench.levels import few_sizes
-from evflow.estimation.bench.rests import find_rests
+from evflow.estimation.bench.rests import find_rests, steps_of_light
 from evflow.estimation.bench.steps import storing
 from evflow.io import write_recording
 from evflow.notes import texts
@@ -240,6 +240,13 @@ def test_few_grey_levels_and_a_lens_are_no_motion(recording: Recording) -> None:
     steps = len(find_rests(recording)) - 1
     assert steps == 4
     assert len(calibrate_step(recording).camera.shape) == 2
+
+
+@pytest.mark.parametrize(("recording", "steps"), [
+    (dim([8, 40, 8, 40, 8]), 4), (dim([25, 225, 25, 225, 25], screen_part=0.3), 0),
+    (textured(2), 0), (dim([100, 100, 100]), 0)], ids=["dim", "part", "motion", "static"])
+def test_a_bench_is_recognised_at_a_glance(recording: Recording, steps: int) -> None:
+    assert steps_of_light(recording) == steps
 
 
 def test_a_lamp_that_settles_is_no_motion() -> None:
