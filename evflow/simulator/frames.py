@@ -98,13 +98,13 @@ def _check_block(
     if not np.issubdtype(block.dtype, np.floating):
         raise EvflowDataError("EV003", f"frames are {block.dtype}.",
                               "Expected uint8, uint16 or floating DN on 0..255.")
-    bad = ~np.isfinite(block)
-    if bad.any():
+    low, high = block.min(initial=0.0), block.max(initial=0.0)
+    if not (np.isfinite(low) and np.isfinite(high)):
+        bad = ~np.isfinite(block)
         at = np.argwhere(bad)[0]
         raise EvflowDataError(
             "EV007", f"{bad.sum()} values of the frames are not finite, first in frame "
             f"{index + int(at[0])} at y={at[1]}, x={at[2]}.")
-    low, high = block.min(initial=0.0), block.max(initial=0.0)
     if low < 0 or high > 255.5:
         doubt = meaning(block) if low < 0 else None
         raise EvflowDataError(
