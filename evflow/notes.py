@@ -19,6 +19,7 @@ NOTES: dict[str, str] = {
     "events.partial": "only the part before the damage was read",
     "events.timeless": "events before the first time word were left out",
     "events.turned": "polarity was turned",
+    "events.unended": "the last line of a text has no end",
     "events.unit": "another unit of the event times is likelier",
     "events.unread": "something of the file was not read",
     "sensor.camera": "which of several cameras was read",

@@ -231,9 +231,17 @@ def wrong(got: Any, want: Any, made: Sample, mutation: str) -> str:
         return ""
     if made.sealed or (mutation == "cut" and made.counted):
         return "" if same(got, want) else "other data than was written"
-    if mutation == "cut" and isinstance(got, Recording) and not begins(got, want):
+    if mutation == "cut" and isinstance(got, Recording) and not begins(sure(got), want):
         return "not a beginning of what was written"
     return ""
+
+
+def sure(got: Recording) -> Recording:
+    """A recording without its last event where a note says that digits of it may be missing."""
+    if all(note.code != "events.unended" for note in got.notes):
+        return got
+    x, y, t, p = (getattr(got.events, name)[:-1] for name in "xytp")
+    return dataclasses.replace(got, events=Events(x, y, t, p, got.events.size))
 
 
 def same(got: Any, want: Any) -> bool:

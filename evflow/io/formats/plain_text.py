@@ -14,6 +14,7 @@ from __future__ import annotations
 import codecs
 import functools
 import itertools
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -67,7 +68,17 @@ def read(path: Path, hints: Hints) -> Recording:
     does not tell the size) and what `stream.gather` raises."""
     with open(path, "rb") as f:
         chunks, native, found = events(path, f, hints)
-        return collect(path, chunks, hints, found.size, lambda: found.notes, native)
+        return collect(path, chunks, hints, found.size,
+                       lambda: (*found.notes, *_unended(path, f, found.order)), native)
+
+
+def _unended(path: Path, f: IO[bytes], order: str) -> tuple[Note, ...]:
+    """What to say where the last line lacks its end: of a polarity no digit can be missing."""
+    f.seek(-1, os.SEEK_END)
+    if order[-1] in "p-" or f.read(1) in b"\r\n":
+        return ()
+    return (Note("events.unended", f"{path} does not end with the end of a line: if it was cut off "
+                 f"there, the {order[-1]} of its last event may lack digits"),)
 
 
 def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str, Layout]:

@@ -26,7 +26,7 @@ def first_stamp_s(path: Path) -> float:
         f.seek(0)
         try:
             return max(0.0, _first(f))
-        except (EOFError, ValueError):
+        except (EOFError, ValueError, OSError):  # OSError: a size that no file has
             return 0.0
 
 

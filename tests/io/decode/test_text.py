@@ -280,3 +280,16 @@ def test_fractional_coordinates_are_told(tmp_path: Path) -> None:
     error = refused(path, size=SIZE)
     assert error.code == "EV003"
     assert "undistorted" in str(error)
+
+
+@pytest.mark.parametrize("order", ["txyp", "ptxy", "xypt"])
+def test_a_last_line_without_its_end_may_be_cut(tmp_path: Path, order: str) -> None:
+    """Of y = 23, 2 is left: no reader can tell, so that it is said. A polarity has one digit."""
+    path = tmp_path / "a.csv"
+    lines = ["_".join(order).replace("_", ","), *(
+        ",".join({"t": f"0.{t}", "x": "30", "y": "23", "p": "1"}[name] for name in order)
+        for t in range(10, 40))]
+    for end, said in (("\n", False), ("\r\n", False), ("", order[-1] != "p")):
+        path.write_bytes(("\n".join(lines) + end).encode())
+        notes = read_recording(path, size=(64, 48)).notes
+        assert [n.code for n in notes if n.code == "events.unended"] == ["events.unended"] * said

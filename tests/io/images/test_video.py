@@ -111,6 +111,9 @@ def test_a_film_that_begins_late_is_no_damaged_one(tmp_path: Path, late_ms: int)
     for end in range(4, 80, 5):  # whatever is left of a header: no error of ours
         path.write_bytes(data[:end])
         assert first_stamp_s(path) == 0
+    beyond = b"\xec\x01" + b"\xff" * 6 + b"\xfe"  # an element of 2^56 bytes, twice: past any file
+    path.write_bytes(data[:4] + b"\x80" + beyond * 200)
+    assert first_stamp_s(path) == 0
 
 
 def test_the_clock_of_coarse_absent_and_backward_stamps() -> None:
