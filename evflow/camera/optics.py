@@ -73,6 +73,22 @@ def read_summary(path: str | os.PathLike) -> tuple[dict[str, float], dict[str, f
     return {n: float(v) for n, v in of.items()}, {n: float(v) for n, v in std.items()}
 
 
+def read_known(path: str | os.PathLike) -> dict[str, tuple[float, float]]:
+    """(value, standard deviation) of all in a camera.npz that was measured of the whole camera: its
+    summary, without what its recording did not tell, and its circuit. Raises EV009, EV016."""
+    held = load_npz(Path(path))
+    values, errors = read_summary(path) or ({}, {})
+    untold = {f"{kind}_{name.partition('_')[2]}" for name in read_undetermined(path)
+              for kind in ("theta", "sigma")}
+    known = {name: (value, errors[name]) for name, value in values.items() if name not in untold}
+    sensor = read_sensor(path)[0]
+    for name in MEASURED:
+        error = float(held.get(f"sensor_{name}_std", np.nan))
+        if getattr(sensor, name) and np.isfinite(error):
+            known[name] = (getattr(sensor, name), error)
+    return known
+
+
 def read_undetermined(path: str | os.PathLike) -> tuple[str, ...]:
     """Thresholds in a camera.npz whose values, and widths, are a prior's: the recording that it
     was estimated from did not tell. None in files that do not say. Raises EV009, EV016."""

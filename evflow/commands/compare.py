@@ -58,21 +58,44 @@ class Compare(Reading):
 
     def _cameras(self, *both: tuple[Camera, Camera | None]) -> None:
         """Two cameras beside each other."""
-        from evflow.metrics.cameras import compare_cameras, describe_cameras
+        from evflow.camera.optics import read_known
+        from evflow.metrics.cameras import compare_cameras, verdict
+        from evflow.report.cameras import describe_cameras, write_cameras
 
-        if self.out:
-            need_absent(self.out / "compare.json", self.overwrite)
+        self._check_targets()
         (a, a_std), (b, b_std) = both
-        numbers = compare_cameras(a, b, a_std, b_std)
-        facts = {"a": str(self.real), "b": str(self.synthetic), **numbers}
+        numbers = compare_cameras(a, b, a_std, b_std, a_known=read_known(self.real),
+                                  b_known=read_known(self.synthetic))
+        facts = {"a": str(self.real), "b": str(self.synthetic), "verdict": verdict(numbers),
+                 **numbers}
+        names = _short(self.real), _short(self.synthetic)
         if self.out:
             write_json(self.out / "compare.json", facts)
-        print(json.dumps(facts, indent=2) if self.json else
-              describe_cameras(numbers, (_short(self.real), _short(self.synthetic))))
+        if self.out and self.plots:
+            write_cameras(self.out / "compare.html", (a, b), numbers, names,
+                          self._compared("First camera", "Second camera"),
+                          overwrite=self.overwrite)
+        print(json.dumps(facts, indent=2) if self.json else describe_cameras(numbers, names))
+        if self.out:
+            print(f"written to {self.out}/", file=sys.stderr)
+
+    def _check_targets(self) -> None:
+        """EV010, EV013 before any long work."""
+        for name in ("compare.json", *(["compare.html"] if self.plots else [])):
+            if self.out:
+                need_absent(self.out / name, self.overwrite)
+        need_packages(self.real, self.synthetic, pictures=bool(self.out) and self.plots)
+
+    def _compared(self, *labels: str) -> dict[str, str]:
+        """What a page says of the two files, the command and the versions."""
+        from evflow.process.provenance import sha256, told
+
+        shown = {label: f"{path}, sha256 {sha256(path)}" for label, path in zip(
+            labels, (self.real, self.synthetic), strict=True)}
+        return {**shown, "Command": shlex.join(["evflow", *sys.argv[1:]]), "Versions": told()}
 
     def run(self) -> None:
         from evflow.metrics.streams import compare
-        from evflow.process.provenance import sha256, told
         from evflow.report.streams import write_comparison
         from evflow.report.verdict import describe_streams, judge_streams, worst
 
@@ -81,11 +104,7 @@ class Compare(Reading):
         if cameras := _cameras(self.real, self.synthetic):
             self._cameras(*cameras)
             return
-        targets = [] if self.out is None else [self.out / "compare.json"] + (
-            [self.out / "compare.html"] if self.plots else [])
-        for target in targets:
-            need_absent(target, self.overwrite)
-        need_packages(self.real, self.synthetic, pictures=bool(self.out) and self.plots)
+        self._check_targets()
         note_idle(self, "streams are compared by their events alone")
         real, synthetic = self._streams()
         numbers = compare(real, synthetic)
@@ -95,11 +114,8 @@ class Compare(Reading):
         if self.out:
             write_json(self.out / "compare.json", facts)
         if self.out and self.plots:
-            shown = {f"{name} stream": f"{path}, sha256 {sha256(path)}" for name, path in (
-                ("Real", self.real), ("Synthetic", self.synthetic))}
-            shown["Command"] = shlex.join(["evflow", *sys.argv[1:]])
-            shown["Versions"] = told()
-            write_comparison(self.out / "compare.html", real, synthetic, numbers, facts=shown,
+            write_comparison(self.out / "compare.html", real, synthetic, numbers,
+                             facts=self._compared("Real stream", "Synthetic stream"),
                              labels=(self.real.name, self.synthetic.name),
                              overwrite=self.overwrite)
         print(json.dumps(facts, indent=2) if self.json else words)

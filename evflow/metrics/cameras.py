@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,19 +10,24 @@ import numpy as np
 from evflow.camera import PARAMETERS, Camera
 from evflow.errors import EvflowDataError
 
-APART = 3.0  # standard deviations by which the medians of a map differ for sure
+APART = 3.0  # standard deviations by which values differ for sure
 FLOOR = 0.01  # of a value: errors below are not believed
+WHOLE = ("sigma_on", "sigma_off", "cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # no maps
+
+Known = Mapping[str, tuple[float, float]]
 
 
 def compare_cameras(
-    a: Camera, b: Camera, a_std: Camera | None = None, b_std: Camera | None = None
-) -> dict[str, Any]:
+    a: Camera, b: Camera, a_std: Camera | None = None, b_std: Camera | None = None, *,
+    a_known: Known | None = None, b_known: Known | None = None,
+) -> dict[str, dict[str, float | None]]:
     """JSON-ready numbers of two cameras of maps (H, W), by parameter.
 
-    Of each: median a and b, their ratio b / a (None where a is 0); r, correlation over the pixels
-    (None where a map does not vary or the sizes differ); error, standard deviation of the
-    difference of the medians, and apart, that difference in units of it (both None without
-    standard deviations): the median pixel's own, as all pixels share most of it.
+    Of each: a and b, the camera's value as it was measured (`read_known`: a_known, b_known), else
+    the median of its map; a_std and b_std, their standard deviations, else those of the median
+    pixel, as all pixels share most of it; their ratio b / a; error, standard deviation of the
+    difference, and apart, the difference in units of it; r, correlation over the pixels. None
+    where a value is not known, a map does not vary, or sizes differ.
 
     Raises EV002 where one holds several cameras.
     """
@@ -29,40 +35,47 @@ def compare_cameras(
         if len(camera.shape) != 2:
             raise EvflowDataError("EV002", f"maps of shape {camera.shape}.",
                                   "Compare two cameras of maps (H, W).")
-    return {name: _one(*(None if c is None else np.asarray(getattr(c, name), np.float64)
-                         for c in (a, b, a_std, b_std))) for name in PARAMETERS}
+    found = {}
+    for name in PARAMETERS:
+        maps = [np.asarray(getattr(camera, name), np.float64) for camera in (a, b)]
+        varies = maps[0].shape == maps[1].shape and all(np.ptp(m) > 0 for m in maps)
+        row = _one(_value(name, maps[0], a_std, a_known), _value(name, maps[1], b_std, b_known))
+        r = float(np.corrcoef(maps[0].ravel(), maps[1].ravel())[0, 1]) if varies else None
+        found[name] = {**row, "r": r if row["a"] is not None and row["b"] is not None else None}
+    for name in WHOLE:
+        if name in (a_known or {}) or name in (b_known or {}):
+            found[name] = {**_one((a_known or {}).get(name), (b_known or {}).get(name)), "r": None}
+    return found
+
+
+def _value(
+    name: str, values: np.ndarray, std: Camera | None, known: Known | None
+) -> tuple[float, float] | None:
+    """The camera's value and its error, NaN for none; None where it was not measured."""
+    if known and set(PARAMETERS) & set(known):
+        return known.get(name)
+    error = np.nan if std is None else float(np.median(np.asarray(getattr(std, name))))
+    return float(np.median(values)), error
 
 
 def _one(
-    a: np.ndarray | None, b: np.ndarray | None, a_std: np.ndarray | None, b_std: np.ndarray | None
+    a: tuple[float, float] | None, b: tuple[float, float] | None
 ) -> dict[str, float | None]:
-    assert a is not None
-    assert b is not None
-    first, second = float(np.median(a)), float(np.median(b))
-    error = apart = None
-    if a_std is not None and b_std is not None:
-        error = float(np.hypot(np.median(a_std), np.median(b_std)))
-        apart = (second - first) / max(error, FLOOR * max(first, second), 1e-12)
-    varies = a.shape == b.shape and np.ptp(a) > 0 and np.ptp(b) > 0
-    return {"a": first, "b": second, "ratio": second / first if first else None,
-            "r": float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) if varies else None,
-            "error": error, "apart": apart}
+    (first, first_std), (second, second_std) = a or (np.nan, np.nan), b or (np.nan, np.nan)
+    error = float(np.hypot(first_std, second_std))
+    apart = (second - first) / max(error, FLOOR * max(first, second), 1e-12)
+    ratio = second / first if first else np.nan
+    return {key: float(value) if np.isfinite(value) else None for key, value in {
+        "a": first, "a_std": first_std, "b": second, "b_std": second_std, "ratio": ratio,
+        "error": error, "apart": apart if np.isfinite(error) else np.nan}.items()}
 
 
-def describe_cameras(numbers: dict[str, Any], names: tuple[str, str]) -> str:
-    """A line a parameter, and which differ for sure."""
-    lines = [f"{'':12} {names[0]:>14.14} {names[1]:>14.14} {'ratio':>8} {'apart':>8} {'r':>6}"]
-    for name, row in numbers.items():
-        ratio, apart, r = (
-            "" if row[k] is None else f"{row[k]:{form}}"
-            for k, form in (("ratio", ".3f"), ("apart", "+.1f"), ("r", ".2f")))
-        lines.append(f"{name:12} {row['a']:14.4f} {row['b']:14.4f} {ratio:>8} {apart:>8} {r:>6}")
+def verdict(numbers: dict[str, Any], labels: Mapping[str, str] | None = None) -> str:
+    """Which parameters differ for sure. labels: what these are called."""
     known = [name for name, row in numbers.items() if row["apart"] is not None]
-    sure = [name for name in known if abs(numbers[name]["apart"]) > APART]
-    lines.append("apart: difference of the medians in standard deviations of it; r: over pixels.")
+    sure = [(labels or {}).get(name, name) for name in known
+            if abs(numbers[name]["apart"]) > APART]
     if not known:
-        lines.append("A camera without standard deviations: whether they differ is not known.")
-    else:
-        lines.append(f"They differ in {', '.join(sure)}." if sure else
-                     "They do not differ by more than the errors allow.")
-    return "\n".join(lines)
+        return "A camera without standard deviations: whether they differ is not known."
+    return (f"They differ in {', '.join(sure)}." if sure else
+            "They do not differ by more than the errors allow.")

@@ -126,7 +126,7 @@ def _map(axis: Any, values: np.ndarray, title: str, unit: str = "", cmap: str = 
 def _few_ticks() -> Any:
     from matplotlib.ticker import MaxNLocator
 
-    return MaxNLocator(4)
+    return MaxNLocator(3, steps=[1, 2, 5, 10])
 
 
 def _printed() -> Any:
@@ -159,17 +159,17 @@ def camera_maps(found: CameraEstimate, path: str | os.PathLike) -> None:
 
 
 def _histogram(axis: Any, found: CameraEstimate, name: str, truth: Camera | None) -> None:
-    """Pixels of a map: all (grey), those with events of their own, the truth (black, dashed)."""
+    """Pixels of a map that have events of their own (the others show the camera's summary, and
+    would be a spike beside which nothing is seen), and the truth (black, dashed)."""
     values = np.asarray(getattr(found.camera, name))
+    own = found.valid & np.isfinite(values)
+    shown, label = (own, f"{own.mean():.0%}, with events") if 0 < own.sum() < own.size else (
+        np.isfinite(values), "all pixels")
     colour = ON_COLOUR if name.endswith("on") else OFF_COLOUR
     parts: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
-        "all pixels": (values[np.isfinite(values)], {"color": "0.75"})}
-    if 0 < found.valid.sum() < found.valid.size:
-        parts["with events"] = (values[found.valid], {"color": colour, "histtype": "step"})
-    else:
-        parts = {"all pixels": (parts["all pixels"][0], {"color": colour, "alpha": 0.6})}
+        label: (values[shown], {"color": colour, "alpha": 0.6})}
     if truth is not None:
-        parts["truth"] = (np.asarray(getattr(truth, name)).ravel(),
+        parts["truth"] = (np.asarray(getattr(truth, name))[shown],
                           {"color": "k", "histtype": "step", "ls": "--"})
     spans = [robust_range(v, 0.5) for v, _ in parts.values() if v.size]
     low, high = min(s[0] for s in spans), max(s[1] for s in spans)
@@ -182,7 +182,7 @@ def _histogram(axis: Any, found: CameraEstimate, name: str, truth: Camera | None
     axis.set_title(SYMBOLS[name])
     axis.set_xlabel(UNITS[name[:3]])
     axis.set_ylabel("pixels")
-    axis.locator_params(nbins=4)
+    axis.xaxis.set_major_locator(_few_ticks())
     axis.set_ylim(top=1.6 * axis.get_ylim()[1])  # room for the legend
     axis.legend(fontsize="small", loc="upper right", labelspacing=0.25, borderaxespad=0.1)
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from helpers.networks import hidden
 
-from evflow import Camera, Recording, cli, read_events, write_events
+from evflow import Camera, Recording, SensorModel, Summary, cli, read_events, write_events
+from evflow.camera.optics import Optics, as_arrays, summary_arrays
 from evflow.cli import main
 
 
@@ -204,3 +205,32 @@ def test_two_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str], flight:
     assert same["apart"] == 0.0
     assert main(["compare", str(a), str(flight)]) == 2
     assert "is a camera" in capsys.readouterr().err
+
+
+def test_two_cameras_beside_each_other_with_their_errors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As they were measured, not as their median pixel is; and no value of a prior."""
+    paths = tmp_path / "static" / "camera.npz", tmp_path / "steps" / "camera.npz"
+    for path, theta, noise in zip(paths, (0.2, 0.25), (0.5, 0.6), strict=True):
+        path.parent.mkdir()
+        summary = Summary(*np.float32([theta, theta, noise, noise, 0.03, 0.03]))
+        std = Summary(*np.float32([0.003, 0.003, 0.005, 0.005, 0.001, 0.001]))
+        Camera.constant((20, 30), theta + 0.01, theta, noise, noise).save(
+            path, **{f"{n}_std": np.full((20, 30), 0.1) for n in (
+                "theta_on", "theta_off", "eta_on", "eta_off")},
+            **summary_arrays(summary, std),
+            **as_arrays(SensorModel(refractory_s=1e-3), {"refractory_s": 2e-5}, Optics()),
+            **({"undetermined": ["theta_off"]} if path == paths[0] else {}))
+    out = tmp_path / "both"
+    assert main(["compare", *map(str, paths), "-o", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert " ".join(lines[1].split()).startswith("theta_on 0.2000 ± 0.0030 0.2500 ± 0.0030 1.25")
+    assert lines[2].split()[:2] == ["theta_off", "–"]
+    assert lines[-1] == "They differ in theta_on, eta_on, eta_off."
+    kept = json.loads((out / "compare.json").read_text())
+    assert (kept["theta_off"]["a"], kept["theta_off"]["b"]) == (None, pytest.approx(0.25))
+    assert kept["refractory_s"]["a_std"] == pytest.approx(2e-5)
+    page = (out / "compare.html").read_text()
+    assert "22.14 ± 0.37" in page  # percent of contrast
+    assert page.count("sha256 ") == 2

@@ -28,7 +28,7 @@ from evflow.estimation.extent import Extent
 from evflow.estimation.refine import stretches
 from evflow.notes import Note
 from evflow.recordings.bunches import Bunch
-from evflow.report import camera, page, resimulate
+from evflow.report import camera, page, plots, resimulate
 from evflow.report.extent import extent_panel
 from evflow.report.resimulate import busiest, usable_runs
 from evflow.report.verdict import judge_estimate, judge_stream, known, poorer, worst
@@ -311,6 +311,19 @@ def test_large_maps_are_shown_in_blocks() -> None:
     np.testing.assert_array_equal(small, [[2.5, 4.5], [10.5, 12.5]])
     same, k = page.blocks(np.ones((3, 5)), 5)
     assert (same.shape, k) == ((3, 5), 1)
+
+
+def test_histograms_are_of_the_pixels_with_events(
+    measured: tuple[CameraEstimate, Recording]
+) -> None:
+    """The others all show the camera's summary: a spike that hides the rest."""
+    found = dataclasses.replace(measured[0], valid=np.arange(
+        measured[0].valid.size).reshape(measured[0].valid.shape) % 10 == 0)
+    axis = plots.new_figure(2.0, 2.0).subplots()
+    plots._histogram(axis, found, "theta_on", None)
+    drawn = axis.patches[0].get_xy()[:, 1].max()
+    assert 0 < drawn <= found.valid.sum()
+    assert axis.get_legend().get_texts()[0].get_text() == "10%, with events"
 
 
 def test_what_was_read_and_its_thirds_are_laid_side_by_side(

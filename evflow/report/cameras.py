@@ -1,0 +1,106 @@
+"""Two cameras side by side: a table in words, and a page to hand to a colleague."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from evflow.camera import Camera
+from evflow.metrics.cameras import verdict
+from evflow.report import page
+from evflow.report.figures import svg
+from evflow.report.page import Panel, figure, grid, number, paragraph, spread, table
+from evflow.report.plots import require, robust_range
+
+LABELS = {
+    "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON [Hz/pixel]",
+    "eta_off": "noise OFF [Hz/pixel]", "sigma_on": "mismatch ON", "sigma_off": "mismatch OFF",
+    "cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz/pixel]",
+    "shot_hz": "shot noise [Hz, dark]"}
+COLOURS = ("#444b57", "#d98200")
+NOTE = ("Apart: the difference over its standard deviation; beyond 3 they differ. r: over the "
+        "pixels of the maps; two cameras of one type have none, the same camera at other biases "
+        "has.")
+
+
+def describe_cameras(numbers: dict[str, Any], names: tuple[str, str]) -> str:
+    """A line a parameter, and which differ for sure."""
+    rows = [["", *(name[:24] for name in names), "ratio", "apart", "r"], *(
+        [name, _shown(row, "a"), _shown(row, "b"), number(row["ratio"]), _signed(row["apart"]),
+         number(row["r"], 2)] for name, row in numbers.items())]
+    widths = [max(len(row[i]) for row in rows) for i in range(6)]
+    lines = ["  ".join(cell.ljust(w) if not i else cell.rjust(w) for i, (cell, w) in enumerate(
+        zip(row, widths, strict=True))) for row in rows]
+    return "\n".join([*lines, NOTE, verdict(numbers)])
+
+
+def write_cameras(
+    path: str | os.PathLike, cameras: tuple[Camera, Camera], numbers: dict[str, Any],
+    names: tuple[str, str], facts: dict[str, str], *, overwrite: bool = False,
+) -> None:
+    """compare.html of two cameras: the verdict, all values with their errors, thresholds in percent
+    of contrast, histograms. numbers: of `compare_cameras`.
+
+    Raises EV010 (no matplotlib), EV013 (exists), EV019 (cannot be written).
+    """
+    require()
+    rows = []
+    for name, row in numbers.items():
+        rows.append([LABELS[name], _shown(row, "a"), _shown(row, "b"), number(row["ratio"]),
+                     _signed(row["apart"]), number(row["r"], 2)])
+        if name.startswith("theta"):
+            rows.append(["in % of contrast", _percent(row, "a"), _percent(row, "b"), "", "", ""])
+    head = ["", *(page.text(name) for name in names), "ratio", "apart", "r"]
+    drawn = [figure(page.drawing(_histograms(cameras, name, names), LABELS[name]), "", LABELS[name])
+             for name in ("theta_on", "theta_off", "eta_on", "eta_off")
+             if numbers[name]["a"] is not None or numbers[name]["b"] is not None]
+    panels = [
+        Panel("verdict", "Side by side", paragraph(verdict(numbers, LABELS)) + table(head, rows)
+              + paragraph(NOTE, "note")),
+        Panel("pixels", "Their pixels", grid(drawn, 22) + paragraph(
+            "All pixels of the maps; those without events of their own show the camera's value.",
+            "note")),
+        Panel("facts", "What was compared", table(
+            ["", ""], [[page.text(k), f"<code>{page.text(v)}</code>"] for k, v in facts.items()],
+            numeric=False))]
+    page.write_page(path, f"{names[0]} and {names[1]}", "two cameras", panels, numbers,
+                    overwrite=overwrite)
+
+
+def _shown(row: dict[str, Any], side: str) -> str:
+    """value ± std; a dash where it was not measured."""
+    value, std = row[side], row[f"{side}_std"]
+    return "–" if value is None else number(value) if std is None else spread(value, std)
+
+
+def _signed(value: float | None) -> str:
+    return "–" if value is None else f"{value:+.1f}"
+
+
+def _percent(row: dict[str, Any], side: str) -> str:
+    """A threshold in percent of contrast."""
+    if row[side] is None:
+        return "–"
+    slope = 100.0 * np.exp(row[side])
+    return (number(slope - 100.0) if row[f"{side}_std"] is None else
+            spread(slope - 100.0, slope * row[f"{side}_std"]))
+
+
+def _histograms(cameras: tuple[Camera, Camera], name: str, names: tuple[str, str]) -> bytes:
+    """Shares of the pixels of both over a parameter."""
+    maps = [np.asarray(getattr(camera, name)).ravel() for camera in cameras]
+
+    def draw(axis: Any) -> None:
+        spans = [robust_range(values, 0.5) for values in maps]
+        bins = np.linspace(min(s[0] for s in spans), max(s[1] for s in spans), 50)
+        for values, colour, label in zip(maps, COLOURS, names, strict=True):
+            axis.hist(np.clip(values, bins[0], bins[-1]), bins=bins, color=colour, alpha=0.45,
+                      weights=np.full(values.size, 100.0 / values.size), label=label)
+            axis.axvline(np.median(values), color=colour, lw=1.2)
+        axis.set(xlabel="natural log units" if name.startswith("theta") else "Hz per pixel",
+                 ylabel="pixels [%]")
+        axis.legend()
+
+    return svg(draw, 4.4, 2.6)
