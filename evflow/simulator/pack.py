@@ -75,19 +75,20 @@ def signal(
     further = []
     for pixels, out in sent:
         first = np.asarray(out.first)[: len(dt_us)]
-        if timed:
+        if not timed:
+            further.append((out, *_where(first, pixels)))
+        elif keys.bits_below:
             flag = np.uint32(1 << keys.bits_below)
-            known, more = first & ~flag, first & flag  # there are few of more than one
-            yield known.ravel() if keys.bits_below else keys(*_ranked(known, pixels))
-        further.append((out, *_where(more if timed else first, pixels)))
+            yield (first & ~flag).ravel()
+            further.append((out, *_where(first & flag, pixels)))
+        else:
+            at, pixel = _where(first, pixels)
+            ranks = first.ravel().take(at)
+            more = np.flatnonzero((ranks & np.uint32(1)) != 0)
+            yield keys(ranks & ~np.uint32(1), pixel)
+            further.append((out, at.take(more), pixel.take(more)))
     if any(len(at) for _, at, _ in further):
         yield _progressions(model, keys, further, dt_us, skip=int(timed))
-
-
-def _ranked(ranks: Array, pixels: Array) -> tuple[Array, Array]:
-    """Ranks (T, K) that are not 0, and the pixels they are of."""
-    at, pixel = _where(ranks, pixels)
-    return ranks.ravel().take(at), pixel
 
 
 def _progressions(
@@ -186,15 +187,29 @@ def sort(
     """The sorted `Events` of a block that begins at `begin_us`, and (N,) bool: which of them are
     noise."""
     height, width = shape
-    bits, dtype = keys.bits, keys.dtype
-    merged = np.concatenate([np.empty(0, dtype), *parts])
-    merged.sort()  # zeros as well, which takes less than to leave them out
-    merged = merged[np.searchsorted(merged, dtype(1)) :]
+    bits, merged = keys.bits, np.concatenate([np.empty(0, keys.dtype), *parts])
+    merged, above = _in_order(merged, bits)
+    dtype = merged.dtype.type
     pixel = merged & dtype((1 << bits) - 1)
     y = pixel // dtype(width)
     x = pixel - y * dtype(width)
     t = (merged >> dtype(bits + 2)).astype(np.int64)
-    t += begin_us
+    t += begin_us + (above >> bits + 2)
     noise, on = ((merged & dtype(flag << bits)).astype(bool) for flag in (1, 2))
     columns = x.astype(np.uint16), y.astype(np.uint16), t, on
     return Events.unchecked(*columns, (width, height)), noise
+
+
+def _in_order(keys: Array, bits: int) -> tuple[Array, Array]:
+    """Sorted integers but zeros, and what to add to them: of 64 bits, where there are few upper
+    halves, the lower ones, sorted by 32 bits in two thirds of the time."""
+    few = keys.dtype == np.uint64 and bits <= 30 and int(keys.max(initial=0)) >> 40 == 0
+    if not few:
+        keys.sort()  # zeros as well, which takes less than to leave them out
+        return keys[np.searchsorted(keys, keys.dtype.type(1)) :], np.zeros((), np.int64)
+    upper = (keys >> np.uint64(32)).astype(np.uint8)
+    counts = np.bincount(upper, minlength=1)
+    lower = keys.astype(np.uint32).take(np.argsort(upper, kind="stable"))
+    for end, count in zip(np.cumsum(counts).tolist(), counts.tolist(), strict=True):
+        lower[end - count : end].sort()
+    return lower, np.repeat(np.arange(len(counts)) << 32, counts)

@@ -67,6 +67,22 @@ def test_keys_of_32_and_of_64_bits_are_the_same_events(
     equal(simulate(KEY, frames, times, NOISY, model=model), short)
 
 
+@pytest.mark.parametrize("length", [200, 2_047, 30_000, 524_287, 3_000_000])
+def test_events_of_any_block_are_sorted(length: int) -> None:
+    """By time, OFF before ON, noise after signal, pixel: keys of 32 bits, and of 64 in halves and
+    whole."""
+    rng, pixels = np.random.default_rng(length), 640 * 480
+    keys = pack.Keys.of(pixels, length)
+    t, on, noise = rng.integers(1, length + 1, 2_000), *rng.integers(0, 2, (2, 2_000))
+    pixel = rng.permutation(pixels)[:2_000]
+    at = np.lexsort((pixel, noise, on, t))
+    parts = np.split(keys((t << 2) + 2 * on + noise, pixel), [3, 1_500])
+    events, labels = pack.sort(keys, parts, 7, (480, 640))
+    for found, right in ((events.t - 7, t), (events.p, on), (labels, noise),
+                         (events.y.astype(int) * 640 + events.x, pixel)):
+        np.testing.assert_array_equal(found, right[at])
+
+
 @pytest.mark.parametrize("model", [EVERYTHING, V2E])
 def test_one_key_gives_the_same_bytes_for_any_chunking(model: SensorModel) -> None:
     """70 frames are no multiple of a block (8), so padding is met too."""
