@@ -77,6 +77,9 @@ class Estimate(Compiling, Reading):
     lux: Annotated[tuple[float, ...], value("LUX ...")] = ()
     """What a light meter read. static: of each recording, in their order, for noise against
     illuminance; step: of each level, the darkest first, in place of the frames' own ratios."""
+    triggers: Annotated[Path | None, value("FILE")] = None
+    """Of --protocol step: instants of the light's edges, for latency and jitter: one time a line,
+    on the clock of the events, or the trigger events of Prophesee RAW (the recording itself)."""
     thresholds: Annotated[Path | None, value("FILE")] = None
     """Of --protocol static: take the thresholds, which a scene at rest does not tell, from this
     camera.npz: noise and thresholds joined in one camera."""
@@ -125,8 +128,9 @@ class Estimate(Compiling, Reading):
             refuse(self, ("simulators",), "of use in the report of --protocol motion only")
         if not self.reconstruct:
             refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
-        if self.protocol != "static":
-            refuse(self, ("thresholds",), "of use with --protocol static only")
+        for name, protocol in (("thresholds", "static"), ("triggers", "step")):
+            if self.protocol != protocol:
+                refuse(self, (name,), f"of use with --protocol {protocol} only")
         need_packages(self.recording, *self.more, pictures=self.plots or self.report)
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording, checked, doubts = self._recorded(self.recording)
@@ -252,9 +256,11 @@ class Estimate(Compiling, Reading):
         from evflow.estimation.joined import with_thresholds
         from evflow.estimation.pipeline import Measured
         from evflow.estimation.static import estimate_noise, noise_over_light
+        from evflow.io.triggers import read_triggers
 
         if self.protocol == "step":
-            return Measured(calibrate_step(recording, lux=self.lux)), {}
+            told = read_triggers(self.triggers, recording.events) if self.triggers else None
+            return Measured(calibrate_step(recording, lux=self.lux, triggers_us=told)), {}
         found = estimate_noise(recording, lux=self.lux[0] if self.lux else None)
         if self.more:
             others = []

@@ -205,7 +205,25 @@ def _by_light(found: CameraEstimate, bench: Bench, thetas: bench_figures.Sides) 
     lasting = [v for level in bench.levels for v in (level.up_s, level.down_s) if v is not None]
     if lasting:
         panels.append(_speed(bench, unit))
+    if bench.latency:
+        panels.append(_latency(bench, unit))
     return panels
+
+
+def _latency(bench: Bench, unit: str) -> Panel:
+    rows = [[number(v.light), f"{bench_figures.contrast(v.change):+.0f}", str(v.steps),
+             number(1e3 * v.seconds) if v.std_s is None else spread(1e3 * v.seconds, 1e3 * v.std_s),
+             number(1e3 * v.jitter_s), f"{v.responded:.0%}"] for v in bench.latency]
+    return Panel("latency", "Latency against contrast and light", grid([figure(
+        page.drawing(bench_figures.latency(bench), "latency over size of a step"),
+        "Bars: jitter. Darker: towards more light.")], 26) + table(
+            [f"to light{unit}", "change [%]", "steps", "latency [ms]", "jitter [ms]",
+             "pixels that answer"], rows) + paragraph(
+            "From a step's trigger to a pixel's first event of its direction: median over pixels "
+            "and repetitions, with the error that follows from how much these differ; jitter is "
+            "half of what the middle 68 % span. The light's own edge is part of it, and so is what "
+            "the pixel still had to go to its threshold, more of it after a step in the other "
+            "direction.", "note"))
 
 
 def _speed(bench: Bench, unit: str) -> Panel:
@@ -214,6 +232,8 @@ def _speed(bench: Bench, unit: str) -> Panel:
             number(1e3 * seconds), f"{cutoff_hz(max(seconds, 1e-6)):.0f}"]
 
     rows = [[number(v.light), *cells(v.up_s), *cells(v.down_s)] for v in bench.levels]
+    seen = "" if bench.latency else (
+        " Latency needs the instants of the edges: --triggers.")
     dead = (f"Dead time of a pixel: {spread(1e3 * bench.dead.seconds, 1e3 * bench.dead.std_s)} ms."
             if bench.dead.measured else
             "No dead time is seen: no step makes enough pixels fire as fast as they can.")
@@ -223,8 +243,7 @@ def _speed(bench: Bench, unit: str) -> Panel:
              "cutoff at least [Hz]"], rows) + paragraph(
             "From half to nine tenths of a step, as its events tell, steps of three thresholds or "
             "more; the light's own edge is part of it: the pixels are at least as fast. The "
-            f"cutoff is that of a first-order low-pass which takes as long. {dead} Latency itself "
-            "needs the instant of the edge (a trigger), which frames do not tell.", "note"))
+            f"cutoff is that of a first-order low-pass which takes as long. {dead}{seen}", "note"))
 
 
 def _facts(recording: Recording, source: Source) -> Panel:

@@ -115,8 +115,28 @@ def speed(bench: Bench) -> bytes:
                       color=SIDES[side][1], label=title)
         _light_axis(axis, bench, list(bench.levels))
         axis.set_ylabel("50 to 90 % of a step [ms]")
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.1 * axis.dataLim.ymax)
         axis.legend()
+
+    return svg(draw, WIDTH, HEIGHT)
+
+
+def latency(bench: Bench) -> bytes:
+    """Median latency and jitter over the size of a step, the darker the more light it leads to."""
+    lights = sorted({v.light for v in bench.latency})
+
+    def draw(axis: Any) -> None:
+        for side, (title, colour) in SIDES.items():
+            own = [v for v in bench.latency if (v.change > 0) == (side == "on")]
+            for i, v in enumerate(own):
+                axis.errorbar(abs(v.change), 1e3 * v.seconds, 1e3 * v.jitter_s, color=colour,
+                              marker="o", ms=4, capsize=2, lw=1.0,
+                              alpha=0.35 + 0.65 * (1 + lights.index(v.light)) / len(lights),
+                              label=title if not i else None)
+        axis.set(xlabel="size of the step [natural log units]", ylabel="latency [ms]")
+        axis.set_xlim(left=0)
+        axis.set_ylim(bottom=0)
+        axis.legend(loc="upper right")
 
     return svg(draw, WIDTH, HEIGHT)
 

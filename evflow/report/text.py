@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from evflow.estimation.bench.levels import Bench
 from evflow.estimation.result import CameraEstimate
-from evflow.report.page import plural, spread
+from evflow.report.page import number, plural, spread
 
 LABELS = {
     "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON (Hz/pixel)",
@@ -19,13 +20,28 @@ def describe(found: CameraEstimate) -> str:
     std = dataclasses.asdict(found.summary_std)
     lines = [_line(found, name, float(value), float(std[name]))
              for name, value in dataclasses.asdict(found.summary).items()]
-    lines += measured(found)
+    lines += [*measured(found), *(by_light(found.bench) if found.bench else ())]
     events = f"from {int(found.n_events.sum()):,} events"
     parts = plural(found.windows, "step" if found.bench else "window")
     lines.append(f"{events} in {parts}; {found.valid.mean():.0%} of the pixels have events of "
                  "their own" if found.windows else f"{events} of a static scene")
     lines += [f"note: {note}" for note in found.notes]
     return "\n".join(lines)
+
+
+def by_light(bench: Bench) -> list[str]:
+    """Noise at each illuminance, and latency by kind of step, a line each."""
+    unit = {"DN": " DN", "lux": " lux", "light": ""}[bench.unit]
+    levels = bench.levels if bench.unit == "lux" and len(bench.levels) > 1 else ()
+    return [*(f"{f'noise at {level.light:g}{unit}':22} ON {spread(level.eta_on, level.eta_on_std)}"
+              f", OFF {spread(level.eta_off, level.eta_off_std)} Hz/pixel" for level in levels),
+            *(f"{f'latency to {v.light:.3g}{unit}':22} {100 * math.expm1(v.change):+.0f} %: "
+              f"{_ms(v.seconds, v.std_s)} ms, jitter {1e3 * v.jitter_s:.3g} ms, "
+              f"{v.responded:.0%} of the pixels" for v in bench.latency)]
+
+
+def _ms(seconds: float, std: float | None) -> str:
+    return number(1e3 * seconds) if std is None else spread(1e3 * seconds, 1e3 * std)
 
 
 def _line(found: CameraEstimate, name: str, value: float, std: float) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 
 from evflow.camera import THETA_MIN, Camera, Summary
 from evflow.errors import EvflowDataError
+from evflow.estimation.bench.latency import measured_latency
 from evflow.estimation.bench.levels import Unit, few_sizes, light_of_rests, measured_bench
 from evflow.estimation.bench.rests import check_steps, find_rests
 from evflow.estimation.bench.steps import (
@@ -76,18 +77,20 @@ class Steps:
 def calibrate_step(
     recording: Recording, *, rests_us: Sequence[Span] | None = None,
     light: Sequence[float] | None = None, lux: Sequence[float] | None = None,
-    fresh: bool = False, literal: bool = False,
+    triggers_us: Sequence[int] | np.ndarray | None = None, fresh: bool = False,
+    literal: bool = False,
 ) -> CameraEstimate:
     """Thresholds, and the noise of the rests, from a screen whose light steps between rests.
 
     rests_us: (begin, end) of each rest in us; found in the frames if left out. light: its light
     (any linear unit: lux, cd/m2) at each rest; the mean of the frames there if left out. lux:
-    instead, that of each level which the frames rest at, darkest first. fresh: the memory is at the
-    light of the first rest, as in a simulation; a running camera's may be
-    anywhere. literal: theta = dlogI / events, the paper's own words; the std then counts a whole
-    event. A polarity's map is measured where a pixel has 2 of its events; else it is the camera's
-    median. Raises EV001 (no events), EV011 (no frames and no light), EV017 (frames that show no two
-    rests, or no screen that steps), EV020.
+    instead, that of each level which the frames rest at, darkest first. triggers_us: instants of
+    the light's edges, for the latency of the pixels. fresh: the memory is at the light of the first
+    rest, as in a simulation; a running camera's may be anywhere. literal: theta = dlogI / events,
+    the paper's own words; the std then counts a whole event. A polarity's map is measured where a
+    pixel has 2 of its events; else it is the camera's median. Raises EV001 (no events), EV011 (no
+    frames and no light), EV012 (no trigger at a step), EV017 (frames that show no two rests, or no
+    screen that steps), EV020.
     """
     steps = _steps(recording, rests_us, light, tuple(lux or ()))
     _check_polarity(steps)
@@ -119,6 +122,10 @@ def calibrate_step(
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.quiet, steps.light,
         np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan))
+    if triggers_us is not None:
+        shown = dataclasses.replace(shown, latency=measured_latency(
+            recording.events, triggers_us, steps.spans, [begin for begin, _ in steps.quiet],
+            steps.light, np.median(steps.levels, (1, 2)), kept))
     return dataclasses.replace(
         found, bench=shown, sensor_std={"refractory_s": shown.dead.std_s},
         sensor=dataclasses.replace(found.sensor, refractory_s=shown.dead.seconds))

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.estimation.bench.latency import Latency
 from evflow.estimation.dead_time import DeadTime, dead_time
 from evflow.notes import Note
 from evflow.types import Events
@@ -61,19 +62,22 @@ class Step:
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """What `CameraEstimate.bench` holds. unit: of the light, "light" where it
-    was given without one; levels: darkest first; steps: in order
-    of time, none of a static scene; dead: time of the pixels, where their events show one."""
+    """What `CameraEstimate.bench` holds. unit: of the light, "light" where it was given without
+    one; levels: darkest first; steps: in order of time, none of a static scene; dead: time of the
+    pixels, where their events show one; latency: by kind of step, where triggers tell its
+    instants."""
 
     unit: Unit
     levels: tuple[Level, ...]
     steps: tuple[Step, ...] = ()
     dead: DeadTime = UNSEEN
+    latency: tuple[Latency, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready values."""
         return {"unit": self.unit, "levels": [dataclasses.asdict(v) for v in self.levels],
                 "steps": [dataclasses.asdict(v) for v in self.steps],
+                "latency": [dataclasses.asdict(v) for v in self.latency],
                 "dead_time_s": self.dead.seconds if self.dead.measured else None,
                 "dead_time_s_std": self.dead.std_s if self.dead.measured else None}
 

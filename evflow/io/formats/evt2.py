@@ -9,6 +9,7 @@ time word have no time and are left out.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.io.decode import prophesee
-from evflow.io.decode.stream import Chunk, Clock, Reserved, collect, typed, words
+from evflow.io.decode.stream import Chunk, Clock, Damage, Reserved, collect, typed, words
 from evflow.io.hints import Hints
 from evflow.notes import Note
 from evflow.types import Recording
@@ -24,7 +25,7 @@ from evflow.types import Recording
 NAME = "evt2"
 EXTENSIONS: tuple[str, ...] = (".raw",)
 
-TIME, TRIGGER = 0x8, 0xA
+TIME, TRIGGER, NEITHER = 0x8, 0xA, 0xF
 RESERVED = np.array([kind not in (0, 1, TIME, TRIGGER, 0xE, 0xF) for kind in range(16)])
 
 
@@ -46,6 +47,23 @@ def read(path: Path, hints: Hints) -> Recording:
     source = words(path, header.start, f"{header.order}u4")
     return collect(path, decoder.chunks(source), hints, size,
                    lambda: (*notes, *told, *decoder.notes()))
+
+
+def triggers(path: Path) -> np.ndarray:
+    """Times (N,) int64 us of the trigger words, of rising and falling edges."""
+    header = prophesee.raw(path)[0]
+    return trigger_times(words(path, header.start, f"{header.order}u4"))
+
+
+def trigger_times(source: Iterator[tuple[int, np.ndarray]]) -> np.ndarray:
+    """Of words of 32 bits, up to damage."""
+    decoder, found = Decoder(), [np.zeros(0, np.int64)]
+    with contextlib.suppress(Damage):
+        for _, table in source:
+            kind = (table >> 28).astype(np.uint8)
+            found.append(decoder.timed(table, np.where(
+                kind == TRIGGER, 0, np.where(kind == TIME, TIME, NEITHER)))[2])
+    return np.concatenate(found)
 
 
 class Decoder:

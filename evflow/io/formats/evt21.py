@@ -48,6 +48,14 @@ def read(path: Path, hints: Hints) -> Recording:
                    lambda: (*notes, *guessed, *told, *decoder.notes()))
 
 
+def triggers(path: Path) -> np.ndarray:
+    """Times (N,) int64 us of the trigger words, of rising and falling edges."""
+    header = prophesee.raw(path)[0]
+    swapped = _halves_swapped(path, header)[0]
+    source = _whole(words(path, header.start, f"{header.order}u8"), swapped)
+    return evt2.trigger_times((byte, (table >> HALF).astype(np.uint32)) for byte, table in source)
+
+
 class Decoder(evt2.Decoder):
     """That of EVT 2.0, for words that stand for several events."""
 

@@ -10,13 +10,14 @@ skipped, as are events before the first row, time or base.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from evflow.io.decode import prophesee
-from evflow.io.decode.stream import Chunk, Clock, Reserved, collect, hold, typed, words
+from evflow.io.decode.stream import Chunk, Clock, Damage, Reserved, collect, hold, typed, words
 from evflow.io.formats.evt2 import leftovers
 from evflow.io.hints import Hints
 from evflow.notes import Note
@@ -54,6 +55,20 @@ def read(path: Path, hints: Hints) -> Recording:
                    lambda: (*notes, *told, *decoder.notes()))
 
 
+def triggers(path: Path) -> np.ndarray:
+    """Times (N,) int64 us of the trigger words, of rising and falling edges."""
+    header = prophesee.raw(path)[0]
+    decoder, found = Decoder(), [np.zeros(0, np.int64)]
+    with contextlib.suppress(Damage):
+        for _, table in words(path, header.start, f"{header.order}u2"):
+            kind = table >> 12
+            asked = kind == TRIGGER
+            found.append(decoder.times(table, kind, np.cumsum(asked, dtype=np.int32),
+                                       int(asked.sum())))
+    times = np.concatenate(found)
+    return times[times != NEVER]
+
+
 class Decoder:
     """The state between chunks: time, row, vector base, and what was not read. unit: what the
     places of the source count."""
@@ -74,7 +89,7 @@ class Decoder:
         before = np.cumsum(emits, dtype=np.int32)  # emitting words before each word
         word, kind_of = table[rows], kind[rows]
         single = kind_of == SINGLE
-        t = self._times(table, kind, before, len(rows))
+        t = self.times(table, kind, before, len(rows))
         y = self._rows(table, kind, before, len(rows))
         x, p = self._columns(table, kind, before, kind_of)
         value = word & 0x7FF
@@ -83,7 +98,7 @@ class Decoder:
         mask = np.where(single, np.uint16(1), word & MASK[kind_of])
         return self._expand(x, y, t, p, mask, rows, byte)
 
-    def _times(
+    def times(
         self, table: np.ndarray, kind: np.ndarray, before: np.ndarray, n: int
     ) -> np.ndarray:
         """Time (n,) int64 us of each emitting word."""

@@ -293,14 +293,20 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
                      "--no-plots", "--json", *more])
         return code, capsys.readouterr().out
 
-    code, out = run(source, "step")
+    edges = tmp_path / "edges.txt"
+    edges.write_text("".join(f"{0.099 + 0.12 * k}\n" for k in range(len(CYCLES) - 1)))
+    code, out = run(source, "step", "--triggers", str(edges))
     said = json.loads(out)
     assert (code, said["protocol"], said["grade"]) == (0, "step", "fair")  # of two levels alone
     assert [level["light"] for level in said["bench"]["levels"]] == pytest.approx([25, 225])
     page = (tmp_path / "step" / "report.html").read_text()
-    assert page.count("<section") == 9
+    # A ramp of 2.2 log units in 20 ms: a threshold, and the half that is left after a turn.
+    down, up = said["bench"]["latency"]
+    assert up["seconds"] == pytest.approx(1.5 * 0.2 / 2.2 * 0.02, rel=0.3)
+    assert down["seconds"] == pytest.approx(1.5 * 0.25 / 2.2 * 0.02, rel=0.3)
+    assert page.count("<section") == 10
     assert "% of contrast" not in page  # the terminal's word
-    for word in ("2 levels of light", "one size", "S-curves", "light [DN]"):
+    for word in ("2 levels of light", "one size", "S-curves", "light [DN]", "Latency against"):
         assert word in page
     found = Camera.load(tmp_path / "step" / "camera.npz")
     assert abs(float(jnp.median(found.theta_on)) - 0.2) < 0.01
@@ -323,6 +329,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (["two.npz", "--protocol", "static"], "0 values of --lux for 2 recordings"),
     (["--protocol", "static", "--lux", "1", "2"], "2 values of --lux for 1 recording"),
     (["--protocol", "static", "--lux", "-1"], "--lux -1"),
+    (["--protocol", "static", "--triggers", "t.txt"], "--triggers: of use with --protocol step"),
 ])
 def test_illuminances_go_with_recordings(
     words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

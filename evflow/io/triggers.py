@@ -1,0 +1,66 @@
+"""Instants that something beside the camera tells: trigger events, or a text file of times."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.files.limits import read_whole
+from evflow.io.decode import prophesee
+from evflow.io.decode.text import HEAD
+from evflow.io.decode.units import UNITS_US, shared_unit
+from evflow.io.formats import evt2, evt3, evt21
+from evflow.io.images.frames import existing
+from evflow.types import Events
+
+MAX_BYTES = 1 << 26  # of text: some four million instants
+WORDS = {"EVT2": evt2.triggers, "EVT2.1": evt21.triggers, "EVT3": evt3.triggers}
+EXPECTED = ("Expected a text file of one time a line, on the clock of the events, or Prophesee RAW "
+            "with trigger events.")
+
+
+def read_triggers(path: Path, events: Events) -> np.ndarray:
+    """Instants (N,) int64 us: rising and falling edges in Prophesee RAW, or the first number of
+    each line of a text file, in the unit in which they lie among the events.
+
+    Raises EV001 (none), EV008 (neither), EV012 (outside the events in any unit), EV016.
+    """
+    with open(existing(path), "rb") as opened:
+        head = opened.read(HEAD)
+    encoding = prophesee.sniffed(path, head)
+    if encoding:
+        found = WORDS[encoding](path) if encoding in WORDS else np.zeros(0, np.int64)
+        if not len(found):
+            raise EvflowDataError("EV001", f"{path} holds no trigger events.", EXPECTED, where=path)
+        return found
+    times = np.array(_first_numbers(path))
+    if not len(times):
+        raise EvflowDataError("EV001", f"{path} holds no times.", EXPECTED, where=path)
+    unit = shared_unit(times, events.t, ["us", *(u for u in UNITS_US if u != "us")])
+    if unit is None:
+        raise EvflowDataError(
+            "EV012", f"the times of {path}, {times.min():g} to {times.max():g}, lie outside the "
+            f"events, {events.t[0]} to {events.t[-1]} us, in any unit.",
+            "Give them on the clock of the events.", where=path)
+    return np.rint(times * UNITS_US[unit]).astype(np.int64)
+
+
+def _first_numbers(path: Path) -> list[float]:
+    found = []
+    for number, line in enumerate(read_whole(path, MAX_BYTES).decode("utf-8", "replace")
+                                  .splitlines(), 1):
+        words = re.split(r"[\s,;]+", line.partition("#")[0].strip())
+        if words == [""]:
+            continue
+        try:
+            found.append(float(words[0]))
+        except ValueError:
+            if number > 1:  # the first line may name the columns
+                raise EvflowDataError("EV008", f"line {number} of {path} begins with {words[0]!r}.",
+                                      EXPECTED, where=path) from None
+    if not np.isfinite(found).all():
+        raise EvflowDataError("EV007", f"{path} holds times that are not finite.", where=path)
+    return found
