@@ -27,6 +27,8 @@ REACH = 33  # halved pixels: from how far away acceleration is taken where flow 
 COVERED = 5  # halved pixels around flow that is not trusted: parts of DIS' patches
 MIDDLE = np.array([9, -50, 225, 225, -50, 9], np.float32) / 368  # Lanczos' kernel of 3 pixels half
 # way between two
+BAND, TOGETHER = 1 << 15, 1 << 24  # pixels whose ways are worked out at a time, so that caches hold
+# much of them, for pictures of so many bytes
 BENT_PX = 0.05  # an acceleration that moves less is left out
 
 
@@ -36,6 +38,11 @@ class Frame:
 
     dn: np.ndarray
     time: int
+
+    @functools.cached_property
+    def ends(self) -> tuple[float, float]:
+        """The least and the most DN."""
+        return float(self.dn.min()), float(self.dn.max())
 
     @functools.cached_property
     def doubled(self) -> np.ndarray:
@@ -77,18 +84,34 @@ class Interval:
             for s in fractions:
                 yield cv2.addWeighted(self.a.dn, 1 - s, self.b.dn, s, 0)
             return
-        a, b = (self.a.doubled, self.b.doubled) if sharp else (self.a.dn, self.b.dn)
-        how = cv2.INTER_CUBIC if sharp else cv2.INTER_LINEAR
-        scale = np.float32(2 if sharp else 1)
-        minus_there = -scale * self.motion.there
-        apart = scale * (self.motion.there + self.motion.back)
-        places, bends = scale * self.grid, [scale * bend for bend in self.bends or ()]
-        least = min(float(self.a.dn.min()), float(self.b.dn.min()))
-        most = max(float(self.a.dn.max()), float(self.b.dn.max()))
+        frames = (self.a.doubled, self.b.doubled) if sharp else (self.a.dn, self.b.dn)
+        shares, shape, reach = list(fractions), self.a.dn.shape, self._reach()
+        height, band = shape[0], max(1, BAND // shape[1])
+        most = max(1, TOGETHER // self.a.dn.nbytes)
+        for first in range(0, len(shares), most):
+            some = shares[first : first + most]
+            pictures = np.empty((len(some), *shape), np.float32)
+            for top in range(0, height, band):
+                rows = slice(top, min(top + band, height))
+                edges = list(_edges(rows, shape, reach))
+                self._fill(pictures[:, rows], some, rows, edges, frames, sharp)
+            yield from pictures
+
+    def _fill(
+        self, pictures: np.ndarray, fractions: list[float], rows: slice,
+        edges: list[tuple[slice, slice]], frames: tuple[np.ndarray, np.ndarray], sharp: bool,
+    ) -> None:
+        """Some rows of the pictures (N, rows, W). edges: parts of them from where something outside
+        the frames may be looked up; frames: doubled where sharp."""
+        a, b = frames
+        how, scale = (cv2.INTER_CUBIC, 2) if sharp else (cv2.INTER_LINEAR, 1)
+        there, back, places, *bends = (np.float32(scale) * values[rows] for values in (
+            self.motion.there, self.motion.back, self.grid, *(self.bends or ())))
+        apart, minus_there = there + back, -there
+        (least_a, most_a), (least_b, most_b) = self.a.ends, self.b.ends
         along, to_a, to_b = (np.empty_like(apart) for _ in range(3))  # new memory costs more
-        seen_a, seen_b = np.empty_like(self.a.dn), np.empty_like(self.a.dn)
-        edges = list(_edges(self.a.dn.shape, self._reach()))
-        for s in fractions:
+        seen_a, seen_b = np.empty_like(pictures[0]), np.empty_like(pictures[0])
+        for s, picture in zip(fractions, pictures, strict=True):
             # flow from the new picture: the quadratic blend of the two measured ones, which is
             # exact for constant velocity, and what acceleration moves it by
             cv2.scaleAdd(apart, s, minus_there, along)
@@ -98,12 +121,12 @@ class Interval:
             cv2.subtract(to_a, along, to_b)
             looked_up(a, to_a, how, seen_a)
             looked_up(b, to_b, how, seen_b)
-            picture = cv2.addWeighted(seen_a, 1 - s, seen_b, s, 0)
+            cv2.addWeighted(seen_a, 1 - s, seen_b, s, 0, picture)
             for edge in edges:
                 in_a, in_b = inside(to_a[edge], a.shape), inside(to_b[edge], b.shape)
                 cv2.copyTo(seen_a[edge], cv2.compare(in_a, in_b, cv2.CMP_GT), picture[edge])
                 cv2.copyTo(seen_b[edge], cv2.compare(in_b, in_a, cv2.CMP_GT), picture[edge])
-            yield np.clip(picture, least, most, out=picture)
+            np.clip(picture, min(least_a, least_b), max(most_a, most_b), out=picture)
 
     def _reach(self) -> int:
         """Pixels beyond which nothing is looked up, from any fraction of the interval."""
@@ -112,15 +135,16 @@ class Interval:
         return math.ceil(max(flows) + bent) + 1
 
 
-def _edges(shape: tuple[int, ...], reach: int) -> Iterator[tuple[slice, slice]]:
-    """Parts of a frame (H, W) that hold all that lies within `reach` of its edge; none twice."""
-    height, width = shape
-    if 2 * reach >= min(height, width):
-        yield slice(None), slice(None)
-        return
-    yield from ((rows, slice(None)) for rows in (slice(reach), slice(height - reach, None)))
-    rows = slice(reach, height - reach)
-    yield from ((rows, columns) for columns in (slice(reach), slice(width - reach, None)))
+def _edges(rows: slice, shape: tuple[int, ...], reach: int) -> Iterator[tuple[slice, slice]]:
+    """Parts of some rows of a frame (H, W), from the first of them on, that hold all that lies
+    within `reach` of its edge; none twice."""
+    (height, width), count = shape, rows.stop - rows.start
+    top = min(max(reach - rows.start, 0), count)
+    bottom = min(max(height - reach - rows.start, top), count)
+    columns = [slice(None)] if 2 * reach >= width else [slice(reach), slice(width - reach, None)]
+    parts = [(slice(top), slice(None)), *((slice(top, bottom), some) for some in columns),
+             (slice(bottom, count), slice(None))]
+    yield from ((along, across) for along, across in parts if along.stop > (along.start or 0))
 
 
 def intervals(

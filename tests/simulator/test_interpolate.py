@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.videos import code_of
 
+import evflow.simulator.between as ways_between
 from evflow.errors import EvflowDataError
 from evflow.notes import Note
 from evflow.simulator.between import _edges, intervals
@@ -145,14 +146,32 @@ def test_lengths_of_flow_do_not_depend_on_where_they_lie_in_memory() -> None:
 
 @pytest.mark.parametrize("shape", [(20, 30), (20, 31), (7, 40)])
 @pytest.mark.parametrize("reach", [1, 3, 9, 10, 400])
-def test_edges_hold_all_that_is_near_the_border_once(shape: tuple[int, int], reach: int) -> None:
+@pytest.mark.parametrize("band", [1, 4, 40])
+def test_edges_hold_all_that_is_near_the_border_once(
+    shape: tuple[int, int], reach: int, band: int
+) -> None:
     seen = np.zeros(shape, int)
-    for edge in _edges(shape, reach):
-        seen[edge] += 1
+    for top in range(0, shape[0], band):
+        rows = slice(top, min(top + band, shape[0]))
+        for edge in _edges(rows, shape, reach):
+            seen[rows][edge] += 1
     y, x = np.indices(shape)
     near = np.minimum(np.minimum(y, shape[0] - 1 - y), np.minimum(x, shape[1] - 1 - x)) < reach
     assert seen.max() == 1
     assert (seen[near] == 1).all()
+
+
+def test_pictures_do_not_depend_on_how_much_is_made_at_a_time(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    *_, interval = intervals([(shifted(4 * k), 1_000 * k) for k in range(4)])
+    shares = [0.1, 0.4, 0.7, 0.9]
+    for sharp in (True, False):
+        whole = list(interval.at(shares, sharp=sharp))
+        monkeypatch.setattr(ways_between, "BAND", 3 * whole[0].shape[1])
+        monkeypatch.setattr(ways_between, "TOGETHER", 3 * whole[0].nbytes)
+        np.testing.assert_array_equal(list(interval.at(shares, sharp=sharp)), whole)
+        monkeypatch.undo()
 
 
 def test_empty_and_single() -> None:
