@@ -6,8 +6,9 @@ stay instant.
 
 from evflow.process import early
 
-if early.is_command():
-    early.end_on_interrupt()  # before anything else is loaded
+if early.is_command():  # before anything else is loaded
+    early.end_on_interrupt()
+    early.save_time()
 
 import lazy_loader
 

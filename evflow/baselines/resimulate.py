@@ -46,7 +46,7 @@ class Scene:
         the first frame's brightness, 0 where it may lie anywhere between the thresholds."""
         totals = np.zeros((len(rows), 4, 2))
         for i, c in enumerate(self.chunks):
-            draws = draw(jax.random.fold_in(key, i), c.bright.shape, len(c.dt_s), self.steps)
+            draws = draw(key, i, c.bright.shape, len(c.dt_s), self.steps)
             start = np.full(2, 0.0 if i else fresh, np.float32)
             for total, row in zip(totals, np.asarray(rows, np.float32), strict=True):
                 made = trace_of_camera(draws, c.path, c.dt_s, draws.thresholds(row), row[2:4],

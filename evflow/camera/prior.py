@@ -5,13 +5,14 @@ Eq. 12). The pixels around it are camera.py's.
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.light.log_maps import Values
 
 Array = jax.Array
 
@@ -85,12 +86,14 @@ class CameraPrior:
                                   "A standard deviation of log eta: >= 0.")
 
 
-def noise_of_threshold(theta: Array) -> Array:
+def noise_of_threshold(theta: Values) -> Values:
     """R(theta) = 4 / (90 theta - 5) of Eq. 12, clipped to the paper's range [.1, 1] Hz.
 
-    The pole at theta = .0556 lies inside the clip: smaller thresholds get 1 Hz.
+    The pole at theta = .0556 lies inside the clip: smaller thresholds get 1 Hz. Of NumPy arrays
+    it is worked out on the host.
     """
-    return jnp.clip(4.0 / (90.0 * jnp.maximum(theta, 0.1) - 5.0), 0.1, 1.0)
+    of: Any = np if isinstance(theta, np.ndarray) else jnp
+    return of.clip(4.0 / (90.0 * of.maximum(theta, 0.1) - 5.0), 0.1, 1.0)
 
 
 def sample_nominal(

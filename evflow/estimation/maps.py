@@ -70,8 +70,9 @@ def with_rates(
     for name, (events, seconds), relative in zip(("eta_on", "eta_off"), quiet, law, strict=True):
         mean, error = (float(getattr(s, name)) for s in (summary, summary_std))
         rate, own = pixel_rates(events, seconds, mean, hot, relative)
-        rates[name] = jnp.asarray(rate, jnp.float32)
-        errors[name] = jnp.asarray(np.hypot(own, rate * (error / mean)), jnp.float32)
+        rates[name] = jax.device_put(rate.astype(np.float32))
+        errors[name] = jax.device_put(
+            np.hypot(own, rate * (error / mean)).astype(np.float32))
     return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)
 
 

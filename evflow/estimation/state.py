@@ -196,7 +196,8 @@ def refine(state: State) -> Refined:
         return Refined(hot, state.chunks, summary, std)
     found = state.eyes.found
     hot = hot_pixels(
-        state.quiet, float(summary.eta_on + summary.eta_off), state.n_events, state.seconds)
+        state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
+        state.n_events, state.seconds)
     chunks = tuple(_without_hot(c, hot) for c in state.chunks)
     summary, std = maps.refined(state.params, list(chunks), summary, std)
     forget(*(c.path for c in chunks))

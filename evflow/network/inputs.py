@@ -27,7 +27,7 @@ LONGEST_WINDOW_S = 10.0  # a hundred times the longest of the training: microsec
 
 def real(values: ArrayLike) -> Array:
     """As float32; float64 stays where JAX's x64 mode keeps it."""
-    values = jnp.asarray(values)
+    values = jax.device_put(values) if isinstance(values, np.ndarray) else jnp.asarray(values)
     return values if values.dtype == jnp.float64 else values.astype(jnp.float32)
 
 

@@ -17,9 +17,9 @@ LABELS = {
 
 def describe(found: CameraEstimate) -> str:
     """The summary as a table, then what to know before trusting it."""
-    std = dataclasses.asdict(found.summary_std)
-    lines = [_line(found, name, float(value), float(std[name]))
-             for name, value in dataclasses.asdict(found.summary).items()]
+    names = [field.name for field in dataclasses.fields(found.summary)]
+    lines = [_line(found, name, float(getattr(found.summary, name)),
+                   float(getattr(found.summary_std, name))) for name in names]
     lines += [*measured(found), *(by_light(found.bench) if found.bench else ())]
     events = f"from {int(found.n_events.sum()):,} events"
     parts = plural(found.windows, "step" if found.bench else "window")

@@ -110,7 +110,7 @@ def seen_frames(
             old, u, pace, last_us = before
             s = _step(old, u, now, 0.5 * (pace + rate), np.float32((t_us - last_us) * 1e-6))
         before = s, now, rate, t_us
-        yield np.minimum(np.asarray(_as_dn(s - darker)), 255), t_us + round(seen_by.delay_s * 1e6)
+        yield np.asarray(_shown(s, darker)), t_us + round(seen_by.delay_s * 1e6)
 
 
 def _light(
@@ -128,4 +128,10 @@ def _followed(s: Array, before: Array, now: Array, rate: Array, dt_s: Array) -> 
     return now - lag + (s - before + lag) * jnp.exp(-rate * dt_s)
 
 
-_light_of_frame, _step, _as_dn = jax.jit(_light), jax.jit(_followed), jax.jit(lin_log_inverse)
+@jax.jit
+def _shown(s: Array, darker: ArrayLike) -> Array:
+    """The frame in DN of 0..255 that shows s, darker by so many log units."""
+    return jnp.minimum(lin_log_inverse(s - darker), 255.0)
+
+
+_light_of_frame, _step = jax.jit(_light), jax.jit(_followed)

@@ -126,8 +126,7 @@ class Fit:
         """Moments of a camera on chunk i, each once: a pass asks for what the last one asked."""
         known, c = (i, row.tobytes(), start.tobytes()), self.chunks[i]
         if i not in self.draws:
-            self.draws[i] = draw(jax.random.fold_in(self.key, np.uint32(i)), c.bright.shape,
-                                 len(c.dt_s), STEPS)
+            self.draws[i] = draw(self.key, i, c.bright.shape, len(c.dt_s), STEPS)
         if known not in self.simulated:
             draws = self.draws[i]
             trace = trace_of_camera(
@@ -205,9 +204,12 @@ class Fit:
                 tied * away, np.array([tied])]
 
 
+_dn = jax.jit(lin_log_inverse)
+
+
 def _mean_factor(chunks: list[Chunk]) -> float:
     """Mean intensity factor of Eq. 12 over the frames."""
-    frames = (np.asarray(lin_log_inverse(jnp.asarray(c.path[::STEPS]))) for c in chunks)
+    frames = (np.asarray(_dn(c.path[::STEPS])) for c in chunks)
     return float(np.mean([noise_factor(normalised_intensity(dn)).mean() for dn in frames]))
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import noise_of_threshold
@@ -124,7 +123,7 @@ def tied_rates(
     theta: np.ndarray, theta_std: np.ndarray, factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Noise rates (2,) in Hz that Eq. 12 foretells at theta (2,), and their relative error."""
-    rates = np.asarray(noise_of_threshold(jnp.asarray(theta)), np.float64) * factor
+    rates = np.asarray(noise_of_threshold(theta.astype(np.float32)), np.float64) * factor
     slope = 90.0 / np.maximum(90.0 * theta - 5.0, 4.0) * (theta > 0.1)  # -dlog R/dtheta
     return rates, np.sqrt((slope * theta_std) ** 2 + TIED_ERROR**2)
 

@@ -104,14 +104,23 @@ def _undecided(p: _Places, bright: Array, table: Array) -> Array:
 def _cumulated(s: Sightings, length: int, steps: int) -> Array:
     """(2, length + 1, H + 1, W + 1) int32: events before each fine step, row and column."""
     step = np.minimum(((s.interval + s.fraction) * steps).astype(np.int64), length - 1)
-    (height, width), side = s.shape, np.where(s.on, 0, 1)
-    out = np.zeros((2, length + 1, height + 1, width + 1), np.int32)
-    row = (side * (length + 1) + step + 1) * (height + 1) + s.pixel // width + 1
-    # Added in place: a histogram would be a copy of the table, and of twice its size.
-    np.add.at(out.reshape(-1), row * (width + 1) + s.pixel % width + 1, 1)
-    for axis in (1, 2, 3):
-        np.cumsum(out, axis, out=out)
+    key = np.where(s.on, 0, length) + step
+    order = np.argsort(key, kind="stable")
+    pixel, ends = s.pixel[order], np.searchsorted(key[order], np.arange(2 * length + 1))
+    out = np.zeros((2, length + 1, s.shape[0] + 1, s.shape[1] + 1), np.int32)
+    # Image by image, which stays in the cache: a fifth of the time of sums over the whole table.
+    for k, (first, last) in enumerate(itertools.pairwise(ends)):
+        side, at = divmod(k, length)
+        counts = np.bincount(pixel[first:last], minlength=s.shape[0] * s.shape[1])
+        np.add(out[side, at], _integral(counts.reshape(s.shape)), out=out[side, at + 1])
     return out
+
+
+def _integral(counts: Array) -> Array:
+    """(H + 1, W + 1) int32: sums of counts (H, W) before each row and column."""
+    if counts.max(initial=0) < 256:
+        return cv2.integral(counts.astype(np.uint8))
+    return np.pad(counts.cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
 
 def _company(table: Array, p: _Places, box: tuple[int, int]) -> Array:

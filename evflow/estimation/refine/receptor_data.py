@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from evflow.estimation.refine.receptor_noise import noise_rates
@@ -68,12 +67,13 @@ def _of_both(on: np.ndarray) -> np.ndarray:
 def smeared_sample(data: Sample, seconds: float) -> Sample:
     """The sample with each count replaced by its mean over that time (smear.py)."""
     on, off = np.array(data.on), np.array(data.off)
+    weight, pixel, at = (np.asarray(a) for a in (data.weight, data.pixel, data.at))
     for c, dt_s in enumerate(np.asarray(data.dt_s)):
-        used = np.flatnonzero(np.asarray(data.weight[c]) > 0)
-        place = np.asarray(data.pixel[c])[used], np.asarray(data.at[c])[used]
+        used = np.flatnonzero(weight[c] > 0)
+        place = pixel[c, used], at[c, used]
         for counts in (on[c], off[c]):
             counts[used] = smeared(*place, counts[used], seconds / float(dt_s.mean()))
-    return data._replace(on=jnp.asarray(on), off=jnp.asarray(off))
+    return data._replace(on=jax.device_put(on), off=jax.device_put(off))
 
 
 def _row(

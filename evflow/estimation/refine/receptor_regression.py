@@ -92,7 +92,7 @@ class Regression:
 
     def _by_block(self, phi: np.ndarray, *, slopes: bool) -> np.ndarray:
         sums = _slopes if slopes else _sums
-        return np.asarray(sums(jnp.asarray(phi, jnp.float32), self.by_light, self.data), np.float64)
+        return np.asarray(sums(phi.astype(np.float32), self.by_light, self.data), np.float64)
 
 
 def left_over(products: np.ndarray, theta: np.ndarray) -> float:

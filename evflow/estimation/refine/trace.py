@@ -78,16 +78,20 @@ class Draws:
         return np.maximum(drawn, np.float32(THETA_MIN))
 
 
-def draw(key: jax.Array, shape: tuple[int, int], intervals: int, steps: int) -> Draws:
-    """Draws for a chunk (H, W): cameras that share them differ by their parameters alone."""
-    return Draws(*(np.asarray(a) for a in _drawn(key, shape, intervals, steps)))
+def draw(
+    key: jax.Array, number: int, shape: tuple[int, int], intervals: int, steps: int
+) -> Draws:
+    """Draws for chunk `number`, (H, W): cameras that share them differ by their parameters
+    alone."""
+    return Draws(*(
+        np.asarray(a) for a in _drawn(key, np.uint32(number), shape, intervals, steps)))
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
+@partial(jax.jit, static_argnums=(2, 3, 4))
 def _drawn(
-    key: jax.Array, shape: tuple[int, int], intervals: int, steps: int
+    key: jax.Array, number: jax.Array, shape: tuple[int, int], intervals: int, steps: int
 ) -> tuple[jax.Array, ...]:
-    k_pixels, k_trace = jax.random.split(key)
+    k_pixels, k_trace = jax.random.split(jax.random.fold_in(key, number))
     k_phase, k_noise, k_when = jax.random.split(k_trace, 3)
     each = intervals, 2, *shape
     return (jax.random.normal(k_pixels, (2, *shape)).reshape(2, -1),

@@ -74,7 +74,7 @@ def test_simulated_trace_is_the_trace_of_the_simulated_events(
     frames, times = video
     theta = np.stack([np.ravel(camera.theta_on), np.ravel(camera.theta_off)])
     made = trace_of_camera(
-        draw(jax.random.key(2), SHAPE, INTERVALS, STEPS), np.asarray(lin_log(frames)),
+        draw(jax.random.key(2), 0, SHAPE, INTERVALS, STEPS), np.asarray(lin_log(frames)),
         np.full(INTERVALS, STEPS * 1e-3), theta, np.zeros(2), np.array(FRESH), STEPS)
     seen = trace_of_events(events, times[::STEPS], STEPS)
     np.testing.assert_array_equal(made.counts, seen.counts)
