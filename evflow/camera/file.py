@@ -6,7 +6,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -21,6 +21,7 @@ EXPECTED = ("Expected the camera.npz of evflow estimate (or Camera.save): maps (
             f"{', '.join(PARAMETERS)}.")
 UNITS = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
 Arrays = dict[str, Any]
+QUICK = 1  # level of compression: maps of floats hardly shrink by more work
 
 
 def write_maps(path: str | os.PathLike, maps: Arrays, extra: Arrays, overwrite: bool) -> Path:
@@ -32,9 +33,17 @@ def write_maps(path: str | os.PathLike, maps: Arrays, extra: Arrays, overwrite: 
     arrays = {**maps, **extra}
     with atomic_write(path, overwrite=overwrite) as temporary:
         with open(temporary, "wb") as opened:
-            np.savez_compressed(opened, meta=np.array(json.dumps(UNITS)), **arrays)
+            _write_arrays(opened, {"meta": np.array(json.dumps(UNITS)), **arrays})
         need_members(temporary, {f"{name}.npy": None for name in ("meta", *arrays)})
     return Path(path)
+
+
+def _write_arrays(opened: BinaryIO, arrays: Arrays) -> None:
+    """As np.savez_compressed, which has no level of compression to choose."""
+    with zipfile.ZipFile(opened, "w", zipfile.ZIP_DEFLATED, compresslevel=QUICK) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
 
 
 def read_maps(path: Path) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
