@@ -9,18 +9,15 @@ from typing import Any
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import evflow as ef
 from evflow.errors import EvflowDataError
 from evflow.network.weights import load_weights, model_card
 from evflow.scenes import make_bank
 from evflow.training.options import TrainOptions
 from evflow.training.run import train_network
 from experiments import (
-    ablate,
     calibrate,
     changes,
     coverage,
@@ -32,7 +29,6 @@ from experiments import (
     true_video,
 )
 from experiments.shared import hidden_scene
-from experiments.shared.common import slug
 
 
 def test_quickstart_draws_truth_beside_estimate(
@@ -160,15 +156,3 @@ def test_equal_scores_count_half() -> None:
 def test_the_encoder_is_scored_beside_frames_and_events(tmp_path: Path) -> None:
     result = changes.main(changes.Options(out=tmp_path, batches=1))
     assert result["frames alone"]["log"] < result["no change"]["log"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("study", ["losses", "steps", "networks"])
-def test_ablations_train_and_score(study: ablate.Study, tmp_path: Path) -> None:
-    result = ablate.main(ablate.Options(study, out=tmp_path, steps=2, batches=1))
-    assert len(result) == 2
-    assert all(np.isfinite(row["pixel/theta_on"]) for row in result.values())
-    for name in result:  # weights that estimate
-        params = load_weights(tmp_path / study / f"{slug(name)}.safetensors")
-        seen = ef.estimate(params, jnp.zeros((2, 3, 32)), jnp.zeros((2, 3)))
-        assert np.isfinite(seen.theta_on).all()
