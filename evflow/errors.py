@@ -47,6 +47,7 @@ CODES: dict[str, str] = {
     "EV033": "pixels far busier than their neighbours",
     "EV034": "events and frames are unrelated",
     "EV035": "events bunch at the frames",
+    "EV036": "the light flickers",
 }
 
 

@@ -1,4 +1,4 @@
-"""Time: its unit, gaps and jumps of the events' clock, dropped frames."""
+"""Time: its unit, gaps and jumps of the events' clock, dropped frames, events that keep time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from evflow.io.decode.units import misread
 from evflow.recordings.bunches import bunch
 from evflow.recordings.check.findings import Finding, Severity
+from evflow.recordings.flicker import flicker
 from evflow.recordings.gaps import event_gaps
 from evflow.recordings.windows import DROPPED
 from evflow.types import Recording
@@ -75,3 +76,15 @@ def bunches(recording: Recording) -> list[Finding]:
         "beyond the rate around them.",
         "The readout of frames that disturbs the pixels (as in a DAVIS240C), or light that flashes "
         "with them: a simulation does not make these events, so expect that many fewer.")]
+
+
+def flickers(recording: Recording) -> list[Finding]:
+    """EV036 where the light flickers."""
+    found = flicker(recording.events)
+    return [] if found is None else [Finding(
+        "EV036", "warning", f"the light flickers at {found.hz:.1f} Hz: all over the sensor the "
+        f"rates of ON and OFF events rise and fall with it, by {found.on:.0%} and {found.off:.0%} "
+        "of their mean.",
+        "Lamps on the mains flicker at 100 or 120 Hz, dimmed screens faster. Frames hardly show "
+        "it, so that an estimate finds thresholds too low (by some 10 % in simulations) and noise "
+        "too high: record in daylight or by a DC lamp.")]

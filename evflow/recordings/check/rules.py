@@ -11,7 +11,7 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.io.hints import Told
 from evflow.recordings.check.agreement import agreement
-from evflow.recordings.check.clocks import bunches, clocks
+from evflow.recordings.check.clocks import bunches, clocks, flickers
 from evflow.recordings.check.contents import contents
 from evflow.recordings.check.findings import Finding, Report
 from evflow.recordings.check.images import images
@@ -30,8 +30,8 @@ def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told
     window, EV021 polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned,
     EV025 gaps, EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029
     mirrored frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034
-    unrelated frames, EV035 events that bunch at the frames; and, of a path, whatever the reader
-    refuses.
+    unrelated frames, EV035 events that bunch at the frames, EV036 flickering light; and, of a path,
+    whatever the reader refuses.
 
     Args:
         recording_or_path: the recording, or a file or folder of any known format.
@@ -62,8 +62,10 @@ def _findings(recording: Recording) -> list[Finding]:
     if not len(recording.events):
         return found
     found += clocks(recording)
+    timed = all(f.code != "EV023" for f in found)
+    found += flickers(recording) if timed else []
     found += images(recording)
-    if recording.has_frames and not any(f.code == "EV023" for f in found):
+    if recording.has_frames and timed:
         try:
             check_overlap(recording)
         except EvflowDataError as error:
