@@ -55,6 +55,7 @@ from evflow.network.inputs import (
 )
 from evflow.network.pooling import Stats
 from evflow.network.posterior import of_window
+from evflow.process.chunks import LARGE, on_cpu
 
 __all__ = [
     "Code", "Params", "Stats", "code_from_video", "encode", "estimate", "estimate_with_std",
@@ -131,7 +132,8 @@ def summarize(
     """
     config, net = _pooling_parts(params)
     inputs = prepare(config, voxels, dlogI, window_s, intensity)
-    return _pool(net["summary"], *inputs, config=config)
+    at_a_time = LARGE if on_cpu(inputs) else None  # activations of all would be new memory
+    return _pool(net["summary"], *inputs, config=config, at_a_time=at_a_time)
 
 
 def _pooling_parts(params: Params) -> tuple[ModelConfig, Params]:
@@ -144,12 +146,12 @@ def _pooling_parts(params: Params) -> tuple[ModelConfig, Params]:
     return config, net
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(jax.jit, static_argnames=("config", "at_a_time"))
 def _pool(
     net: Params, voxels: Array, dlogI: Array, window_s: Array, intensity: Array | None, *,
-    config: ModelConfig,
+    config: ModelConfig, at_a_time: int | None,
 ) -> Stats:
-    return pooling.pool(config, net, voxels, dlogI, window_s, intensity)
+    return pooling.pool(config, net, voxels, dlogI, window_s, intensity, at_a_time=at_a_time)
 
 
 def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:

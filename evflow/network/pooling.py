@@ -22,6 +22,7 @@ import jax.numpy as jnp
 
 from evflow.network.config import ModelConfig
 from evflow.network.coordinates import CENTRE, SCALE, per_channel
+from evflow.process.chunks import in_chunks
 
 Array = jax.Array
 
@@ -98,7 +99,8 @@ def pixel_features(voxels: Array, dlogI: Array, context: Array) -> Array:
 
 
 class PixelNet(nn.Module):
-    """Per-pixel part: features (..., F) -> active (A), rates (R) > 0, gate weights (3 G) > 0."""
+    """Per-pixel part: features (..., F) -> active (A), rates (R) before their softplus, gate
+    weights (3 G) > 0."""
 
     config: ModelConfig
 
@@ -108,7 +110,7 @@ class PixelNet(nn.Module):
         for _ in range(2):
             x = nn.relu(nn.Dense(c.summary_hidden)(x))
         active = nn.Dense(c.summary_features)(x)
-        rates = nn.softplus(nn.Dense(c.rate_features)(x))
+        rates = nn.Dense(c.rate_features)(x)
         return active, rates, nn.softplus(nn.Dense(3 * c.gates)(x))
 
 
@@ -128,13 +130,23 @@ class FinishNet(nn.Module):
 
 def pool(
     config: ModelConfig, params: dict, voxels: Array, dlogI: Array, window_s: Array,
-    intensity: Array | None,
+    intensity: Array | None, *, at_a_time: int | None = None,
 ) -> Stats:
-    """Sum over pixels: voxels (..., H, W, 2B), dlogI (..., H, W) -> Stats of (...,)."""
+    """Sum over pixels: voxels (..., H, W, 2B), dlogI (..., H, W) -> Stats of (...,). at_a_time:
+    pixels that go through the network together, None for all; the sums are the same."""
     context = window_features(jnp.asarray(window_s)[..., None, None], intensity, dlogI.shape)
     features = pixel_features(voxels, dlogI, context)
-    outputs: Any = PixelNet(config).apply({"params": params["pixel"]}, features)
-    active, rates, gates = outputs
+
+    def network(x: Array) -> Any:
+        return PixelNet(config).apply({"params": params["pixel"]}, x)
+
+    if at_a_time is None:
+        active, rates, gates = network(features)
+    else:
+        flat = features.reshape(-1, features.shape[-1])
+        active, rates, gates = (a.reshape(*dlogI.shape, -1)
+                                for a in in_chunks(network, flat, at_a_time))
+    rates = nn.softplus(rates)
     n_on, n_off = (half.sum(-1) for half in jnp.split(voxels, 2, -1))
     total = n_on + n_off
     fired = (total > 0).astype(voxels.dtype)

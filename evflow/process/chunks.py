@@ -62,12 +62,16 @@ def executions(pixels: int, arrays: Any) -> int:
     """How many executions on a tree of arrays are worth running at once: one for each core where
     JAX's first device is a CPU and holds them, and each has a chunk to do; 1 while tracing and
     on accelerators."""
+    return max(1, min(cores_per_device(), pixels // SMALL)) if on_cpu(arrays) else 1
+
+
+def on_cpu(arrays: Any) -> bool:
+    """Whether JAX's first device is a CPU and holds a tree of arrays; False while tracing."""
     leaves, here = jax.tree.leaves(arrays), jax.local_devices()[0]
     if any(isinstance(a, jax.core.Tracer) for a in leaves):
-        return 1
-    if here.platform != "cpu" or any(a.devices() != {here} for a in leaves if isinstance(a, Array)):
-        return 1
-    return max(1, min(cores_per_device(), pixels // SMALL))
+        return False
+    return here.platform == "cpu" and all(
+        a.devices() == {here} for a in leaves if isinstance(a, Array))
 
 
 def at_once(calls: Sequence[Callable[[], Any]]) -> list[Any]:
