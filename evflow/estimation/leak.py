@@ -13,9 +13,9 @@ last event was at any time before, or, in a simulation, at the beginning.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
-from scipy import special
 
 from evflow.estimation.intervals import EDGES, Waits
 
@@ -29,8 +29,6 @@ RATIO_SPREAD = 0.5  # std of its log before any data
 ODDS = 8.0  # log odds that it takes to speak of leak
 LEAST_EVENTS = 200.0  # of leak, to tell its rate
 MOST_HAZARD = 50.0  # of a period: what is left of a wait after it
-NODES = np.sqrt(2.0) * special.roots_hermite(5)[0]
-WEIGHTS = special.roots_hermite(5)[1] / np.sqrt(np.pi)
 FLOOR = 0.05  # relative error: periods of a grid, pixels that differ otherwise
 
 
@@ -52,6 +50,8 @@ def measured_leak(waits: Waits) -> Leak:
     seconds, on, off = tables[:, used]
     if on.sum() < LEAST_EVENTS:
         return Leak()
+    from scipy import special  # of which short recordings have no need
+
     others = float(2.0 * (off.sum() + 0.5) / seconds.sum())
     grid = [(period, spread, fresh) for fresh in (False, True) for spread in SPREADS
             for period in PERIODS]
@@ -74,17 +74,29 @@ def measured_leak(waits: Waits) -> Leak:
 def _hazards(period: float, spread: float, fresh: bool, others: float) -> Array:
     """(2 K,) leak events per second that is waited, between EDGES: since the last event, and since
     pixels are watched that have sent none."""
+    from scipy import special
+
     z = np.log(np.maximum(EDGES, 1e-9) / period) / spread
     own = np.diff(-special.log_ndtr(-z)) / np.diff(EDGES)
     if fresh:
         return np.concatenate([own, own])
     middle = 0.5 * (EDGES[1:] + EDGES[:-1])
-    periods = (period * np.exp(spread * NODES))[:, None]
+    nodes, weights = _nodes()
+    periods = (period * np.exp(spread * nodes))[:, None]
     left = np.maximum(periods - middle, periods / MOST_HAZARD)
     hazard = others / np.expm1(np.clip(others * left, 1e-9, 50.0))
     # Of the slower pixels more are still waiting.
-    waiting = WEIGHTS[:, None] * np.maximum(1.0 - middle / periods, 1e-9)
+    waiting = weights[:, None] * np.maximum(1.0 - middle / periods, 1e-9)
     return np.concatenate([own, (waiting * hazard).sum(0) / waiting.sum(0)])
+
+
+@functools.cache
+def _nodes() -> tuple[Array, Array]:
+    """Normal numbers that stand for all, and their weights."""
+    from scipy import special
+
+    nodes, weights = special.roots_hermite(5)
+    return np.sqrt(2.0) * nodes, weights / np.sqrt(np.pi)
 
 
 def _likelihood(leaked: Array, on: Array, off: Array) -> tuple[Array, Array]:

@@ -35,6 +35,7 @@ from evflow.report.receptor import receptor_panel
 from evflow.report.resimulate import (
     PIXELS,
     SECONDS,
+    Pictures,
     Trial,
     busiest,
     held_out,
@@ -169,8 +170,8 @@ def gather(
     try:
         if not (known(found, "on") and known(found, "off")):
             raise EvflowDataError("EV017", "the thresholds are undetermined.")
-        runs = usable_runs(recording)
-        trial = resimulate(recording, found, busiest(recording, runs), seed)
+        runs, pictures = usable_runs(recording), Pictures(recording)
+        trial = resimulate(recording, found, busiest(recording, runs), seed, pictures)
     except EvflowDataError as error:
         why = why_held = error.seen
     step()
@@ -178,7 +179,8 @@ def gather(
         try:
             stage("the held-out half")
             params = load_weights(weights) if first is None else None
-            half, held, shares = held_out(recording, params, runs, min_window_us, seed, first)
+            half, held, shares = held_out(
+                recording, params, runs, min_window_us, seed, first, pictures)
         except EvflowDataError as error:
             why_held = error.seen
     step()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -27,7 +28,7 @@ from evflow.process.memory import give_back
 from evflow.recordings.bunches import beside, bunch
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
-from evflow.simulator.interpolate import MIN_SIDE, unzip, upsample
+from evflow.simulator.interpolate import MIN_SIDE, Seen, notes_on, unzip, upsample
 from evflow.simulator.photoreceptor import IDEAL, as_measured, seen_frames
 from evflow.types import Events, Recording, release
 
@@ -36,8 +37,10 @@ PIXELS = 100 * 346 * 260  # of frames at most: 100 frames of a DAVIS346
 LEARNT_SECONDS = 5.0  # of the first half that the held-out estimate is made from
 SETTLING = 3  # intervals from which on the first is left out of the comparison
 INSTANT_US = 30_000  # an event image
+MOST_KEPT = 160_000_000  # bytes of pictures, which are those of half a second of a DAVIS346
 
 Run = tuple[int, int]  # first and last frame
+Picture = tuple[np.ndarray, int]  # (H, W) in DN, time in us
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,18 +98,54 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
     return found
 
 
-def resimulate(recording: Recording, found: CameraEstimate, run: Run, seed: int) -> Trial:
+class Pictures:
+    """A recording's frames and what `upsample` puts between them; those of the last run are kept
+    while they are few, as parts of it may be asked for again. seen: of that run's intervals."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording, self.run = recording, (0, 0)
+        self.kept: list[Picture] = []
+        self.seen: list[Seen] = []
+
+    def of(self, run: Run) -> Iterator[Picture]:
+        """Those of the frames (first, last), in DN, and their times in us."""
+        times = self.recording.frame_times
+        if self.kept and self.run[0] <= run[0] < run[1] <= self.run[1]:
+            return (p for p in self.kept if times[run[0]] <= p[1] <= times[run[1]])
+        self.kept, self.seen, self.run = [], [], run
+        return self._made((self.recording.frame_dn(i), int(times[i]))
+                           for i in range(run[0], run[1] + 1))
+
+    def notes(self, run: Run) -> tuple[Note, ...]:
+        """What the interpolation of these frames, which were asked for, could not do well."""
+        begin, end = (int(self.recording.frame_times[i]) for i in run)
+        return tuple(notes_on([s for s in self.seen if begin <= s.t0 and s.t1 <= end]))
+
+    def _made(self, frames: Iterator[Picture]) -> Iterator[Picture]:
+        kept: list[Picture] = []
+        size = 0
+        for picture in upsample(frames, tell=self.seen.append):
+            size += picture[0].nbytes
+            kept.append(picture)
+            if size > MOST_KEPT:
+                kept.clear()
+            yield picture
+        self.kept = kept if size <= MOST_KEPT else []
+
+
+def resimulate(
+    recording: Recording, found: CameraEstimate, run: Run, seed: int,
+    pictures: Pictures | None = None,
+) -> Trial:
     """Simulate the frames of `run` twice, interpolated by `upsample` and seen by the camera as it
     was measured, and compare; beside the bunches of events that come with frames, as no camera
-    makes those."""
-    notes: list[Note] = []
+    makes those. pictures: of the recording, where another part of it is simulated as well."""
+    pictures = pictures or Pictures(recording)
     seen_by, model = as_measured(found.sensor, found.optics)
-    pairs = ((recording.frame_dn(i), int(recording.frame_times[i]))
-             for i in range(run[0], run[1] + 1))
     streams = [
         simulate_stream(key, *unzip(shown), found.camera, model=model) for key, shown in zip(
             jax.random.split(jax.random.key(seed)),
-            itertools.tee(seen_frames(upsample(pairs, warn=notes.append), seen_by)), strict=True)]
+            itertools.tee(seen_frames(pictures.of(run), seen_by)), strict=True)]
     parts = list(zip(*streams, strict=True))  # in step, so that few frames are kept for the other
     begin = run[0] + 1 if run[1] - run[0] >= SETTLING else run[0]
     span = (int(recording.frame_times[begin]), int(recording.frame_times[run[1]]))
@@ -121,7 +160,7 @@ def resimulate(recording: Recording, found: CameraEstimate, run: Run, seed: int)
     release(recording)
     give_back()
     return Trial(real, made, span, run, compare(real, made, span_us=span), ceiling,
-                 busiest_instant(real, span), tuple(dict.fromkeys(notes)))
+                 busiest_instant(real, span), pictures.notes(run))
 
 
 def busiest_instant(events: Events, span_us: tuple[int, int], length_us: int = INSTANT_US) -> int:
@@ -134,7 +173,7 @@ def busiest_instant(events: Events, span_us: tuple[int, int], length_us: int = I
 
 def held_out(
     recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int,
-    first: First | None = None,
+    first: First | None = None, pictures: Pictures | None = None,
 ) -> tuple[CameraEstimate, Trial, tuple[float, float] | None]:
     """An estimate from the first part of a recording, tried on the rest, and what it foretells of
     that (`foretold`). first: of what an estimate has read; without it that is the first half of
@@ -145,7 +184,7 @@ def held_out(
     else:
         half, rest = _halved(recording, runs)
         found = estimate_camera(half, params, min_window_us=min_window_us)
-    trial = resimulate(recording, found, busiest(recording, [rest]), seed)
+    trial = resimulate(recording, found, busiest(recording, [rest]), seed, pictures)
     return found, trial, foretold(recording, found, rest)
 
 

@@ -29,15 +29,15 @@ FAILED = 0.3  # of the pixels that change: flow fails in so many where much is c
 
 def upsample(
     pairs: Iterable[tuple[np.ndarray, int]], *, max_motion_px: float = STEP_PX,
-    warn: Callable[[Note], None] | None = None,
+    warn: Callable[[Note], None] | None = None, tell: Callable[[Seen], None] = lambda _: None,
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Yield (frame, time) with at most ~max_motion_px of motion between neighbours.
 
     pairs: (frame (H, W) in DN 0..255, time in us). Yields float32 frames; the given ones come
     out unchanged, those between lie evenly in time. What lies between two comes after the two
     frames that follow them were read. `warn` is told, at the end, where motion needs more than
-    MAX_STEPS steps, where optical flow fails and where the scene is cut. Raises EV002 (frames too
-    small or of changing size), EV020.
+    MAX_STEPS steps, where optical flow fails and where the scene is cut; `tell` what was seen of
+    each interval. Raises EV002 (frames too small or of changing size), EV020.
     """
     if not max_motion_px > 0:
         raise EvflowDataError("EV020", f"max_motion_px={max_motion_px}.", "It must be > 0.")
@@ -48,13 +48,14 @@ def upsample(
             last[:] = [pair]
             yield pair
 
-    seen: list[_Seen] = []
+    seen: list[Seen] = []
     with ahead(intervals(watched()), AHEAD) as found:
         for number, interval in enumerate(found):
             wanted = math.ceil(interval.speed_px / max_motion_px)
             t0, t1 = interval.a.time, interval.b.time
-            seen.append(_Seen(t0, t1, interval.speed_px, wanted, interval.motion.failed,
-                              interval.motion.lost))
+            seen.append(Seen(t0, t1, interval.speed_px, wanted, interval.motion.failed,
+                             interval.motion.lost))
+            tell(seen[-1])
             yield interval.a.dn, t0
             times = _times(t0, t1, min(MAX_STEPS, wanted), number)
             fractions = [(t - t0) / (t1 - t0) for t in times]
@@ -62,7 +63,7 @@ def upsample(
                 yield from zip(interval.at(fractions), times, strict=True)
     yield from last
     if warn is not None:
-        for note in _notes(seen):
+        for note in notes_on(seen):
             warn(note)
 
 
@@ -78,7 +79,7 @@ def _times(t0: int, t1: int, steps: int, number: int) -> list[int]:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Seen:
+class Seen:
     """Of an interval from t0 to t1 us: motion, the steps that it wants, share of wrong flow,
     whether its motion is lost."""
 
@@ -90,7 +91,7 @@ class _Seen:
     lost: bool
 
 
-def _notes(seen: list[_Seen]) -> Iterator[Note]:
+def notes_on(seen: list[Seen]) -> Iterator[Note]:
     """What interpolation could not do well, of the worst interval of each kind."""
     fast = [s for s in seen if s.wanted > MAX_STEPS]
     if fast:
@@ -113,7 +114,7 @@ def _notes(seen: list[_Seen]) -> Iterator[Note]:
                    "are those of a fade; more frames a second would tell.")
 
 
-def _many(some: list[_Seen], seen: list[_Seen]) -> str:
+def _many(some: list[Seen], seen: list[Seen]) -> str:
     return f" (likewise in {len(some)} of {len(seen)} intervals)" if len(some) > 1 else ""
 
 
