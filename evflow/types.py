@@ -270,7 +270,7 @@ def release(recording: Recording) -> None:
     forget(events.x, events.y, events.t, events.p, recording.frames)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Window:
     """What a camera saw between two of its frames: the input of one estimate.
 
@@ -289,6 +289,9 @@ class Window:
     t0_us: int
     t1_us: int
     index: int
+
+    def __repr__(self) -> str:
+        return f"Window({self.index}: {self.events!r}, from {self.t0_us} to {self.t1_us} us)"
 
     @property
     def window_s(self) -> float:

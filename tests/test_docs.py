@@ -9,9 +9,12 @@ one runs it all, with a small preset for a large one.
 
 from __future__ import annotations
 
+import ast
+import builtins
 import dataclasses
 import importlib
 import importlib.util
+import inspect
 import os
 import re
 import shlex
@@ -29,6 +32,7 @@ import pytest
 
 import evflow as ef
 from evflow.cli import main, offered
+from evflow.dataset.sequence import EventSequence
 from evflow.errors import CODES
 from evflow.io import write_recording
 from evflow.io.registry import FORMATS, WRITERS
@@ -162,6 +166,49 @@ def test_documents_run_to_the_last_line(
     shutil.copytree(material, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     assert run_document(document, quick=False) >= 3
+
+
+SPEAKING = {"recording": ef.Recording, "events": ef.Events, "window": ef.Window,
+            "sequence": EventSequence, "camera": ef.Camera, "found": ef.CameraEstimate}
+
+
+@pytest.mark.parametrize("document", WITH_CODE, ids=lambda d: d.name)
+def test_names_in_python_exist(document: Path) -> None:
+    """Also of what is not run where a package is missing: imports, attributes and keywords of
+    evflow, and no name without a value."""
+    known = {*dir(builtins), "__name__"}
+    for block in blocks(document):
+        if block.kind != "python":
+            continue
+        nodes = list(ast.walk(ast.parse(block.text)))
+        known |= {name for node in nodes for name in bound(node)}
+        assert not {n.id for n in nodes if isinstance(n, ast.Name)} - known, block.text
+        for node in nodes:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("evflow"):
+                room = importlib.import_module(node.module or "")
+                assert all(hasattr(room, alias.name) or importlib.util.find_spec(
+                    f"{node.module}.{alias.name}") for alias in node.names), node.module
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                kind = ef if node.value.id == "ef" else SPEAKING.get(node.value.id)
+                assert kind is None or hasattr(kind, node.attr) or node.attr in getattr(
+                    kind, "__dataclass_fields__", {}), ast.unparse(node)
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).startswith("ef."):
+                called = ef
+                for part in ast.unparse(node.func).split(".")[1:]:
+                    called = getattr(called, part)
+                taken = inspect.signature(called).parameters  # type: ignore[arg-type]
+                assert {k.arg for k in node.keywords if k.arg} <= set(taken), ast.unparse(node)
+
+
+def bound(node: ast.AST) -> list[str]:
+    """Names that a node of a program gives a value."""
+    if isinstance(node, ast.Name):
+        return [node.id] if isinstance(node.ctx, ast.Store) else []
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        return [(alias.asname or alias.name).split(".")[0] for alias in node.names]
+    if isinstance(node, ast.arg):
+        return [node.arg]
+    return [node.name] if isinstance(node, ast.FunctionDef | ast.ClassDef) else []
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: d.name)

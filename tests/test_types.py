@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evflow.errors import EvflowDataError
-from evflow.types import Events, Recording
+from evflow.types import Events, Recording, Window
 
 SIZE = (6, 4)
 COLUMNS = {"x": [0, 5, 2], "y": [0, 3, 1], "t": [10, 10, 12], "p": [0, 1, 1]}
@@ -119,6 +119,8 @@ def test_repr_is_one_line() -> None:
     assert repr(events()) == "3 events, 6x4, 0.000 s, 67 % ON"
     assert repr(Events([], [], [], [], SIZE)) == "0 events, 6x4, 0.000 s"
     assert repr(Recording(events(), frames(), [1, 2])).endswith("2 frames (uint8)")
+    window = Window(events(), *frames().astype(np.float32), 1, 2, 7)
+    assert repr(window) == f"Window(7: {events()!r}, from 1 to 2 us)"
 
 
 def test_empty_events_are_legal() -> None:

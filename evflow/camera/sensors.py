@@ -140,7 +140,7 @@ DVS240 = Voltmeter(4.4241, 23.0, 2e-4, 1e-7, 5e-8, 1e-5)
 
 
 @jax.tree_util.register_pytree_with_keys_class
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class SensorModel(_Numbers):
     """The pixel circuit: what is not per pixel. Frozen, and a pytree of the numbers that are on.
 
@@ -201,6 +201,18 @@ class SensorModel(_Numbers):
     noise_resets_memory: bool = False
     voltmeter: Voltmeter = DVS346
     photoreceptor: SecondOrder | None = None
+
+    def __repr__(self) -> str:
+        """What differs from the default."""
+        plain = type(self)(kind=self.kind)
+        shown = [] if self.kind == "v2e" else [f"kind={self.kind!r}"]
+        for field in dataclasses.fields(self)[1:]:
+            value = getattr(self, field.name)
+            usual = isinstance(value, str | int | float | None) and value == getattr(
+                plain, field.name)
+            if self.kind == "voltmeter" if field.name == "voltmeter" else not usual:
+                shown.append(f"{field.name}={value!r}")
+        return f"SensorModel({', '.join(shown)})"
 
     def __post_init__(self) -> None:
         if self.log_map == "auto":

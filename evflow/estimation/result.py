@@ -22,7 +22,7 @@ from evflow.notes import Note, as_dicts
 THRESHOLDS = ("theta_on", "theta_off")  # of whose measurement `undetermined` speaks
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class CameraEstimate:
     """A measured camera: maps with their errors, what all pixels share, and what to know about it.
 
@@ -72,6 +72,14 @@ class CameraEstimate:
     extent: Extent = EVERYTHING
     thirds: tuple[Third, ...] = ()
     bench: Bench | None = None
+
+    def __repr__(self) -> str:
+        height, width = np.shape(self.valid)
+        told = [name for name in THRESHOLDS if name not in self.undetermined]
+        values = "".join(f", {name} {float(getattr(self.summary, name)):.4g} ± "
+                         f"{float(getattr(self.summary_std, name)):.2g}"
+                         for name in (*told, "eta_on", "eta_off"))
+        return f"CameraEstimate({width}x{height}{values}, {len(self.notes)} notes)"
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write camera.npz: theta_on ..., theta_on_std ... (where told), valid, n_events, hot,

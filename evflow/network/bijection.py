@@ -106,8 +106,10 @@ def code_from_video(
             "EV018", "the paper's condition contains the events; a video cannot make it.",
             'Use load_weights("default").')
     if np.ndim(dL) < 3 or np.shape(dL)[-1] != config.changes:
-        raise EvflowDataError("EV002", f"dL has shape {np.shape(dL)}.",
-                              f"Expected (..., H, W, {config.changes}).")
+        raise EvflowDataError(
+            "EV002", f"dL has shape {np.shape(dL)}.", f"Expected (..., H, W, {config.changes}), "
+            "the change in each of so many equal parts of the window: add up those of finer "
+            f"frames, dL.reshape(H, W, {config.changes}, -1).sum(-1).")
     check_finite("dL", dL)
     check_change("dL", dL)
     dL = real(dL)

@@ -73,8 +73,9 @@ def simulate_counts(
     if law.kind == "voltmeter" or (smooth and any(part is not None for part in unsmooth)):
         raise EvflowDataError(
             "EV020", f"{model} has no {'smooth ' if smooth else ''}counts.",
-            "Leave out refractory_s, leak_jitter and photoreceptor, or add up simulate_voxels over "
-            "bins.")
+            "Add up simulate_voxels over bins." if law.kind == "voltmeter" else
+            "Its dead time, jitter and second order have no gradient: dataclasses.replace(model, "
+            "refractory_s=0, leak_jitter=0, photoreceptor=None).")
     check_log("log_frames", log_frames)
     timed = not isinstance(frame_dt_s, jax.core.Tracer)
     if timed and not 0 < float(frame_dt_s) < math.inf:

@@ -70,6 +70,14 @@ def lost_when_early(events: Events, refractory_us: int) -> np.ndarray:
     return kept
 
 
+def test_repr_shows_what_differs_from_the_default() -> None:
+    assert repr(SensorModel()) == "SensorModel()"
+    assert repr(SensorModel(cutoff_hz=60, cutoff_by_light=False)) == (
+        "SensorModel(cutoff_hz=60.0, cutoff_by_light=False)")
+    assert repr(SENSORS["dvs346"].model).startswith("SensorModel(kind='voltmeter', ")
+    assert "k1=5.265" in repr(SENSORS["dvs346"].model)
+
+
 def test_esim_loses_the_events_of_its_dead_time() -> None:
     """Against a loop over the events of the free pixel; whole microseconds may decide one in
     two hundred the other way."""

@@ -24,6 +24,7 @@ from evflow.notes import Note
 
 RADIANCE = (".hdr", ".exr", ".pfm")  # whose numbers have no white
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RADIANCE)
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 EXIF, HEAD = (b"Exif\0\0", b"eXIf"), 1 << 16  # what may tell which side is up, and where
 UPRIGHT = 6  # OpenCV's IMREAD_ANYCOLOR | IMREAD_ANYDEPTH: as it is, but as EXIF turns it
 MADE = "made from the events by"  # how `evflow reconstruct` marks images in their file of times
@@ -188,8 +189,10 @@ def _find(root: Path) -> tuple[Path, list[Path]]:
     seen = (f"holds images in {sorted(p.name for p in below)[:5]}" if below else
             f"holds no image ({', '.join(s[1:] for s in SUFFIXES)}): "
             f"{sorted(p.name for p in root.iterdir())[:5]}")
-    raise EvflowDataError("EV008", f"{root} {seen}.", "Pass the one folder that has the frames.",
-                          where=root)
+    video = next((p for p in sorted(root.iterdir()) if p.suffix.lower() in VIDEOS), None)
+    raise EvflowDataError(
+        "EV008", f"{root} {seen}.", f"Take videos one by one: {video}, ..." if video and not below
+        else "Pass the one folder that has the frames.", where=root)
 
 
 def _made(folder: Path) -> tuple[Note, ...]:
