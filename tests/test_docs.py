@@ -269,6 +269,9 @@ def test_the_readmes_python_runs_from_a_fresh_checkout(
 @pytest.mark.parametrize("document", DOCUMENTS[1:], ids=lambda d: d.name)
 def test_options_exist(document: Path) -> None:
     known = {"--help", "--xla_force_host_platform_device_count"}  # the second is XLA's
+    known |= {f"--{name}" for name in (
+        "pos_thres", "neg_thres", "sigma_thres", "cutoff_hz", "refractory_period", "leak_rate_hz",
+        "shot_noise_rate_hz")}  # of v2e
     commands = [typing.get_args(c)[0] for c in typing.get_args(offered())]
     scripts = (coverage, curves, evaluate, integrate, true_video, make_dataset, see_better, train,
                train_eventgan, train_network)

@@ -32,11 +32,12 @@ class Check(Reading):
         from evflow.recordings.check import Finding, Report, check
 
         try:
-            recording = tell(self.read(self.recording))
+            recording = self.read(self.recording)
         except EvflowDataError as error:
             report, what = Report((Finding.of(error),)), str(self.recording)
         else:
             report, what = check(recording), repr(recording)
+            tell(recording, beside=report)
         report = report.strict() if self.strict else report
         print(report.to_json() if self.json else f"{what}\n{report}")
         if report.errors:

@@ -185,7 +185,7 @@ class Estimate(Compiling, Reading):
                 recording = self.read(path)
             progress(0, 1, "checking")
             report = check(recording)
-        tell(recording)
+        tell(recording, beside=report)
         if self.checks:
             report.raise_if_failed()
         stepping = self.protocol == "motion" and self._stepping(recording)

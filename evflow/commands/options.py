@@ -184,11 +184,12 @@ def note_idle(options: Reading, why: str) -> None:
         print(f"note: {idle} without effect: {why}.", file=sys.stderr)
 
 
-def tell(recording: Recording) -> Recording:
+def tell(recording: Recording, beside: object = "") -> Recording:
     """The recording, after its notes are printed to stderr: by commands that do not print them
-    with their own."""
+    with their own. beside: what is printed as well, whose sentences are not repeated."""
     for note in recording.notes:
-        print(f"note: {note}", file=sys.stderr)
+        if note.text.rstrip(".") not in str(beside):
+            print(f"note: {note}", file=sys.stderr)
     return recording
 
 

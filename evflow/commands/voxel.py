@@ -99,14 +99,14 @@ def _windows(
 
     Raises EV001, EV011, EV012 as `plan_windows`, EV017 where no window is left.
     """
-    from evflow.recordings.windows import plan_windows
+    from evflow.recordings.windows import condensed, plan_windows
 
     t = recording.events.t
     if recording.has_frames:
         plan = plan_windows(recording, window_us)
         ends = recording.frame_times[np.array(plan.pairs, int).reshape(-1, 2)]
         pairs, starts, lengths = plan.pairs, ends[:, 0], ends[:, 1] - ends[:, 0]
-        notes = tuple(Note("windows.skipped", str(window)) for window in plan.skipped)
+        notes = condensed(plan.skipped)
     else:
         if not len(t):
             raise EvflowDataError("EV001", "the recording has no events.")

@@ -8,6 +8,7 @@ a faulty frame: there the brightness path between its two frames is unknown for 
 from __future__ import annotations
 
 import dataclasses
+import re
 import weakref
 from collections.abc import Iterator
 
@@ -25,6 +26,7 @@ EDGE_US = 5_000  # the events may begin or end this much inside the first or las
 # that starts at the first frame the first one comes when brightness has changed by a threshold
 EDGE_EVENTS = 10  # or this many of the intervals at which events come there
 BEYOND = 0.1  # of the recording's time, events without frames at its beginning or end
+NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
 DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
 
 
@@ -167,14 +169,22 @@ def iter_windows(
 
 
 def condensed(skipped: tuple[Skipped, ...]) -> tuple[Note, ...]:
-    """What was skipped, windows of one reason in one note."""
-    reasons: dict[str, list[str]] = {}
+    """What was skipped, windows of one reason in one note: reasons that differ in a number are one,
+    which spans these."""
+    reasons: dict[str, list[Skipped]] = {}
     for window in skipped:
-        reasons.setdefault(window.why, []).append(window.frames)
+        reasons.setdefault(NUMBER.sub("#", window.why, count=1), []).append(window)
     return tuple(Note(
-        "windows.skipped", f"{frames[0]} skipped: {why}" if len(frames) == 1 else
-        f"{len(frames)} windows skipped ({frames[0]} to {frames[-1]}): {why}")
-        for why, frames in reasons.items())
+        "windows.skipped", f"{of[0].frames} skipped: {of[0].why}" if len(of) == 1 else
+        f"{len(of)} windows skipped ({of[0].frames} to {of[-1].frames}): {_spanned(of)}")
+        for of in reasons.values())
+
+
+def _spanned(of: list[Skipped]) -> str:
+    """The reason of windows that differ in one number at most."""
+    numbers = [found[0] for window in of if (found := NUMBER.search(window.why))]
+    low, high = (pick(numbers, key=float) if numbers else "" for pick in (min, max))
+    return of[0].why if low == high else NUMBER.sub(f"{low} to {high}", of[0].why, count=1)
 
 
 def left_out(recording: Recording, plan: WindowPlan) -> tuple[Note, ...]:

@@ -42,6 +42,17 @@ def found(capsys: pytest.CaptureFixture[str]) -> dict[str, list[str]]:
     return {kind: [f["code"] for f in rows] for kind, rows in report.items() if rows}
 
 
+def test_what_a_reader_doubts_is_said_once(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read_recording(folder / "flight.npz")
+    events = recording.events
+    slow = dataclasses.replace(recording, events=dataclasses.replace(events, t=1000 * events.t))
+    write_events(tmp_path / "slow.npz", slow, format="npz")
+    assert run("check", tmp_path / "slow.npz") == 1
+    assert "".join(capsys.readouterr()).count("pass --time-unit ns") == 1
+
+
 def test_a_sound_recording_is_clean(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("check", folder / "flight.npz", "--strict") == 0
     assert "nothing found" in capsys.readouterr().out

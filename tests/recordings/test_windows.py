@@ -95,6 +95,10 @@ def test_no_window_crosses_a_gap_in_the_events() -> None:
         "(lost packets, or a scene that stood still?)"),)
     assert [note.text for note in condensed(plan.skipped[:1])] == [
         f"frames 2-3 skipped: {plan.skipped[0].why}"]
+    dropped = tuple(Skipped(i, i + 1, f"no frame for {ms:.1f} ms (dropped?)")
+                    for i, ms in ((3, 80.0), (7, 40.0), (9, 120.0)))
+    assert [note.text for note in condensed(dropped)] == [
+        "3 windows skipped (frames 3-4 to frames 9-10): no frame for 40.0 to 120.0 ms (dropped?)"]
 
 
 def test_a_long_window_begins_anew_right_behind_a_dropped_frame() -> None:

@@ -90,6 +90,11 @@ def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
             fit += [table] if table else []
     if len(fit) == 1:
         return fit[0]
+    if {"theta_on", "eta_on"} <= set(found):
+        raise EvflowDataError(
+            "EV008", f"{path} is a camera, not a recording.", "`evflow simulate VIDEO --camera` "
+            "takes it, and so do `evflow export` and, of two of them, `evflow compare`.",
+            where=path)
     held = ", ".join(f"{name} {member.dtype} {member.shape}" for name, member in found.items())
     missing = [c for c in ("t", "x", "y", "p") if c not in map(columns.meaning, found)]
     raise EvflowDataError(

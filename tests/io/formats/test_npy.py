@@ -103,6 +103,9 @@ def test_other_arrays_are_no_events(tmp_path: Path, kind: str) -> None:
 def test_several_arrays_are_not_chosen_from(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", left=matrix("txyp"), right=matrix("txyp"))
     assert "several arrays that may be events: left, right" in str(refused(tmp_path / "a.npz"))
+    names = [f"{kind}_{side}" for kind in ("theta", "eta") for side in ("on", "off")]
+    np.savez(tmp_path / "a.npz", **dict.fromkeys(names, np.ones((4, 6))))
+    assert "is a camera, not a recording" in str(refused(tmp_path / "a.npz"))
 
 
 @pytest.mark.parametrize(("values", "code"), [
