@@ -68,25 +68,20 @@ def from_fractions(
 def signal(
     model: Constants, keys: Keys, sent: Sequence[tuple[Array, Sent]], dt_us: Array
 ) -> Iterator[Array]:
-    """Keys of the signal events of a block, and zeros. sent: what some pixels send, and which they
-    are."""
+    """Keys of the signal events of a block. sent: what some pixels send, and which they are."""
     # Ranks have room for nearly half an hour; time-lapse goes by fractions altogether.
     timed = int(dt_us.sum()) < TICKS
+    flag = np.uint32(1 << keys.bits_below)
     further = []
     for pixels, out in sent:
         first = np.asarray(out.first)[: len(dt_us)]
-        if not timed:
-            further.append((out, *_where(first, pixels)))
-        elif keys.bits_below:
-            flag = np.uint32(1 << keys.bits_below)
-            yield (first & ~flag).ravel()
-            further.append((out, *_where(first & flag, pixels)))
-        else:
-            at, pixel = _where(first, pixels)
-            ranks = first.ravel().take(at)
-            more = np.flatnonzero((ranks & np.uint32(1)) != 0)
-            yield keys(ranks & ~np.uint32(1), pixel)
-            further.append((out, at.take(more), pixel.take(more)))
+        at = np.flatnonzero(first != 0)  # of bools: six times as fast
+        if timed:
+            found = first.ravel().take(at)
+            yield (found & ~flag if keys.bits_below else
+                   keys(found & ~flag, _pixels(at, first, pixels)))
+            at = at.take(np.flatnonzero((found & flag) != 0))  # there are few of more than one
+        further.append((out, at, _pixels(at, first, pixels)))
     if any(len(at) for _, at, _ in further):
         yield _progressions(model, keys, further, dt_us, skip=int(timed))
 
@@ -138,8 +133,8 @@ def noises(
 
 def _struck(pixels: Array, frames: Array, flags: Array) -> tuple[Array, Array, Array]:
     """Interval, pixel and DN, where noise strikes."""
-    at, pixel = _where(flags, pixels)
-    return at // flags.shape[1], pixel, frames[1:].ravel().take(at)
+    at = np.flatnonzero(flags)
+    return at // flags.shape[1], _pixels(at, flags, pixels), frames[1:].ravel().take(at)
 
 
 def _number(odds: noise.Odds, u: Array) -> Array:
@@ -152,11 +147,10 @@ def _number(odds: noise.Odds, u: Array) -> Array:
     return number
 
 
-def _where(flags: Array, pixels: Array) -> tuple[Array, Array]:
-    """Index into arrays (T, K), and pixel, of what is not 0 of the first intervals."""
-    at = np.flatnonzero(flags != 0)  # of bools: six times as fast
-    row = at // flags.shape[1]
-    return at, pixels.take(at - row * flags.shape[1])  # % takes three times as long
+def _pixels(at: Array, values: Array, pixels: Array) -> Array:
+    """The pixels (K,) that indices into an array (T, K) are of."""
+    row = at // values.shape[1]
+    return pixels.take(at - row * values.shape[1])  # % takes three times as long
 
 
 def _of(values: jax.Array, at: Array) -> Array:
@@ -201,12 +195,12 @@ def sort(
 
 
 def _in_order(keys: Array, bits: int) -> tuple[Array, Array]:
-    """Sorted integers but zeros, and what to add to them: of 64 bits, where there are few upper
-    halves, the lower ones, sorted by 32 bits in two thirds of the time."""
+    """Sorted integers, and what to add to them: of 64 bits, where there are few upper halves, the
+    lower ones, sorted by 32 bits in two thirds of the time."""
     few = keys.dtype == np.uint64 and bits <= 30 and int(keys.max(initial=0)) >> 40 == 0
     if not few:
-        keys.sort()  # zeros as well, which takes less than to leave them out
-        return keys[np.searchsorted(keys, keys.dtype.type(1)) :], np.zeros((), np.int64)
+        keys.sort()
+        return keys, np.zeros((), np.int64)
     upper = (keys >> np.uint64(32)).astype(np.uint8)
     counts = np.bincount(upper, minlength=1)
     lower = keys.astype(np.uint32).take(np.argsort(upper, kind="stable"))
