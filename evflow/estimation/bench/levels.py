@@ -14,7 +14,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.latency import Latency
-from evflow.estimation.dead_time import DeadTime, dead_time
+from evflow.estimation.dead_time import DeadTime, dead_time, own_intervals
 from evflow.notes import Note
 from evflow.types import Events
 
@@ -26,6 +26,8 @@ SAME = 0.05  # log units: rests closer than that are of one level, steps of one 
 WAY = (0.5, 0.9)  # of a step's rise or fall in log units: between them its duration is measured
 BANDWIDTH = float(np.log(5.0)) / (2.0 * np.pi)  # cutoff of a first-order low-pass times that
 LARGE = 3.0  # thresholds that a step takes at least, or its events do not tell how long it lasts
+APART, EVEN = 0.87, 0.08  # sizes that are told apart; of a ratio, what is the same
+SHORT = 0.05  # of a pixel's intervals are shorter
 FEW_EVENTS = 100  # of a step, from all pixels: neither do these
 
 
@@ -179,4 +181,23 @@ def measured_bench(
         steps.append(Step(float(change), float(clean[k, side][kept].mean()), _duration(
             t, abs(change) * inverse[side], int(kept.sum()))))
     levels = measured_levels(quiet, light, logs, rests, kept, tuple(steps))
-    return Bench(unit, levels, tuple(steps), dead_time(events))
+    during = [events.slice(spans[k][1], quiet[k + 1][0]) for k in range(len(steps))]
+    return Bench(unit, levels, tuple(steps), _dead_time(events, np.diff(logs), during))
+
+
+def _dead_time(events: Events, changes: np.ndarray, during: list[Events]) -> DeadTime:
+    """Of all events; none where it is the light's own edge, which sends events of even pixels at
+    even intervals too: those of smaller steps are longer then, as much as the steps are smaller.
+
+    changes (K,) and `during` (K) are sizes and events of the steps."""
+    found, sizes = dead_time(events), np.abs(changes)
+    smaller = sizes[sizes < APART * sizes.max()] if len(sizes) else sizes
+    if not found.measured or not len(smaller):
+        return found
+    waits = [own_intervals(Events.concatenate([
+        during[k] for k in np.flatnonzero(np.abs(sizes - size) < SAME)]))
+        for size in (sizes.max(), smaller.max())]
+    if not all(map(len, waits)):
+        return found
+    longer = np.quantile(waits[1], SHORT) / max(np.quantile(waits[0], SHORT), 1.0)
+    return UNSEEN if abs(longer * smaller.max() / sizes.max() - 1.0) < EVEN else found

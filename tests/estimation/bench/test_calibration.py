@@ -18,7 +18,7 @@ from evflow.camera import Camera, CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
-from evflow.estimation.bench.levels import few_sizes
+from evflow.estimation.bench.levels import _dead_time, few_sizes
 from evflow.estimation.bench.rests import find_rests, steps_of_light
 from evflow.estimation.bench.steps import storing
 from evflow.io import write_recording
@@ -381,6 +381,23 @@ def test_how_long_steps_last() -> None:
 def test_steps_of_one_size_are_told(levels: list[float], few: bool) -> None:
     changes = np.diff(np.log(levels))
     assert [note.code for note in few_sizes(changes)] == ["levels.few"] * few
+
+
+@pytest.mark.parametrize(("small_us", "measured"), [(1000, True), (1500, False)])
+def test_an_even_edge_of_the_light_is_no_dead_time(small_us: int, measured: bool) -> None:
+    """Steps of 1.5 and 1 log units: pixels that wait do so in both, those that follow do not."""
+    rng, n = np.random.default_rng(0), SHAPE[0] * SHAPE[1]
+    during = []
+    for k, us in enumerate([1000, small_us, 1000, small_us]):
+        t = 1_000_000 * k + np.arange(6)[:, None] * us + rng.integers(0, 40, (6, n)).cumsum(0)
+        order = np.argsort(t, axis=None, kind="stable")
+        pixel = np.tile(np.arange(n), 6)[order]
+        during.append(Events(pixel % SHAPE[1], pixel // SHAPE[1], t.ravel()[order],
+                             np.full(t.size, k % 2 == 0), SHAPE[::-1]))
+    found = _dead_time(Events.concatenate(during), np.array([1.5, -1.0, 1.5, -1.0]), during)
+    assert found.measured == measured
+    if measured:
+        assert found.seconds == pytest.approx(1e-3, rel=0.05)
 
 
 def test_noise_and_thresholds_join_in_one_camera(
