@@ -146,10 +146,11 @@ class Estimate(Compiling, Reading):
                 plots.camera_histograms(found, out / f"histograms.{self.figures}")
             tested = self._report(
                 out, found, recording, made.first, checked) if self.report else {}
-            facts |= {key: tested[key] for key in ("grade", "verdict", "simulators")
+            facts |= {key: tested[key] for key in ("grade", "verdict", "simulators", "nearest")
                       if key in tested}
             write_json(out / "camera.json", facts)
-        said = [f"verdict: {tested['grade']}", *tested["verdict"]] if tested else []
+        said = [f"verdict: {tested['grade']}", *tested["verdict"], *(
+            [tested["nearest"]] if self.simulators else [])] if tested else []
         print(json.dumps(facts, indent=2) if self.json else
               "\n".join([words, *said]))
         print(f"written to {self.out}/", file=sys.stderr)

@@ -115,7 +115,7 @@ def write_report(
         JSON-ready numbers, which also lie in the page: "grade" ("good", "fair", "poor"),
         "verdict" (what was seen and what to do, a sentence each), "trial"
         and "held_out" (each None, or what `compare` says, with the "ceiling" of the counts' r);
-        "simulators" where they were tried, the nearest first.
+        "simulators" where they were tried, the nearest first, and "nearest", a sentence on them.
 
     Raises:
         EvflowDataError: EV010 (matplotlib is missing), EV013 (exists), EV015 (a recording of
@@ -142,12 +142,13 @@ def write_report(
                   found, recording, checked or check(recording), weights, source, command)]
     rivals: dict[str, Any] = {}
     if simulators:
-        from evflow.report.simulators import as_dicts, simulators_panel, try_simulators
+        from evflow.report import simulators as others
 
         stage("other simulators")
-        tried, why_not = try_simulators(recording, evidence.half, evidence.held, seed)
-        panels.insert(-1, simulators_panel(tried, why_not or evidence.why_not_held))
-        rivals = {"simulators": as_dicts(tried)}
+        tried, why_not = others.try_simulators(recording, evidence.half, evidence.held, seed)
+        why_not = why_not or evidence.why_not_held
+        panels.insert(-1, others.simulators_panel(tried, why_not))
+        rivals = {"simulators": others.as_dicts(tried), "nearest": others.verdict(tried, why_not)}
     step()
     numbers = {"grade": worst(judged), "verdict": sentences(judged),
                "trial": _numbers(evidence.trial), "held_out": _numbers(evidence.held), **rivals}

@@ -247,8 +247,10 @@ def distance(numbers: dict[str, float | None]) -> float:
     return float(np.mean([*apart, known("intervals", 1.0), ratio]))
 
 
-def verdict(tried: Sequence[Tried]) -> str:
-    """Which is nearest, in a sentence."""
+def verdict(tried: Sequence[Tried], why_not: str = "") -> str:
+    """Which is nearest, in a sentence; why_not: the reason where none was tried."""
+    if not tried:
+        return f"No simulator was tried: {why_not}"
     best = [LABELS[t.name] for t in tried if t.distance < tried[0].distance + CLOSE]
     if len(best) == 1:
         return f"Nearest to what was recorded: {best[0]}."
