@@ -78,8 +78,8 @@ class Estimate(Compiling, Reading):
     """What a light meter read. static: of each recording, in their order, for noise against
     illuminance; step: of each level, the darkest first, in place of the frames' own ratios."""
     triggers: Annotated[Path | None, value("FILE")] = None
-    """Of --protocol step: instants of the light's edges, for latency and jitter: one time a line,
-    on the clock of the events, or the trigger events of Prophesee RAW (the recording itself)."""
+    """Of --protocol step: instants of the light's edges, for latency: one time a line, on the clock
+    of the events, or the recording itself (trigger events of Prophesee RAW or AEDAT 4)."""
     thresholds: Annotated[Path | None, value("FILE")] = None
     """Of --protocol static: take the thresholds, which a scene at rest does not tell, from this
     camera.npz: noise and thresholds joined in one camera."""

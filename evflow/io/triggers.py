@@ -12,27 +12,28 @@ from evflow.files.limits import read_whole
 from evflow.io.decode import prophesee
 from evflow.io.decode.text import HEAD
 from evflow.io.decode.units import UNITS_US, shared_unit
-from evflow.io.formats import evt2, evt3, evt21
+from evflow.io.formats import aedat4, evt2, evt3, evt21
 from evflow.io.images.frames import existing
 from evflow.types import Events
 
 MAX_BYTES = 1 << 26  # of text: some four million instants
-WORDS = {"EVT2": evt2.triggers, "EVT2.1": evt21.triggers, "EVT3": evt3.triggers}
+READERS = {"EVT2": evt2.triggers, "EVT2.1": evt21.triggers, "EVT3": evt3.triggers,
+           "aedat4": aedat4.triggers}
 EXPECTED = ("Expected a text file of one time a line, on the clock of the events, or Prophesee RAW "
-            "with trigger events.")
+            "or AEDAT 4 with trigger events.")
 
 
 def read_triggers(path: Path, events: Events) -> np.ndarray:
-    """Instants (N,) int64 us: rising and falling edges in Prophesee RAW, or the first number of
-    each line of a text file, in the unit in which they lie among the events.
+    """Instants (N,) int64 us: edges of external signals in Prophesee RAW and AEDAT 4, or the first
+    number of each line of a text file, in the unit in which they lie among the events.
 
     Raises EV001 (none), EV008 (neither), EV012 (outside the events in any unit), EV016.
     """
     with open(existing(path), "rb") as opened:
         head = opened.read(HEAD)
-    encoding = prophesee.sniffed(path, head)
-    if encoding:
-        found = WORDS[encoding](path) if encoding in WORDS else np.zeros(0, np.int64)
+    known = "aedat4" if aedat4.sniff(path, head) else prophesee.sniffed(path, head)
+    if known:
+        found = READERS[known](path) if known in READERS else np.zeros(0, np.int64)
         if not len(found):
             raise EvflowDataError("EV001", f"{path} holds no trigger events.", EXPECTED, where=path)
         return found

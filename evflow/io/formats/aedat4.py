@@ -36,6 +36,7 @@ from evflow.types import Recording
 
 NAME = "aedat4"
 EXTENSIONS: tuple[str, ...] = (".aedat4",)
+EXTERNAL = (1, 2, 3)  # sources of triggers: a signal's rising and falling edge, a pulse
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -72,6 +73,29 @@ def read(path: Path, hints: Hints) -> Recording:
         reading = _Reading(sound, starts, damage, Aside(path, hints, size), source, taken)
         return reading.aside.collect(
             reading.chunks(), lambda: (*told, *chosen.notes, *reading.notes()))
+
+
+def triggers(path: Path) -> np.ndarray:
+    """Times (N,) int64 us of the edges and pulses of external signals, up to damage."""
+    header = read_header(path)
+    found = [np.zeros(0, np.int64)]
+    with _before(path, _packets(path, header.packets, header.table)[1]) as sound:
+        decoder = iter(_decoder(sound))
+        while packet := _next(decoder):
+            told = packet.get("triggers")
+            if told is not None:
+                found.append(told["t"][np.isin(told["source"], EXTERNAL)].astype(np.int64))
+    return np.concatenate(found)
+
+
+def _next(decoder: Iterator[dict[str, Any]]) -> dict[str, Any] | None:
+    """The next packet; None at the end, and where the decoder fails."""
+    try:
+        return next(decoder, None)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException:  # a Rust panic derives from BaseException
+        return None
 
 
 class _Reading:

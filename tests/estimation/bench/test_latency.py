@@ -10,6 +10,7 @@ import pytest
 
 from evflow import Events, EvflowDataError
 from evflow.estimation.bench.latency import measured_latency
+from evflow.io.formats.write_aedat4 import VERSION, _buffer, _header
 from evflow.io.triggers import read_triggers
 
 SPANS = [(i * 400_000, i * 400_000 + 300_000) for i in range(5)]  # dark and light in turns
@@ -87,6 +88,27 @@ def raw(tmp_path: Path, encoding: str) -> Path:
 def test_trigger_events_of_raw(tmp_path: Path, encoding: str) -> None:
     found = read_triggers(raw(tmp_path, encoding), answers([10] * 4, 1))
     assert found.tolist() == [3 * 4096 + 70, 3 * 4096 + 4000]
+
+
+def test_trigger_events_of_aedat4(tmp_path: Path) -> None:
+    """Edges of an external signal, not the clock's reset, nor the frames' own."""
+    pytest.importorskip("aedat")
+    kind = np.dtype({"names": ["vtable", "source", "t"], "formats": ["<i4", "<i1", "<i8"],
+                     "offsets": [0, 4, 8], "itemsize": 16})
+    told = np.zeros(5, kind)
+    told["vtable"] = 16 + 16 * np.arange(5)
+    told["t"], told["source"] = [10, 340_000, 350_000, 360_000, 740_000], [0, 1, 2, 8, 3]
+    offsets = (24 + 16 + 12 * np.arange(5)).astype("<u4").tobytes().ljust(24, b"\0")
+    vtable = struct.pack("<4H", 8, 16, 8, 4).ljust(16, b"\0")
+    packet = _buffer(b"TRIG", [], 5, offsets + vtable + told.tobytes())
+    header = _header(SIZE, -1).replace(b"FRME", b"TRIG")
+    path = tmp_path / "a.aedat4"
+    whole = VERSION + header + struct.pack("<2i", 1, len(packet)) + packet
+    path.write_bytes(whole)
+    events = answers([10] * 4, 1)
+    assert read_triggers(path, events).tolist() == [340_000, 350_000, 740_000]
+    path.write_bytes(whole + struct.pack("<2i", 1, len(packet)) + packet[:50])  # cut off
+    assert len(read_triggers(path, events)) == 3
 
 
 @pytest.mark.parametrize(("text", "found"), [
