@@ -111,6 +111,7 @@ class Estimate(Compiling, Reading):
 
     def run(self) -> None:
         from evflow.files.folders import staged
+        from evflow.process.memory import keep
         from evflow.report import plots
         from evflow.report.text import describe
 
@@ -132,6 +133,7 @@ class Estimate(Compiling, Reading):
             if self.protocol != protocol:
                 refuse(self, (name,), f"of use with --protocol {protocol} only")
         need_packages(self.recording, *self.more, pictures=self.plots or self.report)
+        keep()
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording, checked, doubts = self._recorded(self.recording)
             made, facts = self._estimated(recording) if moving else self._on_the_bench(recording)

@@ -292,7 +292,7 @@ def _assumptions(
 
 def _agreement(recording: Recording) -> str:
     """How the events' polarity goes with the frames."""
-    steps = frame_steps(recording)
+    steps = frame_steps(recording, {})
     r = steps.correlation() if steps else float("nan")
     return (f" ON minus OFF goes with the frames' change of brightness, r = {r:+.2f}."
             if np.isfinite(r) else "")

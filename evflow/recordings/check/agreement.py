@@ -10,6 +10,7 @@ offset only said beyond max(half a frame interval, 10 ms).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -93,8 +94,9 @@ class Steps:
         return offsets, self.correlations(offsets)
 
 
-def frame_steps(recording: Recording) -> Steps | None:
-    """The steps to look at; None without frames, events or a common time."""
+def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLIPS) -> Steps | None:
+    """The steps to look at, and as they are in mirrored frames; None without frames, events or a
+    common time."""
     try:
         pairs = plan_windows(recording, MIN_STEP_US).pairs
     except EvflowDataError:
@@ -104,11 +106,11 @@ def frame_steps(recording: Recording) -> Steps | None:
     if len(pairs) > MOST_STEPS:
         pairs = tuple(pairs[round(i)] for i in np.linspace(0, len(pairs) - 1, MOST_STEPS))
     cell = max(1, round(max(recording.events.size) / CELLS))
-    changes: dict[str, list[np.ndarray]] = {flip: [] for flip in ("", *FLIPS)}
+    changes: dict[str, list[np.ndarray]] = {flip: [] for flip in ("", *flips)}
     for first, last in pairs:
         change = _change(recording.frame_dn(first), recording.frame_dn(last))
         changes[""].append(_pooled(change, cell))
-        for flip, axes in FLIPS.items():
+        for flip, axes in flips.items():
             changes[flip].append(_pooled(np.flip(change, axes), cell))
     bounds = recording.frame_times[np.array(pairs)]
     interval = float(np.median(np.diff(recording.frame_times)))
