@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from evflow.process import memory
 from evflow.process.memory import _of_c
 
 WORK = """
@@ -35,3 +36,13 @@ def test_freed_memory_is_kept_for_what_comes() -> None:
     pages = 16 * (4 << 20) // 4096
     assert faults("") > pages // 2
     assert faults("memory.keep()") < pages // 4
+
+
+def test_a_small_process_gives_nothing_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(memory, "_of_c", lambda name: asked.append)
+    assert memory.held() > 1 << 20
+    for least, times in ((float("inf"), 0), (0, 1)):
+        monkeypatch.setattr(memory, "SMALL", least)
+        memory.give_back()
+        assert len(asked) == times

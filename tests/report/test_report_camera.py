@@ -195,6 +195,25 @@ def test_it_is_simulated_as_the_command_simulates_it(
     assert Pixels(camera=path, sensor="v2e").model().leak_hz == 0.01
 
 
+def test_pictures_of_a_part_are_those_of_the_whole(
+    measured: tuple[CameraEstimate, Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While they are few; else a part is interpolated by itself."""
+    recording = measured[1]
+    begin, end = (int(recording.frame_times[i]) for i in (2, 4))
+    pictures = resimulate.Pictures(recording)
+    whole = list(pictures.of((0, 5)))
+    part = list(pictures.of((2, 4)))
+    assert [id(frame) for frame, _ in part] == [id(f) for f, t in whole if begin <= t <= end]
+    assert (part[0][1], part[-1][1]) == (begin, end)
+    monkeypatch.setattr(resimulate, "MOST_KEPT", 1)
+    pictures = resimulate.Pictures(recording)
+    list(pictures.of((0, 5)))
+    assert not pictures.kept
+    alone = [t for _, t in pictures.of((2, 4))]
+    assert (alone[0], alone[-1]) == (begin, end)
+
+
 def test_what_comes_with_the_frames_is_not_compared(
     measured: tuple[CameraEstimate, Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
