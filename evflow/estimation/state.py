@@ -34,7 +34,7 @@ from evflow.estimation.refine import (
     simulated_part,
 )
 from evflow.estimation.refine.doubt import doubted, signs
-from evflow.estimation.refine.path import STEPS, without_evidence
+from evflow.estimation.refine.path import STEPS, Films, of_place, without_evidence
 from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
@@ -59,12 +59,13 @@ SIGNAL_ERROR = 0.1  # relative, of noise rates where something moves: what is le
 @dataclasses.dataclass(frozen=True, eq=False)
 class Eyes:
     """What the pixels see the frames by, how noisy these are, DN, and how long pixels rest: found
-    before anything else is read, as all evidence depends on it."""
+    before anything else is read, as all evidence depends on it. films: of stretches to be read."""
 
     seen_by: Photoreceptor = IDEAL
     noise_dn: float = 0.0
     found: Found | None = None
     dead: DeadTime = dataclasses.field(default_factory=DeadTime)
+    films: Films = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -104,9 +105,10 @@ def looked_through(stretches: Sequence[Stretch], *, measured: bool) -> Eyes:
     if not runs:
         return Eyes(dead=dead)
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
-    found = find_photoreceptor(runs, noise_dn) if measured else None
+    films: Films = {}
+    found = find_photoreceptor(runs, noise_dn, films) if measured else None
     return Eyes(found.seen if found is not None and found.needed else IDEAL, noise_dn, found,
-                dead)
+                dead, films)
 
 
 def first_events(events: Events) -> Events:
@@ -157,7 +159,8 @@ def look(
 def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
     """The state with what the path between a stretch's frames tells, and no windows."""
     place, seen_by = (stretch.recording, stretch.run), state.eyes.seen_by
-    chunk = make_chunk(*place, STEPS, seen_by, state.eyes.noise_dn, first=stretch.first)
+    chunk = make_chunk(*place, STEPS, seen_by, state.eyes.noise_dn, first=stretch.first,
+                       film=state.eyes.films.pop(of_place(*place), None))
     kept = simulated_part(chunk, place, seen_by) if simulate else None
     told = State(state.params, state.eyes, evidence=chunk.evidence, quiet=chunk.quiet,
                  chunks=(without_evidence(kept),) if kept else (),

@@ -88,12 +88,12 @@ def refinement_chunks(
 
 def make_chunk(
     recording: Recording, run: Sequence[int], steps: int = STEPS, seen_by: Photoreceptor = IDEAL,
-    noise_dn: float = 0.0, *, first: bool | None = None,
+    noise_dn: float = 0.0, *, first: bool | None = None, film: Film | None = None,
 ) -> Chunk:
     """Interpolate the frames of a run of intervals, put them through what its pixels see them by,
     and count its events. first: whether the camera's recording begins there, if that is not with
-    the first frame."""
-    film = interpolated(recording, run, steps, noise_dn)
+    the first frame. film: of the run, where it is at hand; of no use afterwards."""
+    film = film or interpolated(recording, run, steps, noise_dn)
     give_back()
     times = film.times_us + round(seen_by.delay_s * 1e6)
     fine = as_seen(film, seen_by, out=film.dn)
@@ -178,6 +178,14 @@ class Film:
     shown: np.ndarray
 
 
+Films = dict[tuple[int, ...], Film]  # by `of_place`
+
+
+def of_place(recording: Recording, run: Sequence[int]) -> tuple[int, ...]:
+    """By which a film of these intervals is found again, while the recording is there."""
+    return id(recording), *run
+
+
 def interpolated(
     recording: Recording, run: Sequence[int], steps: int = STEPS, noise_dn: float = 0.0
 ) -> Film:
@@ -230,14 +238,18 @@ def telling(places: Sequence[Place]) -> list[Place]:
     return [places[told[k]] for k in chosen.astype(int)]
 
 
-def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | None:
+def receptor_sample(
+    places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None
+) -> Sample | None:
     """What a few of the runs of intervals, each of a recording, say of the photoreceptor; None
-    where too little happens."""
+    where too little happens. films: where theirs are kept, of few and small ones."""
     def parts() -> Iterator[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]]:
         for recording, run in telling(places):
             film = interpolated(recording, run, STEPS, noise_dn)
             s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
             s, disturbed = beside_readouts(s, film.times_us, bunch(recording))
+            if films is not None and len(places) <= STRETCHES and film.dn[0].size <= LARGE:
+                films[of_place(recording, run)] = film
             yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s, disturbed
             del film, s, disturbed
             give_back()
@@ -245,10 +257,12 @@ def receptor_sample(places: Sequence[Place], noise_dn: float = 0.0) -> Sample | 
     return sample(parts())
 
 
-def find_photoreceptor(places: Sequence[Place], noise_dn: float = 0.0) -> Found | None:
+def find_photoreceptor(
+    places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None
+) -> Found | None:
     """What the pixels of a camera see the frames by, from runs of intervals; None where too little
-    happens."""
-    data = receptor_sample(places, noise_dn)
+    happens. films: as of `receptor_sample`."""
+    data = receptor_sample(places, noise_dn, films)
     return find(data) if data is not None else None
 
 
