@@ -26,13 +26,15 @@ STRIDE = 4  # every 4th pixel of every 4th row is compared first
 
 
 def repeated_frames(recording: Recording) -> Array:
-    """Indices (R,) of frames that equal the one before while pixels fire."""
+    """Indices (R,) of frames that equal the one before while pixels fire; of frames that are all
+    of one value none, as any two of these are equal."""
     frames, times = recording.frames, recording.frame_times
     found = []
     for i in range(1, len(frames)):
         if i % FRAMES == 0:
             release(recording)
-        if _equal(frames[i - 1], frames[i]) and _fires(recording, *times[i - 1:i + 1].tolist()):
+        if _same_picture(frames[i - 1], frames[i]) and _fires(
+                recording, *times[i - 1:i + 1].tolist()):
             found.append(i)
     return np.array(found, int)
 
@@ -67,9 +69,9 @@ def _evenly(recording: Recording, kept: Array) -> Array | None:
                   float(np.median(np.diff(recording.frame_times))))
 
 
-def _equal(a: Array, b: Array) -> bool:
+def _same_picture(a: Array, b: Array) -> bool:
     some = np.s_[::STRIDE, ::STRIDE]
-    return np.array_equal(a[some], b[some]) and np.array_equal(a, b)
+    return np.array_equal(a[some], b[some]) and np.array_equal(a, b) and bool(np.ptp(a))
 
 
 def _fires(recording: Recording, t0: int, t1: int) -> bool:

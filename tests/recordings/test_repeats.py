@@ -62,3 +62,9 @@ def test_scenes_that_stand_still_keep_their_frames(given: Recording) -> None:
 def test_the_check_names_what_is_left_out() -> None:
     given = recording(TWICE)
     assert repeated_frames(given).tolist() == list(range(1, 40, 2))
+
+
+def test_frames_without_a_picture_repeat_nothing() -> None:
+    given = recording(TWICE)
+    assert not len(repeated_frames(
+        Recording(given.events, np.full_like(given.frames, 255), given.frame_times)))
