@@ -27,6 +27,7 @@ NOTES: dict[str, str] = {
     "sensor.unrectified": "events stay at the sensor's own pixels",
     "frames.alpha": "transparent images were laid over a background",
     "frames.clock": "where the times of the frames come from",
+    "frames.coarse": "frames come too seldom for the low-pass",
     "frames.cut": "the scene is cut between two frames",
     "frames.dark": "values of frames below their reset are 0",
     "frames.depth": "16-bit frames that do not reach white",

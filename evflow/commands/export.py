@@ -41,8 +41,9 @@ class Export:
         need_absent(self.out, self.overwrite, self.camera)
         camera, std = Camera.load_with_std(self.camera)
         known = read_summary(self.camera)
+        sensor, optics = read_sensor(self.camera)
         export, maps = export_camera(
-            camera, self.to, std, read_sensor(self.camera)[0], known[0] if known else None)
+            camera, self.to, std, sensor, known[0] if known else None, optics)
         write_export(self.out, export, maps, overwrite=self.overwrite)
         warn_of_prior(read_undetermined(self.camera), "exported")
         files = [*sorted([*export.scripts, *export.arrays]), "maps.npz", "README.txt"]

@@ -21,6 +21,7 @@ from evflow.errors import EvflowDataError
 from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
+    from evflow.camera.sensors import SensorModel
     from evflow.io.images.frames import Frames, FrameSource
     from evflow.io.writer import EventWriter
 
@@ -98,13 +99,16 @@ class Simulate(Pixels, Footage, Compiling):
                 self.out, source.size, format, overwrite=self.overwrite
             ) as writer, behind(DEPTH) as later:
                 fits = _fitting(writer, source.notes)
-                pairs = _recorded(made, lambda *pair: later(writer.append_frames, *fits(*pair)))
+                seen: list[int] = []
+                pairs = _clocked(_recorded(
+                    made, lambda *pair: later(writer.append_frames, *fits(*pair))), seen)
                 for events, noise in simulate_stream(jax.random.key(self.seed), *unzip(pairs),
                                                      camera, model=sensor, labels=True):
                     later(writer.append, events)
                     if self.labels:
                         later(writer.append_labels, noise)
                     count += len(events)
+        source.notes.extend(_coarse(sensor, seen))
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": count, "frames": frames,
@@ -158,6 +162,25 @@ def _timed(pairs: Frames, times: deque[int]) -> Frames:
     for frame, time in pairs:
         times.append(time)
         yield frame, time
+
+
+def _clocked(pairs: Frames, seen: list[int]) -> Frames:
+    """The frames on their way; `seen` becomes the first time, the last, and how many there were."""
+    for frame, time in pairs:
+        seen[:] = [*(seen[:1] or [time]), time, seen[2] + 1 if seen else 1]
+        yield frame, time
+
+
+def _coarse(sensor: SensorModel, seen: list[int]) -> list[Note]:
+    """What is said where v2e's low-pass is shorter than the frames are apart: it is no low-pass
+    then."""
+    if len(seen) < 3 or seen[2] < 2 or not sensor.cutoff_hz or sensor.photoreceptor is not None:
+        return []
+    apart_s, slow_s = 1e-6 * (seen[1] - seen[0]) / (seen[2] - 1), 0.5 / np.pi / sensor.cutoff_hz
+    return [Note(
+        "frames.coarse", f"frames come every {1e3 * apart_s:.3g} ms on average, the low-pass of "
+        f"{sensor.cutoff_hz:g} Hz takes {1e3 * slow_s:.3g} ms at white: bright pixels follow a "
+        "frame at once. Frames that come closer show it.")] if apart_s > slow_s else []
 
 
 def _kept(video: Frames, colour: str, came: deque[Pair]) -> Frames:

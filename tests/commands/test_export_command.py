@@ -18,6 +18,7 @@ from evflow.camera import Camera, CameraPrior
 from evflow.camera.exports import TARGETS, export_camera
 from evflow.camera.exports.common import NOISE
 from evflow.camera.exports.iebcs import FREQUENCIES, spectrum
+from evflow.camera.optics import Optics
 from evflow.cli import main
 
 
@@ -33,6 +34,15 @@ def camera(tmp_path: Path) -> Path:
     drawn = Camera.sample(jax.random.key(0), (48, 64), CameraPrior(
         (0.2, 0.3), (0.03, 0.03), noise="independent", eta_spread=0.3))
     return drawn.save(tmp_path / "camera.npz")
+
+
+@pytest.mark.parametrize("to", list(TARGETS))
+def test_light_that_frames_do_not_show_is_told(to: str) -> None:
+    camera = Camera.constant((4, 6))
+    assert "DN more than" not in export_camera(camera, to)[0].text
+    told = export_camera(camera, to, optics=Optics(18.7, 0.0, 4.6))[0].text
+    assert told.rstrip().endswith("other videos need none.")
+    assert "18.7 DN more than" in told
 
 
 @pytest.mark.parametrize("to", ["v2e", "esim", "openeb", "iebcs"])

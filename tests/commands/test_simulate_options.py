@@ -37,6 +37,15 @@ def run(video: Path, *options: str, capsys: pytest.CaptureFixture[str]) -> Run:
     return read_events(out), json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.parametrize(("cutoff", "rate", "told"), [
+    ("100", "100", True), ("100", "2000", False), ("0", "100", False)])
+def test_frames_too_far_apart_for_the_low_pass_are_told(
+    video: Path, capsys: pytest.CaptureFixture[str], cutoff: str, rate: str, told: bool
+) -> None:
+    facts = run(video, "--fps", rate, "--no-interpolate", "--cutoff-hz", cutoff, capsys=capsys)[1]
+    assert ("frames.coarse" in [note["code"] for note in facts["notes"]]) == told
+
+
 def test_the_circuit_from_the_command_line() -> None:
     """Each option is that field of the sensor's model, and no other."""
     told = {"cutoff_hz": 80.0, "refractory_s": 0.002, "leak_hz": 0.5, "leak_jitter": 0.2,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ from evflow.camera.camera import Camera
 from evflow.camera.exports import esim, iebcs, openeb, v2e
 from evflow.camera.exports.common import Export, Maps, Settings
 from evflow.camera.file import PARAMETERS
+from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.folders import atomic_folder
@@ -23,11 +25,12 @@ TARGETS: Mapping[str, Callable[[Maps, Settings], Export]] = {
 
 def export_camera(
     camera: Camera, to: str, std: Camera | None = None, sensor: SensorModel = SensorModel(),
-    summary: Mapping[str, float] | None = None,
+    summary: Mapping[str, float] | None = None, optics: Optics = Optics(),
 ) -> tuple[Export, Maps]:
     """A camera of maps (H, W) in the words of a simulator, and the maps as float32. std: of an
     estimate's maps, which are more even than the camera; sensor: its circuit, as measured; summary:
-    what the estimate says of the whole camera (`read_summary`), without which maps tell it.
+    what the estimate says of the whole camera (`read_summary`), without which maps tell it; optics:
+    what its frames show beside what its pixels see.
 
     Raises EV020 (no such simulator), EV002 (several cameras at once).
     """
@@ -39,7 +42,18 @@ def export_camera(
     maps, errors = ({name: np.asarray(getattr(c, name), np.float32) for name in PARAMETERS}
                     if c is not None else None for c in (camera, std))
     assert maps is not None
-    return TARGETS[to](maps, Settings.of(maps, errors, sensor, summary)), maps
+    export = TARGETS[to](maps, Settings.of(maps, errors, sensor, summary))
+    return dataclasses.replace(export, text=export.text + _light(optics)), maps
+
+
+def _light(optics: Optics) -> str:
+    """What is to be known of the camera's own frames, if anything is."""
+    if not (np.isfinite(optics.offset_dn_std) and optics.offset_dn):
+        return ""
+    seen = f"{abs(optics.offset_dn):.1f} DN {'more' if optics.offset_dn > 0 else 'less'} than"
+    return (f"- The light of this camera's own frames: its pixels see {seen} they\n"
+            "  show, and the thresholds are those of that light. Add it to its frames, as evflow\n"
+            "  simulate does; other videos need none.\n")
 
 
 def write_export(

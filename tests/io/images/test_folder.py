@@ -41,6 +41,12 @@ def test_a_folder_in_natural_order(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(seen.astype(int), frames, atol=12 if suffix == "jpg" else 0)
 
 
+def test_a_folder_of_videos_is_taken_one_by_one(tmp_path: Path) -> None:
+    (tmp_path / "b.mp4").touch()
+    (tmp_path / "a.MOV").touch()
+    assert "one by one: " + str(tmp_path / "a.MOV") in message(lambda: open_frames(tmp_path))
+
+
 @given(st.lists(st.integers(0, 10**6), unique=True, max_size=8))
 def test_natural_order_is_that_of_the_numbers(numbers: list[int]) -> None:
     assert sorted((f"f{n}.png" for n in numbers), key=natural) == [
