@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 Pair = tuple[np.ndarray, int]  # frame, time in us
 PREVIEW_S = 2.0  # a film is at least so long
+STEPS = 3  # at work beside each one: motion, pictures, simulation and writing
+SMALL = 1 << 17  # pixels; of larger frames a second thread for OpenCV shortens the wait by a tenth,
+# of smaller ones it takes up to a sixth of the CPU time to itself
 DEPTH = 8  # frames made ahead of the simulation, and blocks of events that wait to be written
 
 
@@ -75,7 +78,7 @@ class Simulate(Pixels, Footage, Compiling):
         from evflow import io
         from evflow.process.memory import keep
         from evflow.process.terminal import bar
-        from evflow.process.threads import ahead, behind, prompt
+        from evflow.process.threads import ahead, behind, beside, prompt
         from evflow.simulator import simulate_stream
         from evflow.simulator.interpolate import unzip
 
@@ -91,7 +94,8 @@ class Simulate(Pixels, Footage, Compiling):
             frames = done
             progress(done, total)
 
-        with prompt(), bar("simulating") as progress, ahead(
+        alone = beside(STEPS if source.size[0] * source.size[1] < SMALL else 0)
+        with prompt(), alone, bar("simulating") as progress, ahead(
             self._frames(source, shown), DEPTH
         ) as made:
             camera, sensor = self.pixels(source.size), self.model()

@@ -113,6 +113,20 @@ def prompt() -> Iterator[None]:
         sys.setswitchinterval(before)
 
 
+@contextlib.contextmanager
+def beside(steps: int) -> Iterator[None]:
+    """OpenCV takes as many threads as cores are left by so many other steps at work, at least one:
+    its threads spin while they wait for each other, which small pictures make them do often."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(max(1, before - steps))
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
 def _room(depth: int) -> SimpleQueue[None]:
     """A queue of `depth` places."""
     room: SimpleQueue[None] = SimpleQueue()

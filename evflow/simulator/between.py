@@ -27,8 +27,8 @@ REACH = 33  # halved pixels: from how far away acceleration is taken where flow 
 COVERED = 5  # halved pixels around flow that is not trusted: parts of DIS' patches
 MIDDLE = np.array([9, -50, 225, 225, -50, 9], np.float32) / 368  # Lanczos' kernel of 3 pixels half
 # way between two
-BAND, TOGETHER = 1 << 15, 1 << 24  # pixels whose ways are worked out at a time, so that caches hold
-# much of them, for pictures of so many bytes
+BAND, TOGETHER = 1 << 15, 1 << 24  # pixels a thread whose ways are worked out at a time, so that
+# caches hold much of them, for pictures of so many bytes
 BENT_PX = 0.05  # an acceleration that moves less is left out
 
 
@@ -86,7 +86,7 @@ class Interval:
             return
         frames = (self.a.doubled, self.b.doubled) if sharp else (self.a.dn, self.b.dn)
         shares, shape, reach = list(fractions), self.a.dn.shape, self._reach()
-        height, band = shape[0], max(1, BAND // shape[1])
+        height, band = shape[0], max(1, BAND * cv2.getNumThreads() // shape[1])
         most = max(1, TOGETHER // self.a.dn.nbytes)
         for first in range(0, len(shares), most):
             some = shares[first : first + most]

@@ -7,9 +7,10 @@ import sys
 import threading
 from collections.abc import Iterator
 
+import cv2
 import pytest
 
-from evflow.process.threads import SWITCH_S, ahead, behind, prompt
+from evflow.process.threads import SWITCH_S, ahead, behind, beside, prompt
 
 
 @pytest.fixture(autouse=True)
@@ -115,3 +116,18 @@ def test_threads_are_prompt_in_a_block_and_as_before_after_it() -> None:
         assert sys.getswitchinterval() == pytest.approx(SWITCH_S) != before
         raise KeyError
     assert sys.getswitchinterval() == before
+
+
+@pytest.mark.parametrize(("cores", "steps", "left"), [(2, 3, 1), (1, 3, 1), (9, 3, 6)])
+def test_opencv_takes_the_cores_that_are_left_in_a_block(
+    cores: int, steps: int, left: int
+) -> None:
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(cores)
+        with contextlib.suppress(KeyError), beside(steps):
+            assert cv2.getNumThreads() == left
+            raise KeyError
+        assert cv2.getNumThreads() == cores
+    finally:
+        cv2.setNumThreads(before)

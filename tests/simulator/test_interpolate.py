@@ -17,7 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.notes import Note
 from evflow.simulator.between import _edges, intervals
 from evflow.simulator.interpolate import AHEAD, MAX_STEPS, unzip, upsample
-from evflow.simulator.motion import length
+from evflow.simulator.motion import MotionFinder, length
 
 SIZE = 96
 
@@ -172,6 +172,23 @@ def test_pictures_do_not_depend_on_how_much_is_made_at_a_time(
         monkeypatch.setattr(ways_between, "TOGETHER", 3 * whole[0].nbytes)
         np.testing.assert_array_equal(list(interval.at(shares, sharp=sharp)), whole)
         monkeypatch.undo()
+
+
+def test_flow_is_the_same_with_any_number_of_threads() -> None:
+    """One: both ways at the same time."""
+    a, b, before = shifted(0), shifted(5), cv2.getNumThreads()
+    found = []
+    try:
+        for threads in (1, 2, 5):
+            cv2.setNumThreads(threads)
+            motion = MotionFinder()(a, b)
+            found.append(np.stack([motion.there, motion.back]))
+    finally:
+        cv2.setNumThreads(before)
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
+    assert np.median(found[0][0] + found[0][1]) == pytest.approx(0, abs=0.1)
+    assert np.abs(np.median(found[0][0], (0, 1))).max() == pytest.approx(5, abs=0.3)
 
 
 def test_empty_and_single() -> None:
