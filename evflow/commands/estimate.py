@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 FILES = ("camera.npz", "camera.json", "report.html", *(
     f"{name}.{kind}" for name in ("maps", "histograms") for kind in ("png", "pdf", "svg")))
 READ = ("effort", "budget_s", "on_interrupt")  # options of how much is read
+SHORT = 100 * 346 * 260  # pixels of frames: a recording so short that memory is not what is scarce
 SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate notes these itself
 
 
@@ -133,9 +134,10 @@ class Estimate(Compiling, Reading):
             if self.protocol != protocol:
                 refuse(self, (name,), f"of use with --protocol {protocol} only")
         need_packages(self.recording, *self.more, pictures=self.plots or self.report)
-        keep()
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording, checked, doubts = self._recorded(self.recording)
+            if recording.frames.size <= SHORT:
+                keep()
             made, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
             words = describe(made.found)  # the doubts are on the terminal already
             found = dataclasses.replace(made.found, notes=(*doubts, *made.found.notes))
