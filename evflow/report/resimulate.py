@@ -37,6 +37,7 @@ PIXELS = 100 * 346 * 260  # of frames at most: 100 frames of a DAVIS346
 LEARNT_SECONDS = 5.0  # of the first half that the held-out estimate is made from
 SETTLING = 3  # intervals from which on the first is left out of the comparison
 INSTANT_US = 30_000  # an event image
+USUAL = 25  # pictures to a frame, where much moves
 MOST_KEPT = 160_000_000  # bytes of pictures, which are those of half a second of a DAVIS346
 
 Run = tuple[int, int]  # first and last frame
@@ -113,18 +114,21 @@ class Pictures:
         if self.kept and self.run[0] <= run[0] < run[1] <= self.run[1]:
             return (p for p in self.kept if times[run[0]] <= p[1] <= times[run[1]])
         self.kept, self.seen, self.run = [], [], run
-        return self._made((self.recording.frame_dn(i), int(times[i]))
-                           for i in range(run[0], run[1] + 1))
+        frames = ((self.recording.frame_dn(i), int(times[i])) for i in range(run[0], run[1] + 1))
+        made = upsample(frames, tell=self.seen.append)
+        width, height = self.recording.events.size
+        many = (run[1] - run[0]) * USUAL * 4 * width * height > MOST_KEPT
+        return made if many else self._kept(made)
 
     def notes(self, run: Run) -> tuple[Note, ...]:
         """What the interpolation of these frames, which were asked for, could not do well."""
         begin, end = (int(self.recording.frame_times[i]) for i in run)
         return tuple(notes_on([s for s in self.seen if begin <= s.t0 and s.t1 <= end]))
 
-    def _made(self, frames: Iterator[Picture]) -> Iterator[Picture]:
+    def _kept(self, made: Iterator[Picture]) -> Iterator[Picture]:
         kept: list[Picture] = []
         size = 0
-        for picture in upsample(frames, tell=self.seen.append):
+        for picture in made:
             size += picture[0].nbytes
             kept.append(picture)
             if size > MOST_KEPT:
