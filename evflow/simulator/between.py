@@ -20,7 +20,15 @@ from collections.abc import Iterable, Iterator
 import cv2
 import numpy as np
 
-from evflow.simulator.motion import Motion, MotionFinder, grid, inside, length, looked_up, speed
+from evflow.simulator.motion import (
+    Motion,
+    grid,
+    inside,
+    length,
+    looked_up,
+    motion_between,
+    speed,
+)
 
 UNEVEN = 2.0  # ratio of neighbouring intervals; beyond it the velocity of one tells little of both
 REACH = 33  # halved pixels: from how far away acceleration is taken where flow is not trusted
@@ -171,11 +179,10 @@ def _bent(
     pairs: Iterable[tuple[np.ndarray, int]]
 ) -> Iterator[tuple[_Pair, np.ndarray | None, np.ndarray | None]]:
     """Neighbouring frames, and `_acceleration` at each."""
-    find = MotionFinder()
     last = held = before = None
     for frame in itertools.starmap(Frame, pairs):
         if last is not None:
-            new = _Pair(last, frame, find(last.dn, frame.dn))
+            new = _Pair(last, frame, motion_between(last.dn, frame.dn))
             if held is not None:
                 after = _acceleration(held, new)
                 yield held, before, after

@@ -43,45 +43,37 @@ class Motion:
     lost: bool
 
 
-class MotionFinder:
+def motion_between(a: np.ndarray, b: np.ndarray) -> Motion:
     """Motion between frames (H, W) in DN 0..255."""
-
-    def __init__(self) -> None:
-        self._dis = _dis(), _dis()
-
-    def __call__(self, a: np.ndarray, b: np.ndarray) -> Motion:
-        height, width = a.shape
-        a, b = _coded(a), _coded(b)
-        first, second = halved(a), halved(b)
-        shift = _shift(first, second)
-        there, back = (flow[:height, :width] for flow in self._flows(
-            _padded(_gray8(a)), _padded(_gray8(b)), *shift))
-        halves = halved(there), halved(back)
-        return Motion(there, back, halves, *_verdict(first, second, *halves))
-
-    def _flows(
-        self, a: np.ndarray, b: np.ndarray, x: float, y: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Of a to b, and back, from a shift; at the same time where OpenCV has but one thread."""
-        def flow(dis: Any, a: np.ndarray, b: np.ndarray, x: float, y: float) -> np.ndarray:
-            found: np.ndarray = dis.calc(a, b, _even(a.shape, x, y) if x or y else None)
-            return found
-
-        one, other = self._dis
-        if cv2.getNumThreads() > 1:
-            return flow(one, a, b, x, y), flow(one, b, a, -x, -y)
-        back: list[np.ndarray] = []
-        with behind(1) as later:
-            later(lambda: back.append(flow(other, b, a, -x, -y)))
-            there = flow(one, a, b, x, y)
-        return there, back[0]
+    height, width = a.shape
+    a, b = _coded(a), _coded(b)
+    first, second = halved(a), halved(b)
+    shift = _shift(first, second)
+    there, back = (flow[:height, :width] for flow in _flows(
+        _padded(_gray8(a)), _padded(_gray8(b)), *shift))
+    halves = halved(there), halved(back)
+    return Motion(there, back, halves, *_verdict(first, second, *halves))
 
 
-def _dis() -> Any:
-    made: Any = cv2.DISOpticalFlow_create(  # type: ignore[attr-defined]
+def _flows(a: np.ndarray, b: np.ndarray, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of a to b, and back, from a shift; at the same time where OpenCV has but one thread."""
+    if cv2.getNumThreads() > 1:
+        return _flow(a, b, x, y), _flow(b, a, -x, -y)
+    back: list[np.ndarray] = []
+    with behind(1) as later:
+        later(lambda: back.append(_flow(b, a, -x, -y)))
+        there = _flow(a, b, x, y)
+    return there, back[0]
+
+
+def _flow(a: np.ndarray, b: np.ndarray, x: float, y: float) -> np.ndarray:
+    """Of a to b, from a shift. Of a new object of OpenCV's: one that began from a shift before
+    finds another flow without."""
+    dis: Any = cv2.DISOpticalFlow_create(  # type: ignore[attr-defined]
         cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    made.setVariationalRefinementIterations(SMOOTHING)
-    return made
+    dis.setVariationalRefinementIterations(SMOOTHING)
+    found: np.ndarray = dis.calc(a, b, _even(a.shape, x, y) if x or y else None)
+    return found
 
 
 def halved(values: np.ndarray) -> np.ndarray:

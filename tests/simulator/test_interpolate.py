@@ -17,7 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.notes import Note
 from evflow.simulator.between import _edges, intervals
 from evflow.simulator.interpolate import AHEAD, MAX_STEPS, unzip, upsample
-from evflow.simulator.motion import MotionFinder, length
+from evflow.simulator.motion import length, motion_between
 
 SIZE = 96
 
@@ -181,7 +181,7 @@ def test_flow_is_the_same_with_any_number_of_threads() -> None:
     try:
         for threads in (1, 2, 5):
             cv2.setNumThreads(threads)
-            motion = MotionFinder()(a, b)
+            motion = motion_between(a, b)
             found.append(np.stack([motion.there, motion.back]))
     finally:
         cv2.setNumThreads(before)
@@ -189,6 +189,16 @@ def test_flow_is_the_same_with_any_number_of_threads() -> None:
     np.testing.assert_array_equal(found[2], found[0])
     assert np.median(found[0][0] + found[0][1]) == pytest.approx(0, abs=0.1)
     assert np.abs(np.median(found[0][0], (0, 1))).max() == pytest.approx(5, abs=0.3)
+
+
+def test_motion_does_not_depend_on_what_was_looked_at_before() -> None:
+    """OpenCV's objects remember that they began from a shift."""
+    middle = (SIZE / 2, SIZE / 2)
+    turned = cv2.warpAffine(shifted(0), cv2.getRotationMatrix2D(middle, 8, 1), (SIZE, SIZE))
+    first = motion_between(shifted(0), turned)
+    assert np.abs(motion_between(shifted(0), shifted(24)).there).max() > 20
+    again = motion_between(shifted(0), turned)
+    np.testing.assert_array_equal([again.there, again.back], [first.there, first.back])
 
 
 def test_empty_and_single() -> None:
