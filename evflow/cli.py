@@ -103,7 +103,6 @@ def run() -> NoReturn:
     print_anything()
     code = main()
     early.end_on_interrupt()
-    gc.freeze()  # Python would look for garbage among all modules once more, for half a second
     gc.freeze()  # Python would look for garbage in all that was loaded, for a third of a second
     if code == INTERRUPTED:
         leave(code)
