@@ -92,8 +92,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as e:
         print(f"the output cannot be written: {e}", file=sys.stderr)
         return 3
-    except KeyboardInterrupt:
-        print("interrupted; no half-written file is left.", file=sys.stderr)
+    except KeyboardInterrupt as e:
+        print(str(e) or "interrupted; no half-written file is left.", file=sys.stderr)
         return INTERRUPTED
     return 0
 

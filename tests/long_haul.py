@@ -241,6 +241,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--scale", type=float, default=1.0, help="of every length")
     parser.add_argument("--work", type=Path, help="folder for the files, gigabytes of them")
     told = parser.parse_args(arguments)
+    # What a shell runs in the background ignores Ctrl-C, and so would the commands.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     faults: list[str] = []
     with tempfile.TemporaryDirectory(dir=told.work) as folder:
         for name in told.only:

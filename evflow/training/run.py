@@ -24,7 +24,8 @@ from evflow.training.step import TrainState, init_state, make_run_step, optimise
 
 def train_network(options: TrainOptions) -> Metrics:
     """One run, from joining the other processes to weights.safetensors; returns the mean metrics
-    of its last hundred steps. A signal ends it with the weights of the last step."""
+    of its last hundred steps. A signal ends it with the weights of the last step, and then raises
+    KeyboardInterrupt: they are not those that were asked for."""
     devices.initialise(options.coordinator, options.processes, options.process_id)
     mesh = devices.make_mesh()
     config, small = configuration(options, mesh.size), options.preset == "debug"
@@ -48,6 +49,9 @@ def train_network(options: TrainOptions) -> Metrics:
     if devices.is_main():
         save_weights(options.out / "weights.safetensors", ended.state.average, card, overwrite=True)
     devices.agree(True)  # leave together: a process that ends alone is a dead one to the others
+    if ended.stopped:
+        raise KeyboardInterrupt(
+            f"{ended.stopped} {options.out / 'weights.safetensors'} is of that step.")
     return ended.figures
 
 

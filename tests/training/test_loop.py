@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import signal
+import types
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from evflow import cli
 from evflow.errors import EvflowDataError
 from evflow.process.devices import Votes
-from evflow.training.loop import train
+from evflow.training import run
+from evflow.training.loop import Ended, train
 from evflow.training.options import RunOptions
 
 Stepped = tuple["Walk", dict[str, Any]]
@@ -150,3 +153,17 @@ def test_the_next_step_is_on_its_way_before_metrics_are_fetched(tmp_path: Path) 
 def test_alone_a_vote_counts_at_once(vote: bool) -> None:
     votes = Votes()
     assert [votes.agree(v) for v in (False, vote)] == [False, vote]
+
+
+@pytest.mark.parametrize(("stopped", "code"), [("", 0), ("stopped after step 5 of 20.", 130)])
+def test_a_training_that_a_signal_ends_says_so(
+    stopped: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """So that what a script does next does not take its weights for those of the whole run."""
+    state = types.SimpleNamespace(step=jnp.int32(5), average={"default": {"a": jnp.ones(3)}})
+    monkeypatch.setattr(run, "train", lambda *_: Ended(state, {"loss": 1.0}, stopped))
+    assert cli.main(["train", "--preset", "debug", "--out", str(tmp_path)]) == code
+    assert (tmp_path / "weights.safetensors").exists()
+    said = capsys.readouterr().err
+    assert (f"{stopped} {tmp_path / 'weights.safetensors'} is of that step." in said) == (code > 0)
