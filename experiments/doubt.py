@@ -3,8 +3,9 @@
     python -m experiments.doubt evflow/weights/default.safetensors --out doubted.safetensors
 
 Each hidden camera (two of three as they may be: ideal, slow, blind for a while after an event,
-noisy, with exposed, offset and noisy frames; one of the fusion's training) is measured; the size
-of its error is regressed on what the estimate shows of itself (evflow/estimation/refine/doubt.py).
+noisy, with exposed, offset and noisy frames; one of the fusion's training; after the first 480,
+DVS-Voltmeter's, or seen for 5 s) is measured; the size of its error is regressed on what the
+estimate shows of itself (evflow/estimation/refine/doubt.py).
 Cross-validation over recordings gives the figures of the model card and the factor of the std.
 """
 
@@ -23,10 +24,11 @@ from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, estimator, run_script
 from experiments.shared.doubting import FOLDS, cross_validated, figures_of, fit, flat
 from experiments.shared.many import Setup
-from experiments.shared.real_cameras import draw_real
+from experiments.shared.real_cameras import draw_other, draw_real
 from experiments.shared.refinement import undoubted
 from experiments.shared.rows import collected
 
+FIRST = 480  # recordings as cameras may be; those after are of other pixels, or longer
 COVERED = 0.74  # by one std: tails are heavy, and 1.96 of them are to hold more than nine in ten
 
 
@@ -36,7 +38,7 @@ class Options:
 
     weights: tyro.conf.Positional[Path]
     out: Path
-    recordings: int = 400
+    recordings: int = 600
     workers: int = 1
     """Processes that simulate side by side."""
     seed: int = 5_000_011
@@ -44,6 +46,14 @@ class Options:
     rows: Path | None = None
     """Where to keep the signs, to resume an interrupted run from."""
     overwrite: bool = False
+
+
+def drawn(seed: int, number: int) -> Protocol:
+    """What the recording of that number is like."""
+    rng = np.random.default_rng((seed, number))
+    if number >= FIRST:
+        return draw_other(rng)
+    return draw_real(rng) if number % 3 else draw_protocol(rng)
 
 
 def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
@@ -65,8 +75,7 @@ def main(options: Options) -> dict[str, float]:
     need_absent(options.out, options.overwrite)
     name, net = estimator(options.weights, "summary")
     origin = f"{options.seed} {weights_hash(options.weights)}"
-    protocols = [(draw_real if i % 3 else draw_protocol)(np.random.default_rng((options.seed, i)))
-                 for i in range(options.recordings)]
+    protocols = [drawn(options.seed, i) for i in range(options.recordings)]
     setup = Setup(str(options.weights), options.seed, photos=True)
     rows = collected(row, setup, protocols, options.workers, options.rows, origin)
     both = flat(rows)

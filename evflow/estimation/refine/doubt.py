@@ -25,15 +25,18 @@ NAMES = (
     "regression", "other_regression", "ideal_regression", "unexplained", "explained_more",
     "smear_10", "smear_20", "theta_10", "theta_20", "frame_noise", "needed", "odds", "offset",
     "offset_unneeded", "offset_std", "tau", "tau_std", "even", "open", "open_unneeded",
-    "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal")
+    "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal",
+    "with_missed")
 BEYOND = 2.0  # standard deviations outside of what it learned on, beyond which a sign is held
 NARROWER = 0.5  # of the std before: what a recording leaves open is not learned away
 MOST_ODDS = 10.0
+LENIENT = 3.0  # log odds: how much likelier a camera that is not ideal is than in the search
 POOR = 0.3  # share that a path leaves unexplained, from which on an offset is easily missed
 
 
 def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Array:
-    """(2, F) float64: NAMES of theta_on and theta_off."""
+    """(2, F) float64: NAMES of theta_on and theta_off. A photoreceptor that stays undetected is
+    there with some probability all the same, and thresholds are then off by what it changes."""
     theta, error = (np.array([float(getattr(s, f"theta_{p}")) for p in ("on", "off")])
                     for s in (summary, std))
     needed = float(found.needed)
@@ -46,7 +49,10 @@ def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Arra
     shared = [np.log(left + 1e-3), np.log((1 - ideal + 1e-3) / (1 - seen + 1e-3)),
               *found.smear[:, 0]]
     chance = np.clip(found.chance, 1e-9, 1 - 1e-9)
-    odds = np.clip(np.log(chance / (1 - chance)), -MOST_ODDS, MOST_ODDS) / MOST_ODDS
+    log_odds = np.log(chance / (1 - chance))
+    odds = np.clip(log_odds, -MOST_ODDS, MOST_ODDS) / MOST_ODDS
+    missed = unneeded / (1.0 + np.exp(-log_odds - LENIENT))
+    change = np.log(found.theta / found.ideal_theta)
     camera = [noise_dn / 3.0, needed, odds, needed * found.seen.offset_dn / 20.0,
               unneeded * found.seen.offset_dn / 20.0, np.log(offset_std),
               needed * found.seen.tau_s * 1e3, np.log(tau_std * 1e3),
@@ -57,7 +63,8 @@ def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Arra
         own = [np.log(needed * open_ + 0.01), np.log(unneeded * open_ + 0.01),
                np.log(error[p] / theta[p]),
                np.log(theta[p]), np.log(theta[1 - p]), np.log(found.size), 1.0 - p,
-               unneeded * left, unneeded * float(left > POOR)]
+               unneeded * left, unneeded * float(left > POOR),
+               0.5 * np.log((error[p] / theta[p]) ** 2 + missed * (change[p] ** 2 + open_**2))]
         rows.append([pooled[p], pooled[1 - p], ideally[p], *shared, *found.smear[:, 1 + p],
                      *camera, *own])
     return np.array(rows, np.float64)

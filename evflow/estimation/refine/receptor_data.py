@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from evflow.estimation.refine.net_changes import Changes, changes, joined, offset_by_changes
 from evflow.estimation.refine.receptor_noise import noise_rates
 from evflow.estimation.refine.sightings import Sightings, counted, trusted
 from evflow.estimation.refine.smear import smeared
@@ -25,7 +26,8 @@ class Sample(NamedTuple):
     """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N) by
     pixel and time: pixel (0..P-1), at (in fine steps), on, off (counts so far), weight, and group,
     with whose events one shares a constant: those of its pixel, unless a readout (readouts.py) or
-    noise (receptor_noise.py) came between; block (C, P); noise_hz (C, 2): of `noise_rates`."""
+    noise (receptor_noise.py) came between; block (C, P); noise_hz (C, 2): of `noise_rates`; told
+    (C, 2): the offset and its std by net_changes.py, of all stretches."""
 
     dn: Array
     dt_s: Array
@@ -37,6 +39,7 @@ class Sample(NamedTuple):
     group: Array
     block: Array
     noise_hz: Array
+    told: Array | None = None
 
 
 def sample(
@@ -47,16 +50,36 @@ def sample(
     one length; None where too little happens. One is looked at at a time."""
     rng, count, told = np.random.default_rng(seed), np.zeros(2, int), np.zeros(2, int)
     rows: list[tuple[np.ndarray, ...]] = []
+    nets: list[tuple[Changes, ...]] = []
     for dn, dt_s, s, disturbed in parts:
         if len(s.pixel):
             row, used = _row(dn, dt_s, s, disturbed, rng, len(rows))
             rows.append(row)
+            nets.append(_changes(dn, s, rng, len(nets)))
             count += _of_both(s.on)
             told += _of_both(used)
         del dn, s  # before the next is made
     if count.min() < ENOUGH or told.min() < LEAST:
         return None
-    return Sample(*(jax.device_put(np.stack(column)) for column in zip(*rows, strict=True)))
+    told = np.tile(offset_by_changes(joined(nets)), (len(rows), 1)).astype(np.float32)
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    return Sample(*map(jax.device_put, [*columns, told]))
+
+
+def _changes(
+    dn: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
+) -> tuple[Changes, ...]:
+    """Of a stretch, those between its frames."""
+    steps = (len(dn) - 1) // (len(s.frames) - 1)
+    block = _block(np.arange(dn[0].size), s.shape, number)
+    return changes(dn[::steps], s, block, rng)
+
+
+def _block(where: np.ndarray, shape: tuple[int, int], number: int) -> np.ndarray:
+    """In which of TILES pixels lie, of the stretch of that number."""
+    (height, width), tiles = shape, TILES[0] * TILES[1]
+    y, x = where // width * TILES[0] // height, where % width * TILES[1] // width
+    return np.asarray(y * TILES[1] + x + number * tiles)
 
 
 def _of_both(on: np.ndarray) -> np.ndarray:
@@ -92,8 +115,7 @@ def _row(
     place = np.full(len(pixels), -1)
     place[chosen] = np.arange(len(chosen))
     kept = np.flatnonzero((place[group] >= 0) & (weight > 1e-6))[:EVENTS]
-    (height, width), where = s.shape, pixels[chosen]
-    block = (where // width * TILES[0] // height) * TILES[1] + where % width * TILES[1] // width
+    where = pixels[chosen]
 
     def filled(values: np.ndarray, n: int) -> np.ndarray:
         pad = [(0, 0)] * (values.ndim - 1) + [(0, n - values.shape[-1])]
@@ -106,6 +128,6 @@ def _row(
     new = (np.diff(group[kept], prepend=-1) != 0) | (np.diff(disturbed[kept], prepend=-1) != 0)
     part = filled(np.cumsum(new) - 1, EVENTS).astype(np.int32)
     row = (light, dt_s.astype(np.float32), pixel, *events, part,
-           filled(block + number * TILES[0] * TILES[1], PIXELS).astype(np.int32),
+           filled(_block(where, s.shape, number), PIXELS).astype(np.int32),
            noise_rates(s, interval_s))
     return row, s.on[kept]

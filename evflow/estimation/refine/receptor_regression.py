@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.estimation.refine.receptor_data import EVENTS, TILES, Sample
+from evflow.estimation.refine.receptor_prior import Prior
 from evflow.simulator.photoreceptor import seen_path
 
 Array = jax.Array
@@ -44,6 +45,10 @@ class Regression:
 
     data: Sample
     by_light: bool = True
+
+    @property
+    def prior(self) -> Prior:
+        return Prior.of(self.data)
 
     def solved(self, phi: np.ndarray) -> tuple[np.ndarray, float, float]:
         """theta_on, theta_off of the regression, what it leaves and what there is."""

@@ -15,25 +15,27 @@ from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.refine.receptor_data import Sample, smeared_sample
 from evflow.estimation.refine.receptor_noise import parted
+from evflow.estimation.refine.receptor_prior import Prior
 from evflow.estimation.refine.receptor_profile import along_offset
 from evflow.estimation.refine.receptor_regression import SCALE, Regression, Slopes
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor
 
 OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, where the search begins
 TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
-PRIOR = np.array([25.0, 5e-3, 8e-4])  # std of offset (DN), tau and delay (s) before any data
 STEP = np.array([12.0, 3e-3, 1e-3])  # most that one step changes
 LOW, HIGH = np.array([-25.0, FAST, -4e-3]), np.array([90.0, 3e-2, 4e-3])
 PATTERN = (4.0, 1.0, 0.25)  # SCALEs that are tried, one coordinate at a time
 MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
 MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
-ALL = np.full(3, True)
+ALL, OFFSET = np.full(3, True), np.arange(3) == 0
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # The path is wrong in its own way everywhere. What it explains better by less than a few per cent
 # of what is left says nothing of the pixel, and so much is left open of what is found:
 BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
 FLOOR = np.array([0.5, 1e-4, 5e-4])
 DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
+ALONE = 2.0  # log odds, beside those of the changes from frame to frame, that it takes to say that
+# the frames of an ideal pixel lack light
 BY_OFFSET = 5.0  # log odds that it takes to say that a slow pixel's frames lack light
 BY_LIGHT = 1.5  # log odds, a priori, that a low-pass goes with light
 TYPICAL = 0.4  # pace of such a low-pass, of its pace at 255 DN
@@ -121,12 +123,18 @@ def find(data: Sample) -> Found:
         theta = np.abs(by_light.solved(phi)[0])
         by_light = Regression(parted(data, _receptor(phi), theta))
     plain = by_light.unexplained(PLAIN)
-    model, phi = _with_law(phi, by_light, min(size, BELIEVED))
-    odds = 0.5 * min(size, BELIEVED) * (plain - model.unexplained(phi)) - DOUBT - _unlikely(phi)
-    if odds > 0:
-        phi = _without_offset(phi, model, min(size, BELIEVED))
+    believed = min(size, BELIEVED)
+    model, phi = _with_law(phi, by_light, believed)
+    odds = _odds(phi, model, believed, plain)
+    if odds > 0 and phi[1] > 2 * FAST:
+        phi = _without_offset(phi, model, believed)
+        odds = _odds(phi, model, believed, plain)
+    alone, alone_odds = _offset_alone(by_light, believed, plain)
+    if odds <= 0 < alone_odds:
+        model, phi = by_light, alone
+    odds = max(odds, alone_odds)
     value = model.unexplained(phi)
-    covariance, open_ = _errors(phi, model, min(size, BELIEVED))
+    covariance, open_ = _errors(phi, model, believed)
     fits, ideal_fits = (model.solved(at)[0] for at in (phi, PLAIN))
     if fits.min() <= 0:  # brightness that falls with ON events: there is no path
         odds = -np.inf
@@ -159,6 +167,22 @@ def _with_law(phi: np.ndarray, by_light: Regression, size: float) -> tuple[Regre
     return (even, other) if gain > BY_LIGHT else (by_light, phi)
 
 
+def _odds(phi: np.ndarray, model: Regression, size: float, plain: float) -> float:
+    """Log odds of the constants against an ideal pixel, which leaves `plain`."""
+    gain = 0.5 * size * (plain - model.unexplained(phi))
+    return gain - DOUBT - Prior().unlikely(phi) + model.prior.likelier(float(phi[0]))
+
+
+def _offset_alone(model: Regression, size: float, plain: float) -> tuple[np.ndarray, float]:
+    """The constants of an ideal pixel whose frames lack light as the changes from one to the next
+    tell, and their log odds. plain: what an ideal pixel leaves."""
+    evidence = model.prior.evidence()
+    if evidence <= 0.0:
+        return PLAIN, -np.inf
+    phi = _descend(np.where(OFFSET, model.prior.centre, PLAIN), model, size, OFFSET)
+    return phi, 0.5 * size * (plain - model.unexplained(phi)) - ALONE + evidence
+
+
 def _without_offset(phi: np.ndarray, model: Regression, size: float) -> np.ndarray:
     """The constants without an offset, if with it the events are not much more probable."""
     none = _descend(np.where(np.arange(3) == 0, 0.0, phi), model, size, free=np.arange(3) > 0)
@@ -166,22 +190,16 @@ def _without_offset(phi: np.ndarray, model: Regression, size: float) -> np.ndarr
     return phi if gain > BY_OFFSET else none
 
 
-def _unlikely(phi: np.ndarray) -> float:
-    """By the prior, minus its logarithm but for a constant."""
-    away = (phi - PLAIN) / PRIOR
-    return 0.5 * float(away @ away)
-
-
 def _value(phi: np.ndarray, model: Regression, size: float) -> float:
     """Minus the log of the posterior of phi."""
-    return 0.5 * size * model.unexplained(phi) + _unlikely(phi)
+    return 0.5 * size * model.unexplained(phi) + model.prior.unlikely(phi)
 
 
 def _errors(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray, np.ndarray]:
     """Covariance (3, 3) of (offset, tau, delay), and relative errors (2,) of theta: by the slopes
     at phi, and along the offset by the likelihood where that goes farther."""
     slopes = model.slopes(phi)
-    near = _covariance(slopes, model.curvature(phi))
+    near = _covariance(slopes, model.curvature(phi), model.prior)
     lead = near[:, 0] / near[0, 0]
 
     def step(at: np.ndarray) -> np.ndarray:
@@ -199,17 +217,17 @@ def _errors(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray
 
 def _newton(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray, np.ndarray]:
     """Gradient and curvature of `_value`, by Gauss and Newton."""
-    slopes = model.slopes(phi)
-    return (0.5 * size * slopes.gradient + (phi - PLAIN) / PRIOR**2,
-            0.5 * size * slopes.bent + np.diag(PRIOR**-2.0))
+    slopes, prior = model.slopes(phi), model.prior
+    return (0.5 * size * slopes.gradient + (phi - prior.centre) / prior.std**2,
+            0.5 * size * slopes.bent + np.diag(prior.std**-2.0))
 
 
-def _covariance(slopes: Slopes, curvature: np.ndarray) -> np.ndarray:
+def _covariance(slopes: Slopes, curvature: np.ndarray, prior: Prior) -> np.ndarray:
     """Of (offset, tau, delay), (3, 3)."""
     away, units = slopes.by_block - slopes.by_block.mean(0), np.outer(SCALE, SCALE)
     bent = curvature * units
     information = bent @ np.linalg.inv(away.T @ away * units + 1e-12 * np.eye(3)) @ bent
-    information += np.diag((SCALE / PRIOR) ** 2)
+    information += np.diag((SCALE / prior.std) ** 2)
     return np.asarray(np.linalg.inv(information) * units + np.diag(FLOOR**2))
 
 
@@ -258,7 +276,7 @@ def _descend(
     best = _value(phi, model, size)
     for _ in range(MOST_STEPS):
         gradient, bent = _newton(phi, model, size)
-        bent = np.where(np.outer(free, free), bent, np.diag(PRIOR**-2.0))
+        bent = np.where(np.outer(free, free), bent, np.diag(model.prior.std**-2.0))
         steps = [-np.linalg.solve(bent + np.diag(np.diag(bent)) * damping, gradient * free)
                  for damping in (0.02, 0.5, 5.0)]
         steps += [sign * much * SCALE * (np.arange(3) == k)

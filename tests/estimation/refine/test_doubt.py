@@ -10,7 +10,7 @@ import pytest
 
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
-from evflow.estimation.refine.doubt import NAMES, doubted, relative_error, signs
+from evflow.estimation.refine.doubt import LENIENT, NAMES, doubted, relative_error, signs
 from evflow.estimation.refine.receptor_search import Found
 from evflow.simulator.photoreceptor import Photoreceptor
 from experiments.shared import doubting
@@ -44,6 +44,14 @@ def test_signs_are_those_that_are_named() -> None:
     assert (ideal[0]["offset_unneeded"], ideal[0]["odds"]) == (1.0, -1.0)
     assert ideal[0]["open_unneeded"] == seen[0]["open"]
     assert ideal[1]["unexplained_ideal"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("chance", "missed"), [
+    (1.0, 0.0), (1e-9, 0.0), (1 / (1 + np.exp(LENIENT)), 0.5)], ids=["found", "none", "open"])
+def test_what_may_have_been_missed_is_added_by_its_chance(chance: float, missed: float) -> None:
+    seen = dict(zip(NAMES, signs(found(chance), 0.0, SUMMARY, STD)[0], strict=True))
+    more = missed * (np.log(0.19 / 0.25) ** 2 + 0.04**2)
+    assert seen["with_missed"] == pytest.approx(0.5 * np.log(0.05**2 + more), abs=1e-4)
 
 
 def test_the_std_of_the_thresholds_alone_is_replaced() -> None:
