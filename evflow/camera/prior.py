@@ -42,6 +42,14 @@ class Summary:
     sigma_on: Array
     sigma_off: Array
 
+    def __repr__(self) -> str:
+        """One line: the values of a single camera, the shape of others or of traced ones."""
+        known = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        if all(isinstance(v, np.ndarray | np.generic | jax.Array | float)
+               and not isinstance(v, jax.core.Tracer) and np.ndim(v) == 0 for v in known.values()):
+            return f"Summary({', '.join(f'{k}={float(v):.4g}' for k, v in known.items())})"
+        return f"Summary({'x'.join(map(str, np.shape(self.theta_on)))})"
+
 
 @dataclasses.dataclass(frozen=True)
 class CameraPrior:

@@ -19,6 +19,7 @@ from evflow.camera import (
     THETA_MIN,
     Camera,
     CameraPrior,
+    Summary,
     noise_of_threshold,
     sample_nominal,
     sample_pixels,
@@ -317,3 +318,8 @@ def test_it_is_shown_in_one_line() -> None:
     shown = []
     jax.jit(lambda c: shown.append(repr(c)) or c.theta_on)(Camera.constant((4, 5)))
     assert shown == ["Camera(4x5)"]
+    one = Summary(*map(jnp.float32, (0.25, 0.2, 0.1, 0.1, 0.03, 0.03)))
+    assert repr(one).startswith("Summary(theta_on=0.25, theta_off=0.2, eta_on=0.1, ")
+    several = jax.tree.map(lambda a: jnp.full(3, a), one)
+    jax.jit(lambda s: shown.append(repr(s)) or s.theta_on)(several)
+    assert [repr(several), shown[-1]] == ["Summary(3)"] * 2
