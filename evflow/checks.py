@@ -200,3 +200,10 @@ def _float_frames(frames: np.ndarray) -> None:
         fix = "Multiply by 255." if low >= 0 and high <= 1 else "Rescale, or pass uint16."
         raise EvflowDataError(
             "EV003", f"float frames span {low:g}..{high:g}; expected DN 0..255.", fix)
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    """A view that cannot be written; the caller's own array keeps its flags."""
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -27,6 +27,7 @@ from evflow.checks import (
     check_times,
     need,
     plain,
+    read_only,
 )
 from evflow.errors import EvflowDataError
 from evflow.files.spool import forget
@@ -297,10 +298,3 @@ class Window:
     def window_s(self) -> float:
         """Length in seconds, the `window_s` of `estimate`."""
         return (self.t1_us - self.t0_us) / 1e6
-
-
-def read_only(array: np.ndarray) -> np.ndarray:
-    """A view that cannot be written; the caller's own array keeps its flags."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
