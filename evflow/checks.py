@@ -16,6 +16,7 @@ from evflow.errors import EvflowDataError
 Size = tuple[int, int]
 
 COLUMNS = ("x", "y", "t", "p")
+LATEST_US = 1 << 62
 RESET_US = 1_000_000  # a step back by more than this is another clock, not a late packet
 
 
@@ -87,7 +88,16 @@ def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
     back = t[1:] <= t[:-1] if strict else t[1:] < t[:-1]
     if back.any():
         raise _unsorted(t, np.flatnonzero(back), name)
+    if beyond(t[0], t[-1]):
+        raise EvflowDataError(
+            "EV003", f"{name} spans {t[0]:,} to {t[-1]:,} us, "
+            "beyond 2^62 us, 146,000 years.", "Another unit, or other bytes than times?")
     return t
+
+
+def beyond(first: float | np.integer, last: float | np.integer) -> bool:
+    """Whether int64 might not hold what lies between two times (us) of these ends."""
+    return int(first) <= -LATEST_US or int(last) > LATEST_US
 
 
 def _unsorted(t: np.ndarray, steps: np.ndarray, name: str) -> EvflowDataError:

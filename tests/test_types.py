@@ -92,6 +92,7 @@ def test_canonical_dtypes_and_no_copy() -> None:
     ({"x": np.array([0.0, 5.5, 2.0])}, "EV003", "undistorted"),
     ({"t": np.array([0.1, 0.2, 0.3])}, "EV003", "Multiply seconds by 1e6"),
     ({"t": np.array([1, 2, 2**63], np.uint64)}, "EV003", "9223372036854775808"),
+    ({"t": np.array([-(2**62), 0, 2**62])}, "EV003", "146,000 years"),
     ({"t": np.array([10, 12, 9])}, "EV004", "first at index 2: 12 -> 9 us (at most 3 us back)"),
     ({"t": np.array([9_000_000, 1, 2])}, "EV004", "two recordings joined"),
     ({"x": np.array([0, 6, 2])}, "EV005", "1 of 3 events (33.3 %) lie outside 6x4: x 0..6"),

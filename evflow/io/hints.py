@@ -12,7 +12,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from evflow.checks import Size, check_polarity, check_size
+from evflow.checks import Size, beyond, check_polarity, check_size
 from evflow.errors import EvflowDataError
 from evflow.io.decode.units import UNITS_US, since_1970
 from evflow.light.colour import COLOURS
@@ -157,15 +157,15 @@ class Hints:
         """Times of any dtype in `time_unit` (auto: `native`) as int64 us, offset_us added.
 
         Integers stay exact; floats and ns are rounded to the nearest microsecond.
-        Raises EV003, EV007, EV009 (the offset takes them beyond int64).
+        Raises EV003, EV007, EV009 (the offset takes them beyond 2^62 us).
         """
         if t.size == 0:
             return np.zeros(0, np.int64)
         us = self._microseconds(t, native)
         if offset_us == 0:
             return us
-        if not all(-(2**63) <= int(end) + offset_us < 2**63 for end in (us.min(), us.max())):
-            raise EvflowDataError("EV009", f"an offset of {offset_us} us takes times beyond int64.")
+        if beyond(int(us.min()) + offset_us, int(us.max()) + offset_us):
+            raise EvflowDataError("EV009", f"an offset of {offset_us} takes times beyond 2^62 us.")
         return us + np.int64(offset_us)
 
     def _microseconds(self, t: np.ndarray, native: str) -> np.ndarray:
@@ -179,12 +179,12 @@ class Hints:
                 raise EvflowDataError("EV007", f"{(~np.isfinite(t)).sum():,} times are not finite.")
             with np.errstate(over="ignore"):  # an overflow is too late, as below
                 us = np.rint(t.astype(np.float64) * UNITS_US[unit])
-            if np.abs(us).max() >= 2.0**63:
+            if beyond(us.min(), us.max()):
                 raise _too_late(t, unit)
             return us.astype(np.int64)
         if t.dtype.kind not in "iu":
             raise EvflowDataError("EV003", f"times have dtype {t.dtype}.", "Expected numbers.")
-        if max(abs(int(t.min())), abs(int(t.max()))) * max(UNITS_US[unit], 1) >= 2**63:
+        if beyond(*(int(end) * max(UNITS_US[unit], 1) for end in (t.min(), t.max()))):
             raise _too_late(t, unit)
         whole = t.astype(np.int64, copy=False)
         if unit == "ns":
@@ -250,6 +250,6 @@ def _too_late(t: np.ndarray, unit: str) -> EvflowDataError:
     last = float(t.max())
     since = since_1970(last)
     return EvflowDataError(
-        "EV003", f"times span {t.min():.0f}..{last:.0f} {unit}, more than int64 microseconds hold"
+        "EV003", f"times span {t.min():.0f}..{last:.0f} {unit}, beyond 2^62 microseconds"
         f"{f'; in {since[0]} they are times since 1970' if since else ''}.",
         f"Pass the right time_unit (--time-unit {since[0] if since else 'us, or ns'}).")
