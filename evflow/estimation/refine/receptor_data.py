@@ -51,17 +51,19 @@ def sample(
     rng, count, told = np.random.default_rng(seed), np.zeros(2, int), np.zeros(2, int)
     rows: list[tuple[np.ndarray, ...]] = []
     nets: list[tuple[Changes, ...]] = []
+    seen = 0
     for dn, dt_s, s, disturbed in parts:
         if len(s.pixel):
             row, used = _row(dn, dt_s, s, disturbed, rng, len(rows))
             rows.append(row)
             nets.append(_changes(dn, s, rng, len(nets)))
+            seen += s.inner.size
             count += _of_both(s.on)
             told += _of_both(used)
         del dn, s  # before the next is made
     if count.min() < ENOUGH or told.min() < LEAST:
         return None
-    told = np.tile(offset_by_changes(joined(nets)), (len(rows), 1)).astype(np.float32)
+    told = np.tile(offset_by_changes(joined(nets), seen), (len(rows), 1)).astype(np.float32)
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
     return Sample(*map(jax.device_put, [*columns, told]))
 

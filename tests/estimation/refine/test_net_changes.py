@@ -8,6 +8,7 @@ import pytest
 from evflow.estimation.refine.net_changes import (
     ENOUGH,
     LAGS,
+    LEAST_SEEN,
     Changes,
     changes,
     joined,
@@ -35,7 +36,7 @@ def seen_with(offset: float, n: int = 4000, there_and_back: float = 0.5, seed: i
 
 @pytest.mark.parametrize("offset", [-16.0, -6.0, 0.0, 10.0, 25.0])
 def test_the_offset_is_found_without_a_path(offset: float) -> None:
-    found, std = offset_by_changes((seen_with(offset), seen_with(offset, seed=1)))
+    found, std = offset_by_changes((seen_with(offset), seen_with(offset, seed=1)), LEAST_SEEN)
     assert std < 6.0
     assert abs(found - offset) < 2.0 * std
 
@@ -48,7 +49,12 @@ def test_the_offset_is_found_without_a_path(offset: float) -> None:
     (seen_with(-16.0), seen_with(40.0)),
 ], ids=["few", "events that no change explains", "lags that contradict each other"])
 def test_where_nothing_is_told(of_lags: tuple[Changes, ...]) -> None:
-    assert offset_by_changes(of_lags) == (0.0, np.inf)
+    assert offset_by_changes(of_lags, LEAST_SEEN) == (0.0, np.inf)
+
+
+def test_of_few_pixels_nothing_is_told() -> None:
+    alike = seen_with(25.0), seen_with(25.0, seed=1)
+    assert offset_by_changes(alike, 64 * 64 * 8) == (0.0, np.inf)
 
 
 def test_changes_are_those_of_shown_pixels_with_their_events() -> None:
