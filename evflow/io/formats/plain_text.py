@@ -171,6 +171,9 @@ def _laid_out(
         return default._replace(order=order, notes=notes, unit=unit if unit != "auto" else
                                 _unit(order, default))
     order = columns.order_of(np.array(rows)) if rows and len(rows[0]) == 4 and not told else ""
+    if order and default.unit == "whole" and len(rows) < columns.TELLING and (
+            {row[2] for row in rows} <= columns.POLARITIES):
+        order = columns.PROPHESEE  # few values tell little, but the tool has this order
     if not order:
         return None
     notes = () if order in columns.KNOWN else (columns.inferred(order),)

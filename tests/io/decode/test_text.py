@@ -293,3 +293,14 @@ def test_a_last_line_without_its_end_may_be_cut(tmp_path: Path, order: str) -> N
         path.write_bytes(("\n".join(lines) + end).encode())
         notes = read_recording(path, size=(64, 48)).notes
         assert [n.code for n in notes if n.code == "events.unended"] == ["events.unended"] * said
+
+
+@pytest.mark.parametrize("cut", ["102,33,1,1", "102,33,1,1000\n103,4,0,1001", "1,1,1,7\n"])
+def test_the_first_lines_of_openeb_are_in_its_order(tmp_path: Path, cut: str) -> None:
+    """Whatever else so few values could be."""
+    path = tmp_path / "a.csv"
+    path.write_text(f"%geometry:240,180\n{cut}")
+    got = read_recording(path).events
+    first = cut.split()[0].split(",")
+    assert (int(got.x[0]), int(got.y[0]), bool(got.p[0])) == (
+        int(first[0]), int(first[1]), first[2] == "1")
