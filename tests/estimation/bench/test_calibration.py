@@ -3,58 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 from pathlib import Path
 
 import cv2
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers.benches import CYCLES, SHAPE, STAIRS, bench, cameras
 
-from evflow import Recording, simulate
-from evflow.camera import Camera, CameraPrior
+from evflow import Recording
+from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
-from evflow.estimation.bench.levels import _dead_time, few_sizes
 from evflow.estimation.bench.rests import find_rests, steps_of_light
 from evflow.estimation.bench.steps import storing
 from evflow.io import write_recording
 from evflow.notes import texts
 from evflow.types import Events
-
-IDEAL, SHAPE = SensorModel(), (24, 32)
-CYCLES = [25, 225, 25, 225, 25, 225, 25]
-STAIRS = [25, 40, 64, 100, 160, 225, 160, 100, 64, 40, 25]
-
-
-def screen(levels: list[float], rest: int = 100, ramp: int = 20) -> np.ndarray:
-    """DN over time, a frame every ms: `rest` ms at each level, `ramp` ms (even in log) between."""
-    logs = [np.full(rest, np.log(levels[0]))]
-    for a, b in itertools.pairwise(levels):
-        logs += [np.linspace(np.log(a), np.log(b), ramp + 1)[1:], np.full(rest, np.log(b))]
-    return np.exp(np.concatenate(logs)).astype(np.float32)
-
-
-def bench(
-    camera: Camera, levels: list[float], before: tuple[float, ...] = (),
-    model: SensorModel = IDEAL,
-) -> Recording:
-    """Events of a screen and its frames every 10 ms. before: levels that the camera saw first."""
-    lead = len(screen([*before, levels[0]])) - 100 if before else 0
-    dn = screen([*before, *levels])
-    frames, times = np.broadcast_to(dn[:, None, None], (len(dn), *SHAPE)), 1000 * np.arange(len(dn))
-    events = simulate(jax.random.key(0), frames, times, camera, model=model)
-    kept = np.arange(lead, len(dn), 10)
-    events = events.slice(int(times[lead]) + 1, int(times[-1]) + 1)
-    return Recording(events, np.ascontiguousarray(frames[kept]), times[kept])
-
-
-def cameras(mismatch: float, noise: str = "none") -> Camera:
-    prior = CameraPrior(theta=(0.15, 0.35), mismatch=(mismatch, mismatch), noise=noise)
-    return Camera.sample(jax.random.key(3), SHAPE, prior)
 
 
 def errors(found, camera: Camera, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -338,66 +305,6 @@ def test_illuminances_go_with_recordings(
 
     assert main(["estimate", "one.npz", "-o", str(tmp_path / "out"), *words]) == 2
     assert said in capsys.readouterr().err
-
-
-def test_levels_of_light_are_told_apart() -> None:
-    """Noise and duration of the steps at each, with a light meter's values as with the frames'."""
-    camera = cameras(0.03, "eq12")
-    recording = bench(camera, STAIRS)
-    found = calibrate_step(recording, fresh=True)
-    assert "levels.few" not in [note.code for note in found.notes]
-    assert found.bench is not None
-    levels = found.bench.levels
-    np.testing.assert_allclose([v.light for v in levels], sorted(set(STAIRS)), rtol=1e-3)
-    assert [v.rests for v in levels] == [2, 2, 2, 2, 2, 1]
-    for name in ("eta_on", "eta_off"):
-        true = float(np.mean(getattr(camera, name)))
-        off = [(getattr(v, name) - true) / getattr(v, f"{name}_std") for v in levels]
-        assert np.abs(off).max() < 3.5
-    assert all(v.up_s is None is v.down_s for v in levels)  # steps of two thresholds
-    assert len(found.bench.steps) == len(STAIRS) - 1
-    metered = calibrate_step(recording, lux=[0.3 * v for v in sorted(set(STAIRS))], fresh=True)
-    assert metered.bench is not None
-    assert metered.bench.unit == "lux"
-    np.testing.assert_allclose(metered.camera.theta_on, found.camera.theta_on, atol=1e-4)
-    for lux in ([1, 2], [6, 5, 4, 3, 2, 1], [0, 1, 2, 3, 4, 5]):
-        with pytest.raises(EvflowDataError, match=r"EV020.*the frames rest at 6 levels"):
-            calibrate_step(recording, lux=lux)
-
-
-def test_how_long_steps_last() -> None:
-    """Ramps of 20 ms, even in log: from half to nine tenths they take 8 ms, turned or not."""
-    found = calibrate_step(bench(cameras(0.1), [25, 75, 225, 60, 225, 80, 25, 120, 25]))
-    assert found.bench is not None
-    lasting = [step.seconds for step in found.bench.steps]
-    assert None not in lasting
-    np.testing.assert_allclose(lasting, 0.008, rtol=0.2)
-    assert np.median(lasting) == pytest.approx(0.008, rel=0.06)
-    assert found.bench.levels[0].up_s is None
-
-
-@pytest.mark.parametrize(("levels", "few"), [
-    (CYCLES, True), ([25, 75, 225, 75, 25], True), ([25, 60, 225, 60, 25], False)])
-def test_steps_of_one_size_are_told(levels: list[float], few: bool) -> None:
-    changes = np.diff(np.log(levels))
-    assert [note.code for note in few_sizes(changes)] == ["levels.few"] * few
-
-
-@pytest.mark.parametrize(("small_us", "measured"), [(1000, True), (1500, False)])
-def test_an_even_edge_of_the_light_is_no_dead_time(small_us: int, measured: bool) -> None:
-    """Steps of 1.5 and 1 log units: pixels that wait do so in both, those that follow do not."""
-    rng, n = np.random.default_rng(0), SHAPE[0] * SHAPE[1]
-    during = []
-    for k, us in enumerate([1000, small_us, 1000, small_us]):
-        t = 1_000_000 * k + np.arange(6)[:, None] * us + rng.integers(0, 40, (6, n)).cumsum(0)
-        order = np.argsort(t, axis=None, kind="stable")
-        pixel = np.tile(np.arange(n), 6)[order]
-        during.append(Events(pixel % SHAPE[1], pixel // SHAPE[1], t.ravel()[order],
-                             np.full(t.size, k % 2 == 0), SHAPE[::-1]))
-    found = _dead_time(Events.concatenate(during), np.array([1.5, -1.0, 1.5, -1.0]), during)
-    assert found.measured == measured
-    if measured:
-        assert found.seconds == pytest.approx(1e-3, rel=0.05)
 
 
 def test_noise_and_thresholds_join_in_one_camera(
