@@ -78,11 +78,6 @@ class Constants:
         """Whether an event that comes within the refractory period of another fires later."""
         return self.is_dead_between and self.kind == "v2e" and self.photoreceptor is None
 
-    @property
-    def is_traced(self) -> bool:
-        """Whether any number is not known."""
-        return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self))
-
     def on_device(self) -> Constants:
         """The same for calls of many programs."""
         return jax.tree.map(jnp.asarray, self)

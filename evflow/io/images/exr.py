@@ -17,7 +17,6 @@ TILES, DEEP, PARTS = 0x200, 0x800, 0x1000  # bits of the version
 COMPRESSIONS = ("none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
 LINES = {"none": 1, "RLE": 1, "ZIPS": 1, "ZIP": 16}  # of a block
 KINDS = (np.dtype("<u4"), np.dtype("<f2"), np.dtype("<f4"))
-LEAST_BYTES = 40  # of any header
 
 
 class Channel(NamedTuple):
