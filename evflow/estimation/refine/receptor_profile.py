@@ -1,11 +1,14 @@
-"""How far the offset may be off: the likelihood along it, tau and delay at their best everywhere.
+"""How far the constants may be off where the likelihood is no parabola.
 
-At the knee of the lin-log the likelihood bends, and is far flatter to the side of more light than
-its curvature at the top says; and a threshold goes with the offset's logarithm, not in proportion.
+Along the offset, with tau and delay at their best everywhere: at the knee of the lin-log the
+likelihood bends, and is far flatter to the side of more light than its curvature at the top says;
+and a threshold goes with the offset's logarithm, not in proportion. Between the two laws of the
+low-pass, of which the less probable may be the true one.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +20,25 @@ Array = np.ndarray
 WALK = (1.0, 1.0, 1.0, 2.0, 2.0, 4.0)  # lengths of the steps to either side, in std of the offset
 SHORTEST, LONGEST = 1.5, 6.0  # DN, of that std
 FAR = 5.0  # below the best log-likelihood, where a walk ends
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Other:
+    """The less probable law of a low-pass: its probability, and tau (s) and theta (2,) by it."""
+
+    chance: float
+    tau_s: float
+    theta: Array
+
+    def beside(
+        self, tau_s: float, theta: Array, covariance: Array, theta_error: Array
+    ) -> tuple[Array, Array]:
+        """Covariance (3, 3) of the constants and relative errors (2,) of theta, of the more
+        probable law with tau_s and theta, widened by how far this one lies from it."""
+        wider = np.zeros((3, 3))
+        wider[1, 1] = self.chance * (self.tau_s - tau_s) ** 2
+        apart = np.log(np.abs(self.theta) / np.abs(theta))
+        return covariance + wider, np.hypot(theta_error, np.sqrt(self.chance) * apart)
 
 
 def along_offset(

@@ -16,7 +16,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.estimation.refine.receptor_data import Sample, smeared_sample
 from evflow.estimation.refine.receptor_noise import parted
 from evflow.estimation.refine.receptor_prior import Prior
-from evflow.estimation.refine.receptor_profile import along_offset
+from evflow.estimation.refine.receptor_profile import Other, along_offset
 from evflow.estimation.refine.receptor_regression import SCALE, Regression, Slopes
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor
 
@@ -37,7 +37,7 @@ DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera
 ALONE = 2.0  # log odds, beside those of the changes from frame to frame, that it takes to say that
 # the frames of an ideal pixel lack light
 BY_OFFSET = 5.0  # log odds that it takes to say that a slow pixel's frames lack light
-BY_LIGHT = 1.5  # log odds, a priori, that a low-pass goes with light
+BY_LIGHT = 1.0  # log odds, a priori, that a low-pass goes with light
 TYPICAL = 0.4  # pace of such a low-pass, of its pace at 255 DN
 
 # The less of the contrast a path keeps, the less of the events it explains. On simulated recordings
@@ -124,7 +124,7 @@ def find(data: Sample) -> Found:
         by_light = Regression(parted(data, _receptor(phi), theta))
     plain = by_light.unexplained(PLAIN)
     believed = min(size, BELIEVED)
-    model, phi = _with_law(phi, by_light, believed)
+    model, phi, other = _with_law(phi, by_light, believed)
     odds = _odds(phi, model, believed, plain)
     if odds > 0 and phi[1] > 2 * FAST:
         phi = _without_offset(phi, model, believed)
@@ -136,6 +136,8 @@ def find(data: Sample) -> Found:
     value = model.unexplained(phi)
     covariance, open_ = _errors(phi, model, believed)
     fits, ideal_fits = (model.solved(at)[0] for at in (phi, PLAIN))
+    if other is not None and phi[1] > 2 * FAST:
+        covariance, open_ = other.beside(phi[1], fits, covariance, open_)
     if fits.min() <= 0:  # brightness that falls with ON events: there is no path
         odds = -np.inf
     return Found(_receptor(phi, by_light=model.by_light), np.abs(fits), np.abs(ideal_fits),
@@ -157,14 +159,20 @@ def explained(data: Sample, seen_by: Photoreceptor, theta: np.ndarray) -> float:
     return Regression(parted(data, seen_by, theta), seen_by.by_light).explained_by(at, theta)
 
 
-def _with_law(phi: np.ndarray, by_light: Regression, size: float) -> tuple[Regression, np.ndarray]:
-    """The law of the low-pass that explains more, and the most probable constants with it."""
+def _with_law(
+    phi: np.ndarray, by_light: Regression, size: float
+) -> tuple[Regression, np.ndarray, Other | None]:
+    """The law of the low-pass that explains more, the most probable constants with it, and what
+    the other law would say."""
     if phi[1] <= 2 * FAST:
-        return by_light, phi
+        return by_light, phi, None
     even = dataclasses.replace(by_light, by_light=False)
     other = _descend(np.where(np.arange(3) == 1, phi[1] / TYPICAL, phi), even, size)
-    gain = _value(phi, by_light, size) - _value(other, even, size)
-    return (even, other) if gain > BY_LIGHT else (by_light, phi)
+    odds = _value(phi, by_light, size) - _value(other, even, size) - BY_LIGHT
+    laws = [(by_light, phi), (even, other)]
+    (model, at), (left, there) = laws[::-1] if odds > 0 else laws
+    chance = 1.0 / (1.0 + np.exp(min(abs(odds), 50.0)))
+    return model, at, Other(chance, float(there[1]), left.solved(there)[0])
 
 
 def _odds(phi: np.ndarray, model: Regression, size: float, plain: float) -> float:

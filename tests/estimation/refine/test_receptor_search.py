@@ -9,6 +9,7 @@ import pytest
 from evflow.estimation.refine import receptor_search
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
+from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_search import find
 from evflow.estimation.refine.sightings import Sightings, sight
@@ -194,3 +195,12 @@ def test_events_that_no_frame_shows_tell_nothing(shown: bool) -> None:
     s = sight(events, times, lin_log(dn), STEPS, np.full((INTERVALS + 1, *SHAPE), shown))
     found = sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s, no_readouts(s))])
     assert (found is not None) == shown
+
+
+def test_the_less_probable_law_widens_what_is_left_open() -> None:
+    """As a mixture of two values: chance times the square of their distance."""
+    other = Other(0.25, 5e-3, np.array([0.2, 0.6]))
+    covariance, theta_error = other.beside(
+        3e-3, np.array([0.2, 0.3]), np.diag([4.0, 1e-8, 1e-8]), np.array([0.1, 0.0]))
+    assert covariance == pytest.approx(np.diag([4.0, 1e-8 + 0.25 * 4e-6, 1e-8]))
+    assert theta_error == pytest.approx([0.1, 0.5 * np.log(2)])
