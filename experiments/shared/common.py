@@ -6,8 +6,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -21,6 +23,7 @@ from evflow.network.weights import load_weights, weights_hash
 from evflow.process.provenance import provenance
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
+STARTED = time.monotonic()
 HOW = ("out", "workers", "max_seconds")  # options that change nothing in a result
 
 
@@ -41,10 +44,18 @@ class StudyOptions:
 
 
 def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> None:
-    """Save a result with its configuration, the hashes of the weights that this names, and
-    provenance as JSON."""
-    record = {"result": result, "config": config, "weights_sha256": hashes(config), **provenance()}
+    """Save a result with its configuration, the hashes of the weights that this names, what it
+    took and provenance as JSON."""
+    record = {"result": result, "config": config, "weights_sha256": hashes(config),
+              "took": took(), **provenance()}
     atomic_text(path, json.dumps(record, indent=2, default=str) + "\n", overwrite=True)
+
+
+def took() -> dict[str, float]:
+    """Seconds of this process so far, and of the processes that it has ended: by the clock, and of
+    CPU. Rows that an earlier run had kept are not in them."""
+    cpu_s = sum(os.times()[:4])
+    return {"wall_s": round(time.monotonic() - STARTED, 1), "cpu_s": round(cpu_s, 1)}
 
 
 def write_text(path: Path, text: str) -> None:

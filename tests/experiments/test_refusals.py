@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -74,6 +75,8 @@ def test_a_result_of_other_options_is_not_replaced(tmp_path: Path) -> None:
     options = generate.Options(out=tmp_path, scenes=3)
     begin(options, "generate")
     write_result(tmp_path / "generate.json", {}, dataclasses.asdict(options))
+    took = json.loads((tmp_path / "generate.json").read_text())["took"]
+    assert took["cpu_s"] > 0 < took["wall_s"]
     begin(options, "generate")
     other = dataclasses.replace(options, scenes=4, seed=5)
     with pytest.raises(EvflowDataError, match=r"EV013.*other options \(seed, scenes\)"):
