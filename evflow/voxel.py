@@ -50,18 +50,32 @@ def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np
     if window_us <= 0 or not isinstance(bins, int | np.integer) or bins < 2:
         raise EvflowDataError("EV020", f"window_us={window_us}, bins={bins}.",
                               "Need a window > 0 and a whole number of bins, 2 or more.")
-    t0_us, window_us = int(t0_us), int(window_us)  # a sum of small integers would overflow
+    width, height = events.size
+    pixels, voxels = fired_voxels(events, int(t0_us), int(window_us), bins)
+    grid = np.zeros((height * width, 2 * bins), np.float32)
+    grid[pixels] = voxels
+    return grid.reshape(height, width, 2 * bins)
+
+
+def fired_voxels(
+    events: Events, t0_us: int, window_us: int, bins: int = BINS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those pixels alone that have events in the window: their numbers y * W + x (k,), and their
+    voxels (k, 2*bins), as of `voxelize`."""
     inside = events.slice(t0_us, t0_us + window_us)
     width, height = events.size
     position = (inside.t - t0_us) * ((bins - 1) / window_us)
     low = np.minimum(position.astype(np.int64), bins - 2)
     weight = position - low
     pixel = inside.y.astype(np.int64) * width + inside.x
-    index = (pixel * 2 + ~inside.p) * bins + low
-    size = height * width * 2 * bins
-    grid = np.bincount(index, 1.0 - weight, size)
-    grid += np.bincount(index + 1, weight, size)
-    return grid.astype(np.float32).reshape(height, width, 2 * bins)
+    fired = np.zeros(height * width, bool)
+    fired[pixel] = True
+    pixels = np.flatnonzero(fired)
+    index = ((np.cumsum(fired) - 1)[pixel] * 2 + ~inside.p) * bins + low
+    size = len(pixels) * 2 * bins
+    voxels = np.bincount(index, 1.0 - weight, size)
+    voxels += np.bincount(index + 1, weight, size)
+    return pixels, voxels.astype(np.float32).reshape(-1, 2 * bins)
 
 
 def voxelize_padded(

@@ -18,16 +18,17 @@ from evflow.estimation.intervals import QuietWaits, Waits
 from evflow.estimation.pixel_noise import calm, quiet_time
 from evflow.estimation.refine.stretches import BAND, LARGE
 from evflow.estimation.shot import LIGHTS, by_light
-from evflow.light.log_maps import lin_log, noise_factor, normalised_intensity
+from evflow.light.log_maps import mean_and_change, noise_factor, normalised_intensity
 from evflow.network import api
+from evflow.network.weighted import summarize_weighted
 from evflow.recordings.glitches import exposed
 from evflow.recordings.region import bands, rows_of
 from evflow.recordings.windows import iter_windows
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 from evflow.types import Recording, Window
-from evflow.voxel import voxelize
+from evflow.voxel import fired_voxels, voxelize
 
-Array = jax.Array
+_mean_and_change = jax.jit(mean_and_change)
 
 
 def window_inputs(
@@ -45,13 +46,6 @@ def _light(frame: np.ndarray, seen_by: Photoreceptor) -> np.ndarray:
     if not seen_by.offset_dn:
         return frame
     return np.maximum(frame.astype(np.float32) + np.float32(seen_by.offset_dn), np.float32(0.0))
-
-
-@jax.jit
-def _mean_and_change(frame0: ArrayLike, frame1: ArrayLike) -> tuple[Array, Array]:
-    """Mean of the log intensity of two frames (H, W) in DN, and its change."""
-    before, after = lin_log(frame0), lin_log(frame1)
-    return 0.5 * (before + after), after - before
 
 
 def pool_recording(
@@ -87,9 +81,8 @@ def window_counts(window: Window) -> tuple[np.ndarray, np.ndarray]:
 def window_stats(
     params: api.Params, window: Window, seen_by: Photoreceptor = IDEAL
 ) -> api.Stats:
-    """Stats of the pixels that a window's frames show. The others are replaced by random ones of
-    them and the sums scaled down to their number: arrays of one shape are compiled once. Large
-    sensors go band by band, whose sums add."""
+    """Stats of the pixels that a window's frames show, or of all if they show none. Large sensors
+    go band by band, whose sums add."""
     shape = window.frame0.shape
     if shape[0] * shape[1] <= LARGE:
         return _stats(params, window, seen_by)
@@ -98,29 +91,19 @@ def window_stats(
 
 
 def _stats(params: api.Params, window: Window, seen_by: Photoreceptor) -> api.Stats:
-    voxels, dlogI, given = window_inputs(window, seen_by)
-    shown = exposed(window.frame0, window.frame1)
-    share = float(shown.mean())
-    if 0 < share < 1:
-        rng = np.random.default_rng(window.index)
-        hidden = np.flatnonzero(~shown)
-        source = rng.choice(np.flatnonzero(shown), hidden.size)
-
-        def filled(values: ArrayLike) -> np.ndarray:
-            pixels = np.array(values)
-            flat = pixels.reshape(shown.size, -1)
-            flat[hidden] = flat[source]
-            return pixels
-
-        voxels, dlogI = filled(voxels), filled(dlogI)
-        given["intensity"] = filled(given["intensity"])
-    stats = api.summarize(params, voxels, dlogI, **given)
-    return stats if share == 1 else _scaled(stats, share)
-
-
-@jax.jit
-def _scaled(stats: api.Stats, share: ArrayLike) -> api.Stats:
-    return jax.tree.map(lambda leaf: leaf * share, stats)
+    """Quiet pixels of the same brightness go through the network once, with their number."""
+    shown = exposed(window.frame0, window.frame1).ravel()
+    counted = shown if shown.any() else ~shown
+    frames = np.stack([_light(f, seen_by).ravel() for f in (window.frame0, window.frame1)], 1)
+    pixels, voxels = fired_voxels(window.events, window.t0_us, window.t1_us - window.t0_us)
+    quiet = counted.copy()
+    quiet[pixels] = False
+    pairs, numbers = np.unique(frames[quiet].view(np.uint64), return_counts=True)
+    kept = counted[pixels]
+    return summarize_weighted(
+        params, voxels[kept],
+        np.concatenate([frames[pixels[kept]], pairs.view(np.float32).reshape(-1, 2)]),
+        np.concatenate([np.ones(kept.sum()), numbers]), window.window_s)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

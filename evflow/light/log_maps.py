@@ -135,6 +135,12 @@ def noise_factor(i01: Values) -> Values:
     return 1.0 - 0.75 * i01
 
 
+def mean_and_change(frame0: ArrayLike, frame1: ArrayLike) -> tuple[Array, Array]:
+    """Mean of the lin-log intensity of two frames in DN on 0..255, and its change."""
+    before, after = lin_log(frame0), lin_log(frame1)
+    return 0.5 * (before + after), after - before
+
+
 def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
     """Change of log intensity between two frames: the dlogI of `estimate`.
 

@@ -130,13 +130,13 @@ def summarize(
         >>> stats = sum(ef.summarize(params, v, d) for v, d in windows)
         >>> summary, std = ef.finish(params, stats)
     """
-    config, net = _pooling_parts(params)
+    config, net = pooling_parts(params)
     inputs = prepare(config, voxels, dlogI, window_s, intensity)
     at_a_time = LARGE if on_cpu(inputs) else None  # activations of all would be new memory
     return _pool(net["summary"], *inputs, config=config, at_a_time=at_a_time)
 
 
-def _pooling_parts(params: Params) -> tuple[ModelConfig, Params]:
+def pooling_parts(params: Params) -> tuple[ModelConfig, Params]:
     """`parts` of a network that has a summary; EV018 for others."""
     config, net = parts(params)
     if not config.pool or "summary" not in net:
@@ -169,7 +169,7 @@ def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
         EvflowDataError: EV018 (weights of the paper's network, which has no summary, or no
             weights), EV020 (no statistics).
     """
-    config, net = _pooling_parts(params)
+    config, net = pooling_parts(params)
     need(stats, Stats, "stats", "Give what summarize returns, one or a sum.")
     return squashed_summary(*_finish(net["summary"], stats, config=config))
 

@@ -130,10 +130,11 @@ class FinishNet(nn.Module):
 
 def pool(
     config: ModelConfig, params: dict, voxels: Array, dlogI: Array, window_s: Array,
-    intensity: Array | None, *, at_a_time: int | None = None,
+    intensity: Array | None, *, at_a_time: int | None = None, weight: Array | None = None,
 ) -> Stats:
     """Sum over pixels: voxels (..., H, W, 2B), dlogI (..., H, W) -> Stats of (...,). at_a_time:
-    pixels that go through the network together, None for all; the sums are the same."""
+    pixels that go through the network together, None for all; the sums are the same. weight: how
+    often each counts, (..., H, W); None for once."""
     context = window_features(jnp.asarray(window_s)[..., None, None], intensity, dlogI.shape)
     features = pixel_features(voxels, dlogI, context)
 
@@ -154,11 +155,16 @@ def pool(
         [n_on * n_on, n_off * n_off, n_on * n_off, n_on * dlogI, n_off * dlogI], -1)
     # 1/(1+n): otherwise the few pixels at the clamp, with most of the events, decide alone.
     weights = gates / (1.0 + total)[..., None]
+    pixels = jnp.full(dlogI.shape[:-2], float(dlogI.shape[-1] * dlogI.shape[-2]), voxels.dtype)
+    if weight is not None:
+        pixels, fired = jnp.sum(weight, (-2, -1)), fired * weight
+        rates, weights = rates * weight[..., None], weights * weight[..., None]
     squares, brighter, darker = jnp.split(weights, 3, -1)
     rise = jnp.stack([nn.relu(dlogI - DEAD_CHANGE), nn.relu(-dlogI - DEAD_CHANGE)], -1)
     sides = jnp.stack([brighter, darker], -1) * rise[..., None, :]
     terms = jnp.stack([n_on, n_off, dlogI], -1)
-    pixels = jnp.full(dlogI.shape[:-2], float(dlogI.shape[-1] * dlogI.shape[-2]), voxels.dtype)
+    if weight is not None:
+        n_on, n_off = n_on * weight, n_off * weight
     return Stats(
         active=jnp.sum(active * fired[..., None], (-3, -2)),
         rates=jnp.sum(rates, (-3, -2)),
