@@ -1,7 +1,7 @@
 """evflow: measure an event camera from its recording, and simulate any video as it would see it.
 
-The public names (`__init__.pyi`) load on first use, so that `import evflow` and `evflow --help`
-stay instant.
+The public names (`__init__.pyi`) load on first use, which keeps `import evflow` and `evflow --help`
+fast.
 """
 
 from evflow.process import early

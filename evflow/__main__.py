@@ -1,4 +1,4 @@
-"""`python -m evflow` and the command `evflow`: what is done before anything else is loaded."""
+"""Entry point of `python -m evflow` and of the command `evflow`."""
 
 import sys
 from typing import NoReturn
@@ -7,7 +7,7 @@ from evflow.process import early
 
 
 def run() -> NoReturn:
-    """The process `evflow`; `main` of cli.py takes Ctrl-C over."""
+    """Run the command; from `main` of cli.py on, Ctrl-C is handled there."""
     early.end_on_interrupt()
     from evflow.cli import run
     from evflow.process.terminal import open_closed

@@ -1,4 +1,4 @@
-"""The border: what arrays must be to become `Events` or a `Recording`. NumPy only.
+"""Input validation: checks that turn user arrays into `Events` or a `Recording`. NumPy only.
 
 Every check returns its argument in the canonical dtype (without a copy where it fits) or raises
 an `EvflowDataError` that says what was seen, where, and what to do. Nothing is repaired.
@@ -21,32 +21,32 @@ RESET_US = 1_000_000  # a step back by more than this is another clock, not a la
 
 
 def plain(name: str, value: Any) -> Any:
-    """The value as an array of NumPy, or as it is where it is one of JAX. EV003 for masked values,
-    whose mask would be lost, for times with a unit, and for what is no array."""
+    """`value` as a NumPy array; JAX arrays pass unchanged. Raises EV003 for masked arrays (the mask
+    would be lost), datetime64 or timedelta64, and objects that are not arrays."""
     if hasattr(value, "aval"):
         return value
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise EvflowDataError(
-            "EV003", f"{name} has {np.ma.count_masked(value):,} masked values, which would count "
-            "as any others.", "Leave those out, or fill them: value.compressed(), value.filled(0).")
+            "EV003", f"{name} has {np.ma.count_masked(value):,} masked values, which would be "
+            "treated as valid.", "Remove or fill them: value.compressed(), value.filled(0).")
     try:
         array = np.asarray(value)
     except EvflowDataError:
         raise
-    except Exception as e:  # of tensors on other devices, with gradients: a kind a library
+    except Exception as e:  # e.g. tensors on a GPU or with gradients; each library
         raise EvflowDataError(
-            "EV003", f"{name} is a {type(value).__name__} that is no array ({e}).",
-            "Of a PyTorch tensor: tensor.detach().cpu().numpy().") from e
+            "EV003", f"{name} is a {type(value).__name__}, which cannot be made an array ({e}).",
+            "For a PyTorch tensor: tensor.detach().cpu().numpy().") from e
     if array.dtype.kind in "mM":
         raise EvflowDataError(
-            "EV003", f"{name} has dtype {array.dtype}: times with a unit of their own.",
+            "EV003", f"{name} has dtype {array.dtype}, a type with its own time unit.",
             f"Times are integer us: {'t' if array.dtype.kind == 'm' else '(t - t[0])'}"
             ".astype('timedelta64[us]').astype(np.int64).")
     return array
 
 
 def need(value: Any, kind: Any, name: str, fix: str) -> None:
-    """EV020 where a value of another kind, a class or a union of some, was given."""
+    """Raise EV020 unless `value` is an instance of `kind`, a class or a union of classes."""
     if not isinstance(value, kind):
         expected = getattr(kind, "__name__", kind)
         raise EvflowDataError(
@@ -54,14 +54,14 @@ def need(value: Any, kind: Any, name: str, fix: str) -> None:
 
 
 def require(config: Any, name: str, good: bool, rule: str) -> None:
-    """EV020 unless `good`: the field `name` of a configuration must follow `rule`."""
+    """Raise EV020 unless `good`: the field `name` of a configuration must follow `rule`."""
     if not good:
         kind, value = type(config).__name__, getattr(config, name)
         raise EvflowDataError("EV020", f"{kind}({name}={value!r}).", f"It must be {rule}.")
 
 
 def check_size(size: Any) -> Size:
-    """(width, height) as ints, 1..65536, or EV020."""
+    """(width, height) as ints in 1..65536; raises EV020."""
     try:
         width, height = (operator.index(v) for v in size)
     except (TypeError, ValueError):
@@ -73,7 +73,7 @@ def check_size(size: Any) -> Size:
 
 
 def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
-    """Times (N,) as int64 in order (strict: no two equal); EV003, EV004."""
+    """Times (N,) as sorted int64 (strict: strictly increasing); raises EV003, EV004."""
     if t.size == 0:
         return np.zeros(0, np.int64)
     if t.dtype.kind not in "iu":
@@ -82,7 +82,7 @@ def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
             "Multiply seconds by 1e6 and round: np.rint(t * 1e6).astype(np.int64).")
     if t.dtype == np.uint64 and t.max() > np.iinfo(np.int64).max:
         raise EvflowDataError(
-            "EV003", f"{name} reaches {t.max()}, more than int64 holds.",
+            "EV003", f"{name} reaches {t.max()}, which does not fit int64.",
             "Times are microseconds; was a negative time stored as unsigned?")
     t = t.astype(np.int64, copy=False)
     back = t[1:] <= t[:-1] if strict else t[1:] < t[:-1]
@@ -91,12 +91,12 @@ def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
     if beyond(t[0], t[-1]):
         raise EvflowDataError(
             "EV003", f"{name} spans {t[0]:,} to {t[-1]:,} us, "
-            "beyond 2^62 us, 146,000 years.", "Another unit, or other bytes than times?")
+            "beyond 2^62 us (146,000 years).", "Wrong time unit, or bytes that are not times?")
     return t
 
 
 def beyond(first: float | np.integer, last: float | np.integer) -> bool:
-    """Whether int64 might not hold what lies between two times (us) of these ends."""
+    """Whether the difference of two times in [first, last] (us) might overflow int64."""
     return int(first) <= -LATEST_US or int(last) > LATEST_US
 
 
@@ -106,15 +106,15 @@ def _unsorted(t: np.ndarray, steps: np.ndarray, name: str) -> EvflowDataError:
     verb = "do not advance" if most == 0 else "go back"
     seen = (f"{name}: timestamps {verb} {len(steps):,} {times}, first at index {first + 1:,}: "
             f"{t[first]:,} -> {t[first + 1]:,} us (at most {most:,} us back).")
-    fix = ("Two of them share an instant: wrong time unit, or repeated?" if most == 0 else
+    fix = ("Two of them are equal: wrong time unit, or repeated entries?" if most == 0 else
            "A camera reset, or two recordings joined? Split them there." if most > RESET_US else
-           "Nothing is sorted silently: if the order does not matter, sort all columns by "
+           "Nothing is sorted silently: if the order does not matter, sort all columns with "
            "np.argsort(t, kind='stable').")
     return EvflowDataError("EV004", seen, fix)
 
 
 def check_polarity(p: np.ndarray) -> np.ndarray:
-    """Polarity (N,) as bool, True = ON, from bool or integers in {0, 1} or {-1, 1}; EV006."""
+    """Polarity (N,) as bool, True = ON; from bool, {0, 1} or {-1, 1}; raises EV006."""
     if p.size == 0 or p.dtype == bool:
         return p.astype(bool, copy=False)
     if p.dtype.kind in "iu":
@@ -127,19 +127,19 @@ def check_polarity(p: np.ndarray) -> np.ndarray:
     values = ", ".join(str(v) for v in some[:5])
     raise EvflowDataError(
         "EV006", f"p has dtype {p.dtype} and holds {values}.",
-        "Expected bool, {0, 1} or {-1, 1}; a -1 stored as unsigned reads 255: use int8.")
+        "Expected bool, {0, 1} or {-1, 1}; a -1 stored as an unsigned byte reads as 255: use int8.")
 
 
 def check_columns(*given: Any) -> dict[str, np.ndarray]:
-    """x, y, t, p as 1-D arrays of one length without NaN; EV002, EV003, EV007."""
+    """x, y, t, p as 1-D arrays of equal length without NaN; raises EV002, EV003, EV007."""
     columns = {name: np.asarray(plain(name, v))
                for name, v in zip(COLUMNS, given, strict=True)}
     for name, a in columns.items():
         if a.ndim != 1:
-            fix = "Columns are 1-D arrays of one length."
+            fix = "Columns must be 1-D arrays of equal length."
             if a.ndim == 2 and 4 in a.shape:
                 rows = "events.T" if a.shape[1] == 4 else "events"
-                fix = f"That looks like all columns in one array: unpack it, x, y, t, p = {rows}."
+                fix = f"All columns in one array? Unpack it: x, y, t, p = {rows}."
             raise EvflowDataError("EV002", f"{name} has shape {a.shape}.", fix)
     lengths = {name: len(a) for name, a in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -148,19 +148,19 @@ def check_columns(*given: Any) -> dict[str, np.ndarray]:
         if a.dtype.kind == "f" and not (finite := np.isfinite(a)).all():
             where = int(np.argmin(finite))
             raise EvflowDataError(
-                "EV007", f"{name} is {a[where]} at event {where:,} ({(~finite).sum():,} such).")
+                "EV007", f"{name} is {a[where]} at event {where:,} ({(~finite).sum():,} in all).")
     return columns
 
 
 def check_coordinates(x: np.ndarray, y: np.ndarray, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """x, y as uint16 inside `size`; EV003, EV005."""
+    """x, y as uint16 inside `size`; raises EV003, EV005."""
     if x.size == 0:
         return np.zeros(0, np.uint16), np.zeros(0, np.uint16)
     for name, a in (("x", x), ("y", y)):
         if a.dtype.kind not in "iu":
             raise EvflowDataError(
                 "EV003", f"{name} has dtype {a.dtype} (first value {a[0]}).",
-                "Coordinates are raw integer pixels: were they undistorted? Use the raw ones.")
+                "Were they undistorted? Use the raw integer pixel coordinates.")
     width, height = size
     if min(x.min(), y.min()) < 0 or x.max() >= width or y.max() >= height:
         outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
@@ -172,18 +172,18 @@ def check_coordinates(x: np.ndarray, y: np.ndarray, size: Size) -> tuple[np.ndar
             f"{width}x{height}: x {x.min()}..{x.max()}, y {y.min()}..{y.max()}, first at event "
             f"{first:,} (x={x[first]}, y={y[first]}).",
             f"size is (width, height): did you mean ({height}, {width})?" if swapped else
-            "Wrong sensor size or bit mask? Pass the size of this sensor.")
+            "Wrong sensor size or bit mask? Pass this sensor's size.")
     return x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False)
 
 
 def check_frames(frames: np.ndarray, size: Size) -> None:
-    """(T, H, W) of a known dtype, of the events' size, finite; EV002, EV003, EV007, EV015."""
+    """Check shape (T, H, W), dtype, size and finite values; raises EV002, EV003, EV007, EV015."""
     width, height = size
     if frames.ndim == 4 and frames.shape[-1] in (3, 4):
         raise EvflowDataError(
             "EV002", f"frames are colour, {frames.shape}.",
-            "Convert them: frames = evflow.light.colour.luma(frames[..., 2::-1]) of R, G, B(, A); "
-            "frames[..., :3] of OpenCV's B, G, R(, A).")
+            "Convert them: frames = evflow.light.colour.luma(frames[..., 2::-1]) for RGB(A), "
+            "frames[..., :3] for OpenCV's BGR(A).")
     if frames.ndim != 3:
         raise EvflowDataError("EV002", f"frames have shape {frames.shape}.", "Expected (T, H, W).")
     if frames.dtype not in (np.uint8, np.uint16, np.float32):
@@ -193,7 +193,7 @@ def check_frames(frames: np.ndarray, size: Size) -> None:
         swapped = " Swap width and height of size." if frames.shape[1:] == (width, height) else ""
         raise EvflowDataError(
             "EV015", f"frames are {frames.shape[2]}x{frames.shape[1]} (width x height) but events "
-            f"are {width}x{height}.", f"Both must come from one sensor, uncropped.{swapped}")
+            f"are {width}x{height}.", f"Both must come from the same sensor, uncropped.{swapped}")
     if frames.dtype == np.float32 and len(frames):
         _float_frames(frames)
 
@@ -204,7 +204,7 @@ def _float_frames(frames: np.ndarray) -> None:
         if not finite.all():
             raise EvflowDataError(
                 "EV007", f"frame {index} has {(~finite).sum():,} NaN or infinite values.",
-                "The log of negative or missing pixels? Frames are linear DN.")
+                "Frames must be linear DN; a logarithm of pixels <= 0, or missing pixels?")
     low, high = float(frames.min()), float(frames.max())
     if low < 0 or high > 255 or 0 < high <= 1:
         fix = "Multiply by 255." if low >= 0 and high <= 1 else "Rescale, or pass uint16."
@@ -213,7 +213,7 @@ def _float_frames(frames: np.ndarray) -> None:
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
-    """A view that cannot be written; the caller's own array keeps its flags."""
+    """A read-only view; the caller's own array stays writable."""
     view = array.view()
     view.flags.writeable = False
     return view

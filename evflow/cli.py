@@ -34,7 +34,7 @@ from evflow.process import early
 from evflow.process.compilation import remember
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
-EXITS = {"EV019": 3, "EV020": 2}  # codes of resources and of usage
+EXITS = {"EV019": 3, "EV020": 2}  # exit codes other than 1
 
 COMMANDS: dict[str, type] = {
     "info": Info, "check": Check, "estimate": Estimate, "compare": Compare, "render": Render,
@@ -43,24 +43,24 @@ COMMANDS: dict[str, type] = {
 
 
 def offered(arguments: Sequence[str] = ()) -> Any:
-    """The type of the command line: a command by its name. `bench` is one where there are
-    benchmarks; the options of `train` are made where it is what is asked for."""
+    """The type that tyro parses: one of the commands by its name. `bench` is offered only where
+    benchmarks/ exists; the options of `train` are built only when `train` is called."""
     found = COMMANDS | ({"bench": Bench} if at_hand() else {})
     if arguments[:1] == ["train"]:
         found["train"] = with_configuration(arguments)
     named = tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in found.items())
-    return Union[named]  # noqa: UP007 - of types that are not known beforehand
+    return Union[named]  # noqa: UP007 - built at run time
 
 
 def understood(arguments: list[str]) -> list[str]:
-    """The command line as it is parsed. Raises EV020 where it begins with no command."""
+    """The arguments in the order the parser expects; raises EV020 for an unknown command."""
     first = arguments[0] if arguments else ""
     if first == "--version":
         return ["version", *arguments[1:]]
     if first and not first.startswith("-") and first not in {*COMMANDS, "bench"}:
         near = difflib.get_close_matches(first, COMMANDS, n=1)
         fix = f"Did you mean: evflow {near[0]}?" if near else (
-            "A recording is measured by evflow estimate RECORDING -o cam/."
+            "To measure a recording: evflow estimate RECORDING -o cam/."
             if Path(first).exists() else f"Commands: {', '.join(COMMANDS)}.")
         raise EvflowDataError("EV020", f"evflow has no command {first!r}.", fix)
     return forwarded(arguments)
@@ -99,11 +99,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def run() -> NoReturn:
-    """The process `evflow`: `main`, and its exit code."""
+    """Run `main` and end the process with its exit code."""
     print_anything()
     code = main()
     early.end_on_interrupt()
-    gc.freeze()  # Python would look for garbage in all that was loaded, for a third of a second
+    gc.freeze()  # a search for garbage among all loaded objects takes a third of a second
     if code == INTERRUPTED:
         leave(code)
     sys.exit(code)

@@ -1,8 +1,8 @@
-"""One exception for bad data, with a stable code.
+"""The one exception for bad data, with stable codes.
 
 Every message says what was seen, where, what it probably means and what to do about it.
-Nothing else in evflow raises for data: a `ValueError` or `TypeError` from the library is a
-programming error, an `EvflowDataError` is something about the user's file or arrays.
+An `EvflowDataError` is always about the user's file, arrays or options; a `ValueError` or
+`TypeError` raised by evflow is a programming error.
 """
 
 from __future__ import annotations
@@ -59,9 +59,8 @@ class EvflowDataError(Exception):
     Attributes:
         code: one of `CODES`, "EV001" and so on; stable, so programs may branch on it.
         seen: what was found, and where.
-        fix: what to do about it; "" where there is nothing to say.
-        where: the file, or place in one, that `seen` names; None where it is about arrays or
-            options.
+        fix: what to do about it; "" if there is no advice.
+        where: the file, or the place in it, that `seen` names; None for arrays and options.
 
     Example:
         >>> try:
@@ -76,13 +75,13 @@ class EvflowDataError(Exception):
         super().__init__(f"{code} {CODES[code]}: {seen}{' ' + fix if fix else ''}")
 
     def __reduce__(self) -> tuple[Callable[..., EvflowDataError], tuple[str, str, str]]:
-        """Pickled by its parts, so that it passes from process to process."""
+        """Pickle by parts, so that the error can pass between processes."""
         return partial(type(self), where=self.where), (self.code, self.seen, self.fix)
 
 
 @contextlib.contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Every message from the block names its file: `path` is put before those that name none."""
+    """Prefix the messages of errors raised in the block with `path`, unless they name a file."""
     try:
         yield
     except EvflowDataError as e:

@@ -1,4 +1,4 @@
-"""The words all rooms speak: `Events`, `Recording`, `Window`. Host side, NumPy only.
+"""The data types shared by all packages: `Events`, `Recording`, `Window`. Host side, NumPy only.
 
 An object that exists is valid: construction checks shape, dtype, NaN, order, coordinates and
 polarity once, and raises an `EvflowDataError` that says what was seen, where, and what to do.
@@ -33,7 +33,7 @@ from evflow.errors import EvflowDataError
 from evflow.files.spool import forget
 from evflow.notes import Note
 
-BIT_DEPTHS = (8, 10, 12, 14, 16)  # of the converters in image sensors; 16-bit files hold any
+BIT_DEPTHS = (8, 10, 12, 14, 16)  # of image sensors' converters; a 16-bit file may hold any
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -127,7 +127,7 @@ class Events:
         return text + (f", {100 * self._share_on():.0f} % ON" if len(self) else "")
 
     def _share_on(self) -> float:
-        """Of the events that are ON, counted in parts: they may lie on the disk."""
+        """Share of ON events, counted in blocks because the events may be memory-mapped."""
         on = 0
         for first in range(0, len(self), 1 << 24):
             on += int(np.count_nonzero(self.p[first : first + (1 << 24)]))
@@ -165,7 +165,7 @@ class Events:
             plane = np.where(self.p[part], 0, height)
             index = (plane + self.y[part]) * width + self.x[part]
             counts += np.bincount(index, minlength=counts.size).astype(np.uint32)
-            if len(self) > 1 << 22:  # they may lie on the disk
+            if len(self) > 1 << 22:  # they may be memory-mapped
                 forget(self.x, self.y, self.p)
         return counts.reshape(2, height, width)
 
@@ -184,7 +184,7 @@ class Recording:
     Raises:
         EvflowDataError: EV002 (shape, or colour), EV003 (dtype, or range of float frames), EV004
             (times do not increase), EV007 (NaN), EV015 (frames and events of different size),
-            EV020 (`events` are no `Events`, or notes that are none).
+            EV020 (`events` is not an `Events`, or `notes` are not `Note`s).
 
     Example:
         >>> recording = ef.Recording(events, frames, frame_times)
@@ -197,7 +197,7 @@ class Recording:
     notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
-        need(self.events, Events, "events", "Of a path: evflow.read_recording(path).")
+        need(self.events, Events, "events", "For a path: evflow.read_recording(path).")
         frames, times = (np.asarray(plain(name, getattr(self, name)))
                          for name in ("frames", "frame_times"))
         check_frames(frames, self.events.size)
@@ -207,7 +207,7 @@ class Recording:
                 "Give one mid-exposure time in microseconds per frame.")
         times = check_times(times, "frame_times", strict=True)
         for note in self.notes:
-            need(note, Note, "a note", "Of a sentence: evflow.notes.Note(code, sentence).")
+            need(note, Note, "a note", "For a sentence: evflow.notes.Note(code, sentence).")
         object.__setattr__(self, "frames", read_only(frames))
         object.__setattr__(self, "frame_times", read_only(times))
 
@@ -223,16 +223,16 @@ class Recording:
             The recording; its frames are (0, H, W) uint8.
 
         Raises:
-            EvflowDataError: EV020 (`events` are no `Events`, or notes that are none).
+            EvflowDataError: EV020 (`events` is not an `Events`, or `notes` are not `Note`s).
         """
-        need(events, Events, "events", "Of a recording: recording.events.")
+        need(events, Events, "events", "For a recording: recording.events.")
         width, height = events.size
         return Recording(
             events, np.zeros((0, height, width), np.uint8), np.zeros(0, np.int64), notes)
 
     @property
     def frames_were_made(self) -> bool:
-        """Whether a network made the frames of the events, as a note on them says."""
+        """Whether a note says that the frames were reconstructed from the events by a network."""
         return any(note.code == "frames.made" for note in self.notes)
 
     def __repr__(self) -> str:
@@ -240,14 +240,14 @@ class Recording:
 
     @property
     def has_frames(self) -> bool:
-        """Whether there is any frame."""
+        """Whether there is at least one frame."""
         return len(self.frames) > 0
 
     @functools.cached_property
     def full_scale(self) -> int:
-        """The DN of a saturated pixel: 255 for uint8 and, by convention, for float32; for uint16
-        that of the smallest converter (8, 10, 12, 14, 16 bits: 255, 1023, 4095, 16383, 65535)
-        that holds the maximum of all frames."""
+        """The DN of a saturated pixel: 255 for uint8 and, by convention, float32; for uint16 the
+        maximum of the smallest converter (8, 10, 12, 14 or 16 bits: 255, 1023, 4095, 16383, 65535)
+        that covers all frames."""
         if self.frames.dtype != np.uint16 or not self.has_frames:
             return 255
         peak = int(self.frames.max())
@@ -257,7 +257,7 @@ class Recording:
         """One frame on the common scale.
 
         Args:
-            index: of the frame, 0..T-1.
+            index: frame number, 0..T-1.
 
         Returns:
             float32 (H, W), scaled so that `full_scale` is 255 DN.
@@ -266,22 +266,22 @@ class Recording:
 
 
 def release(recording: Recording) -> None:
-    """Give back the memory of what was read of a recording that lies on the disk."""
+    """Release the pages that were read from a memory-mapped recording."""
     events = recording.events
     forget(events.x, events.y, events.t, events.p, recording.frames)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Window:
-    """What a camera saw between two of its frames: the input of one estimate.
+    """What a camera saw between two of its frames: the input of one `estimate`.
 
     Attributes:
         events: those with t0_us <= t < t1_us.
         frame0: float32 (H, W), DN on 0..255, the frame taken at t0_us.
         frame1: float32 (H, W), DN on 0..255, the frame taken at t1_us.
-        t0_us: beginning in microseconds, the mid-exposure of frame0.
+        t0_us: start in microseconds, the mid-exposure of frame0.
         t1_us: end in microseconds, the mid-exposure of frame1.
-        index: its place among the windows of the recording, from 0.
+        index: index among the recording's windows, from 0.
     """
 
     events: Events

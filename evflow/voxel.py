@@ -24,11 +24,11 @@ def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np
     """Events of one time window as a voxel grid, one per polarity (Eq. 2 of the paper).
 
     An event adds weight 1, shared linearly between the two time bins next to it. Counts are not
-    normalised: their size is what tells the threshold.
+    normalised: their size determines the threshold.
 
     Args:
         events: of the whole recording or a part; only those in [t0_us, t0_us + window_us) enter.
-        t0_us: beginning of the window, integer microseconds.
+        t0_us: start of the window, integer microseconds.
         window_us: length of the window, integer microseconds, > 0.
         bins: time bins B per polarity, >= 2. The released network takes 16.
 
@@ -37,12 +37,12 @@ def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np
 
     Raises:
         EvflowDataError: EV003 (times are not integers), EV020 (an empty window, too few bins, or
-            no `Events`).
+            `events` is not an `Events`).
 
     Example:
         >>> voxels = ef.voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
     """
-    need(events, Events, "events", "Of a path: evflow.read_events(path).")
+    need(events, Events, "events", "For a path: evflow.read_events(path).")
     for name, value in (("t0_us", t0_us), ("window_us", window_us)):
         if not isinstance(value, int | np.integer):
             raise EvflowDataError("EV003", f"{name} is {value!r}.",

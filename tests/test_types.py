@@ -56,7 +56,7 @@ class Graded:
 
 
 @pytest.mark.parametrize(("change", "seen"), [
-    (lambda a: np.ma.masked_equal(a, a[1]), "masked values"), (Graded, "Graded that is no array"),
+    (lambda a: np.ma.masked_equal(a, a[1]), "masked values"), (Graded, "Graded, which cannot be"),
     (lambda a: a.astype("m8[us]"), "timedelta64"), (lambda a: a.astype("M8[us]"), "datetime64")])
 @pytest.mark.parametrize("column", ["x", "y", "t", "p"])
 def test_what_is_no_plain_array_is_refused(change: Any, seen: str, column: str) -> None:
@@ -87,7 +87,7 @@ def test_canonical_dtypes_and_no_copy() -> None:
 
 @pytest.mark.parametrize(("changed", "code", "seen"), [
     ({"x": np.zeros((3, 4))}, "EV002", "events.T"),
-    ({"x": np.zeros((4, 3))}, "EV002", "unpack it, x, y, t, p = events."),
+    ({"x": np.zeros((4, 3))}, "EV002", "Unpack it: x, y, t, p = events."),
     ({"t": np.array([1, 2])}, "EV002", "'t': 2"),
     ({"x": np.array([0.0, 5.5, 2.0])}, "EV003", "undistorted"),
     ({"t": np.array([0.1, 0.2, 0.3])}, "EV003", "Multiply seconds by 1e6"),
@@ -101,10 +101,10 @@ def test_canonical_dtypes_and_no_copy() -> None:
     ({"size": (4, 6)}, "EV005", "did you mean (6, 4)?"),
     ({"p": np.array([0, 1, 2])}, "EV006", "0, 1, 2"),
     ({"p": np.array([-1, 0, 1])}, "EV006", "-1, 0, 1"),
-    ({"p": np.array([255, 1, 1], np.uint8)}, "EV006", "unsigned reads 255"),
+    ({"p": np.array([255, 1, 1], np.uint8)}, "EV006", "unsigned byte reads as 255"),
     ({"p": np.array([0.0, 1.0, 1.0])}, "EV006", "float64"),
     ({"p": np.array([0, None, 1], object)}, "EV006", "None"),
-    ({"x": np.array([0.0, np.nan, 2.0])}, "EV007", "x is nan at event 1 (1 such)"),
+    ({"x": np.array([0.0, np.nan, 2.0])}, "EV007", "x is nan at event 1 (1 in all)"),
     ({"t": np.array([0.0, np.inf, 2.0])}, "EV007", "inf"),
     ({"size": (6,)}, "EV020", "(6,)"),
     ({"size": (0, 4)}, "EV020", "(0, 4)"),

@@ -1,4 +1,4 @@
-"""The camera as values: maps per pixel, what all pixels share, the prior, and known sensors.
+"""The camera as values: per-pixel maps, what all pixels share, the prior, and known sensors.
 
     prior.py     Summary (what a whole camera shares), and the distribution it is drawn from
     camera.py    Camera: theta and eta per pixel

@@ -1,8 +1,8 @@
 """The camera: per-pixel contrast thresholds and noise rates.
 
-`Camera` is a pytree of four float32 maps (..., H, W); it passes through jit, vmap and grad. What
-is *not* per pixel is the `SensorModel` (sensors.py); what cameras are drawn from, the
-`CameraPrior` (prior.py).
+`Camera` is a pytree of four float32 maps (..., H, W); it passes through jit, vmap and grad. The
+`SensorModel` (sensors.py) holds what is not per pixel, the `CameraPrior` (prior.py) the
+distribution that cameras are drawn from.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Camera:
         return tuple(np.shape(self.theta_on))
 
     def __repr__(self) -> str:
-        """One line: the size, and the median of each map; of traced maps their shape alone."""
+        """One line: the size and the median of each map; only the shape for traced maps."""
         size = "x".join(str(n) for n in self.shape)
         if self._traced() or 0 in self.shape or any(
                 getattr(getattr(self, n), "dtype", np.dtype("O")).kind not in "fiu"
@@ -115,7 +115,7 @@ class Camera:
     def drawn(self, key: Array, std: Camera) -> Camera:
         """A camera drawn from an estimate: each pixel from N(estimate, std^2), kept in range.
 
-        Estimates alone are too even: pixels of which little was seen have the camera's median.
+        Estimated maps alone are too uniform: pixels with few events have the camera's median.
 
         Args:
             key: of jax.random.

@@ -1,4 +1,4 @@
-"""The maps of a camera as an .npz: arrays by name, before they are a `Camera` and after."""
+"""Reading and writing the maps of a camera as an .npz of arrays by name."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ EXPECTED = ("Expected the camera.npz of evflow estimate (or Camera.save): maps (
             f"{', '.join(PARAMETERS)}.")
 UNITS = {"theta": "natural log", "eta": "Hz per pixel and polarity"}
 Arrays = dict[str, Any]
-QUICK = 1  # level of compression: maps of floats hardly shrink by more work
+QUICK = 1  # compression level: higher ones hardly shrink maps of floats
 
 
 def write_maps(path: str | os.PathLike, maps: Arrays, extra: Arrays, overwrite: bool) -> Path:
-    """Write maps of PARAMETERS with their units, and other arrays; EV020 where one of these has a
-    name that is taken, EV013, EV019."""
+    """Write the maps of PARAMETERS with their units, and other arrays; raises EV020 if one of these
+    has a reserved name, EV013, EV019."""
     if taken := {*PARAMETERS, "meta"} & set(extra):
         raise EvflowDataError("EV020", f"extra arrays named {', '.join(sorted(taken))}.",
                               "The camera's own maps have these names; choose others.")
@@ -39,7 +39,7 @@ def write_maps(path: str | os.PathLike, maps: Arrays, extra: Arrays, overwrite: 
 
 
 def _write_arrays(opened: BinaryIO, arrays: Arrays) -> None:
-    """As np.savez_compressed, which has no level of compression to choose."""
+    """Like np.savez_compressed, which does not let one choose the level."""
     with zipfile.ZipFile(opened, "w", zipfile.ZIP_DEFLATED, compresslevel=QUICK) as archive:
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -47,7 +47,7 @@ def _write_arrays(opened: BinaryIO, arrays: Arrays) -> None:
 
 
 def read_maps(path: Path) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
-    """The arrays of PARAMETERS, and of their std where the file has these; EV008, EV009, EV016."""
+    """The arrays of PARAMETERS, and their std if the file has them; raises EV008, EV009, EV016."""
     _check_kind(path)
     data = load_npz(path)
     missing = [n for n in PARAMETERS if n not in data]
@@ -56,7 +56,7 @@ def read_maps(path: Path) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
         raise EvflowDataError(
             "EV008", f"{path} holds {', '.join(sorted(data)[:12])} but not "
             f"{', '.join(missing)}.{recording}", EXPECTED if not recording else
-            f"make a camera of it, evflow estimate {path} -o cam/, and pass cam/camera.npz.")
+            f"Estimate its camera, evflow estimate {path} -o cam/, and pass cam/camera.npz.")
     with naming(path):
         for name in {*PARAMETERS, *ERRORS} & set(data):
             if data[name].dtype.kind not in "fiu":
@@ -76,7 +76,7 @@ def holds_camera(path: Path) -> bool:
 
 
 def _check_kind(path: Path) -> None:
-    """EV016 where there is no file, EV008 where it is no .npz."""
+    """Raise EV016 if there is no file, EV008 if it is not an .npz."""
     inside = path / "camera.npz"
     if path.is_dir() and inside.is_file():
         raise EvflowDataError("EV016", f"{path} is a folder.", f"Pass {inside}.")
@@ -89,4 +89,4 @@ def _check_kind(path: Path) -> None:
     if head == np.lib.format.MAGIC_PREFIX:
         raise EvflowDataError("EV008", f"{path} is one array (.npy), not a camera.", EXPECTED)
     if head[:2] != b"PK" and path.suffix.lower() != ".npz":
-        raise EvflowDataError("EV008", f"{path} is no .npz: it begins with {head!r}.", EXPECTED)
+        raise EvflowDataError("EV008", f"{path} is not an .npz: it begins with {head!r}.", EXPECTED)

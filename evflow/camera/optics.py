@@ -1,5 +1,5 @@
-"""What of a measured camera is not per pixel: its summary, its circuit, and what its frames show
-beside it.
+"""What is measured of a camera beyond its maps: summary, circuit, and how its frames relate to what
+its pixels see.
 
 camera.npz holds them as scalars, `summary_theta_on`, `sensor_cutoff_hz`, `optics_offset_dn`, ...
 and their standard deviations `..._std`, NaN where nothing was measured.
@@ -26,11 +26,11 @@ LAW = "cutoff_by_light"  # 1 or 0
 
 @dataclasses.dataclass(frozen=True)
 class Optics:
-    """What the frames of a recording show beside what its pixels saw.
+    """How the frames of a recording relate to the light on its pixels.
 
-    offset_dn: light in DN that pixels see beside it (dark light, less the frames' black level);
-    delay_s: seconds by which events come after what the frames' times say; the standard
-    deviations of both, NaN where they were not measured.
+    offset_dn: light in DN that the pixels see and the frames do not show (dark light minus the
+    frames' black level); delay_s: delay in seconds of events after the frame times; and the
+    standard deviations of both, NaN where not measured.
     """
 
     offset_dn: float = 0.0
@@ -42,7 +42,7 @@ class Optics:
 def as_arrays(
     sensor: SensorModel, std: Mapping[str, float], optics: Optics
 ) -> dict[str, np.ndarray]:
-    """Scalars by the names that they have in camera.npz."""
+    """Scalars by their names in camera.npz."""
     named = {f"sensor_{name}": getattr(sensor, name) for name in MEASURED}
     named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
     named[f"sensor_{LAW}"] = float(sensor.cutoff_by_light)
@@ -51,14 +51,14 @@ def as_arrays(
 
 
 def summary_arrays(summary: Summary, std: Summary) -> dict[str, np.ndarray]:
-    """A summary as scalars by the names that they have in camera.npz."""
+    """A summary as scalars by their names in camera.npz."""
     return {f"summary_{name}{end}": np.asarray(value, np.float64)
             for end, kind in (("", summary), ("_std", std))
             for name, value in dataclasses.asdict(kind).items()}
 
 
 def read_summary(path: str | os.PathLike) -> tuple[dict[str, float], dict[str, float]] | None:
-    """The summary in a camera.npz and its standard deviations, by name; None in files without one.
+    """The summary in a camera.npz and its standard deviations, by name; None if it has none.
     Raises EV009, EV016."""
     held = load_npz(Path(path))
     names = [field.name for field in dataclasses.fields(Summary)]
@@ -68,14 +68,14 @@ def read_summary(path: str | os.PathLike) -> tuple[dict[str, float], dict[str, f
     if any(np.shape(v) != () or v.dtype.kind not in "fiu"
            for values in (of, std) for v in values.values()) or not np.isfinite(
                [*of.values()]).all() or np.isinf([*std.values()]).any():
-        raise EvflowDataError("EV009", f"{path}: its summary holds what is no finite number.",
+        raise EvflowDataError("EV009", f"{path}: a value of its summary is not a finite number.",
                               "Make the file again: evflow estimate.")
     return {n: float(v) for n, v in of.items()}, {n: float(v) for n, v in std.items()}
 
 
 def read_known(path: str | os.PathLike) -> dict[str, tuple[float, float]]:
-    """(value, standard deviation) of all in a camera.npz that was measured of the whole camera: its
-    summary, without what its recording did not tell, and its circuit. Raises EV009, EV016."""
+    """(value, standard deviation) of everything in a camera.npz that was measured for the camera as
+    a whole: the determined part of its summary, and its circuit. Raises EV009, EV016."""
     held = load_npz(Path(path))
     values, errors = read_summary(path) or ({}, {})
     untold = {f"{kind}_{name.partition('_')[2]}" for name in read_undetermined(path)
@@ -90,15 +90,15 @@ def read_known(path: str | os.PathLike) -> dict[str, tuple[float, float]]:
 
 
 def read_undetermined(path: str | os.PathLike) -> tuple[str, ...]:
-    """Thresholds in a camera.npz whose values, and widths, are a prior's: the recording that it
-    was estimated from did not tell. None in files that do not say. Raises EV009, EV016."""
+    """Thresholds in a camera.npz whose values and widths are the prior's, because the recording did
+    not determine them; empty for files that do not say. Raises EV009, EV016."""
     named = load_npz(Path(path)).get("undetermined")
     return () if named is None or named.dtype.kind != "U" else tuple(str(n) for n in named.ravel())
 
 
 def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
-    """The circuit and the optics in a camera.npz; those of an ideal pixel where it holds none.
-    Raises EV009 where a value is no number, EV016 where there is no file."""
+    """The circuit and the optics in a camera.npz; those of an ideal pixel if it holds none.
+    Raises EV009 if a value is not a finite number, EV016 if there is no file."""
     held = load_npz(Path(path))
     values: dict[str, dict[str, Any]] = {"sensor": {}, "optics": {}}
     names = {"sensor": (*MEASURED, LAW),
@@ -110,7 +110,7 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
                 continue
             if np.shape(value) != () or value.dtype.kind not in "fiu" or (
                     not name.endswith("_std") and not np.isfinite(value)):
-                raise EvflowDataError("EV009", f"{path}: {room}_{name} is no finite number.",
+                raise EvflowDataError("EV009", f"{path}: {room}_{name} is not a finite number.",
                                       "Make the file again: evflow estimate.")
             values[room][name] = float(value)
     if LAW in values["sensor"]:

@@ -1,8 +1,9 @@
-"""Pixels that differ from their neighbours: hot ones, dead ones, and noise as it was measured.
+"""Pixels that differ from their neighbours: hot ones, dead ones, and measured noise.
 
-A `Camera` goes in, a `Camera` comes out. `with_faults` makes a small share of the pixels hot or
-dead; `with_noise_histogram` gives every pixel the noise rates of a measured one. The measurements
-are files in the layout of IEBCS (Joubert et al., Frontiers in Neuroscience 2021), host side.
+Functions take a `Camera` and return a `Camera`. `with_faults` makes a small share of the pixels hot
+or dead; `with_noise_histogram` gives every pixel the noise rates of a measured one. The
+measurements are host-side files in the layout of IEBCS (Joubert et al., Frontiers in Neuroscience
+2021).
 """
 
 from __future__ import annotations
@@ -83,8 +84,8 @@ class NoiseHistogram:
     counts: np.ndarray
 
     def rates(self) -> np.ndarray:
-        """Mean rate of each pixel in Hz, (N,): its intervals over their sum, log-uniform within
-        a bin. 0 for a pixel without any, which fired once at most."""
+        """Mean rate of each pixel in Hz, (N,): its number of intervals over their total length,
+        log-uniform within a bin; 0 for a pixel without intervals (one event at most)."""
         width = np.log(AXIS_HZ[1:] / AXIS_HZ[:-1])
         seconds = self.counts @ ((1.0 / AXIS_HZ[:-1] - 1.0 / AXIS_HZ[1:]) / width)
         return self.counts.sum(1) / np.where(seconds > 0, seconds, 1.0)
@@ -119,29 +120,29 @@ def read_noise_histogram(path: str | os.PathLike, name: str | None = None) -> No
                 data = _chosen({k: data[k] for k in data.files}, path, name)
     except EvflowDataError:
         raise
-    except Exception as e:  # zip, zlib, NumPy's header parser, tokenize: a dozen kinds
+    except Exception as e:  # zip, zlib, NumPy's header parser, tokenize raise many types
         raise EvflowDataError("EV009", f"{path} is not a readable .npy or .npz ({e}).") from e
     return NoiseHistogram(_counts(data, path))
 
 
 def _chosen(arrays: dict[str, np.ndarray], path: Path, name: str | None) -> np.ndarray:
-    """The array of this name; the only histogram where none is given."""
+    """The array of this name, or the only histogram if no name is given."""
     axes = [a for a in arrays.values() if a.shape == AXIS_HZ.shape and a.dtype.kind == "f"]
     if any(not np.allclose(axis, AXIS_HZ) for axis in axes):
-        raise EvflowDataError("EV008", f"{path} has a frequency axis of its own.",
+        raise EvflowDataError("EV008", f"{path} has another frequency axis.",
                               "Expected 1..9 x 10^k Hz, k = -3..4.")
     names = sorted(k for k, a in arrays.items() if a.ndim >= 2 and a.shape[-1] == len(AXIS_HZ))
     if name is None and len(names) == 1:
         name = names[0]
     if name not in names:
         raise EvflowDataError(
-            "EV020", f"{path} holds the histograms {names}, and name={name!r} was asked for.",
+            "EV020", f"{path} holds the histograms {names}, but not name={name!r}.",
             "Pass the name of one of them.")
     return arrays[name]
 
 
 def _counts(data: np.ndarray, path: Path) -> np.ndarray:
-    """Intervals per pixel and bin, (N, 71) float64, of cumulative rows (..., 72)."""
+    """Intervals per pixel and bin, (N, 71) float64, from cumulative rows (..., 72)."""
     if data.ndim not in (2, 3) or data.shape[-1] != len(AXIS_HZ):
         raise EvflowDataError("EV002", f"{path} holds an array of shape {data.shape}.",
                               "Expected (H, W, 72) or (N, 72) cumulative histograms.")
@@ -157,8 +158,8 @@ def _counts(data: np.ndarray, path: Path) -> np.ndarray:
     wrong = (counts < 0).any(1) | ((spare != 0) & (spare != total))
     if wrong.any():
         raise EvflowDataError(
-            "EV009", f"{path}: row {int(np.argmax(wrong))} falls ({int(wrong.sum())} such rows).",
-            "A cumulative histogram rises along its 71 bins; was it stored as plain counts?")
+            "EV009", f"{path}: row {int(np.argmax(wrong))} decreases ({int(wrong.sum())} in all).",
+            "A cumulative histogram never decreases along its 71 bins; are these plain counts?")
     return counts
 
 
@@ -167,13 +168,13 @@ def with_noise_histogram(
 ) -> Camera:
     """The camera with the noise rates of measured pixels, drawn with replacement.
 
-    Where both histograms hold as many pixels, ON and OFF of a pixel come from the same measured
-    one: in the dark they go together (correlation .95 at .1 lux in the files of IEBCS). Otherwise
-    they are drawn independently.
+    Where both histograms hold the same number of pixels, ON and OFF rates of a pixel come from the
+    same measured one: in the dark they are correlated (.95 at .1 lux in the files of IEBCS).
+    Otherwise they are drawn independently.
 
     Args:
         key: of jax.random.
-        camera: maps (..., H, W); its thresholds stay.
+        camera: maps (..., H, W); its thresholds are kept.
         on: ON noise, of `read_noise_histogram`.
         off: OFF noise.
 

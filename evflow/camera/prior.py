@@ -1,5 +1,5 @@
-"""What a whole camera shares, and the distribution that it is drawn from (paper, Section IV-E,
-Eq. 12). The pixels around it are camera.py's.
+"""What a whole camera shares, and the distribution it is drawn from (Section IV-E and Eq. 12 of the
+paper). Per-pixel values are in camera.py.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ Array = jax.Array
 class Summary:
     """What a whole camera shares, each float32 (...,): a scalar per camera, a pytree.
 
-    Noise rates of an estimate are means over pixels rather than medians, as noise adds up; where
-    pixels differ by a tenth the two differ by half a percent.
+    Noise rates of an estimate are means over pixels rather than medians, because noise adds up;
+    with a spread of 10 % over pixels, mean and median differ by half a percent.
 
     Attributes:
         theta_on: median ON threshold over pixels, natural-log units.
@@ -43,7 +43,7 @@ class Summary:
     sigma_off: Array
 
     def __repr__(self) -> str:
-        """One line: the values of a single camera, the shape of others or of traced ones."""
+        """One line: the values of a single camera; only the shape of several or traced ones."""
         known = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         if all(isinstance(v, np.ndarray | np.generic | jax.Array | float)
                and not isinstance(v, jax.core.Tracer) and np.ndim(v) == 0 for v in known.values()):
@@ -61,15 +61,15 @@ class CameraPrior:
         mismatch: range of the standard deviation of the threshold over pixels, natural-log units
             (v2e's default .03; the paper .15).
         noise: "eq12" ties the rate to the threshold, eta = g R(theta) with the intensity factor g
-            of Eq. 12, uniform in [F, 1] (F = .25) where the scene's intensity is not known;
+            of Eq. 12, uniform in [F, 1] (F = .25) if the scene's intensity is not known;
             "independent" draws it log-uniform in `eta`; "mixed" takes either with equal chance,
-            and in half of the tied cameras a g that is not the scene's; "none" is silent.
+            and in half of the tied cameras a g independent of the scene; "none" is silent.
         eta: range of the noise rate in Hz per pixel and polarity, > 0, for "independent" and
             "mixed".
         eta_spread: standard deviation of log eta over pixels.
 
     Raises:
-        EvflowDataError: EV020 (an unknown `noise`, a range that is none).
+        EvflowDataError: EV020 (an unknown `noise`, an invalid range).
     """
 
     theta: tuple[float, float] = (0.1, 0.5)
@@ -97,8 +97,8 @@ class CameraPrior:
 def noise_of_threshold(theta: Values) -> Values:
     """R(theta) = 4 / (90 theta - 5) of Eq. 12, clipped to the paper's range [.1, 1] Hz.
 
-    The pole at theta = .0556 lies inside the clip: smaller thresholds get 1 Hz. Of NumPy arrays
-    it is worked out on the host.
+    The pole at theta = .0556 lies inside the clip: smaller thresholds get 1 Hz. NumPy arrays are
+    computed on the host.
     """
     of: Any = np if isinstance(theta, np.ndarray) else jnp
     return of.clip(4.0 / (90.0 * of.maximum(theta, 0.1) - 5.0), 0.1, 1.0)
@@ -108,7 +108,7 @@ def sample_nominal(
     key: Array, batch: tuple[int, ...], prior: CameraPrior, factor: Array | None = None
 ) -> Summary:
     """Draw the camera-wide values, each of shape `batch`. factor: the intensity factor of Eq. 12
-    of the scene that will be seen, where it is known."""
+    of the scene to be seen, if known."""
     k_theta, k_sigma, k_gain, k_free, k_link = jax.random.split(key, 5)
     theta = jax.random.uniform(k_theta, (2, *batch), minval=prior.theta[0], maxval=prior.theta[1])
     sigma = jax.random.uniform(

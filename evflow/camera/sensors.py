@@ -1,9 +1,9 @@
 """Sensor models: what of an event camera is not per pixel, and known sensors by name.
 
-`SensorModel` is a frozen description of the pixel circuit, and a pytree: choices, and which of its
-numbers are off (0), belong to its structure, and the other numbers are leaves. So jit compiles
-once for all cameras of one structure, and grad and vmap reach their numbers. `SENSORS` holds
-published settings, each with the thresholds that go with them.
+`SensorModel` is a frozen description of the pixel circuit, and a pytree: its choices, and which of
+its numbers are off (0), are static structure; the other numbers are leaves. So jit compiles once
+for all cameras of one structure, and grad and vmap reach the numbers. `SENSORS` holds published
+settings, each with its thresholds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SENSOR_SIZES: dict[str, tuple[int, int]] = {  # (width, height)
     "celex5": (1280, 800)}
 LogMap = Literal["auto", "linlog", "log_eps"]
 KINDS = ("v2e", "esim", "voltmeter", "paper")
-# Options that a kind of circuit has no part for.
+# Options that do not apply to a kind of circuit.
 WITHOUT = {
     "v2e": (),
     "esim": ("cutoff_hz", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz"),
@@ -39,13 +39,13 @@ NUMBERS = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_deca
 
 
 def is_off(value: Any) -> bool:
-    """Whether a number is 0 for certain: one that is traced may be anything."""
+    """Whether a number is known to be 0: a traced one may have any value."""
     return isinstance(value, int | float) and value == 0
 
 
 def _settle(config: Any, name: str, low: float, rule: str) -> None:
-    """A field that is a number becomes a float, EV020 unless it is finite and at least low; one
-    that is traced stays as it is."""
+    """Turn a numeric field into a float; raises EV020 unless it is finite and at least `low`.
+    Traced numbers stay as they are."""
     value = getattr(config, name)
     require(config, name, np.ndim(value) == 0, "one number; jax.vmap takes several")
     if isinstance(value, jax.core.Tracer):
@@ -55,19 +55,20 @@ def _settle(config: Any, name: str, low: float, rule: str) -> None:
 
 
 class _Numbers:
-    """A frozen dataclass as a pytree of the fields that `leaves` names, which is decided when one
-    is made. What is put back is not looked at: JAX puts back tangents and placeholders too."""
+    """A frozen dataclass as a pytree whose leaves are the fields named in `leaves`, which is
+    decided at construction. Unflattening checks nothing: JAX also puts tangents and placeholders
+    back."""
 
     leaves: tuple[str, ...]
 
     def tree_flatten_with_keys(self) -> tuple[tuple[tuple[Any, Any], ...], Any]:
-        """Leaves with their names; and all else, `leaves` too."""
+        """Leaves with their names, and everything else, including `leaves`."""
         leaves = tuple((jax.tree_util.GetAttrKey(n), getattr(self, n)) for n in self.leaves)
         return leaves, tuple((n, v) for n, v in vars(self).items() if n not in self.leaves)
 
     @classmethod
     def tree_unflatten(cls, structure: Any, leaves: Any) -> Any:
-        """The dataclass again."""
+        """Rebuild the dataclass."""
         made = object.__new__(cls)
         vars(made).update(structure)
         vars(made).update(zip(made.leaves, leaves, strict=True))
@@ -78,7 +79,7 @@ class _Numbers:
 @dataclasses.dataclass(frozen=True)
 class Voltmeter(_Numbers):
     """Constants of DVS-Voltmeter (Lin et al., ECCV 2022, Eq. 10 and 11), for DN on 0..255 and
-    times in us; a pytree of them.
+    times in us; a pytree.
 
     mu = k1 dL/dt / (L + k2) + k4 + k5 L per us, sigma = k3 sqrt(L) / (L + k2) + k6 per sqrt(us),
     in units of the published threshold. A contrast theta is the level k1 theta, so that
@@ -107,9 +108,9 @@ class SecondOrder(_Numbers):
 
     The photoreceptor has the natural frequency w, w^2 = (loop_gain + 1) / ((input + miller)
     output), and the damping (input + output + (gain + 1) miller) / (2 w (input + miller) output),
-    where input_s and miller_s are given at 255 DN and go as 1 / light: in the dark it is a
-    low-pass of first order whose corner is proportional to light, and in bright light it may ring.
-    The defaults have that corner at 199 Hz for 255 DN.
+    where input_s and miller_s are given at 255 DN and are proportional to 1 / light: in the dark it
+    is a first-order low-pass whose corner is proportional to light, and in bright light it may
+    ring. With the default values that corner is at 199 Hz for 255 DN.
     """
 
     input_s: float = 0.03
@@ -127,8 +128,8 @@ class SecondOrder(_Numbers):
             _settle(self, name, low, f"finite, and at least {low:g}")
 
     def at(self, cutoff_hz: float) -> SecondOrder:
-        """The same with photoreceptors that are faster or slower, such that in the dark they are
-        as a low-pass of first order of this `cutoff_hz` at 255 DN."""
+        """The same with a faster or slower photoreceptor, such that in the dark it is a first-order
+        low-pass whose corner would be `cutoff_hz` at 255 DN."""
         slow_s = (self.input_s + (self.gain + 1) * self.miller_s) / (self.loop_gain + 1)
         by = 1.0 / (2 * np.pi * cutoff_hz * slow_s)
         return dataclasses.replace(self, input_s=by * self.input_s, miller_s=by * self.miller_s,
@@ -145,9 +146,9 @@ class SensorModel(_Numbers):
     """The pixel circuit: what is not per pixel. Frozen, and a pytree of the numbers that are on.
 
     The default is v2e's noise-free pixel with true crossing times. A number that is 0 is off and
-    no leaf; all others are, `voltmeter` where `kind` says so: pass a model to jit, grad or vmap
-    as any other argument. A number that is traced when a model is made counts as on, and gives
-    what 0 gives where it is 0.
+    not a leaf; all others are leaves, `voltmeter` only for that `kind`. Pass a model to jit, grad
+    or vmap like any other argument. A number that is traced when a model is made counts as on;
+    where its value is 0, the result is that of 0.
 
     Attributes:
         kind: "v2e": all of the below; "esim": log-eps intensity, and events that come within the
@@ -159,28 +160,28 @@ class SensorModel(_Numbers):
         log_map: "linlog" (v2e: linear below 20 DN) or "log_eps" (ESIM: log(I/255 + 1e-3));
             "auto" becomes the kind's own.
         cutoff_hz: corner frequency of the first-order low-pass at 255 DN; 0 = off.
-        cutoff_by_light: let the corner go with intensity, as in v2e; False: the same everywhere,
-            as where not the photoreceptor but what follows it is slow.
+        cutoff_by_light: let the corner be proportional to intensity, as in v2e; False: the same at
+            any light, as when a later stage, not the photoreceptor, limits the bandwidth.
         refractory_s: dead time after an event in seconds; with "v2e" the contrast is kept and
             fires later.
         leak_hz: ON leak events per second.
         leak_jitter: relative jitter of each leak step.
         leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.
         shot_hz: v2e's shot-noise rate in Hz, both polarities together, on top of the camera's eta.
-        eta_is_all: the camera's eta is all of its noise, as that of a measured camera is: leak is a
-            part of eta_on, and shot_hz how much all other noise would be in the dark, uneven as
-            eta is. False: leak and shot noise come on top of eta.
+        eta_is_all: the camera's eta is all of its noise, as for a measured camera: leak is a part
+            of eta_on, and shot_hz says how large the rest would be in the dark, spread over pixels
+            as eta is. False: leak and shot noise come on top of eta.
         eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
             of the first frame.
         noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
             False adds it to the stream (the paper).
         voltmeter: constants of kind "voltmeter".
-        photoreceptor: a `SecondOrder` in place of the low-pass of first order, for kind "v2e" with
-            crossing times. What light does within the refractory period is then lost.
+        photoreceptor: a `SecondOrder` in place of the first-order low-pass, for kind "v2e" with
+            crossing times. Light changes within the refractory period are then lost.
 
     Raises:
-        EvflowDataError: EV020 (an unknown choice, a negative value, or an option that a pixel of
-            this kind has no part for).
+        EvflowDataError: EV020 (an unknown choice, a negative value, or an option that does not
+            apply to this kind).
 
     Example:
         >>> model = ef.SensorModel(cutoff_hz=200.0, refractory_s=5e-4, leak_hz=0.1)
@@ -203,7 +204,7 @@ class SensorModel(_Numbers):
     photoreceptor: SecondOrder | None = None
 
     def __repr__(self) -> str:
-        """What differs from the default."""
+        """The fields that differ from the default."""
         plain = type(self)(kind=self.kind)
         shown = [] if self.kind == "v2e" else [f"kind={self.kind!r}"]
         for field in dataclasses.fields(self)[1:]:
@@ -232,19 +233,19 @@ class SensorModel(_Numbers):
         if second and (self.kind, self.timestamps, "cutoff_hz" in on) != ("v2e", "crossing", False):
             raise EvflowDataError(
                 "EV020", f"SensorModel(kind={self.kind!r}, timestamps={self.timestamps!r}, "
-                f"cutoff_hz={self.cutoff_hz}) and a photoreceptor of second order.",
-                "It takes the place of the low-pass, in pixels of kind 'v2e' with crossing times: "
+                f"cutoff_hz={self.cutoff_hz}) with a second-order photoreceptor.",
+                "It replaces the low-pass, in pixels of kind 'v2e' with crossing times: "
                 "photoreceptor=SecondOrder().at(cutoff_hz).")
         for name in WITHOUT[self.kind]:
             if not is_off(getattr(self, name)):
                 raise EvflowDataError(
                     "EV020", f"SensorModel(kind={self.kind!r}, {name}={getattr(self, name)}).",
-                    "A pixel of this kind has none; leave it out, or take kind='v2e'.")
+                    "It does not apply to this kind: leave it out, or use kind='v2e'.")
 
 
 @dataclasses.dataclass(frozen=True)
 class KnownSensor:
-    """A published sensor: the model, and the thresholds that go with it.
+    """A published sensor: the model and its thresholds.
 
     Attributes:
         model: its pixel circuit.

@@ -1,4 +1,4 @@
-"""Files, whatever they hold: written whole or not at all, and read without trusting what they say.
+"""Files of any kind: written completely or not at all, and read without trusting their headers.
 
-Nothing here knows of events.
+Nothing here depends on events.
 """

@@ -1,5 +1,5 @@
-"""Zip archives and .npy headers of unknown origin: whatever Python's readers raise on damage
-becomes EV009, bombs are refused before they are unpacked, pickles are never loaded."""
+"""Zip archives and .npy headers of unknown origin: damage becomes EV009 whatever Python's readers
+raise, zip bombs are refused before they are unpacked, pickles are never loaded."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DAMAGE = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOF
 
 
 def is_zip(path: Path) -> bool:
-    """Whether a file is a zip archive, or a damaged one, as `unzipped` then says."""
+    """Whether a file is a zip archive, or a damaged one, for which `unzipped` raises."""
     try:
         return zipfile.is_zipfile(path)
     except zipfile.BadZipFile:  # its last record claims several disks
@@ -35,14 +35,14 @@ def is_zip(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.ZipFile]:
-    """The open archive; EV009 where it, or what the block reads of it, is damaged or a bomb.
+    """Open an archive; EV009 if it, or anything the block reads from it, is damaged or a bomb.
 
-    streamed: members that are read piece by piece, and so may be of any size."""
+    streamed: members that are read in pieces and may therefore be of any size."""
     try:
         with zipfile.ZipFile(path) as archive:
             found, there = archive.infolist(), os.path.getsize(path)
             if (most := max((info.compress_size for info in found), default=0)) > there:
-                # zipfile would ask for memory for all of them
+                # zipfile would allocate memory for all of them
                 raise ValueError(f"a member of {most} bytes in a file of {there}")
             sizes = [info.file_size for info in found if info.filename not in streamed]
             check_expansion(sum(sizes), there, path)
@@ -54,12 +54,12 @@ def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.Zip
 
 
 def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, Fortran order and dtype of the .npy that f begins; ValueError where it is damaged or
-    holds Python objects."""
+    """Shape, Fortran order and dtype from the header of the .npy at f; ValueError if it is damaged
+    or holds Python objects."""
     begin = f.read(8)  # magic and version
     first = begin[6:7] == b"\x01"
     length = f.read(2 if first else 4)
-    if int.from_bytes(length, "little") > MAX_HEADER:  # NumPy would take memory for all of it
+    if int.from_bytes(length, "little") > MAX_HEADER:  # NumPy would allocate all of it
         raise ValueError("its header is damaged")
     whole = io.BytesIO(begin + length + f.read(int.from_bytes(length, "little")))
     try:
@@ -67,7 +67,7 @@ def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
         read: Any = (np.lib.format.read_array_header_1_0 if first
                      else np.lib.format.read_array_header_2_0)
         shape, fortran, dtype = read(whole)
-    except Exception as e:  # a dozen kinds: tokenize's, and MemoryError where brackets are nested
+    except Exception as e:  # many types: tokenize's, MemoryError for deeply nested brackets
         raise ValueError(str(e) or f"its header is damaged ({type(e).__name__})") from None
     if dtype.hasobject:
         raise ValueError("it holds Python objects: pickles are refused")
@@ -77,14 +77,14 @@ def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz by key; EV009 where any of them is damaged or pickled."""
+    """All arrays of an .npz by key; EV009 if any of them is damaged or pickled."""
     with members(path) as found:
         return {name: member.whole() for name, member in found.items()}
 
 
 @contextlib.contextmanager
 def members(path: Path) -> Iterator[dict[str, Member]]:
-    """The arrays of an .npz by key, to be read in the block; EV009 as `unzipped`."""
+    """The arrays of an .npz by key, readable within the block; EV009 as in `unzipped`."""
     with unzipped(path) as archive:
         found = {info.filename.removesuffix(".npy"): Member(archive, info)
                  for info in archive.infolist()}
@@ -96,31 +96,31 @@ def members(path: Path) -> Iterator[dict[str, Member]]:
 
 
 class Member:
-    """An array of an open .npz, read whole or from its beginning on, rows by rows; ValueError and
-    what zipfile raises where it is damaged. Its checksum is compared at its end."""
+    """An array of an open .npz, read whole or in order by rows; ValueError or zipfile's errors if
+    it is damaged. The checksum is verified at its end."""
 
     def __init__(self, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
-        if not info.filename.endswith(".npy"):  # skipping it could lose the frames unseen
+        if not info.filename.endswith(".npy"):  # skipping it could silently lose the frames
             raise ValueError(f"{info.filename} is not an array")
         self._archive, self._info = archive, info
-        self._file: IO[bytes] | None = None  # of some that are read: an open one takes 50 kB
+        self._file: IO[bytes] | None = None  # opened when read: an open one takes 50 kB
         with archive.open(info) as f:
             self.shape, self.fortran, self.dtype = npy_header(f)
         if math.prod(self.shape) * self.dtype.itemsize > info.file_size:
             raise ValueError(f"{info.filename} is cut off: {self.dtype} {self.shape}")
 
     def take(self, count: int) -> np.ndarray:
-        """The next `count` values, (count,), in the order of the file."""
+        """The next `count` values, (count,), in file order."""
         return np.frombuffer(self._data().read(count * self.dtype.itemsize), self.dtype, count)
 
     def finish(self) -> None:
-        """Read what is left of it, for the checksum."""
+        """Read the rest, to verify the checksum."""
         while self._data().read(BLOCK):
             pass
         self.close()
 
     def whole(self) -> np.ndarray:
-        """The array, in memory."""
+        """The whole array, in memory."""
         try:
             flat = self.take(math.prod(self.shape))
             self.finish()
@@ -129,7 +129,7 @@ class Member:
         return flat.reshape(self.shape, order="F" if self.fortran else "C")
 
     def spooled(self) -> np.ndarray:
-        """The array, in memory or on disk as `Spool` has it."""
+        """The array, in memory or on disk as `Spool` decides."""
         spool, left = Spool(self.dtype), math.prod(self.shape)
         while left:
             spool.append(self.take(min(left, BLOCK)))
@@ -138,7 +138,7 @@ class Member:
         return spool.array().reshape(self.shape, order="F" if self.fortran else "C")
 
     def close(self) -> None:
-        """It can be read again, from its beginning on."""
+        """Close it; a later read starts from the beginning."""
         if self._file is not None:
             self._file.close()
             self._file = None

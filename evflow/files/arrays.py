@@ -1,4 +1,4 @@
-"""Single .npy arrays on disk: opened without reading them, lying headers and pickles refused; and
+"""Single .npy arrays on disk: memory-mapped with their headers checked and pickles refused, and
 written row by row.
 """
 
@@ -19,12 +19,12 @@ from evflow.files.whole import need_size
 
 def mapped(path: Path, shape: tuple[int | None, ...], *, fields: bool = False) -> np.ndarray:
     """A memory-mapped .npy of numbers; trailing axes of length 1 beyond `shape` are dropped.
-    fields: of records with fields instead.
+    fields: expect a structured array instead.
 
     Raises EV009 (damaged, pickled, another shape), EV016 (absent).
     """
     if not path.is_file():
-        raise EvflowDataError("EV016", f"{path} is not there.", "Is the folder complete?",
+        raise EvflowDataError("EV016", f"{path} does not exist.", "Is the folder complete?",
                               where=path)
     try:
         with open(path, "rb") as f:
@@ -32,12 +32,12 @@ def mapped(path: Path, shape: tuple[int | None, ...], *, fields: bool = False) -
             start = f.tell()
     except (OSError, EOFError, ValueError) as e:
         raise EvflowDataError(
-            "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
+            "EV009", f"{path} is not a valid .npy ({e or type(e).__name__}).",
             "Copy or export it again.", where=path) from e
     need, size = start + math.prod(found) * dtype.itemsize, os.path.getsize(path)
     if not (dtype.fields if fields else dtype.kind in "biuf") or need > size:
         raise EvflowDataError(
-            "EV009", f"{path} claims {found} {dtype}, {need:,} bytes, and has {size:,}.",
+            "EV009", f"{path} claims {found} {dtype}, {need:,} bytes, but has {size:,}.",
             "Cut off? Copy or export it again.", where=path)
     kept = found
     while len(kept) > len(shape) and kept[-1] == 1:
@@ -53,7 +53,7 @@ def mapped(path: Path, shape: tuple[int | None, ...], *, fields: bool = False) -
 
 
 class GrowingArray:
-    """A .npy file of rows of shape `item`, any number of them, written as they come."""
+    """A .npy file of rows of shape `item`, appended in any number."""
 
     def __init__(self, path: Path, dtype: Any, item: tuple[int, ...] = ()) -> None:
         self.dtype, self.item, self.rows = np.dtype(dtype), item, 0
@@ -70,13 +70,13 @@ class GrowingArray:
 
     def append(self, rows: np.ndarray) -> None:
         """Add rows (n, *item), cast to the dtype."""
-        # not tofile, which raises the error of a full disk without its number
+        # not tofile, which raises the error of a full disk without its errno
         self._file.write(np.ascontiguousarray(rows, self.dtype).data.cast("B"))
         self.rows += len(rows)
 
     def close(self) -> None:
-        """Write the number of rows into the header, without which the file says 0; EV019 where not
-        all rows are there."""
+        """Write the number of rows into the header (0 until then); EV019 unless all rows were
+        written."""
         self._file.seek(0)
         self._header()
         size = self._file.tell() + self.rows * math.prod(self.item) * self.dtype.itemsize
@@ -84,7 +84,7 @@ class GrowingArray:
         need_size(Path(self._file.name), size)
 
     def _header(self) -> None:
-        # NumPy leaves room for the first axis to grow: the header keeps its length.
+        # NumPy reserves room for the first axis to grow: the header keeps its length.
         np.lib.format.write_array_header_1_0(self._file, {
             "descr": np.lib.format.dtype_to_descr(self.dtype), "fortran_order": False,
             "shape": (self.rows, *self.item)})

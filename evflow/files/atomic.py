@@ -1,4 +1,4 @@
-"""Writing files so that nothing is ever half-written or overwritten unasked."""
+"""Writing files so that none is ever left half-written or overwritten without permission."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from evflow.files.whole import write_checked
 from evflow.process.alive import is_dead, mark
 from evflow.process.signals import uninterrupted
 
-NAME_BYTES = 180  # of a name, in that of its temporary file; file systems take 255 in all
+NAME_BYTES = 180  # of the target's name in its temporary file's name; file systems allow 255
 LEFTOVER = re.compile(r"([0-9a-f]+-[0-9a-f]+)\.[0-9a-f]{8}\.(tmp|part)(\.\w+)?")
 REASONS = {
     errno.ENOSPC: "no space left", errno.EDQUOT: "the quota is used up",
@@ -29,13 +29,13 @@ REASONS = {
 
 
 def aside(path: Path, ending: str) -> Path:
-    """A hidden name beside `path` that no other process has, on whatever machine it runs. One that
-    ends in tmp or part goes with the next writing of `path`, should this process be killed."""
+    """A hidden name beside `path` that no other process uses, on any machine. If it ends in tmp or
+    part and this process is killed, the next write of `path` removes it."""
     return path.with_name(f"{_begin(path)}{mark()}.{secrets.token_hex(4)}.{ending}")
 
 
 def clear_leftovers(path: Path) -> None:
-    """Remove what killed processes left beside `path` for it; nothing of one that may live."""
+    """Remove what killed processes left beside `path` for it, but nothing of a live process."""
     begin = _begin(path)
     with contextlib.suppress(OSError):
         for name in os.listdir(path.parent):
@@ -48,16 +48,17 @@ def clear_leftovers(path: Path) -> None:
 def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it into place only if the block succeeds.
 
-    Raises EV013 where `path` exists, or does by the end, and `overwrite` is false, or is no file,
-    EV019 where the disk is full or the path cannot be written. The temporary file is removed on any
-    failure, Ctrl-C included; that of a killed process, by the next one that writes `path`.
+    Raises EV013 if `path` exists before or after the block and `overwrite` is false, or if it is
+    not a regular file; EV019 if the disk is full or the path cannot be written. The temporary file
+    is removed on any failure including Ctrl-C; that of a killed process by the next write of
+    `path`.
     """
     with written_aside(path, _move, overwrite=overwrite) as temporary:
         yield temporary
 
 
 def atomic_text(path: str | os.PathLike, data: str | bytes, *, overwrite: bool = False) -> None:
-    """Write a text or bytes, which are read again before they get their name; as `atomic_write`."""
+    """Write text or bytes and read them back before the rename; as `atomic_write`."""
     with atomic_write(path, overwrite=overwrite) as temporary:
         write_checked(temporary, data)
 
@@ -68,7 +69,7 @@ def written_aside(
 ) -> Iterator[Path]:
     """`atomic_write` of a file or folder; move(temporary, path, overwrite) puts it in place."""
     path = Path(path)
-    if os.path.exists(path) and not overwrite:  # false, not an error, for an impossible path
+    if os.path.exists(path) and not overwrite:  # False, not an error, for an impossible path
         raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).",
                               where=path)
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
@@ -79,7 +80,7 @@ def written_aside(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
-            os.lstat(path)  # a name that is too long, before the work
+            os.lstat(path)  # fails early for a name that is too long
         clear_leftovers(path)
         yield temporary
         with uninterrupted():
@@ -103,8 +104,8 @@ def _move(temporary: Path, path: Path, overwrite: bool) -> None:
 
 
 def _begin(path: Path) -> str:
-    """How the names of all temporary files of `path` begin; a long name is cut, and told from
-    others by its checksum."""
+    """Prefix of the names of all temporary files of `path`; a long name is cut and made unique by
+    its checksum."""
     name = os.fsencode(path.name)
     if len(name) > NAME_BYTES:
         cut = name[:NAME_BYTES].decode(errors="ignore")

@@ -1,4 +1,4 @@
-"""Files that are read by libraries which believe whatever size a damaged one claims."""
+"""Files for libraries that trust whatever size a damaged file claims."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-LITTLE = 1 << 16  # bytes for which nothing is asked, as that takes longer than reading them
+LITTLE = 1 << 16  # bytes that are read without asking for the file's size, which takes longer
 
 
 class BoundedPath(type(Path())):  # type: ignore[misc]
-    """A path whose file, opened for its bytes, never takes memory for more than it has left."""
+    """A path whose binary file never allocates more memory than it has bytes left."""
 
     def open(self, mode: str = "r", *rest: Any, **named: Any) -> Any:
         if mode == "rb":

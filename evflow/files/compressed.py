@@ -1,8 +1,8 @@
-"""Frames of zstd, LZ4 and bzip2, unpacked no further than told; and how much zstd and LZ4 frames
-can expand to, by the headers of their blocks alone.
+"""Frames of zstd, LZ4 and bzip2, unpacked up to a limit; and how large zstd and LZ4 frames may
+become, from their block headers alone.
 
-A zstd block of 4 bytes stands for 128 KiB of one byte, so that 1 MB of them fill 32 GB (RFC 8878,
-3.1.1; lz4_Frame_format.md). Decoders that take no limit are asked only after `most_bytes`.
+A zstd block of 4 bytes stands for 128 KiB of one byte, so 1 MB of them expands to 32 GB (RFC 8878,
+3.1.1; lz4_Frame_format.md). Decoders without a limit are called only after `most_bytes`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import struct
 from typing import Any
 
 ZSTD, LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
-SKIPPED = b"\x2a\x4d\x18"  # behind a byte of 0x50 to 0x5f: a frame of no data, of either kind
+SKIPPED = b"\x2a\x4d\x18"  # after a byte 0x50 to 0x5f: a skippable frame of either format
 ZSTD_BLOCK = 1 << 17
 LZ4_RATIO = 255
 
 
 def decoder_of(kind: str) -> Any:
-    """A decoder of "zstd", "lz4" or "bz2" with decompress(data, max_length), eof and unused_data;
-    ImportError where its package is missing, ValueError for other kinds."""
+    """A decoder for "zstd", "lz4" or "bz2" with decompress(data, max_length), eof and unused_data;
+    ImportError if its package is missing, ValueError for other names."""
     if kind == "zstd":
         try:
             from compression import zstd  # type: ignore[import-not-found, unused-ignore]
@@ -33,12 +33,12 @@ def decoder_of(kind: str) -> Any:
         import bz2
 
         return bz2.BZ2Decompressor()
-    raise ValueError(f"compression {kind[:20]!r} is not known")
+    raise ValueError(f"compression {kind[:20]!r} is unknown")
 
 
 def unpack(data: bytes, kind: str, most: int) -> bytes:
-    """What all frames of `data` hold; ValueError where that is more than `most` bytes, or they are
-    cut off, and what the decoder raises on damage."""
+    """The content of all frames in `data`; ValueError if it exceeds `most` bytes or is cut off, and
+    the decoder's own errors on damage."""
     parts, left, rest = list[bytes](), most, data
     while rest:
         decoder = decoder_of(kind)
@@ -52,8 +52,8 @@ def unpack(data: bytes, kind: str, most: int) -> bytes:
 
 
 def most_bytes(data: bytes) -> int:
-    """Bytes that the frames in `data` hold at most; its own length where it is not compressed.
-    What is behind damage does not count: no decoder gets there."""
+    """Upper bound on the bytes that the frames in `data` hold; its length if it is not compressed.
+    Nothing after damage counts: no decoder gets there."""
     read = {ZSTD: _zstd, LZ4: _lz4}
     at = total = 0
     try:
@@ -71,7 +71,7 @@ def most_bytes(data: bytes) -> int:
 
 
 def _zstd(data: bytes, at: int) -> tuple[int, int]:
-    """(where the frame that begins at `at`, behind its magic, ends; bytes it holds at most)."""
+    """(offset of the end of the frame whose magic is before `at`, upper bound on its bytes)."""
     told = data[at]
     single, checksum = told >> 5 & 1, told >> 2 & 1
     dictionary, content = (0, 1, 2, 4)[told & 3], (single, 2, 4, 8)[told >> 6]

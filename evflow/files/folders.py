@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all, as `files.atomic_write` does for a file."""
+"""Folders that appear completely or not at all, like the files of `files.atomic_write`."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def atomic_folder(
 ) -> Iterator[Path]:
     """Yield a new folder beside `path`; rename it into place only if the block succeeds.
 
-    names: the files that such a folder holds. One that holds anything else is never replaced,
-    overwrite or not, because somebody may miss it.
-    Raises EV013 and EV019 as `atomic_write`; nothing is left behind by any failure.
+    names: the files that such a folder may hold. A folder that holds anything else is never
+    replaced, even with overwrite, because somebody may need it.
+    Raises EV013 and EV019 like `atomic_write`; no failure leaves anything behind.
     """
     path = Path(path).resolve()
 
     def move(temporary: Path, path: Path, overwrite: bool) -> None:
         if overwrite and path.is_dir():
-            _refuse_foreign(path, names)  # again: the work may have taken hours
+            _refuse_foreign(path, names)  # again: the block may have taken hours
             swap_folders(temporary, path, aside(path, "old"))
         elif overwrite:
             os.replace(temporary, path)
@@ -54,10 +54,10 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
            ) -> Iterator[Path]:
     """Yield an empty folder; move what the block leaves there into `folder` once it succeeds.
 
-    names: all files that the block may write, of which those in `folder` from another time are
-    removed, so that nothing stale lies beside the new ones; other files stay.
-    Raises EV013 where one of them exists and `overwrite` is false, EV019 where the folder cannot
-    be written.
+    names: all files that the block may write. Those already in `folder` are removed, so that no
+    stale file lies beside the new ones; other files stay.
+    Raises EV013 if one of them exists and `overwrite` is false, EV019 if the folder cannot be
+    written.
     """
     folder = Path(folder)
     if not overwrite and (old := [name for name in names if (folder / name).exists()]):
@@ -86,7 +86,7 @@ def _unstage(stage: Path, folder: Path, names: Sequence[str], *, overwrite: bool
     if overwrite:
         for name in names:
             (folder / name).unlink(missing_ok=True)
-    for path in sorted(stage.iterdir()):  # sorted: of two processes, one has the first and goes on
+    for path in sorted(stage.iterdir()):  # sorted: of two processes, one wins the first and goes on
         if overwrite:
             os.replace(path, folder / path.name)
         else:

@@ -1,4 +1,4 @@
-"""Renaming that replaces nothing, and that swaps, each in one step of the file system."""
+"""Renaming that never replaces a file, and swapping folders, each in one file-system operation."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from pathlib import Path
 
 from evflow.errors import EvflowDataError
 
-NOREPLACE, EXCHANGE = 1, 2  # of linux/fs.h
+NOREPLACE, EXCHANGE = 1, 2  # from linux/fs.h
 AT_FDCWD = -100
-UNKNOWN = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)  # to the system or its disk
+UNKNOWN = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)  # not supported here
 
 
 def move_new(source: Path, target: Path) -> None:
-    """Rename a file or folder to a name that nothing has; EV013 where something has it by now, as
-    of two processes that write one name at once only the first may."""
+    """Rename a file or folder to an unused name; EV013 if the name is taken by then: of two
+    processes that write one name at once, only the first succeeds."""
     try:
         if _renameat2(source, target, NOREPLACE):
             return
         (_move_folder if source.is_dir() else _move_file)(source, target)
     except FileExistsError as e:
         raise EvflowDataError(
-            "EV013", f"{target} has appeared meanwhile.",
-            "It was left as it is: another process writes there.", where=target) from e
+            "EV013", f"{target} was created meanwhile.",
+            "It was left untouched: another process writes there.", where=target) from e
 
 
 def swap_folders(new: Path, old: Path, aside: Path) -> None:
-    """`new` takes the place of the folder `old`, which is removed. aside: a name beside it, for
-    disks that cannot exchange names."""
+    """Replace the folder `old`, which is removed, by `new`. aside: a free name beside it, for file
+    systems that cannot exchange names."""
     if _renameat2(new, old, EXCHANGE):
         shutil.rmtree(new, ignore_errors=True)
         return
@@ -45,7 +45,7 @@ def swap_folders(new: Path, old: Path, aside: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """A file or folder, where it is there and can be removed."""
+    """Remove a file or folder if it exists and can be removed."""
     with contextlib.suppress(OSError):  # where even the folder around it is missing
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
@@ -54,7 +54,7 @@ def remove(path: Path) -> None:
 
 
 def _renameat2(source: Path, target: Path, flag: int) -> bool:
-    """Linux's rename with a flag; False where it, or the file system, does not know it."""
+    """Linux's rename with a flag; False if the kernel or file system does not support it."""
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if (
         os.name == "posix") else None
     if call is None:
@@ -68,11 +68,11 @@ def _renameat2(source: Path, target: Path, flag: int) -> bool:
 
 def _move_file(source: Path, target: Path) -> None:
     try:
-        os.link(source, target)  # fails where the name is taken, as rename does not
+        os.link(source, target)  # unlike rename, fails if the name is taken
     except OSError as e:
         if e.errno not in (*UNKNOWN, errno.EMLINK):
             raise
-        if os.path.lexists(target):  # no links here (FAT): what is left is to look first
+        if os.path.lexists(target):  # no hard links here (FAT): checking first must do
             raise FileExistsError(errno.EEXIST, "exists", str(target)) from e
         os.rename(source, target)
     else:
@@ -80,7 +80,7 @@ def _move_file(source: Path, target: Path) -> None:
 
 
 def _move_folder(source: Path, target: Path) -> None:
-    target.mkdir()  # fails where the name is taken; an empty folder of our own is then replaced
+    target.mkdir()  # fails if the name is taken; rename then replaces our own empty folder
     try:
         os.replace(source, target)
     except BaseException:

@@ -1,10 +1,10 @@
-"""Data out of pickles, without running them.
+"""Data out of pickles, without executing them.
 
-A pickle is a program for a stack machine that may call anything. `load` has Python's own reader
-carry it out with a cut table of instructions: none but those that containers, numbers, strings
-and arrays need, and no name but those it is handed a function for. That reader is the one written
-in Python, as the one in C takes memory for any length or index that a file claims. ValueError for
-everything it will not do; the number of instructions is bounded.
+A pickle is a program for a stack machine that may call anything. `load` runs it on Python's own
+reader with a restricted instruction table: only what containers, numbers, strings and arrays need,
+and only names for which the caller passes a builder. It is the pure-Python reader, because the one
+in C allocates memory for any length or index that a file claims. Anything else raises ValueError;
+the number of instructions is bounded.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import IO, Any
 
-MOST_INSTRUCTIONS = 1_000_000  # a tensor takes about 50, and networks have hundreds
+MOST_INSTRUCTIONS = 1_000_000  # a tensor takes about 50, a network has hundreds of tensors
 Builder = Callable[..., Any]
 
 _Python: Any = pickle._Unpickler  # type: ignore[attr-defined]
@@ -30,12 +30,12 @@ _DAMAGE = (pickle.UnpicklingError, EOFError, struct.error, IndexError, KeyError,
 
 
 class Refused(ValueError):
-    """The pickle is as its writer left it, perhaps, but asks for what is not to be done."""
+    """The pickle may be intact but asks for something that is not allowed."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Named:
-    """A name the pickle mentions, with the builder that is called in its place."""
+    """A name that the pickle mentions, with the builder called in its place."""
 
     name: str
     build: Builder
@@ -45,7 +45,7 @@ class Named:
 
 
 class Inert:
-    """What stands for an object of which only the presence matters; it holds nothing."""
+    """Stands for an object whose content does not matter; it holds nothing."""
 
     def __init__(self, *_: object, **__: object) -> None:
         pass
@@ -57,12 +57,12 @@ _FLAT = (str, int, float, bytes, type(None), Named, Inert)
 def load(
     file: IO[bytes], names: Mapping[str, Builder], persistent: Builder | None = None
 ) -> Any:
-    """The object of the pickle at the file's position, which moves behind it.
+    """The object of the pickle at the file's position, which moves past it.
 
-    file: in memory, or one of `BoundedPath`, of which reading takes no more than is there.
-    names: "module.name" -> what is called in its place. persistent: called with each persistent
-    id. Raises Refused, a ValueError, for other names and unknown instructions, and ValueError for
-    every kind of damage.
+    file: in memory, or of a `BoundedPath`, which never allocates more than the file holds.
+    names: "module.name" -> the function called in its place. persistent: called with each
+    persistent id. Raises Refused, a ValueError, for other names and instructions, and ValueError
+    for damage of any kind.
     """
     reader = _Reader(file, names, persistent)
     try:
@@ -75,13 +75,13 @@ def load(
 
 
 def _is_key(value: Any) -> bool:
-    """Tuples in tuples could be nested so deep that hashing them overflows the stack."""
+    """Only flat keys: hashing deeply nested tuples would overflow the stack."""
     return isinstance(value, _FLAT) or (
         type(value) is tuple and all(isinstance(part, _FLAT) for part in value))
 
 
 class _Reader(_Python):
-    """Python's reader, but for names, persistent ids and what is done to objects."""
+    """Python's reader with its own names, persistent ids and operations on objects."""
 
     def __init__(
         self, file: IO[bytes], names: Mapping[str, Builder], persistent: Builder | None
@@ -108,8 +108,8 @@ class _Reader(_Python):
         state, target = self.stack.pop(), self.stack[-1]
         if hasattr(target, "set_state"):
             target.set_state(state)
-        elif not isinstance(target, Inert | dict):  # an OrderedDict's attributes: none of use
-            raise ValueError("the pickle sets the state of what has none")
+        elif not isinstance(target, Inert | dict):  # attributes of an OrderedDict are unused
+            raise ValueError("the pickle sets the state of an object without one")
 
     def load_append(self) -> None:
         self._extend([self.stack.pop()])
@@ -121,7 +121,7 @@ class _Reader(_Python):
         if type(self.stack[-1]) is list:
             self.stack[-1].extend(items)
         elif not isinstance(self.stack[-1], Inert):
-            raise ValueError("the pickle appends to what is no list")
+            raise ValueError("the pickle appends to something that is not a list")
 
     def load_dict(self) -> None:
         items = self.pop_mark()
@@ -139,14 +139,14 @@ class _Reader(_Python):
         if isinstance(self.stack[-1], Inert):
             return
         if type(self.stack[-1]) is not dict or len(items) % 2:
-            raise ValueError("the pickle sets items of no dict, or a key without a value")
+            raise ValueError("the pickle sets items of what is no dict, or a key without a value")
         if not all(map(_is_key, items[::2])):
             raise Refused("the pickle has a dict with keys of a kind that no weights need")
         self.stack[-1].update(zip(items[::2], items[1::2], strict=True))
 
 
 class _Table(dict[int, Callable[[Any], None]]):
-    """Instructions by their byte, as many as may be carried out."""
+    """Instructions by their opcode; counts them up to the limit."""
 
     left = MOST_INSTRUCTIONS
 

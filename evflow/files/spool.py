@@ -1,8 +1,8 @@
-"""A column that grows part by part: in memory, and from a limit on in a temporary file.
+"""A column that grows in parts: in memory, and above a limit in a temporary file.
 
-So a recording larger than memory is read like any other: its columns are mapped from disk, and a
-window takes what it needs. The file lies in the system's temporary folder (TMPDIR) and is gone
-with the last array that shows it, or with the process.
+A recording larger than memory is thus read like any other: its columns are memory-mapped, and a
+window loads what it needs. The file lies in the system's temporary folder (TMPDIR) and disappears
+with the last array that uses it, or with the process.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 from evflow.errors import EvflowDataError
 
 LIMIT = 1 << 29  # bytes of a column in memory: 67 million int64 times
-SOME = 1 << 25  # the same, where little of a column is looked at again: 4 million times
-LITTLE = 1 << 24  # and where columns are read once
-JOINED = 1 << 25  # bytes of parts; malloc gives smaller arrays memory that is warm
+SOME = 1 << 25  # the same for columns of which little is used again: 4 million times
+LITTLE = 1 << 24  # and for columns that are read once
+JOINED = 1 << 25  # bytes of parts; malloc reuses warm memory for smaller arrays
 
 
 _limit: contextvars.ContextVar[int | None] = contextvars.ContextVar("limit", default=None)
@@ -30,8 +30,8 @@ _limit: contextvars.ContextVar[int | None] = contextvars.ContextVar("limit", def
 
 @contextlib.contextmanager
 def on_disk(limit: int = LITTLE) -> Iterator[None]:
-    """Columns that are begun in this block keep `limit` bytes each in memory: where they are read
-    once, in order, as by a conversion."""
+    """Columns begun in this block keep only `limit` bytes each in memory, for work that reads them
+    once and in order, such as a conversion."""
     before = _limit.set(limit)
     try:
         yield
@@ -40,8 +40,8 @@ def on_disk(limit: int = LITTLE) -> Iterator[None]:
 
 
 def forget(*arrays: np.ndarray) -> None:
-    """Give back the memory of what was read of mapped arrays: it stays in their files, and is read
-    again where it is asked for. Others stay as they are."""
+    """Release the memory pages of mapped arrays: their data stay on disk and are read again on
+    demand. Other arrays are unaffected."""
     for array in arrays:
         base: Any = array
         while isinstance(base, np.ndarray):
@@ -53,7 +53,7 @@ def forget(*arrays: np.ndarray) -> None:
 
 
 def put_aside(array: np.ndarray) -> np.ndarray:
-    """The array, on the disk until it is looked at; EV019 where that is full."""
+    """The array, moved to disk until it is used; EV019 if the disk is full."""
     spool = Spool(array.dtype, 0)
     spool.append(array.ravel())
     aside = np.asarray(spool.array()).reshape(array.shape)
@@ -62,18 +62,18 @@ def put_aside(array: np.ndarray) -> np.ndarray:
 
 
 class Spool:
-    """Parts (n,) of one dtype, joined by `array`. Memory: the rows below the limit, an eighth of
-    them that is not filled, and `JOINED` bytes of parts."""
+    """Parts (n,) of one dtype, joined by `array`. Memory: the rows below the limit, up to an eighth
+    more that is unused, and `JOINED` bytes of parts."""
 
     def __init__(self, dtype: Any, limit: int | None = None) -> None:
         self.dtype, self.rows = np.dtype(dtype), 0
         self.limit = (_limit.get() or LIMIT) if limit is None else limit
         self._memory, self._filled = np.empty(0, self.dtype), 0
-        self._parts: list[np.ndarray] = []  # rows behind those of _memory or _file
+        self._parts: list[np.ndarray] = []  # rows after those of _memory or _file
         self._file: IO[bytes] | None = None
 
     def append(self, part: np.ndarray) -> None:
-        """Add a part, cast to the dtype, copied if it is a view; EV019 where the disk is full."""
+        """Add a part, cast to the dtype, copied if it is a view; EV019 if the disk is full."""
         self._parts.append(part.astype(self.dtype, copy=part.base is not None))
         self.rows += len(part)
         if self._file is None and self.rows * self.dtype.itemsize > self.limit:
@@ -86,8 +86,8 @@ class Spool:
             self._join()
 
     def _join(self) -> None:
-        """Move the parts behind the rows in memory, which grow by realloc: it moves large arrays
-        without a copy, so that nothing is there twice."""
+        """Append the parts to the rows in memory, which grow by realloc: it moves large arrays
+        without copying, so nothing exists twice."""
         if self.rows > len(self._memory):
             self._memory.resize(max(self.rows, len(self._memory) * 9 // 8), refcheck=False)
         parts, self._parts = self._parts, []
@@ -105,14 +105,14 @@ class Spool:
             if e.errno != errno.ENOSPC:
                 raise
             raise EvflowDataError(
-                "EV019", f"the recording is larger than memory, and {tempfile.gettempdir()}, where "
-                "it is kept meanwhile, is full.",
-                "Set TMPDIR to a folder with room, or read a part: --start, --stop.") from e
+                "EV019", f"the recording is larger than memory, and its temporary folder "
+                f"{tempfile.gettempdir()} is full.",
+                "Set TMPDIR to a folder with more space, or read a part: --start, --stop.") from e
 
     def array(self) -> np.ndarray:
-        """All rows: one array in memory, or a map of the file. The spool is empty afterwards."""
+        """All rows, in one array or mapped from the file. The spool is empty afterwards."""
         if self._file is not None:
-            with self._file as file:  # the map outlives it
+            with self._file as file:  # the map outlives the open file
                 return np.memmap(file, self.dtype, "r+", shape=(self.rows,))
         if self._parts and not self._filled:
             parts, self._parts = self._parts, []

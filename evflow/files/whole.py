@@ -1,5 +1,5 @@
-"""Whether a file that was just written is whole, before it gets its name: errors that a library
-dropped on the way, and lost ends, show in sizes and tables of contents. Large data are not read."""
+"""Check that a written file is complete before it gets its name: errors that a library swallowed
+and truncated ends show in sizes and tables of contents. Large data are not read again."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from evflow.errors import EvflowDataError
 
 
 def not_whole(path: Path, what: str) -> EvflowDataError:
-    """EV019 for a file that is not as it was written."""
-    return EvflowDataError("EV019", f"{path} was not written whole: {what}.",
-                           "It was not kept. Does the disk work? Write it again.", where=path)
+    """EV019 for a file that differs from what was written."""
+    return EvflowDataError("EV019", f"{path} was not written completely: {what}.",
+                           "It was not kept. Is the disk failing? Write it again.", where=path)
 
 
 def need_size(path: Path, size: int) -> None:
-    """EV019 unless the file has as many bytes."""
+    """Raise EV019 unless the file has `size` bytes."""
     if (found := os.path.getsize(path)) != size:
         raise not_whole(path, f"it has {found:,} bytes of {size:,}")
 
 
 def write_checked(path: Path, data: str | bytes) -> None:
-    """Write a text (UTF-8; a file's name in it need not be) or bytes, and read them again; EV019
-    where something else is there."""
+    """Write text (UTF-8, except for undecodable file names in it) or bytes and read them back;
+    EV019 if they differ."""
     data = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
     path.write_bytes(data)
     if path.read_bytes() != data:
-        raise not_whole(path, "something else is there")
+        raise not_whole(path, "its content differs")
 
 
 def need_members(path: Path, sizes: Mapping[str, int | None]) -> None:
-    """EV019 unless a zip holds just these files, of so many bytes each (None: any), one behind the
-    other."""
+    """Raise EV019 unless a zip holds exactly these files, of these sizes (None: any), without gaps
+    between them."""
     try:
         with zipfile.ZipFile(path) as archive:
             infos = archive.infolist()
             for info in infos:
-                archive.open(info).close()  # its own header is there, and has its name
+                archive.open(info).close()  # checks that its own header is there with its name
             begins = [*sorted(info.header_offset for info in infos), archive.start_dir]
     except (zipfile.BadZipFile, EOFError) as e:
         raise not_whole(path, str(e)) from e

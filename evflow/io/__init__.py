@@ -1,4 +1,4 @@
-"""Recordings from and to files. NumPy only: reading never imports JAX."""
+"""Reading and writing recordings. NumPy only: reading never imports JAX."""
 
 from evflow.io.formats.dsec import DsecWriter
 from evflow.io.registry import (

@@ -1,7 +1,7 @@
-"""What a user may tell a reader, and how every reader obeys it.
+"""What a user may tell a reader about a file, and how every reader follows it.
 
-`stream.gather` passes what a reader parses through `microseconds`, `on`, `sensor` and `span_us`;
-so units, polarity, size and time range mean the same for every format.
+`stream.gather` passes what a reader parses through `microseconds`, `on`, `sensor` and `span_us`, so
+units, polarity, size and time range mean the same for every format.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LATE = ("stop", "drop", "sort", "join")
 
 
 def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
-    """EV020 where an attribute of `options` is none of its choices."""
+    """Raise EV020 if an attribute of `options` is not one of its choices."""
     for name, allowed in choices.items():
         if getattr(options, name) not in allowed:
             raise EvflowDataError(
@@ -31,7 +31,8 @@ def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
 
 
 def known(given: Mapping[str, Any], fields_of: type, who: str) -> Mapping[str, Any]:
-    """`given`; EV020 where it names what is no field of the dataclass. who: takes its fields."""
+    """`given`; raises EV020 for names that are not fields of the dataclass. who: for the
+    message."""
     names = [field.name for field in dataclasses.fields(fields_of)]
     unknown = sorted(set(given) - set(names))
     if unknown:
@@ -41,7 +42,7 @@ def known(given: Mapping[str, Any], fields_of: type, who: str) -> Mapping[str, A
 
 
 class Told(TypedDict, total=False):
-    """The keyword arguments that become `Hints`."""
+    """The keyword arguments from which `Hints` are made."""
 
     start_s: float | None
     stop_s: float | None
@@ -63,21 +64,23 @@ class Hints:
 
     start_s, stop_s: keep events and frames with start <= time < stop, in seconds from the
         file's first event; None = all.
-    time_unit: "auto" = what the format says; "s", "ms", "us" or "ns" overrides it.
-    polarity: "auto" = {0, 1} or {-1, 1}, whichever it is; "01" and "pm1" insist; "invert"
+    time_unit: "auto" = what the format says; "s", "ms", "us" or "ns" override it.
+    polarity: "auto" = {0, 1} or {-1, 1}, whichever fits; "01" and "pm1" require one; "invert"
         swaps ON and OFF.
     size: (width, height), overrides what the file says.
-    partial: of a damaged or cut-off file take what lies before the damage; of HDF5 and npz, which
+    partial: of a damaged or truncated file, read what lies before the damage; of HDF5 and npz,
+    which
         are sound or not as a whole, only what lies before a time that goes back.
     drop_outside: leave out events outside the sensor instead of refusing them.
-    frames_topic: of several streams of images the one whose images are the frames (see `streams`).
-    no_frames: read the events alone.
-    late: what becomes of times that go back: "stop" = they are refused, or with `partial` end the
-        reading; "drop" leaves out as few events as make the others ordered; "sort" puts them in
-        their place; "join" puts one clock behind the other.
-    events_topic: of several streams of events (of several cameras) the one to read.
-    colour: what a pixel sees of colour: "luma", or a Bayer pattern: its own colour under that
-        mosaic, as the events of a colour sensor do. Raw mosaics then stay as they are.
+    frames_topic: which of several image streams holds the frames (see `streams`).
+    no_frames: read only the events.
+    late: what to do with times that go back: "stop" refuses them, or with `partial` ends the
+    reading
+        there; "drop" leaves out the fewest events such that the rest are ordered; "sort" sorts them
+        in; "join" appends one clock to the other.
+    events_topic: which of several event streams (cameras) to read.
+    colour: what a pixel sees of colour frames: "luma", or a Bayer pattern: one colour of that
+        mosaic, as in a colour sensor's events. Raw mosaics then stay as they are.
     """
 
     start_s: float | None = None
@@ -112,32 +115,32 @@ class Hints:
                                       "Give the name of a topic, group or data set.")
         if self.frames_topic is not None and self.no_frames:
             raise EvflowDataError(
-                "EV020", f"frames_topic={self.frames_topic!r} and no_frames contradict.",
-                "Give one of them (--frames-topic, --no-frames).")
+                "EV020", f"frames_topic={self.frames_topic!r} and no_frames contradict each other.",
+                "Give only one of them (--frames-topic, --no-frames).")
         if self.size is not None:
             object.__setattr__(self, "size", check_size(self.size))
 
     @staticmethod
     def parse(given: Mapping[str, Any]) -> Hints:
-        """Hints of keyword arguments; an unknown one raises EV020."""
+        """Hints from keyword arguments; an unknown one raises EV020."""
         return Hints(**known(given, Hints, "Readers"))
 
     def camera(self, names: Sequence[str]) -> tuple[str, tuple[Note, ...]]:
-        """Which of several streams of events to read, the first unless one is asked for: by its
-        name, or as the only one that ends so; and what is to be said. EV020 where none is it."""
+        """Which of several event streams to read (the first unless one is requested, by its name or
+        a unique ending of it), and notes on it. EV020 if none fits."""
         named, best = self.events_topic, names[0]
         if named is not None:
             ends = [n for n in names if n == named] or [
                 n for n in names if f"/{n}".endswith("/" + named.strip("/"))]
             if len(ends) != 1:
                 raise EvflowDataError(
-                    "EV020", f"events_topic={named!r} names {len(ends)} streams of events.",
+                    "EV020", f"events_topic={named!r} matches {len(ends)} event streams.",
                     f"There are: {', '.join(names)}.")
             best = ends[0]
         elif len(names) == 1:
             return best, ()
         others = ", ".join(name for name in names if name != best) or "none"
-        return best, (Note("sensor.camera", f"events are those of {best}; not read: {others}"
+        return best, (Note("sensor.camera", f"events of {best} were read; not read: {others}"
                            + ("" if others == "none" else "; --events-topic NAME reads another")),)
 
     def sensor(self, *known: Size | None, reach: tuple[int, int] | None = None) -> Size:
@@ -149,12 +152,12 @@ class Hints:
             if size is not None:
                 return check_size(size)
         raise EvflowDataError(
-            "EV015", "the file does not tell the size of its sensor"
+            "EV015", "the file does not contain the size of its sensor"
             + (f" (events reach x={reach[0]}, y={reach[1]})." if reach else "."),
             "Pass size=(width, height), --size WxH.")
 
     def microseconds(self, t: np.ndarray, native: str, offset_us: int = 0) -> np.ndarray:
-        """Times of any dtype in `time_unit` (auto: `native`) as int64 us, offset_us added.
+        """Times of any dtype in `time_unit` (auto: `native`) as int64 us, plus offset_us.
 
         Integers stay exact; floats and ns are rounded to the nearest microsecond.
         Raises EV003, EV007, EV009 (the offset takes them beyond 2^62 us).
@@ -173,11 +176,11 @@ class Hints:
         if t.dtype.kind == "f":
             if self.time_unit == "auto" and native != "s":
                 raise EvflowDataError(
-                    "EV003", f"times have dtype {t.dtype} (first {t[0]}) where {native} are whole.",
+                    "EV003", f"times are {t.dtype} (first {t[0]}), but {native} must be integers.",
                     "Are they seconds? Pass time_unit='s' (--time-unit s).")
             if not np.isfinite(t).all():
                 raise EvflowDataError("EV007", f"{(~np.isfinite(t)).sum():,} times are not finite.")
-            with np.errstate(over="ignore"):  # an overflow is too late, as below
+            with np.errstate(over="ignore"):  # an overflow is refused below
                 us = np.rint(t.astype(np.float64) * UNITS_US[unit])
             if beyond(us.min(), us.max()):
                 raise _too_late(t, unit)
@@ -192,31 +195,31 @@ class Hints:
         return whole if unit == "us" else whole * np.int64(UNITS_US[unit])
 
     def instant(self, t: Any, native: str) -> int:
-        """One time as `microseconds` has it."""
+        """One time, converted as by `microseconds`."""
         return int(self.microseconds(np.asarray(t).reshape(1), native)[0])
 
     def on(self, p: np.ndarray) -> np.ndarray:
-        """Polarity as bool, True = ON, after the convention asked for; EV006."""
+        """Polarity as bool, True = ON, by the requested convention; EV006."""
         expected = {"01": (0, 1), "pm1": (-1, 1)}.get(self.polarity)
         if expected and p.size and p.dtype != bool:
             values = np.unique(p)
             if not np.isin(values, expected).all():
                 raise EvflowDataError(
-                    "EV006", f"p holds {values[:5]} but polarity={self.polarity!r} was asked for.",
+                    "EV006", f"p holds {values[:5]} but polarity={self.polarity!r} was requested.",
                     f"Expected {expected} only; polarity='auto' detects the convention.")
         on = check_polarity(p)
         return ~on if self.polarity == "invert" else on
 
     def forgive(self, error: EvflowDataError, sound: bool) -> Note:
-        """A note on the error where what is sound before the damage was asked for and is some;
-        else it is raised."""
+        """A note on the error if reading what is sound before the damage was requested and there is
+        something; else the error is raised."""
         if not (self.partial and sound and error.code in ("EV004", "EV009")):
             raise error
         return Note("events.partial",
                     f"only the part before the damage was read (--partial): {error.seen}")
 
     def span_us(self, first_us: int) -> tuple[int, int]:
-        """The absolute half-open range [start, stop) in us for a file that begins at first_us."""
+        """The half-open range [start, stop) in us on the file's clock, which begins at first_us."""
         limits = np.iinfo(np.int64)
         start = limits.min if self.start_s is None else first_us + round(self.start_s * 1e6)
         stop = limits.max if self.stop_s is None else first_us + round(self.stop_s * 1e6)
@@ -235,18 +238,18 @@ class Hints:
 
 
 def within(x: np.ndarray, y: np.ndarray, size: Size) -> np.ndarray:
-    """(N,) bool: which coordinates lie on a sensor of (width, height)."""
+    """(N,) bool: which coordinates lie on a sensor of size (width, height)."""
     return (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
 
 
 def dropped(count: int, total: int, size: Size) -> Note:
-    """What is said of events that were left out."""
+    """The note on events that were left out."""
     return Note("events.outside", f"{count:,} of {total:,} events lay outside {size[0]}x{size[1]} "
                 "and were left out (--drop-outside)")
 
 
 def _too_late(t: np.ndarray, unit: str) -> EvflowDataError:
-    """The unit that makes them times since 1970 is named, if there is one."""
+    """EV003 that names the unit in which the times would be dates since 1970, if there is one."""
     last = float(t.max())
     since = since_1970(last)
     return EvflowDataError(

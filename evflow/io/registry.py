@@ -1,9 +1,9 @@
 """Reading and writing recordings: the registry of formats.
 
-A format is a module with a NAME, its EXTENSIONS, `sniff` and `read`, and an `EventWriter` where it
-can be written; adding one is a new file and an entry in `FORMATS` and in `WRITERS`. A file is
-recognised by its content, and by its extension only where several formats claim it. Whatever is
-wrong with a file comes out as an `EvflowDataError`.
+A format is a module with a NAME, its EXTENSIONS, `sniff` and `read`, and an `EventWriter` if it can
+be written; to add one, create its file and list it in `FORMATS` and in `WRITERS`. A file is
+recognised by its content; its extension matters only if several formats claim it. Whatever is wrong
+with a file is reported as an `EvflowDataError`.
 """
 
 from __future__ import annotations
@@ -60,26 +60,26 @@ class Format(Protocol):
     EXTENSIONS: tuple[str, ...]
 
     def sniff(self, path: Path, head: bytes) -> bool:
-        """Does this look like mine? `head` is the file's beginning, b"" for a folder."""
+        """Whether the file looks like this format. `head`: its beginning, b"" for a folder."""
 
     def read(self, path: Path, hints: Hints) -> Recording:
-        """The recording, every hint obeyed; a file without frames gives an empty stack."""
+        """The recording, with all hints followed; a file without frames gives an empty stack."""
 
 
-FORMATS: tuple[Format, ...] = (  # of two that claim a file and its extension, the first
+FORMATS: tuple[Format, ...] = (  # if two claim a file and its extension, the first one wins
     aedat4, aedat3, aedat2, evt2, evt21, evt3, dat, v2e, mvsec, event_utils, metavision, dsec, hdf5,
     npz, npy, evimo2, evreal, e2vid, v2e_text, ijrr, plain_text, ros1, ros2, nmnist)
 WRITERS: dict[str, type[EventWriter]] = {w.NAME: w for w in (
     dsec.DsecWriter, e2vid.E2vidWriter, event_utils.EventUtilsWriter, evreal.EvrealWriter,
     npz.NpzWriter, Aedat4Writer, Aedat2Writer)}
-WRITTEN = {  # the format that an output's extension stands for, unless told otherwise
+WRITTEN = {  # the default format for an output's extension
     ".h5": "dsec", ".hdf5": "dsec", ".zip": "e2vid", ".txt": "e2vid", ".npz": "npz",
     ".aedat4": "aedat4", ".aedat": "aedat2", "": "evreal"}
-SEVERAL = {".h5": ("dsec", "event_utils"), ".hdf5": ("dsec", "event_utils")}  # else: the one format
+SEVERAL = {".h5": ("dsec", "event_utils"), ".hdf5": ("dsec", "event_utils")}  # others: one format
 
 
 def find_format(path: str | os.PathLike) -> Format:
-    """The format of a file or folder; EV008 (unknown), EV009 (empty file), EV016 (not there)."""
+    """The format of a file or folder; EV008 (unknown), EV009 (empty file), EV016 (not found)."""
     path = Path(path)
     try:
         head = b"" if path.is_dir() else _head(path)
@@ -99,31 +99,31 @@ def find_format(path: str | os.PathLike) -> Format:
             else f"it begins with {head[:16]!r}")
     raise EvflowDataError(
         "EV008", f"{path} is none of {', '.join(f.NAME for f in FORMATS)}: {seen}.",
-        "Convert it, or check that it was copied completely. Text has lines of numbers `t x y p`, "
-        "decimal points, and a header where the order is another.", where=path)
+        "Convert it, or check that it was copied completely. Text must have lines of numbers "
+        "`t x y p`, decimal points, and a header if the order differs.", where=path)
 
 
 def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
-    """Read events and frames of a file or folder; its format is recognised by content.
+    """Read events and frames from a file or folder; its format is recognised by its content.
 
     Args:
         path: AEDAT, Prophesee RAW, DAT and HDF5, DSEC, MVSEC, ROS bags, text and others: see
             docs/formats.md.
-        **hints: what the file does not tell. start_s, stop_s: the part to read, seconds from its
+        **hints: what the file does not say. start_s, stop_s: the part to read, seconds from its
             first event; time_unit: "s", "ms", "us" or "ns"; polarity: "01", "pm1" or "invert";
-            size: (width, height); partial: of a damaged file, what lies before the damage;
+            size: (width, height); partial: of a damaged file, read what lies before the damage;
             drop_outside: leave out events outside the sensor; frames_topic: which of several
-            streams of images holds the frames; no_frames: read the events alone; late: "drop",
-            "sort" or "join" events whose time goes back; events_topic: which of several streams
-            of events to read; colour: "luma", or the Bayer pattern that pixels see through.
+            image streams holds the frames; no_frames: read only the events; late: "drop",
+            "sort" or "join" events whose time goes back; events_topic: which of several event
+            streams to read; colour: "luma", or the Bayer pattern of the sensor.
 
     Returns:
-        The recording; without frames in the file they are (0, H, W). Its notes say what was
+        The recording; if the file has no frames they are (0, H, W). Its notes say what was
         assumed or converted.
 
     Raises:
         EvflowDataError: EV001 (no event), EV008 (unknown format), EV009 (damaged), EV010 (a
-            package is missing), EV016 (not there), EV020 (unknown or bad hint), EV023 (whole
+            package is missing), EV016 (not found), EV020 (unknown or bad hint), EV023 (whole
             seconds), and what `Events` and `Recording` raise.
 
     Example:
@@ -133,7 +133,7 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
     if not isinstance(path, str | os.PathLike):
         raise EvflowDataError(
             "EV020", f"a path was expected, not {type(path).__name__}.",
-            "Events without frames become a recording by Recording.of_events(events).")
+            "For events without frames: Recording.of_events(events).")
     told = Hints.parse(hints)
     path = Path(path)
     found = find_format(path)
@@ -181,7 +181,7 @@ def write_events(
     """Write events, and the frames of a `Recording`, to a file; all or nothing.
 
     Args:
-        path: of the file, with an ending of the format.
+        path: of the file, with an extension of the format.
         events: events or, with frames, a recording.
         format: one of `WRITERS`: "dsec" (HDF5: events/{x, y, t, p}, ms_to_idx, t_offset), "npz",
             "aedat4", "aedat2", "e2vid", "event_utils", "evreal".
@@ -189,8 +189,8 @@ def write_events(
 
     Raises:
         EvflowDataError: EV003 (what the format cannot hold), EV010 (a package is missing), EV013
-            (exists), EV019 (cannot be written), EV020 (unknown format, one that the path's ending
-            does not stand for, or one without frames for a recording with).
+            (exists), EV019 (cannot be written), EV020 (unknown format, one that does not match the
+            path's extension, or one without frames for a recording that has some).
     """
     if not isinstance(events, Recording):
         need(events, Events, "events", "The path comes first: write_events(path, events).")
@@ -208,9 +208,9 @@ def write_recording(
     """Write a recording to a file or folder; all or nothing.
 
     Args:
-        path: of the file; a folder where it has no ending.
+        path: of the file; of a folder if it has no extension.
         recording: events and frames.
-        format: as in `write_events`; None is what the ending of the path stands for (.h5: "dsec",
+        format: as in `write_events`; None chooses by the path's extension (.h5: "dsec",
             .npz: "npz", .aedat4: "aedat4", .aedat: "aedat2", .zip and .txt: "e2vid", none:
             "evreal").
         overwrite: replace what exists.
@@ -218,7 +218,7 @@ def write_recording(
     Raises:
         EvflowDataError: EV003, EV010, EV013, EV019, EV020 as in `write_events`.
     """
-    need(recording, Recording, "recording", "Of events: Recording.of_events(events).")
+    need(recording, Recording, "recording", "For events: Recording.of_events(events).")
     with open_writer(path, recording.events.size, format, overwrite=overwrite) as out:
         copy(recording, out)
 
@@ -226,7 +226,7 @@ def write_recording(
 def open_writer(
     path: str | os.PathLike, size: Size, format: str | None = None, *, overwrite: bool = False
 ) -> EventWriter:
-    """A writer for a recording that comes in parts; all or nothing, at the end of the `with` block.
+    """A writer for a recording that comes in parts; the file appears when the `with` block ends.
 
     Args:
         path: as in `write_recording`.
@@ -249,8 +249,8 @@ def open_writer(
 
 
 def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventWriter]:
-    """The writer of a format, None: of an output's extension; EV020 where there is none, or where
-    the extension stands for another format."""
+    """The writer of a format, or of an output's extension; EV020 if there is none, or if the
+    extension stands for another format."""
     if format is not None and format not in WRITERS:
         raise EvflowDataError("EV020", f"format={format!r}.", f"Choose from {sorted(WRITERS)}.")
     suffix = Path(path).suffix.lower()
@@ -259,20 +259,20 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
         endings = [s or "none (a folder)" for s, name in WRITTEN.items()
                    if format in SEVERAL.get(s, (name,))]
         raise EvflowDataError(
-            "EV020", f"format {format} is not what a name that ends in {suffix} holds.",
+            "EV020", f"a file with the extension {suffix} does not hold format {format}.",
             f"Name the output with {' or '.join(endings)}, or pass format={stands_for[0]!r} "
             f"(--format {stands_for[0]}).")
     if format is None and suffix not in WRITTEN:
         kinds = ", ".join(f"{s or 'a folder'} ({name})" for s, name in WRITTEN.items())
         raise EvflowDataError(
-            "EV020", f"the extension {suffix} of {path} stands for no format that can be written.",
+            "EV020", f"the extension {suffix} of {path} is not one of a format to write.",
             f"Take one of {kinds}, or pass format (--format): {', '.join(WRITERS)}.", where=path)
     return WRITERS[WRITTEN[suffix] if format is None else format]
 
 
 def _doubted(recording: Recording, format: str, told: Hints, written: Written) -> Recording:
-    """The recording, with a note where another unit of its times is likelier, or where they are
-    coarse; EV023 where that must be answered."""
+    """The recording, with a note if another unit of its times is more likely or if they are coarse;
+    EV023 if the user must decide."""
     said = coarse(recording.events.t, written)
     found = doubt(recording.events, recording.frame_times, format, written.unit) if (
         told.time_unit == "auto") else None
@@ -286,14 +286,14 @@ def _doubted(recording: Recording, format: str, told: Hints, written: Written) -
 
 
 def _check_named(recording: Recording, told: Hints) -> None:
-    """EV020 where a stream of images or events was named to a format that has no such."""
+    """Raise EV020 if an image or event stream was named but the file has only one, or none."""
     if told.events_topic is not None and all(n.code != "sensor.camera" for n in recording.notes):
         raise EvflowDataError(
             "EV020", f"events_topic={told.events_topic!r}, but there are no several streams of "
             "events.", "Leave it out (--events-topic).")
     if told.frames_topic is not None and all(n.code != "frames.stream" for n in recording.notes):
         raise EvflowDataError(
-            "EV020", f"frames_topic={told.frames_topic!r}, but no images stand beside the events.",
+            "EV020", f"frames_topic={told.frames_topic!r}, but the file has no images.",
             "Leave it out (--frames-topic); --frames takes images from elsewhere.")
 
 

@@ -1,8 +1,8 @@
-"""Frames from whatever a user points at, one by one: a video file, a folder of images, a NumPy
-stack, or a recording with frames.
+"""Frames from any source, one by one: a video file, a folder of images, a NumPy stack, or a
+recording with frames.
 
-How they code light is what the source usually does, where `response` is "auto": videos and 8-bit
-images are sRGB; raw mosaics, deeper images, arrays and what a camera recorded beside its events are
+With `response` "auto" they are assumed to encode light as usual for their source: videos and 8-bit
+images are sRGB; raw mosaics, deeper images, arrays and frames recorded by an event camera are
 linear.
 """
 
@@ -26,11 +26,11 @@ from evflow.notes import Note, why_no_frames
 
 
 def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
-    """The frames of anything, in bounded memory (a recording's are read whole).
+    """The frames of any source, in bounded memory (a recording is read as a whole).
 
     hints: those of `FrameHints`.
-    Raises EV001 (none between start_s and stop_s), EV008 (nothing that has frames), EV011 (a
-    recording without frames), EV016 (not there), EV020 (unknown hint; no times), and what the
+    Raises EV001 (none between start_s and stop_s), EV008 (not a source of frames), EV011 (a
+    recording without frames), EV016 (not found), EV020 (unknown hint; no times), and what the
     readers raise.
     """
     told, path = FrameHints.parse(hints), existing(path)
@@ -48,7 +48,7 @@ def _open(path: Path, told: FrameHints) -> FrameSource:
         return _of_images(ImageFolder((path,), np.zeros(1, np.int64), ()), told)
     if not _is_recording(path):
         if told.frames_topic is not None:
-            raise EvflowDataError("EV020", f"{path} is no recording, with streams of images.",
+            raise EvflowDataError("EV020", f"{path} is not a recording with image streams.",
                                   "Leave out frames_topic (--frames-topic).", where=path)
         return _folder(path, told) if path.is_dir() else _video(path, told)
     return _recording(path, told)
@@ -99,8 +99,8 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
     if told.fps is not None or told.timestamps is not None:
         raise EvflowDataError(
             "EV020", f"{path} is a recording, whose frames have their own times.",
-            "Leave out --fps and --timestamps, or pass its images alone.", where=path)
-    # Of the recording only the frames are seen: order among its events stands in nobody's way.
+            "Leave out --fps and --timestamps, or pass only its images.", where=path)
+    # Only the frames of the recording are used, so the order of its events does not matter.
     recording = read_recording(path, time_unit=told.time_unit, partial=told.partial,
                                start_s=told.start_s, stop_s=told.stop_s, late="drop",
                                frames_topic=told.frames_topic, colour=told.colour)
@@ -123,19 +123,19 @@ def _recording(path: Path, told: FrameHints) -> FrameSource:
 
 
 def _responding(told: FrameHints, usual: str, what: str) -> tuple[FrameHints, tuple[Note, ...]]:
-    """The hints with a response, where it was left open the usual one, and what is said of it."""
+    """The hints with the response chosen if it was "auto", and the note that says so."""
     if told.response != "auto":
         return told, ()
-    said = {"srgb": "turned into light by the sRGB curve, as {} mostly are coded "
-                    "(--response linear: they are light already)",
-            "linear": "taken as linear in light, as {} mostly are (--response srgb: they are coded "
-                      "as videos are)"}[usual].format(what)
+    said = {"srgb": "converted to light by the sRGB curve, the usual encoding of {} "
+                    "(--response linear: they are already linear)",
+            "linear": "assumed to be linear in light, as usual for {} (--response srgb: they are "
+                      "encoded like videos)"}[usual].format(what)
     return (dataclasses.replace(told, response=usual),
             (Note("frames.response", f"frames were {said}."),))
 
 
 def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:
-    """The images from start_s to stop_s after the first; EV001 where there is none."""
+    """The images from start_s to stop_s after the first; EV001 if there is none."""
     start, stop = (None if s is None else 1e6 * s for s in (told.start_s, told.stop_s))
     first = last = None
     count = 0

@@ -1,4 +1,4 @@
-"""Instants that something beside the camera tells: trigger events, or a text file of times."""
+"""Times of external events: from the triggers of a recording, or from a text file."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from evflow.types import Events
 MAX_BYTES = 1 << 26  # of text: some four million instants
 READERS = {"EVT2": evt2.triggers, "EVT2.1": evt21.triggers, "EVT3": evt3.triggers,
            "aedat4": aedat4.triggers}
-EXPECTED = ("Expected a text file of one time a line, on the clock of the events, or Prophesee RAW "
-            "or AEDAT 4 with trigger events.")
+EXPECTED = ("Expected a text file with one time per line, on the clock of the events, or Prophesee "
+            "RAW or AEDAT 4 with trigger events.")
 
 
 def read_triggers(path: Path, events: Events) -> np.ndarray:
-    """Instants (N,) int64 us: edges of external signals in Prophesee RAW and AEDAT 4, or the first
-    number of each line of a text file, in the unit in which they lie among the events.
+    """Times (N,) int64 us: edges of external signals in Prophesee RAW and AEDAT 4, or the first
+    number of each line of a text file, in the unit in which they lie within the events' span.
 
     Raises EV001 (none), EV008 (neither), EV012 (outside the events in any unit), EV016.
     """

@@ -1,9 +1,9 @@
-"""What every writer does: events and frames in parts, checked, and all or nothing.
+"""What every writer does: take events and frames in parts, check them, and write all or nothing.
 
-A format's writer derives from `EventWriter`, says what it can hold, and stores what `_write` and
-`_write_frames` are given. Memory: `FLUSH` events, and what the caller appends at once. The file
-appears, under its name, when the `with` block ends well and `_verify` finds it whole; nothing is
-left behind otherwise.
+A format's writer derives from `EventWriter`, declares what it can hold, and stores what `_write`
+and `_write_frames` are given. Memory: `FLUSH` events, and what the caller appends at once. The file
+gets its name when the `with` block ends without error and `_verify` finds it complete; otherwise
+nothing is left behind.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from evflow.files.spool import forget
 from evflow.process.signals import uninterrupted
 from evflow.types import Events, Recording
 
-FLUSH = 1 << 20  # events gathered and written at a time: what a compressor likes
-FRAMES = 16  # written at a time: a signal may have to wait for them
+FLUSH = 1 << 20  # events written at a time, which suits compressors
+FRAMES = 16  # frames written at a time: a signal may have to wait for them
 DEPTHS = ("uint8", "uint16", "float32")
 SECONDS_US = 2**31 * 10**6  # float64 seconds keep the microsecond up to here, the year 2038
 
@@ -35,15 +35,15 @@ Self = TypeVar("Self", bound="EventWriter")
 
 
 class EventWriter(abc.ABC):
-    """Write a recording of one camera part by part.
+    """Write a recording of one camera in parts.
 
     >>> with open_writer("out.zip", (346, 260)) as out:
     ...     for events in simulate_stream(...):
     ...         out.append(events)
 
-    NAME: the format. DEPTHS: the dtypes of frames it can hold, () for none. MAX_SIDE: pixels of
-    its largest sensor. TIMES_US: its first and last time. LABELS: whether it can tell noise from
-    signal.
+    NAME: the format. DEPTHS: dtypes of frames it can hold, () for none. MAX_SIDE: largest side of a
+    sensor in pixels. TIMES_US: its first and last possible time. LABELS: whether it can label noise
+    events.
     """
 
     NAME: ClassVar[str]
@@ -79,7 +79,7 @@ class EventWriter(abc.ABC):
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """The file from its beginning to its name."""
+        """The lifetime of the file, from its creation to its final name."""
         with self._place() as temporary:
             with contextlib.ExitStack() as self._stack:
                 with self._guard():
@@ -91,7 +91,7 @@ class EventWriter(abc.ABC):
             self._verify(temporary)
 
     def append(self, events: Events) -> None:
-        """Add events that follow those appended before; EV003 (times), EV004 (order), EV015."""
+        """Add events that follow those appended before; raises EV003 (times), EV004, EV015."""
         if events.size != self.size:
             raise EvflowDataError(
                 "EV015", f"events of size {events.size} for a file of size {self.size}.")
@@ -106,10 +106,10 @@ class EventWriter(abc.ABC):
             self._flush()
 
     def append_labels(self, noise: np.ndarray) -> None:
-        """Add which events are noise, bool (N,), one for each event in their order, in parts of any
-        length; EV020 where the format has no place for it."""
+        """Add labels, bool (N,), True = noise, one for each event in order, in parts of any length;
+        EV020 if the format cannot store them."""
         if not self.LABELS:
-            raise EvflowDataError("EV020", f"{self.NAME} does not tell noise from signal.",
+            raise EvflowDataError("EV020", f"{self.NAME} cannot label noise events.",
                                   "Write dsec (.h5) or npz.")
         if len(noise):
             with self._guard():
@@ -118,7 +118,7 @@ class EventWriter(abc.ABC):
     def append_frames(self, frames: np.ndarray, frame_times: np.ndarray) -> None:
         """Add frames (T, H, W) at frame_times (T,) int64 us.
 
-        Raises EV020 (the format has no frames), EV003 (none of this dtype, or of several; float
+        Raises EV020 (the format has no frames), EV003 (unsupported or mixed dtypes; float
         frames outside 0..255; times), EV004 (order), EV002 and EV015 (shape), EV007 (NaN).
         """
         frames, times = _sound_frames(frames, frame_times, self.size)
@@ -128,7 +128,7 @@ class EventWriter(abc.ABC):
         if self._depth not in (None, frames.dtype):
             raise EvflowDataError(
                 "EV003", f"frames of {frames.dtype} after {self._depth}.",
-                "All frames of a recording have one dtype.")
+                "All frames of a recording must have the same dtype.")
         if not len(frames):
             return
         check_times(np.append(self._last_frame_us, times), "frame_times", strict=True)
@@ -141,7 +141,7 @@ class EventWriter(abc.ABC):
 
     @classmethod
     def refuses(cls, depth: np.dtype) -> str:
-        """Why frames of this dtype cannot be written, "" where they can."""
+        """Why frames of this dtype cannot be written, "" if they can."""
         if not cls.DEPTHS:
             return f"{cls.NAME} holds events only"
         return "" if depth.name in cls.DEPTHS else (
@@ -151,16 +151,16 @@ class EventWriter(abc.ABC):
         return atomic_write(self.path, overwrite=self.overwrite)
 
     def _guard(self) -> contextlib.AbstractContextManager[None]:
-        """What each step of the format runs in."""
+        """A context for each step of writing."""
         return contextlib.nullcontext()
 
     @abc.abstractmethod
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
-        """Begin the file `temporary`; what must be closed goes on the stack."""
+        """Create the file `temporary`; whatever must be closed goes on the stack."""
 
     @abc.abstractmethod
     def _write(self, events: Events) -> None:
-        """Store events, one or more, that follow those before."""
+        """Store events (at least one) that follow those before."""
 
     def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
         """Store frames (T, H, W) of one dtype, T > 0, that follow those before."""
@@ -175,7 +175,7 @@ class EventWriter(abc.ABC):
 
     @abc.abstractmethod
     def _verify(self, temporary: Path) -> None:
-        """Refuse the closed file unless it is whole, before it gets its name; EV019."""
+        """Refuse the closed file unless it is complete, before it gets its name; EV019."""
 
     def _check(self, events: Events) -> None:  # noqa: B027 (most have nothing)
         """Refuse events that the format cannot hold."""
@@ -197,7 +197,8 @@ class EventWriter(abc.ABC):
 
 
 def copy(recording: Recording, out: EventWriter) -> None:
-    """All of a recording, each frame behind the events before it, as a camera sends them."""
+    """Copy a whole recording, each frame after the events that precede it, as a camera sends
+    them."""
     events, first = recording.events, 0
     cuts = np.searchsorted(events.t, recording.frame_times)
     for index, last in enumerate(cuts.tolist()):
@@ -210,7 +211,7 @@ def copy(recording: Recording, out: EventWriter) -> None:
 
 
 def _copy_events(events: Events, first: int, last: int, out: EventWriter) -> None:
-    """Part by part, each of which is forgotten where it lies on the disk."""
+    """Copy in parts, releasing the memory of each memory-mapped part afterwards."""
     for begin in range(first, last, FLUSH):
         out.append(_part(events, begin, min(begin + FLUSH, last)))
         for name in COLUMNS:
@@ -220,7 +221,7 @@ def _copy_events(events: Events, first: int, last: int, out: EventWriter) -> Non
 def _sound_frames(
     frames: np.ndarray, times: np.ndarray, size: Size
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames and times of any part of a recording: float frames, dark as they may be, in DN."""
+    """Frames and times of a part of a recording; float frames in DN, however dark."""
     frames, times = np.asarray(frames), np.asarray(times)
     check_frames(frames[:0], size)
     if times.shape != frames.shape[:1]:

@@ -1,1 +1,1 @@
-"""Light: what frames in DN say of it, and the log that a pixel answers to."""
+"""Light: from frames in DN to linear light and to the log intensity a pixel responds to."""

@@ -1,11 +1,11 @@
-"""Colour frames -> what one pixel sees: luma, or its own colour under a Bayer mosaic; and a raw
-mosaic -> luma.
+"""Colour frames -> what one pixel sees: luma, or one colour under a Bayer mosaic; and raw mosaic ->
+luma.
 
 Frames are (H, W, 3) in OpenCV's order B, G, R, of dtype uint8, uint16 or float32, and keep that
-dtype. Luma has the weights of Rec. 601, which OpenCV's grey and so v2e, ESIM and OpenEB have: one
-colour video gives the same events there and here, from whatever it is read.
+dtype. Luma has the weights of Rec. 601, as OpenCV's grey conversion does, which v2e, ESIM and
+OpenEB use: a colour video gives the same events there and here, whatever reader it comes through.
 A pattern names the four corners of the mosaic's cell from the top left, row by row: under "rggb"
-pixel (0, 0) sees red and pixel (1, 1) blue. A mosaic is a grey frame to everything after.
+pixel (0, 0) sees red and pixel (1, 1) blue. All later steps treat a mosaic as a grey frame.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ Frames = Iterator[tuple[np.ndarray, int]]
 Colour = Literal["luma", "rggb", "bggr", "grbg", "gbrg"]
 COLOURS: tuple[str, ...] = get_args(Colour)
 PATTERNS = COLOURS[1:]
-CONVERTED = Note("frames.luma", "colour frames were converted to luma; where the events come from "
-                 "behind a colour mosaic (a colour DAVIS), pass --colour rggb, or how it begins")
-LUMA = ("frames.luma", "frames.mosaic")  # codes of notes on frames that are luma of colours
+CONVERTED = Note("frames.luma", "colour frames were converted to luma; if the events come from "
+                 "behind a colour mosaic (a colour DAVIS), pass --colour rggb (or its own pattern)")
+LUMA = ("frames.luma", "frames.mosaic")  # note codes that say that frames are luma
 
 CELLS = tuple(np.s_[row::2, column::2] for row in (0, 1) for column in (0, 1))
 WEIGHTS = {"r": 0.299, "g": 0.587, "b": 0.114}  # of `luma`
@@ -34,12 +34,12 @@ BETWEEN = {  # bilinear interpolation of a colour known at one pixel of a cell, 
     "r": np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], np.float32) / 4,
     "g": np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], np.float32) / 4}
 BETWEEN["b"] = BETWEEN["r"]
-PLANE_MARGIN = 32  # rows of repeated edge around a plane: more than frames to interpolate move
+PLANE_MARGIN = 32  # rows of repeated edge around a plane: more than motion between frames
 
 
 def luma(bgr: np.ndarray) -> np.ndarray:
-    """Luma .299 R + .587 G + .114 B (..., H, W) of frames (..., H, W, 3), B, G, R: OpenCV's
-    BGR2GRAY, to the bit. Integers are rounded. RGB frames are passed as frames[..., ::-1].
+    """Luma .299 R + .587 G + .114 B (..., H, W) of frames (..., H, W, 3) in B, G, R order:
+    bit-exact with OpenCV's BGR2GRAY. Integers are rounded. Pass RGB frames as frames[..., ::-1].
 
     Raises EV002 (not (..., H, W, 3)), EV003 (dtype).
     """
@@ -65,11 +65,11 @@ def mosaic(bgr: np.ndarray, pattern: str) -> np.ndarray:
 def mosaic_luma(seen: np.ndarray, pattern: str, where: str = "a mosaic") -> np.ndarray:
     """Luma (H, W) of a mosaic (H, W) at its own resolution, of the same dtype.
 
-    Each colour is interpolated bilinearly: a missing one is the mean of its 2 or 4 nearest pixels;
-    beyond the edges the mosaic is mirrored, which keeps its cells whole. Of three equal channels,
-    as videos store grey, one is taken. where: names the frame in messages.
-    Raises EV002 (not (H, W), or less than a cell), EV003 (dtype), EV020 (pattern, or the frame has
-    colours already).
+    Missing colours are interpolated bilinearly, as the mean of the 2 or 4 nearest pixels; the
+    mosaic is mirrored at its edges, which keeps cells whole. If a frame has three equal channels,
+    as videos store grey, one of them is used. where: names the frame in messages.
+    Raises EV002 (not (H, W), or smaller than a cell), EV003 (dtype), EV020 (pattern, or the frame
+    has colours already).
     """
     import cv2
 
@@ -77,7 +77,7 @@ def mosaic_luma(seen: np.ndarray, pattern: str, where: str = "a mosaic") -> np.n
     if seen.ndim == 3:
         if (seen[..., 1:] != seen[..., :1]).any():
             raise EvflowDataError(
-                "EV020", f"{where} has colours already, and is no {pattern.upper()} mosaic.",
+                "EV020", f"{where} has colours already: it is not a {pattern.upper()} mosaic.",
                 "Leave out --bayer.")
         seen = np.ascontiguousarray(seen[..., 0])
     if seen.ndim != 2 or min(seen.shape) < 2:
@@ -99,11 +99,11 @@ def mosaic_luma(seen: np.ndarray, pattern: str, where: str = "a mosaic") -> np.n
 def as_seen(
     pairs: Frames, colour: str, interpolated: Callable[[Frames, float], Frames] | None = None
 ) -> Frames:
-    """The frames (H, W) that the pixels see, of (frame, time) pairs.
+    """The frames (H, W) that the pixels see, from (frame, time) pairs.
 
-    pairs: frames (H, W), or (H, W, 3) where `colour` is a pattern. interpolated(pairs, pixel)
-    fills up a grey video one sensor pixel of which measures `pixel` of its own. It works on the
-    planes of `stack_planes`: between pixels of different colours it would make flicker.
+    pairs: frames (H, W), or (H, W, 3) if `colour` is a pattern. interpolated(pairs, pixel) adds
+    frames to a grey video whose pixels are `pixel` sensor pixels wide. It works on the planes of
+    `stack_planes`: interpolating between pixels of different colours would create flicker.
     """
     first = next(pairs, None)
     pairs = pairs if first is None else itertools.chain([first], pairs)
@@ -117,18 +117,18 @@ def as_seen(
 
 
 def stack_planes(frame: np.ndarray) -> np.ndarray:
-    """The planes of a frame, one below the other, as one grey frame.
+    """The planes of a frame stacked vertically as one grey frame.
 
-    Of colour (H, W, 3) the three channels; of a mosaic (H, W) the four colours of its cell, each
-    (H/2, W/2). Interpolation between frames warps pixels and must not mix colours; in this form
-    each plane is interpolated as the grey video that it is. Every plane is framed above and
-    below by `PLANE_MARGIN` repeated rows, so that none moves into the next.
+    A colour frame (H, W, 3) has three planes, its channels; a mosaic (H, W) has four, one for each
+    pixel of its cell, (H/2, W/2) each. Interpolation between frames warps pixels and must not mix
+    colours: stacked like this, each plane is interpolated as a grey video. Every plane is padded
+    above and below by `PLANE_MARGIN` repeated rows, so that none moves into the next.
     Raises EV002 (a mosaic of odd size).
     """
     if frame.ndim == 2:
         if frame.shape[0] % 2 or frame.shape[1] % 2:
             raise EvflowDataError(
-                "EV002", f"a mosaic of shape {frame.shape} has no whole number of 2x2 cells.",
+                "EV002", f"a mosaic of shape {frame.shape} is not a whole number of 2x2 cells.",
                 "Crop it to even sides, or do not interpolate (--no-interpolate).")
         planes = np.stack([frame[cell] for cell in CELLS])
     else:
@@ -149,29 +149,29 @@ def unstack_planes(stacked: np.ndarray, count: int) -> np.ndarray:
 
 
 def parse_pattern(text: str) -> str:
-    """One of `PATTERNS`, written in any case; EV020."""
+    """The pattern from `PATTERNS`, in any letter case; raises EV020."""
     if text.lower() not in PATTERNS:
         raise EvflowDataError(
-            "EV020", f"{text!r} is no Bayer pattern.", f"Choose from {', '.join(PATTERNS)}.")
+            "EV020", f"{text!r} is not a Bayer pattern.", f"Choose from {', '.join(PATTERNS)}.")
     return text.lower()
 
 
 def mosaic_note(pattern: str) -> Note:
-    """What is said of frames that were a mosaic."""
+    """The note on frames that were a mosaic."""
     return Note(
-        "frames.mosaic", f"frames were a colour mosaic ({pattern.upper()}) and are its luma; where "
-        f"the events come from behind it too (a colour DAVIS), pass --colour {pattern.lower()}")
+        "frames.mosaic", f"frames were a colour mosaic ({pattern.upper()}), converted to luma; if "
+        f"the events also come from behind it (a colour DAVIS), pass --colour {pattern.lower()}")
 
 
 def seen_note(pattern: str, colour: bool) -> Note:
-    """What is said of frames, grey or colour, that are what pixels see under a mosaic."""
-    return Note("frames.raw", f"colour frames were laid under a {pattern} mosaic: each pixel has "
-                "its own colour alone." if colour else
-                f"frames have one channel: taken as a {pattern} mosaic as they are.")
+    """The note on grey or colour frames that are used as pixels see them under a mosaic."""
+    return Note("frames.raw", f"colour frames were sampled by a {pattern} mosaic: each pixel has "
+                "one colour only." if colour else
+                f"frames have one channel: used as they are, as a {pattern} mosaic.")
 
 
 def are_luma(notes: Iterable[Note]) -> bool:
-    """Whether the notes on a recording say that its frames were colour, and are luma."""
+    """Whether the notes on a recording say that its frames are luma of colour frames."""
     return any(note.code in LUMA for note in notes)
 
 

@@ -1,7 +1,7 @@
 """From pixel values (DN, 0..255) to log intensity, and back.
 
-Every log here is natural. `lin_log` is v2e's map: linear below 20 DN, logarithmic above, so
-that dark pixels do not turn quantisation steps into contrast. `log_eps` is ESIM's.
+All logarithms are natural. `lin_log` is v2e's map: linear below 20 DN and logarithmic above, so
+that quantisation steps in dark pixels do not become contrast. `log_eps` is ESIM's.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from jax.typing import ArrayLike
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
 
-DEPTHS = (np.dtype(np.uint8), np.dtype(np.uint16))  # whose whole range is an image's
+DEPTHS = (np.dtype(np.uint8), np.dtype(np.uint16))  # dtypes whose maximum is white
 
 Array = jax.Array
-Values = Any  # jax.Array or np.ndarray, and what comes in comes out
+Values = Any  # jax.Array or np.ndarray; results have the same type
 
 LINLOG_KNEE = 20.0  # DN; v2e's threshold between the linear and the logarithmic part
 LINLOG_SLOPE = float(np.log(LINLOG_KNEE) / LINLOG_KNEE)
 LOG_EPS = 1e-3
-MOST_LOG = 6.0  # more than the logarithm of 255 DN
-MOST_OF_ONE = 12.0  # of one pixel: a thousand times as bright as white
-SAMPLED = 61  # every so many values are compared with it
+MOST_LOG = 6.0  # above the logarithm of 255 DN
+MOST_OF_ONE = 12.0  # for a single pixel: a thousand times as bright as white
+SAMPLED = 61  # stride of the values that are compared with it
 
 
 def lin_log(dn: ArrayLike) -> Array:
-    """v2e's lin-log map of DN in 0..255: I ln(20)/20 up to 20 DN, ln I above. Range 0..5.54."""
+    """v2e's lin-log map of DN 0..255: I ln(20)/20 up to 20 DN, ln I above. Range 0..5.54."""
     dn = jnp.asarray(dn)
     dn = dn if jnp.issubdtype(dn.dtype, jnp.floating) else dn.astype(jnp.float32)
     above = jnp.log(jnp.maximum(dn, LINLOG_KNEE))
@@ -39,20 +39,20 @@ def lin_log(dn: ArrayLike) -> Array:
 
 
 def lin_log_inverse(log_i: Array) -> Array:
-    """DN of a lin-log value."""
+    """The DN of a lin-log value."""
     above = jnp.exp(jnp.maximum(log_i, LINLOG_KNEE * LINLOG_SLOPE))
     return jnp.where(log_i <= LINLOG_KNEE * LINLOG_SLOPE, log_i / LINLOG_SLOPE, above)
 
 
 def log_eps(dn: ArrayLike) -> Array:
-    """ESIM's map ln(I/255 + 1e-3) of DN in 0..255."""
+    """ESIM's map ln(I/255 + 1e-3) of DN 0..255."""
     dn = jnp.asarray(dn)
     dn = dn if jnp.issubdtype(dn.dtype, jnp.floating) else dn.astype(jnp.float32)
     return jnp.log(dn / 255.0 + LOG_EPS)
 
 
 def log_eps_inverse(log_i: Array) -> Array:
-    """DN of a `log_eps` value."""
+    """The DN of a `log_eps` value."""
     return 255.0 * (jnp.exp(log_i) - LOG_EPS)
 
 
@@ -62,13 +62,13 @@ LOG_MAPS = {"linlog": (lin_log, lin_log_inverse), "log_eps": (log_eps, log_eps_i
 @lru_cache
 def uint8_table(log_map: str) -> np.ndarray:
     """The log map of the 256 byte values, computed in float64 and rounded to 1e-8 as in v2e,
-    then float32: exact threshold ties of 8-bit video fall as they do there."""
+    then float32: exact threshold ties of 8-bit video are resolved as in v2e."""
     value = log64(np.arange(256), log_map)
     return (np.round(value, 8) if log_map == "linlog" else value).astype(np.float32)
 
 
 def log64(dn: np.ndarray, log_map: str) -> np.ndarray:
-    """The log map of DN on 0..255 in float64 (host)."""
+    """The log map of DN 0..255 in float64 (host)."""
     dn = dn.astype(np.float64)
     if log_map == "linlog":
         return np.where(dn <= LINLOG_KNEE, dn * LINLOG_SLOPE, np.log(np.maximum(dn, 1.0)))
@@ -86,8 +86,8 @@ def to_log(frames: ArrayLike, log_map: str = "linlog") -> Array:
 
 
 def check_log(name: str, values: Any) -> None:
-    """EV007 where not all is finite (a sum tells in a third of the time, unless it overflows),
-    EV003 where it cannot be a logarithm of DN. Traced values pass."""
+    """Raise EV007 unless all values are finite (fast path: a finite sum implies it), EV003 if they
+    cannot be logarithms of DN. Traced values pass."""
     if isinstance(values, jax.core.Tracer):
         return
     values = np.asarray(values)
@@ -97,25 +97,25 @@ def check_log(name: str, values: Any) -> None:
         if not (np.isfinite(mean) or np.isfinite(values).all()):
             raise EvflowDataError(
                 "EV007", f"{name} holds NaN or infinite values.",
-                "The logarithm of 0 or of a missing pixel? Use evflow.light.log_maps.to_log.")
+                "A logarithm of 0, or of a missing pixel? Use evflow.light.log_maps.to_log.")
     if 0 < mean < 1:
         _check_no_fractions(name, values)
     some = float(values.reshape(-1)[::SAMPLED].max(initial=0))
     if mean > MOST_LOG or some > MOST_OF_ONE:
         raise EvflowDataError(
-            "EV003", f"{name} has a mean of {mean:.3g} and reaches {max(some, mean):.3g}, but "
-            "white (255 DN) has 5.54.",
-            "Is it DN? Take evflow.light.log_maps.to_log(frames) first.")
+            "EV003", f"{name} has a mean of {mean:.3g} and reaches {max(some, mean):.3g}, but the "
+            "logarithm of white (255 DN) is 5.54.",
+            "Is it DN? Convert: evflow.light.log_maps.to_log(frames).")
 
 
 def _check_no_fractions(name: str, values: np.ndarray) -> None:
-    """EV003 where all logarithms are those of DN below 7, and none is negative: fractions of white
-    are what is like that."""
+    """Raise EV003 if all values are non-negative logarithms of DN below 7: those are fractions of
+    white, not logarithms."""
     low, high = values.min(), values.max()
     if low >= 0 and high <= 1:
         raise EvflowDataError(
-            "EV003", f"{name} spans {low:.3g}..{high:.3g}, but white (255 DN) has 5.54.",
-            "Fractions of white? Take evflow.light.log_maps.to_log(255 * frames) first.")
+            "EV003", f"{name} spans {low:.3g}..{high:.3g}, but the logarithm of white is 5.54.",
+            "Fractions of white? Convert: evflow.light.log_maps.to_log(255 * frames).")
 
 
 def to_dn(frames: np.ndarray, full_scale: float) -> np.ndarray:
@@ -126,12 +126,12 @@ def to_dn(frames: np.ndarray, full_scale: float) -> np.ndarray:
 
 
 def normalised_intensity(dn: Values) -> Values:
-    """I01 = (I + 20) / 275 in (.07, 1]: v2e's rescaling, the N_01 of Eq. 12."""
+    """I01 = (I + 20) / 275 in (.07, 1]: v2e's rescaling, N_01 of Eq. 12."""
     return (dn + 20.0) / 275.0
 
 
 def noise_factor(i01: Values) -> Values:
-    """((F - 1) I01 + 1) of Eq. 12 with F = 0.25: noise falls linearly with intensity."""
+    """((F - 1) I01 + 1) of Eq. 12 with F = 0.25: noise decreases linearly with intensity."""
     return 1.0 - 0.75 * i01
 
 
@@ -147,11 +147,11 @@ def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
     The logarithm is v2e's lin-log, I ln(20)/20 up to 20 DN and ln I above.
 
     Args:
-        frame0: (..., H, W) grey frames at the window's beginning: uint8, floats on 0..255 DN, or
+        frame0: (..., H, W) grey frames at the start of the window: uint8, floats on 0..255 DN, or
             uint16 on 0..65535 (`evflow.light.log_maps.to_dn` for fewer bits).
         frame1: frames at its end, of the same shape.
 
-    Returns:
+        float32 (..., H, W), natural-log units, > 0 where the pixel became brighter.
         float32 (..., H, W), natural-log units, > 0 where it became brighter.
 
     Raises:
@@ -168,12 +168,12 @@ def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
             "EV002", f"the frames differ in shape: {before.shape} and {after.shape}.")
     if len({f.dtype for f in (before, after) if f.dtype in DEPTHS}) > 1:
         raise EvflowDataError("EV003", f"the frames are {before.dtype} and {after.dtype}.",
-                              "They are on different scales: evflow.light.log_maps.to_dn for each.")
+                              "They are on different scales: evflow.light.log_maps.to_dn on each.")
     return to_log(after) - to_log(before)
 
 
 def _native(frame: ArrayLike) -> Any:
-    """An array in this machine's byte order."""
+    """The array in this machine's byte order."""
     if isinstance(frame, jax.Array):
         return frame
     frame = np.asarray(plain("frame", frame))
@@ -186,7 +186,7 @@ def _check_frame(name: str, frame: Any) -> None:
         raise EvflowDataError("EV002", f"{name} has shape {shape}.", "Expected (..., H, W).")
     if len(shape) > 2 and shape[-1] in (3, 4) and shape[-2] > 16:
         raise EvflowDataError("EV002", f"{name} has shape {shape}: colour?",
-                              "Expected gray frames (..., H, W): evflow.light.colour.luma(frame).")
+                              "Expected grey frames (..., H, W): evflow.light.colour.luma(frame).")
     if frame.dtype in DEPTHS or isinstance(frame, jax.core.Tracer):
         return
     if not jnp.issubdtype(frame.dtype, jnp.integer) and not jnp.issubdtype(

@@ -1,7 +1,7 @@
-"""What float frames probably are, by the numbers in them: DN, or what is often mistaken for them.
+"""What float frames probably hold, judged by their values: DN, or what is often mistaken for DN.
 
-A frame in DN on 0..255 nearly always reaches beyond `DARKEST_DN` somewhere. Numbers that stay below
-are fractions of white, logarithms or radiance; simulated as DN they would be a black video.
+Frames in DN 0..255 nearly always exceed `DARKEST_DN` somewhere. Values that stay below it are
+fractions of white, logarithms or radiance; simulated as DN they would be a black video.
 """
 
 from __future__ import annotations
@@ -10,22 +10,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-DARKEST_DN = 8.0  # frames none of which reaches beyond are no DN
+DARKEST_DN = 8.0  # if no frame exceeds it, they are not DN
 MOST_LOG = 6.0  # the logarithm of 255 DN is 5.54
-LOG_MEDIAN = 1.0  # logarithms of DN are mostly above, radiance mostly below
-AS_THEY_ARE = "if they are that dark, --full-scale 255, or in Python uint16, frames * 257"
+LOG_MEDIAN = 1.0  # logarithms of DN are mostly above it, radiance mostly below
+AS_THEY_ARE = "if they are really that dark: --full-scale 255, or in Python uint16, frames * 257"
 
 
 class Meaning(NamedTuple):
-    """what: the numbers probably are; fix: what to do about it."""
+    """what: what the numbers probably are; fix: what to do about it."""
 
     what: str
     fix: str
 
 
 def meaning(frame: np.ndarray) -> Meaning | None:
-    """What a finite float frame (or several) probably is, if that is not DN on 0..255; None also
-    for frames that are black altogether."""
+    """What a finite float frame (or several) probably holds, if not DN 0..255; None also for frames
+    that are entirely black."""
     low, high = float(frame.min(initial=0)), float(frame.max(initial=0))
     if low < 0:
         return _negative(frame, low, high)
@@ -37,14 +37,14 @@ def meaning(frame: np.ndarray) -> Meaning | None:
     if high <= MOST_LOG and float(np.median(frame)) > LOG_MEDIAN:
         return Meaning("logarithms", "Pass --response log (response=\"log\"), or in Python "
                        f"np.exp(frames); radiance: --full-scale {high:.3g}; {AS_THEY_ARE}.")
-    return Meaning("radiance", f"Pass the value of white, such as --full-scale {high:.3g} "
+    return Meaning("radiance", f"Pass the value of white, e.g. --full-scale {high:.3g} "
                    "(full_scale=), or in Python evflow.light.log_maps.to_dn(frames, white); "
                    f"{AS_THEY_ARE}.")
 
 
 def _negative(frame: np.ndarray, low: float, high: float) -> Meaning:
     if high > DARKEST_DN:
-        return Meaning("what a sharpening filter or a resize leaves beside edges",
+        return Meaning("undershoot of a sharpening filter or a resize beside edges",
                        "Light is not negative: np.clip(frames, 0, None).")
     if low >= -1 and high <= 1 and abs(float(np.median(frame))) < 0.9:
         return Meaning("normalised to -1..1, or logarithms of fractions of white",

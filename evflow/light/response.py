@@ -1,5 +1,5 @@
-"""Frames as they came -> the light that fell on the sensor: a response undone, a mirrored image
-turned. Single frames (H, W) or (H, W, 3).
+"""From stored frames to the light that fell on the sensor: undo a response curve, or a mirroring.
+For single frames (H, W) or (H, W, 3).
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from evflow.notes import Note
 
 FLIPS: dict[str, tuple[int, ...]] = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}  # axes
 CURVES = ("gamma", "srgb")
-RESPONSES = ("linear", *CURVES, "log")  # log: float frames that are natural logarithms of light
+RESPONSES = ("linear", *CURVES, "log")  # log: float frames of natural logarithms of light
 GAMMA = 2.2
 
 
 def linear_light(frame: np.ndarray, response: str) -> np.ndarray:
-    """DN on 0..255 proportional to light, float32; of "linear" the frame itself.
+    """DN on 0..255 proportional to light, float32; for "linear" the frame itself.
 
-    response: "gamma" (code = light^(1/2.2)) or "srgb" (IEC 61966-2-1). Thresholds are measured
-    against the log of light: of frames with a gamma of 2.2 they come out 2.2 times too small.
-    EV020 on any other response.
+    response: "gamma" (code = light^(1/2.2)) or "srgb" (IEC 61966-2-1). Thresholds refer to the log
+    of light: measured from frames with a gamma of 2.2 they would come out 2.2 times too small.
+    Raises EV020 for any other response.
     """
     if response == "linear":
         return frame
@@ -32,13 +32,13 @@ def linear_light(frame: np.ndarray, response: str) -> np.ndarray:
     if frame.dtype == np.uint8:
         import cv2
 
-        return cv2.LUT(np.ascontiguousarray(frame), _table(response))  # five times as fast as [...]
+        return cv2.LUT(np.ascontiguousarray(frame), _table(response))  # 5x faster than indexing
     return _light(frame.astype(np.float32), response)
 
 
 @lru_cache
 def _table(response: str) -> np.ndarray:
-    """The light (256,) of each byte."""
+    """The light (256,) of each byte value."""
     return _light(np.arange(256, dtype=np.float32), response)
 
 
@@ -54,10 +54,10 @@ def _srgb(code: np.ndarray) -> np.ndarray:
 
 
 def linearised(response: str) -> Note:
-    """What is said of frames whose response was undone."""
+    """The note on frames whose response was undone."""
     return Note("frames.linearised", f"frames linearised ({response})")
 
 
 def flipped(side: str) -> Note:
-    """What is said of mirrored frames."""
+    """The note on mirrored frames."""
     return Note("frames.flipped", f"frames flipped ({side})")

@@ -1,4 +1,4 @@
-"""Whether the process that made something still runs, told by a mark that it left."""
+"""Whether the process that made something is still running, judged by a mark that it left."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ MARK = re.compile(r"([0-9a-f]{8})-([0-9a-f]+)")
 
 
 def mark() -> str:
-    """Of this process: the machine since it started and its space of process ids, and its id."""
+    """The mark of this process: its machine's boot and process-id namespace, and its process id."""
     return f"{_here() or '0' * 8}-{os.getpid():x}"
 
 
 def is_dead(text: str) -> bool:
-    """Has the process of this mark surely ended? False in any doubt: of another machine or
-    container, whose processes cannot be seen, of one that started anew, where the system does not
-    tell, or where another process has the id by now."""
+    """Whether the process of this mark has certainly ended. False if in doubt: for another machine
+    or container, whose processes are invisible, after a reboot, if the system does not say, or if
+    another process has the id by now."""
     found = MARK.fullmatch(text)
     if not found or not _here() or found[1] != _here():
         return False
@@ -34,8 +34,8 @@ def is_dead(text: str) -> bool:
 
 @functools.cache
 def _here() -> str:
-    """"" where Linux's /proc is absent. The id of the boot tells hosts of a shared disk apart, the
-    space of process ids the containers of a host."""
+    """Hash of boot id and process-id namespace, which distinguish hosts that share a disk and
+    containers on one host; "" without Linux's /proc."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text()
         return hashlib.sha256((boot + os.readlink("/proc/self/ns/pid")).encode()).hexdigest()[:8]

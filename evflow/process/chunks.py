@@ -1,11 +1,11 @@
-"""Pixels are independent: a chunk of them at a time, and a share of them on every core of a CPU.
+"""Pixels are independent: process them in chunks, and a share of them on every core of a CPU.
 
-XLA splits each operation among its threads, which below some 5,000 pixels costs more than it
-gives, while activations stay in a core's cache only up to some 1,000. So where the caller is not
-tracing, `at_once` runs one execution per core, each on its share and in small chunks. `estimate`
-of a 346x260 frame, given the summary, on two cores: .71 s so; one execution alone takes 1.50,
-1.33, 1.29, 1.33, 1.55, 6.1 s in chunks of 2560, 4096, 6144, 11264, 16384 and 46000 (and the flow
-.96, .85, .69, .72, .76, .78 s).
+XLA splits each operation among its threads, which does not pay below some 5,000 pixels, while
+activations stay in a core's cache only up to some 1,000. So unless the caller is tracing, `at_once`
+runs one execution per core, each on its share and in small chunks. `estimate` of a 346x260 frame,
+given the summary, on two cores: .71 s this way; a single execution takes 1.50, 1.33, 1.29, 1.33,
+1.55, 6.1 s in chunks of 2560, 4096, 6144, 11264, 16384 and 46000 (and the flow .96, .85, .69, .72,
+.76, .78 s).
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ import jax.numpy as jnp
 
 Array = jax.Array
 
-# Pixels. SMALL is for one core: 512, 640, 960, 1280 take .71, .70, .69, .73 s, and have 1.6 MB of
-# activations at 640; HUGE, for accelerators, keeps these below 1 GB.
+# Pixels. SMALL is for one core: 512, 640, 960, 1280 take .71, .70, .69, .73 s; activations take
+# 1.6 MB at 640. HUGE is for accelerators, where activations stay below 1 GB.
 SMALL, LARGE, HUGE = 640, 6144, 2**18
 
 
 def in_chunks(f: Callable[..., Any], rows: Any, size: int) -> Any:
-    """f of a tree of arrays (n, ...), `size` rows at a time or some fewer (size a multiple of 16);
-    its results are (n, ...)."""
+    """f of a tree of arrays (n, ...), at most `size` rows at a time (a multiple of 16); results are
+    (n, ...)."""
     n = len(jax.tree.leaves(rows)[0])
     if n <= size:
         return f(rows)
-    # Chunks alike, of whole vectors of 16 floats; the last one is padded with zeros.
+    # Equal chunks of whole vectors of 16 floats; the last one is padded with zeros.
     even = 16 * math.ceil(n / (16 * math.ceil(n / size)))
 
     def cut(a: Array) -> Array:
@@ -45,23 +45,22 @@ def in_chunks(f: Callable[..., Any], rows: Any, size: int) -> Any:
 
 
 def by_platform(f: Callable[..., Any], rows: Any, *, alone: bool) -> Any:
-    """`in_chunks` of the size that suits where it runs. alone: all cores are there for this."""
+    """`in_chunks` with the size that suits the platform. alone: this call may use all cores."""
     size = LARGE if alone and cores_per_device() > 1 else SMALL
     return jax.lax.platform_dependent(
         rows, cpu=partial(in_chunks, f, size=size), default=partial(in_chunks, f, size=HUGE))
 
 
 def cores_per_device() -> int:
-    """Cores that this process may use, for each of JAX's devices."""
+    """Cores that this process may use per JAX device."""
     usable = getattr(os, "sched_getaffinity", None)  # Linux
     cores = len(usable(0)) if usable else os.cpu_count() or 1
     return max(1, cores // jax.local_device_count())
 
 
 def executions(pixels: int, arrays: Any) -> int:
-    """How many executions on a tree of arrays are worth running at once: one for each core where
-    JAX's first device is a CPU and holds them, and each has a chunk to do; 1 while tracing and
-    on accelerators."""
+    """How many executions on a tree of arrays to run at once: one per core if JAX's first device is
+    a CPU that holds them and each has a full chunk; 1 while tracing and on accelerators."""
     return max(1, min(cores_per_device(), pixels // SMALL)) if on_cpu(arrays) else 1
 
 
@@ -77,8 +76,8 @@ def on_cpu(arrays: Any) -> bool:
 def at_once(calls: Sequence[Callable[[], Any]]) -> list[Any]:
     """Results of jitted calls that run side by side.
 
-    XLA keeps the order of what one thread dispatches, so every call but the first gets its own.
-    The first goes ahead under the caller's settings: what it compiles, the others find.
+    XLA keeps the order of calls from one thread, so every call but the first gets its own thread.
+    The first runs under the caller's settings and compiles; the others find its program.
     """
     first = calls[0]()
     if len(calls) == 1:
@@ -87,14 +86,14 @@ def at_once(calls: Sequence[Callable[[], Any]]) -> list[Any]:
 
     def run(call: Callable[[], Any]) -> Any:
         with jax.enable_x64(x64):
-            return jax.block_until_ready(call())  # else a thread would be free for a second call
+            return jax.block_until_ready(call())  # else the thread would take a second call
 
     with ThreadPoolExecutor(len(calls) - 1) as pool:
         return [first, *pool.map(run, calls[1:])]
 
 
 def joined(shares: Sequence[Array], pixels: int) -> Array:
-    """(images, pixels, C) from equal shares (images, n, C) in order, the last beginning early."""
+    """(images, pixels, C) from equal shares (images, n, C) in order; the last one may overlap."""
     if len(shares) == 1:
         return shares[0]
     extra = sum(share.shape[1] for share in shares) - pixels

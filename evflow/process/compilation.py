@@ -1,6 +1,6 @@
-"""Compiled programs: kept between runs of a command, and told of while they are made.
+"""Compiled programs: cached between runs of a command, and reported while they are compiled.
 
-The library sets nothing: where programs are kept is a matter of the process, and a command is one.
+The library itself changes no setting: a cache belongs to the process, and a command is one.
 """
 
 from __future__ import annotations
@@ -11,29 +11,29 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # the last thing before compilation
+LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # the last event before compilation
 COMPILED = "/jax/core/compile/backend_compile_duration"
 JAX_OWN = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")
 
 
 def cache_folder(environ: Mapping[str, str], system: str = sys.platform) -> Path | None:
-    """Where this system keeps what can be made again: evflow's folder there; None without a
-    home."""
+    """evflow's folder in this system's cache directory; None without a home."""
     named = environ.get("LOCALAPPDATA" if system == "win32" else "XDG_CACHE_HOME", "")
     try:
         home = Path.home()
     except RuntimeError:
         return Path(named, "evflow") if Path(named).is_absolute() else None
     usual = {"win32": "AppData/Local", "darwin": "Library/Caches"}.get(system, ".cache")
-    # The specification of XDG_CACHE_HOME has a relative path ignored.
+    # The XDG specification says that a relative XDG_CACHE_HOME is to be ignored.
     return (Path(named) if Path(named).is_absolute() else home / usual) / "evflow"
 
 
 def remember(environ: Mapping[str, str] = os.environ) -> Path | None:
-    """Keep what this process compiles in the user's cache folder, for the next one; the folder.
+    """Cache what this process compiles in the user's cache folder for later runs; returns the
+    folder.
 
-    None, and nothing is changed, where JAX's own variables say where or whether to, and where the
-    folder cannot be written."""
+    Returns None and changes nothing if JAX's own environment variables configure the cache, or if
+    the folder cannot be written."""
     if any(name in environ for name in JAX_OWN):
         return None
     folder = cache_folder(environ)
@@ -57,8 +57,8 @@ def remember(environ: Mapping[str, str] = os.environ) -> Path | None:
 
 @contextlib.contextmanager
 def told_of(tell: Callable[[bool], None]) -> Iterator[None]:
-    """Call tell(True) when a program is about to be compiled in this block, or looked up, and
-    tell(False) when it is there."""
+    """Call tell(True) whenever a program is about to be compiled or looked up in this block, and
+    tell(False) when it is ready."""
     import jax
 
     def listen(event: str, duration_secs: float, **_: str | int) -> None:

@@ -1,10 +1,10 @@
 """Data parallelism: one program for a CPU, a GPU, many devices, many hosts.
 
-All devices of all processes lie on one mesh axis, "data". The state is replicated, a batch is
-sharded by scene: XLA partitions the step and adds up the gradients. The code of the step stays
-global (it sees whole batches); only loops over sequences, which XLA would run whole on every
-device, are run under `by_shard`. The mesh is ambient while a `parallel` function runs; where
-none is set, everything runs as written. `initialise` comes before any other use of JAX.
+All devices of all processes form one mesh axis, "data". The state is replicated and a batch is
+sharded by scene: XLA partitions the step and sums the gradients. The step's code stays global (it
+sees whole batches); only loops over sequences, which XLA would run whole on every device, run under
+`by_shard`. The mesh is ambient while a `parallel` function runs; without one, everything runs as
+written. `initialise` must come before any other use of JAX.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from jax.sharding import PartitionSpec as P
 from evflow.errors import EvflowDataError
 
 AXIS = "data"
-# A process that dies ends the others within the heartbeat; one that fails waits for them at exit
-# until the shutdown's limit and dies then: 25 s at most, where JAX's defaults make 400.
+# If a process dies, the others end within the heartbeat; one that fails waits for the others at
+# exit until the shutdown timeout: 25 s at most, against 400 s with JAX's defaults.
 HEARTBEAT_S, SHUTDOWN_S = 10, 15
-# What each launcher sets, the last naming the number of processes it started.
+# Variables set by each launcher; the last one is the number of processes it started.
 LAUNCHERS = (
     ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_PROCID", "SLURM_LOCALID", "SLURM_NTASKS"),
     ("OMPI_MCA_orte_hnp_uri", "OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
@@ -47,10 +47,10 @@ def launched(environ: Mapping[str, str]) -> bool:
 def initialise(
     coordinator: str | None = None, processes: int | None = None, process_id: int | None = None
 ) -> None:
-    """Join the other processes of this run: those named by the options, else the launcher's; a
-    process on its own does nothing.
+    """Join the other processes of this run, given by the options or else by the launcher; a single
+    process does nothing.
 
-    coordinator: HOST:PORT of process 0. Raises EV020 where the options are incomplete or wrong.
+    coordinator: HOST:PORT of process 0. Raises EV020 if the options are incomplete or wrong.
     """
     # SIGTERM belongs to the training loop.
     jax.config.update("jax_enable_preemption_service", False)
@@ -73,22 +73,22 @@ def initialise(
 
 
 def is_main() -> bool:
-    """Whether this is the process that writes logs and prints."""
+    """Whether this process writes the logs and prints."""
     return jax.process_index() == 0
 
 
 def agree(vote: bool) -> bool:
-    """Whether any process votes yes: the same answer on all, which wait here for each other."""
+    """Whether any process votes yes: all processes wait here and get the same answer."""
     if jax.process_count() == 1:
         return vote
     return bool(np.any(multihost_utils.process_allgather(np.asarray(vote))))
 
 
 class Votes:
-    """`agree` for a loop that keeps the devices busy: it waits for none of their work.
+    """`agree` for a loop that keeps the devices busy, without waiting for their work.
 
-    Of several processes, a vote is counted one call later (the first at once): the answer is the
-    same on all in the same call.
+    With several processes a vote counts one call later (except the first): every process gets the
+    same answer in the same call.
     """
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class Votes:
         self._asked: jax.Array | None = None
 
     def agree(self, vote: bool) -> bool:
-        """Whether any process voted yes in its call before; alone, the vote itself."""
+        """Whether any process voted yes in the previous call; with one process, the vote itself."""
         if jax.process_count() == 1:
             return vote
         votes = jax.make_array_from_callback(
@@ -113,7 +113,7 @@ def make_mesh() -> Mesh:
 
 
 def replicate(tree: Result, mesh: Mesh) -> Result:
-    """A pytree that every process computed for itself, on all devices."""
+    """A pytree that every process computed for itself, replicated on all devices."""
     sharding = NamedSharding(mesh, P())
 
     def put(leaf: Any) -> jax.Array:
@@ -127,7 +127,7 @@ def replicate(tree: Result, mesh: Mesh) -> Result:
 
 
 def parallel(step: Callable[..., Any], mesh: Mesh) -> jax.stages.Wrapped:
-    """step(state, ...) jitted for the mesh: replicated results, the state's buffers reused."""
+    """step(state, ...) jitted for the mesh: results are replicated, the state's buffers donated."""
     def meshed(*args: Any) -> Any:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
             return step(*args)
@@ -137,8 +137,8 @@ def parallel(step: Callable[..., Any], mesh: Mesh) -> jax.stages.Wrapped:
 
 @contextlib.contextmanager
 def compiled_quickly(wanted: bool) -> Iterator[None]:
-    """Programs of this block are compiled without optimisation, in half of the time, if `wanted`:
-    where they run a few times only."""
+    """If `wanted`, compile programs of this block without optimisation, in half the time, because
+    they run only a few times."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", wanted or before)
     try:
@@ -151,12 +151,12 @@ def by_shard(
     f: Callable[[Common, Shard], Result],
 ) -> Callable[[Common, Shard], Result]:
     """f(common, shard) -> result, run by every device on its share of the leading axis; f itself
-    where no mesh is set.
+    without a mesh.
 
-    common: replicated pytree; shard, result: pytrees whose leaves are split along axis 0. XLA
-    left to itself runs a loop over sequences (and renders their scenes) whole on every device.
+    common: replicated pytree; shard, result: pytrees whose leaves are split along axis 0. Left to
+    itself, XLA runs a loop over sequences (and renders their scenes) whole on every device.
     """
     if jax.sharding.get_abstract_mesh().empty:
         return f
-    # check_vma: f's scans start from constants, which would all have to be marked as varying.
+    # check_vma: f's scans start from constants, all of which would have to be marked as varying.
     return jax.shard_map(f, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False)

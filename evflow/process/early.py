@@ -1,36 +1,37 @@
-"""Before modules load. Ctrl-C while they do, which takes a second and which they do not all
-survive, and while the process ends: nothing is begun yet, or all is done, so that it ends at once
-and without a traceback. And what a process can only be told before they are there.
+"""What must happen before other modules load: settings that a process can only get at its start,
+and Ctrl-C during the second that loading takes, or while the process ends. Nothing has begun then,
+or all is done, so the process ends at once, without a traceback (some modules do not survive an
+interrupted import).
 
-This is the first module of evflow that is loaded, so it loads nothing itself.
+This is the first module of evflow to be loaded, so it loads nothing itself.
 """
 
 import gc
 import os
 import sys
 
-GARBAGE = 20_000  # new objects after which it is looked for
+GARBAGE = 20_000  # new objects before Python searches for garbage
 
 
 def is_command() -> bool:
-    """Whether this process is the command `evflow`, or `python -m evflow`, and no other program
-    that imports evflow, nor a worker."""
-    program = sys.orig_argv[-len(sys.argv):][:1]  # -m hides it in sys.argv while it is looked for
+    """Whether this process is the command `evflow` or `python -m evflow`, rather than a worker or
+    another program that imports evflow."""
+    program = sys.orig_argv[-len(sys.argv):][:1]  # sys.argv hides -m while modules are located
     return os.path.basename("".join(program)) in ("evflow", "evflow.exe")
 
 
 def save_time() -> None:
-    """Let the process do less beside its work. NumPy's threads for linear algebra wait for each
-    other, spinning, longer than products of a few numbers take; an environment that says how many
-    there are is obeyed. And Python looks for garbage among all objects after every 700 new ones,
-    which is hundreds of times while modules load and programs are traced."""
+    """Reduce overhead. NumPy's linear-algebra threads spin while they wait for each other, longer
+    than products of a few numbers take (the environment's own setting is respected); and Python
+    searches all objects for garbage after every 700 new ones, hundreds of times while modules load
+    and programs are traced."""
     if "OMP_NUM_THREADS" not in os.environ:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
 
 
 def end_on_interrupt() -> None:
-    """Let Ctrl-C end the process, exit code 130; not where a shell has it ignored."""
+    """Let Ctrl-C end the process with exit code 130, unless the shell has it ignored."""
     try:
         import signal
 
@@ -41,7 +42,7 @@ def end_on_interrupt() -> None:
 
 
 def interrupt_as_usual() -> None:
-    """Ctrl-C raises KeyboardInterrupt again, after `end_on_interrupt`."""
+    """Let Ctrl-C raise KeyboardInterrupt again, after `end_on_interrupt`."""
     import signal
 
     if signal.getsignal(signal.SIGINT) is _end:

@@ -1,4 +1,4 @@
-"""Memory that is free: what the process still holds, and what it gives back."""
+"""Freed memory: what the process keeps of it, and what it returns to the system."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from pathlib import Path
 from typing import Any
 
 TRIM_ABOVE, MAP_ABOVE = -1, -3  # glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD
-KEPT, LARGEST = 1 << 29, 1 << 25  # bytes; glibc keeps none larger
-SMALL = 1 << 30  # bytes of a process, a third of them its modules and programs
+KEPT, LARGEST = 1 << 29, 1 << 25  # bytes; glibc allows no larger threshold
+SMALL = 1 << 30  # bytes of a process; modules and programs take a third of that
 
 
 def give_back() -> None:
-    """Give the system back what the allocator keeps of freed arrays: after large ones of several
-    sizes that is as much again. Does nothing while the process is small, as the next arrays would
-    wait for the same memory, nor where it cannot be asked to (other than glibc)."""
+    """Return freed memory that the allocator keeps to the system: after large arrays of several
+    sizes it can equal what is in use. Does nothing while the process is small, because the next
+    arrays would have to get the memory back, or without glibc."""
     trim = _of_c("malloc_trim")
     if trim is not None and held() >= SMALL:
         trim(0)
 
 
 def held() -> float:
-    """Bytes of memory that the process holds; inf where the system does not tell."""
+    """Bytes of memory that the process holds; inf if the system does not say."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
@@ -32,9 +32,9 @@ def held() -> float:
 
 
 def keep() -> None:
-    """Let the allocator keep freed arrays for the next ones, up to KEPT bytes: work that makes
-    arrays of the same sizes again and again would else wait for the system to clear them. Until the
-    process ends; does nothing where it cannot be asked to (other than glibc)."""
+    """Let the allocator keep up to KEPT bytes of freed arrays until the process ends: otherwise
+    work that makes arrays of the same sizes again and again waits for the system to clear them.
+    Does nothing without glibc."""
     tell = _of_c("mallopt")
     if tell is not None:
         tell(MAP_ABOVE, LARGEST)
@@ -43,8 +43,8 @@ def keep() -> None:
 
 @functools.cache
 def _of_c(name: str) -> Any:
-    """A function of the C library, None where it has none of that name."""
+    """A function of the C library; None if it has none of that name."""
     try:
         return getattr(ctypes.CDLL(None), name)
-    except (AttributeError, OSError, TypeError):  # macOS and musl; Windows has no library None
+    except (AttributeError, OSError, TypeError):  # macOS, musl; on Windows there is no library None
         return None

@@ -16,8 +16,8 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scikit-image", "opencv-p
 
 
 def provenance() -> dict[str, Any]:
-    """Saved with every result: evflow's version, its source (`source`), the versions of Python and
-    of what is installed of PACKAGES, and the machine."""
+    """Saved with every result: evflow's version and source (`source`), the versions of Python and
+    of the installed PACKAGES, and the machine."""
     import jax
 
     import evflow
@@ -35,7 +35,7 @@ def provenance() -> dict[str, Any]:
 
 
 def told() -> str:
-    """The provenance in a line, for people."""
+    """The provenance in one line, for people."""
     known = provenance()
     parts = {"evflow": known["evflow"], "source": known["source"], **known["versions"],
              "device": known["machine"]["device"], "platform": known["machine"]["platform"]}
@@ -44,16 +44,16 @@ def told() -> str:
 
 @functools.cache
 def source() -> str:
-    """The git commit of the source tree that evflow runs from, "+dirty" where a file that git
-    knows differs from it; the version where there is no such tree."""
+    """The git commit of the source tree that evflow runs from, with "+dirty" if tracked files were
+    changed; the version if there is no such tree."""
     import evflow
 
     return commit(Path(evflow.__file__).resolve().parents[1]) or evflow.__version__
 
 
 def commit(tree: Path) -> str:
-    """The git commit of `tree`, marked "+dirty" where files differ; "" where the folder is not the
-    top of a git tree (an installed package may lie amid somebody else's)."""
+    """The git commit of `tree`, with "+dirty" if files were changed; "" if the folder is not the
+    top of a git tree (an installed package may lie within another repository)."""
     if not (tree / ".git").exists() or not (tree / "pyproject.toml").is_file():
         return ""
     try:
@@ -61,13 +61,13 @@ def commit(tree: Path) -> str:
                                 check=True, timeout=60).stdout.strip()
                  for arguments in (("rev-parse", "HEAD"),
                                    ("status", "--porcelain", "--untracked-files=no"))]
-    except (OSError, subprocess.SubprocessError):  # no git, or none that may look here
+    except (OSError, subprocess.SubprocessError):  # no git, or git refuses to look here
         return ""
     return asked[0] + ("+dirty" if asked[1] else "")
 
 
 def sha256(path: str | os.PathLike) -> str:
-    """Of a file; of a folder, that of its files' names and hashes in order."""
+    """SHA-256 of a file; for a folder, of its files' names and hashes in order."""
     path = Path(path)
     if not path.is_dir():
         with open(path, "rb") as file:

@@ -1,4 +1,5 @@
-"""Signals that wait: for the end of a step that nothing may break off, or for a loop to look."""
+"""Deferred signals: until the end of a step that must not be interrupted, or until a loop
+checks."""
 
 from __future__ import annotations
 
@@ -15,9 +16,9 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 def uninterrupted() -> Iterator[None]:
     """Hold SIGINT and SIGTERM back while the block runs; their handlers run at its end.
 
-    For code that calls Python back from C and drops what the call raises, as HDF5 does: a
-    KeyboardInterrupt would be lost there, and a part of the file with it. What the system does
-    itself (a handler of SIG_DFL or SIG_IGN) is left alone, and other threads have no handlers.
+    For C code that calls Python and drops exceptions, as HDF5 does: a KeyboardInterrupt would be
+    lost there, and part of the file with it. Signals with the system's own handling (SIG_DFL,
+    SIG_IGN) are unaffected; in threads other than the main one this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -29,7 +30,7 @@ def uninterrupted() -> Iterator[None]:
     def hold(number: int, frame: FrameType | None) -> None:
         if held:
             came.append(number)
-        else:  # between the end of the block and `restore`, or where that was broken off
+        else:  # the block has ended, or `restore` itself was interrupted
             before[number](number, frame)
 
     try:
@@ -46,7 +47,7 @@ def uninterrupted() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[list[int]]:
-    """A list that SIGINT and SIGTERM add themselves to; a second signal acts as usual."""
+    """A list to which SIGINT and SIGTERM append themselves; a second signal acts as usual."""
     requests: list[int] = []
 
     def ask(number: int, _: FrameType | None) -> None:

@@ -1,5 +1,5 @@
-"""Long work: a bar with an estimate of the time left, silent where stderr is no terminal; one way
-to stop; and where nobody reads on."""
+"""Long work in a terminal: a progress bar with the time left (silent if stderr is no terminal), one
+way to stop, and output that nobody reads any more."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ INTERRUPTED = 130  # the shell's exit code of Ctrl-C
 
 
 def print_anything() -> None:
-    """Let standard output take what its encoding has no letter for, such as the bytes of a file's
-    name, as \\x..: words must not end the work that they tell of."""
+    """Print characters that standard output cannot encode, such as bytes of a file name, as \\x..,
+    so that printing a message never ends the work."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 class Report(Protocol):
-    """progress(done, total): how far the work is; with a title, which then replaces the bar's."""
+    """progress(done, total): how far the work is; an optional title replaces the bar's."""
 
     def __call__(self, done: int, total: int, title: str | None = None) -> None: ...
 
 
 class Stages:
-    """A bar's title that names the stage under way, and what is known so far."""
+    """A bar's title that names the current stage and what is known so far."""
 
     def __init__(self, report: Report) -> None:
         self._report, self._at, self._known, self._done = report, "", "", (0, 1)
 
     def stage(self, name: str) -> None:
-        """Another stage begins."""
+        """Start another stage."""
         self._at = name
         self._show()
 
     def count(self, done: int, total: int) -> None:
-        """So far the work is."""
+        """Report progress."""
         self._done = done, total
         self._show()
 
     def know(self, text: str) -> None:
-        """So much is known."""
+        """Add a result that is known by now."""
         self._known = f": {text}"
         self._show()
 
@@ -61,8 +61,8 @@ class Stages:
 
 @contextlib.contextmanager
 def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[Report]:
-    """Yield progress(done, total). shown: False where another process shows the bar; compiles:
-    whether the work compiles programs, which the title then says."""
+    """Yield progress(done, total). shown: False if another process shows the bar; compiles: whether
+    the work compiles programs, which the title then says."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                TimeRemainingColumn())
@@ -85,12 +85,12 @@ def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[R
 
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
-    """SIGTERM, as schedulers send it, ends the block as Ctrl-C does: through every `finally`, so
-    that nothing half-written is left. One of either that comes while Python collects garbage, where
-    exceptions are ignored, or imports a module, which compiled ones do not survive or swallow,
-    comes again."""
+    """SIGTERM, which schedulers send, ends the block like Ctrl-C: through every `finally`, so that
+    nothing half-written is left. If either signal arrives during garbage collection, which ignores
+    exceptions, or during an import, which compiled modules do not survive or swallow, it is raised
+    again."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # handlers belong to the main thread
+        yield  # only the main thread may set handlers
         return
 
     def later(number: int) -> None:
@@ -109,7 +109,7 @@ def stoppable() -> Iterator[None]:
             hook(lost)
 
     again: list[threading.Timer] = []
-    outside = _imports(sys._getframe())  # of the module that the block itself is run by
+    outside = _imports(sys._getframe())  # import frames that surround the block itself
     before, hook = signal.signal(signal.SIGTERM, stop), sys.unraisablehook
     keyboard = signal.getsignal(signal.SIGINT)
     if keyboard is signal.default_int_handler:  # not where a shell has it ignored
@@ -126,7 +126,7 @@ def stoppable() -> Iterator[None]:
 
 
 def _imports(frame: FrameType | None) -> int:
-    """How many frames of the stack are of the machinery that imports."""
+    """The number of import-machinery frames on the stack."""
     count = 0
     while frame is not None:
         count += frame.f_code.co_filename.startswith("<frozen importlib")
@@ -135,14 +135,14 @@ def _imports(frame: FrameType | None) -> int:
 
 
 def open_closed() -> None:
-    """Standard streams that were closed (`evflow ... >&-`) lead nowhere: Python has none then, and
-    the next file that is opened would be taken for them."""
+    """Reopen closed standard streams (`evflow ... >&-`) on the null device: otherwise the next file
+    to be opened would take their place."""
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         if getattr(sys, name) is not None:
             continue
         nowhere = os.open(os.devnull, os.O_RDWR)
         with contextlib.suppress(OSError):
-            os.fstat(number)  # somebody's by now, or this very one
+            os.fstat(number)  # already taken by another file, or this very stream
             setattr(sys, name, open(nowhere, mode, closefd=False))  # noqa: SIM115 (to the end)
             continue
         os.dup2(nowhere, number)
@@ -150,13 +150,13 @@ def open_closed() -> None:
 
 
 def unread() -> None:
-    """After BrokenPipeError (`evflow info ... | head`): nobody reads on, and nothing is wrong."""
+    """After BrokenPipeError (`evflow info ... | head`): the reader is gone, which is no error."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def leave(code: int) -> NoReturn:
-    """End the process after Ctrl-C: nothing is waited for, as a compilation in another thread does
-    not survive the usual end."""
+    """End the process after Ctrl-C without waiting: a compilation in another thread does not
+    survive the usual exit."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

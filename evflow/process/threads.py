@@ -1,8 +1,8 @@
-"""Steps of a long work at the same time, in threads: reading ahead, and writing behind.
+"""Overlapping the steps of long work in threads: reading ahead and writing behind.
 
-For steps that spend their time where Python lets others run: in OpenCV, XLA, HDF5. Order, and so
-the result, is that of one thread. Signals reach the main thread alone, wherever it is: so the
-queues are those that no signal can leave locked, and each block ends with its thread.
+For steps that release the GIL: OpenCV, XLA, HDF5. Order and results are those of one thread.
+Signals reach the main thread only, at any point, so the queues are of a kind that a signal cannot
+leave locked, and each block ends its thread.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ SWITCH_S = 5e-4
 
 @contextlib.contextmanager
 def ahead(items: Iterable[T], depth: int) -> Iterator[Iterator[T]]:
-    """The same items, made by a thread up to `depth` + 1 ahead of the reader. What making them
-    raises is raised in its place, to the reader."""
+    """The same items, produced by a thread up to `depth` + 1 ahead of the reader. An exception is
+    raised to the reader in place of the item."""
     made: SimpleQueue[tuple[T] | BaseException | None] = SimpleQueue()
     room = _room(depth)
     stopped = False
@@ -62,9 +62,9 @@ def ahead(items: Iterable[T], depth: int) -> Iterator[Iterator[T]]:
 
 @contextlib.contextmanager
 def behind(depth: int) -> Iterator[Callable[..., None]]:
-    """A function later(do, *arguments): a thread makes these calls, one after the other, up to
-    `depth` behind. At the end of the block all are made; where it raises, those that wait are
-    dropped. What a call raises ends them, and comes out of the next `later` or of the block."""
+    """A function later(do, *arguments): a thread makes these calls in order, up to `depth` behind.
+    The block ends when all are made; if it raises, waiting calls are dropped. An exception in a
+    call stops them and is raised by the next `later` or at the end of the block."""
     calls: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
     room = _room(depth)
     dropped = False
@@ -103,8 +103,8 @@ def behind(depth: int) -> Iterator[Callable[..., None]]:
 
 @contextlib.contextmanager
 def prompt() -> Iterator[None]:
-    """Threads that come back to Python from a short call of OpenCV or HDF5 wait no longer than such
-    a call takes; as Python begins, ten times as long."""
+    """Shorten the time that threads wait for Python after a short call of OpenCV or HDF5 to that of
+    such a call; Python's default is ten times as long."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -115,8 +115,8 @@ def prompt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def beside(steps: int) -> Iterator[None]:
-    """OpenCV takes as many threads as cores are left by so many other steps at work, at least one:
-    its threads spin while they wait for each other, which small pictures make them do often."""
+    """Limit OpenCV to the cores left by `steps` other threads, at least one: its threads spin while
+    they wait for each other, often with small images."""
     import cv2
 
     before = cv2.getNumThreads()
@@ -128,7 +128,7 @@ def beside(steps: int) -> Iterator[None]:
 
 
 def _room(depth: int) -> SimpleQueue[None]:
-    """A queue of `depth` places."""
+    """A queue with `depth` slots."""
     room: SimpleQueue[None] = SimpleQueue()
     for _ in range(depth):
         room.put(None)

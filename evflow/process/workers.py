@@ -1,4 +1,4 @@
-"""Worker processes that end with the block they are made for, and where their parent is killed."""
+"""Worker processes that end with their block, or when their parent is killed."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from typing import Any
 def worker_pool(
     workers: int, prepare: Callable[..., Any] | None = None, *arguments: Any
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool of fresh interpreters, as JAX's threads do not survive a fork. Each calls
-    prepare(*arguments) first. Ctrl-C is left to the parent."""
+    """A pool of fresh interpreters, because JAX's threads do not survive a fork. Each first calls
+    prepare(*arguments). Ctrl-C is left to the parent."""
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin,
                                initargs=(prepare, *arguments))
@@ -25,12 +25,12 @@ def worker_pool(
         yield pool
     finally:
         for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()  # what they still do is not wanted
+            worker.terminate()  # unfinished results are not needed
         pool.shutdown(cancel_futures=True)
 
 
 def _begin(prepare: Callable[..., Any] | None, *arguments: Any) -> None:
-    """The first that a worker does."""
+    """The first call in a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:

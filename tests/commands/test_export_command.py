@@ -41,7 +41,7 @@ def test_light_that_frames_do_not_show_is_told(to: str) -> None:
     camera = Camera.constant((4, 6))
     assert "DN more than" not in export_camera(camera, to)[0].text
     told = export_camera(camera, to, optics=Optics(18.7, 0.0, 4.6))[0].text
-    assert told.rstrip().endswith("other videos need none.")
+    assert told.rstrip().endswith("other videos do not need it.")
     assert "18.7 DN more than" in told
 
 

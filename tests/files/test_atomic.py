@@ -130,7 +130,7 @@ def test_of_two_writers_of_one_name_the_first_stays(
                 assert first != second
                 first.write_text("first")
 
-    with pytest.raises(EvflowDataError, match=r"EV013.*out\.txt has appeared"):
+    with pytest.raises(EvflowDataError, match=r"EV013.*out\.txt was created"):
         both()
     assert path.read_text() == "first"
     assert os.listdir(tmp_path) == ["out.txt"]
@@ -151,7 +151,7 @@ def test_of_two_writers_of_one_folder_the_first_stays(
                 for name in before:
                     (first / name).write_text("first")
 
-    with pytest.raises(EvflowDataError, match=r"EV013.*out has appeared"):
+    with pytest.raises(EvflowDataError, match=r"EV013.*out was created"):
         both()
     assert os.listdir(path) == before
     assert os.listdir(tmp_path) == ["out"]
@@ -189,7 +189,7 @@ def test_of_two_stages_of_one_folder_the_first_stays(
             with staged(tmp_path / "out", names=names) as first:
                 (first / "a.txt").write_text("first")
 
-    with pytest.raises(EvflowDataError, match=r"EV013.*a\.txt has appeared"):
+    with pytest.raises(EvflowDataError, match=r"EV013.*a\.txt was created"):
         both()
     assert os.listdir(tmp_path / "out") == ["a.txt"]
     assert (tmp_path / "out" / "a.txt").read_text() == "first"

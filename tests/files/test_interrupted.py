@@ -157,7 +157,7 @@ def test_what_is_not_whole_gets_no_name(
 
     monkeypatch.setattr(WRITERS[kind], "_verify", damaged)
     recording = make(3000) if WRITERS[kind].DEPTHS else Recording.of_events(make(3000).events)
-    with pytest.raises(EvflowDataError, match=r"EV019.*not written whole"):
+    with pytest.raises(EvflowDataError, match=r"EV019.*not written completely"):
         write_recording(tmp_path / f"out{SUFFIXES[kind]}", recording, kind)
     assert os.listdir(tmp_path) == []
 
@@ -175,7 +175,7 @@ def test_rows_that_are_not_in_an_array_are_missed(
 
     monkeypatch.setattr(GrowingArray, "append", short)
     for name in ("out", "out.npz"):
-        with pytest.raises(EvflowDataError, match=r"EV019.*not written whole"):
+        with pytest.raises(EvflowDataError, match=r"EV019.*not written completely"):
             write_recording(tmp_path / name, Recording.of_events(make(50).events))
     assert os.listdir(tmp_path) == []
 

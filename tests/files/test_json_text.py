@@ -12,7 +12,7 @@ from evflow.files.json_text import DEEPEST, parse_json
 
 @pytest.mark.parametrize("opened", ["[", "[ ", '{"a": ', '[{"a": ', "[[], "])
 def test_deeper_than_any_file_is(opened: str) -> None:
-    with pytest.raises(ValueError, match="brackets within brackets"):
+    with pytest.raises(ValueError, match="nested too deeply"):
         parse_json(opened * (DEEPEST + 1))
 
 

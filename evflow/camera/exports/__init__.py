@@ -1,7 +1,7 @@
-"""A measured camera in the words of other simulators: maps, settings and a script per simulator.
+"""A measured camera as the settings of other simulators: maps, settings and a script for each.
 
-A target is a module with `export(maps, settings)`; what the other program cannot
-represent is said in the text that goes with it.
+A target is a module with `export(maps, settings)`; its text says what the other program cannot
+represent.
 """
 
 from evflow.camera.exports.common import Export, Settings

@@ -1,4 +1,4 @@
-"""What all exports share: the scalars nearest to a camera, the noise, and what an export is."""
+"""What all exports share: the scalars that summarise a camera, the noise, and the export itself."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from evflow.camera.sensors import SensorModel
 from evflow.camera.shares import beside_leak
 
 Maps = Mapping[str, np.ndarray]
-PACE = (128 + 20) / 275  # of a low-pass that goes with light at 128 DN, of that at 255 DN
-GREY = 1 - 0.75 * PACE  # shot noise of v2e and of OpenEB at 128 DN over that at 0 DN
+PACE = (128 + 20) / 275  # cutoff at 128 DN over that at 255 DN, for a low-pass that follows light
+GREY = 1 - 0.75 * PACE  # shot noise of v2e and OpenEB at 128 DN over that at 0 DN
 MAD = 1.4826  # standard deviations in a median absolute deviation of a normal distribution
 
 NOISE = '''"""Adds the measured noise to simulated events: Poisson, per pixel and polarity."""
@@ -23,8 +23,8 @@ import numpy as np
 def add_noise(x, y, t_us, p, maps, start, stop, seed=0):
     """Columns (N,) of a simulation without noise -> columns sorted by time; p is 0 or 1.
 
-    maps: eta_on, eta_off (H, W) in Hz. start, stop: of the video, in us: noise does not wait for
-    the first event. The pixel's memory is not reset by a noise event.
+    maps: eta_on, eta_off (H, W) in Hz. start, stop: of the video, in us: noise occurs throughout,
+    not only between the first and the last event. A noise event does not reset the pixel's memory.
     """
     rng, columns = np.random.default_rng(seed), [[x], [y], [t_us], [p]]
     for polarity, name in ((1, "eta_on"), (0, "eta_off")):
@@ -43,11 +43,12 @@ def add_noise(x, y, t_us, p, maps, start, stop, seed=0):
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The scalars nearest to a camera's maps: medians over the pixels, thresholds in natural-log
-    units, rates in Hz per pixel and polarity; sigma: the spread of a threshold over the pixels.
-    cutoff_hz (at 255 DN, where it goes with light), dead_s, leak_hz and shot_hz (v2e's, in the
-    dark), both parts of eta: of the circuit, 0 where they were not measured; even_hz: the measured
-    cutoff where it is the same in any light: cutoff_hz is then right at 128 DN."""
+    """The scalars that summarise a camera's maps: medians over the pixels, thresholds in
+    natural-log units, rates in Hz per pixel and polarity; sigma: standard deviation of a threshold
+    over pixels. Of the circuit, 0 where not measured: cutoff_hz (at 255 DN, if it depends on
+    light), dead_s, leak_hz and shot_hz (v2e's, in the dark), both part of eta. even_hz: the
+    measured cutoff if it does not depend on light; cutoff_hz is then chosen to be right at 128
+    DN."""
 
     width: int
     height: int
@@ -68,9 +69,10 @@ class Settings:
         maps: Maps, std: Maps | None = None, sensor: SensorModel = SensorModel(),
         summary: Mapping[str, float] | None = None,
     ) -> Settings:
-        """From maps (H, W), their standard deviations and the circuit; hot and dead pixels move
-        neither median nor spread, which is that of the estimates and that within each, together.
-        summary: what an estimate says of the whole camera itself, in place of these."""
+        """From maps (H, W), their standard deviations and the circuit. Medians and spreads are
+        robust to hot and dead pixels; a spread combines that of the estimates with their own
+        errors.
+        summary: an estimate's summary, which is used instead of medians of the maps."""
         middle = {name: float(np.median(values)) for name, values in maps.items()}
         sigma = {}
         for name in ("theta_on", "theta_off"):
@@ -87,30 +89,30 @@ class Settings:
 
     @property
     def leak_seen(self) -> float:
-        """Hz of the ON noise that are leak."""
+        """ON noise that is leak, in Hz."""
         on, off = np.float64(self.eta_on), np.float64(self.eta_off)
         return float(on - beside_leak(on, off, self.leak_hz)) if self.leak_hz else 0.0
 
     @property
     def circuit(self) -> str:
-        """What was measured of the circuit, in words."""
+        """The measured circuit in words."""
         cutoff = f"cutoff {self.cutoff_hz:.0f} Hz at 255 DN" if self.cutoff_hz else "no cutoff"
         if self.even_hz:
-            cutoff = f"cutoff {self.even_hz:.0f} Hz in any light, which is that of {cutoff} in grey"
+            cutoff = f"cutoff {self.even_hz:.0f} Hz at any light, equal to {cutoff} at mid-grey"
         dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
-        leak = f", leak {self.leak_hz:.3f} Hz, a part of the ON noise" if self.leak_hz else ""
+        leak = f", leak {self.leak_hz:.3f} Hz (part of the ON noise)" if self.leak_hz else ""
         return f"{cutoff}, {dead}{leak}"
 
     @property
     def sigma(self) -> float:
-        """One spread for both polarities: the root of the mean variance."""
+        """One standard deviation for both polarities: the root of the mean variance."""
         return float(np.hypot(self.sigma_on, self.sigma_off) / np.sqrt(2))
 
 
 @dataclasses.dataclass(frozen=True)
 class Export:
     """text: how to use it and what is lost. scripts: name -> Python source. arrays: name.npy ->
-    array, beside the maps."""
+    array, written beside the maps."""
 
     text: str
     scripts: Mapping[str, str]

@@ -39,11 +39,11 @@ What ESIM cannot represent
   {sigma_on:.4f} and OFF {sigma_off:.4f}, is lost. (rpg_esim's contrast_threshold_sigma is no
   substitute: it draws anew for every pixel and frame.)
 - Noise: it has none. add_noise.py adds the measured rates, ON {eta_on:.4f} and OFF {eta_off:.4f} Hz
-  at the median pixel, to its output; the pixels' memories do not know of it.
-- The photoreceptor's low-pass (measured: {circuit}): it has none. Within the dead time it loses
-  contrast, where v2e's pixels, and evflow's, keep it for later.
-- The log map: ESIM's is log(I / 255 + eps), evflow measures against v2e's, linear below 20 DN. Dark
-  scenes give other counts: 22 % fewer on one video, with eps = 1e-3.
+  at the median pixel, to its output; noise events do not reset the pixels' memories.
+- The photoreceptor's low-pass (measured: {circuit}): it has none. ESIM discards contrast changes
+  within the dead time; the pixels of v2e and evflow keep them for later.
+- The log map: ESIM uses log(I / 255 + eps), evflow's thresholds refer to v2e's map, linear below
+  20 DN. Dark scenes give other counts: 22 % fewer on one video, with eps = 1e-3.
 '''
 
 

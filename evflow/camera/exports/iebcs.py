@@ -1,10 +1,10 @@
-"""IEBCS (ICNS): thresholds by renewing its maps before each frame, noise by its spectra.
+"""IEBCS (ICNS): thresholds by resetting its maps before each frame, noise as its spectra.
 
 A spectrum file is (H, W, 72): per pixel the cumulative share of intervals up to each of the
-instantaneous frequencies 1..9 x 10^k Hz, k = -3..4; the last entry is 0, as in the measured ones.
-IEBCS draws the interval of the entry below, so that entries here hold the share up to the
-geometric mean with the next frequency: the rate that comes out is the camera's, and one worked out
-of the file as if it were measured is 15 % higher.
+instantaneous frequencies 1..9 x 10^k Hz, k = -3..4; the last entry is 0, as in the measured files.
+IEBCS draws the interval of the entry below, so an entry here holds the share up to the geometric
+mean with the next frequency: the simulated rate is then the camera's. (Read as if it were measured,
+such a file gives a rate 15 % higher.)
 """
 
 from __future__ import annotations
@@ -63,16 +63,17 @@ Scalars only: set_dvs_sensor(th_pos={theta_on:.4f}, th_neg={theta_off:.4f}, th_n
     lat=100, tau=40, jit=10, bgnp={bgnp:.4f}, bgnn={bgnn:.4f}, ref={dead_us})
 
 What IEBCS cannot represent
-- Thresholds of a pixel: it draws each anew after every event, around one mean (th_n is a noise in
-  time, not a mismatch). The script puts the measured maps back before every frame: right for a
-  pixel's first event in a frame interval, the median for its others. Use many frames per second.
+- Per-pixel thresholds: it redraws each after every event, around one mean (th_n is noise in time,
+  not mismatch). The script restores the measured maps before every frame: a pixel's first event in
+  a frame interval uses its own threshold, later ones the median. Use many frames per second.
 - Noise maps: noise_pos.npy and noise_neg.npy hold the spectrum of a Poisson process at the measured
-  rate of each pixel, but IEBCS gives them to its pixels at random: the distribution of rates is
-  kept, the places are not. Rates go by its bins, 1 to 9 times a power of ten. A silent pixel fires
-  once in 1000 s. A noise event stores the present intensity.
-- Latency, time constant and jitter (lat, tau, jit) are IEBCS's own examples, and so is the dead
-  time (ref, microseconds) where none was measured (here: {circuit}). Its latency is no low-pass.
-- The log map is log(I + 1) with white at 1e4, evflow measures against v2e's, linear below 20 DN.
+  rate of each pixel, but IEBCS assigns them to its pixels at random: the distribution of rates is
+  kept, the locations are not. Rates are quantised to its bins, 1 to 9 times a power of ten; a
+  silent pixel fires once in 1000 s. A noise event stores the present intensity.
+- Latency, time constant and jitter (lat, tau, jit) are those of IEBCS's examples, and so is the
+  dead time (ref, microseconds) if none was measured (here: {circuit}). Its latency is no low-pass.
+- The log map is log(I + 1) with white at 1e4; evflow's thresholds refer to v2e's map, linear below
+  20 DN.
 '''
 
 

@@ -1,4 +1,4 @@
-"""OpenEB (metavision_core_ml.video_to_event): maps of thresholds fit; its noise does not work."""
+"""OpenEB (metavision_core_ml): threshold maps can be set; its noise does not work."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ What OpenEB cannot represent
 - The command line has one sigma for both polarities (measured ON {sigma_on:.4f}, OFF
   {sigma_off:.4f}); thresholds are clipped to .01 .. 1{clipped}.
 - Noise: one rate for ON and OFF together, in the dark; and its simulator makes shot noise only in
-  intervals in which some pixel has an event, 0 in a static scene. So the script leaves it off, and
-  add_noise.py adds the measured maps; the pixels' memories do not know of it.
-- Its low-pass has two poles where one was measured ({circuit}).
-- The log map is log(I / 255 + 1e-7), evflow measures against v2e's, linear below 20 DN: dark scenes
-  give other counts.
+  intervals in which some pixel has an event, none in a static scene. So the script turns it off and
+  add_noise.py adds the measured maps; noise events do not reset the pixels' memories.
+- Its low-pass has two poles; one pole was measured ({circuit}).
+- The log map is log(I / 255 + 1e-7); evflow's thresholds refer to v2e's map, linear below 20 DN:
+  dark scenes give other counts.
 '''
 
 

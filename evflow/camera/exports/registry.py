@@ -27,10 +27,10 @@ def export_camera(
     camera: Camera, to: str, std: Camera | None = None, sensor: SensorModel = SensorModel(),
     summary: Mapping[str, float] | None = None, optics: Optics = Optics(),
 ) -> tuple[Export, Maps]:
-    """A camera of maps (H, W) in the words of a simulator, and the maps as float32. std: of an
-    estimate's maps, which are more even than the camera; sensor: its circuit, as measured; summary:
-    what the estimate says of the whole camera (`read_summary`), without which maps tell it; optics:
-    what its frames show beside what its pixels see.
+    """A camera of maps (H, W) as the settings of a simulator, with the maps as float32. std: that
+    of an estimate's maps, which are smoother than the camera; sensor: its measured circuit;
+    summary: the estimate's summary (`read_summary`), by default computed from the maps; optics: how
+    the light on the pixels differs from what the frames show.
 
     Raises EV020 (no such simulator), EV002 (several cameras at once).
     """
@@ -47,20 +47,20 @@ def export_camera(
 
 
 def _light(optics: Optics) -> str:
-    """What is to be known of the camera's own frames, if anything is."""
+    """A line about an offset between this camera's frames and its pixels; "" if there is none."""
     if not (np.isfinite(optics.offset_dn_std) and optics.offset_dn):
         return ""
     seen = f"{abs(optics.offset_dn):.1f} DN {'more' if optics.offset_dn > 0 else 'less'} than"
-    return (f"- The light of this camera's own frames: its pixels see {seen} they\n"
-            "  show, and the thresholds are those of that light. Add it to its frames, as evflow\n"
-            "  simulate does; other videos need none.\n")
+    return (f"- Light: the pixels of this camera see {seen} its frames show, and\n"
+            "  the thresholds refer to that light. Add it to frames of this camera, as evflow\n"
+            "  simulate does; other videos do not need it.\n")
 
 
 def write_export(
     folder: str | os.PathLike, export: Export, maps: Maps, *, overwrite: bool = False
 ) -> Path:
     """maps.npz, README.txt, the scripts and arrays in a new folder; EV013, EV019."""
-    corner = {name: values[:1, :1] for name, values in maps.items()}  # files are named by no map
+    corner = {name: values[:1, :1] for name, values in maps.items()}  # names depend on no size
     kinds = [make(corner, Settings.of(corner)) for make in TARGETS.values()]
     names = {"maps.npz", "README.txt"}.union(*(k.scripts.keys() | k.arrays.keys() for k in kinds))
     with atomic_folder(folder, names=names, overwrite=overwrite) as new:

@@ -1,5 +1,5 @@
-"""v2e (SensorsINI): every map fits, by two attributes of its emulator; its command line takes
-scalars. Log map, thresholds and memory are those of evflow's `SensorModel(kind="v2e")`.
+"""v2e (SensorsINI): two attributes of its emulator take all maps; its command line takes scalars.
+Log map, thresholds and memory are those of evflow's `SensorModel(kind="v2e")`.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ while True:
     events = emulator.generate_events(grey, frame * step)
     if frame == 0:  # v2e draws its thresholds at the first frame: here they are replaced
         emulator.pos_thres, emulator.neg_thres = maps["theta_on"], maps["theta_off"]
-        # v2e's probability of a noise event is (R / 2) dt f(I) times these
-        # but for the leak of the median pixel, which v2e adds itself
+        # v2e's probability of a noise event is (R / 2) dt f(I) times these; the median pixel's
+        # leak is left out, as v2e adds leak itself
         emulator.pos_thres_pre_prob = (maps["eta_on"] - {leak_seen:.5f}).clip(min=0)
         emulator.neg_thres_pre_prob = maps["eta_off"]
     if events is not None:

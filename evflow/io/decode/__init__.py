@@ -1,1 +1,1 @@
-"""What several formats share: streams of words, lines of text, tables of HDF5."""
+"""What several formats share: streams of words, lines of text, HDF5 tables."""

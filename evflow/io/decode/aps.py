@@ -1,9 +1,9 @@
-"""Frames of a DAVIS out of the samples of its converter: each pixel is read after its reset, and
-again after its exposure; the difference is the light.
+"""DAVIS frames from the samples of its converter: each pixel is read after its reset and again
+after its exposure; the difference is the light.
 
-Columns are read one after another. Under a global shutter all resets come before all signals, and
-the exposure lies between them; under a rolling one each column has its own, and they are mixed. A
-frame begins where the resets go back to the first column.
+Columns are read one after another. With a global shutter all resets come before all signals, and
+the exposure lies between them; with a rolling shutter each column has its own exposure and the two
+are interleaved. A frame begins where the resets return to the first column.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from evflow.notes import Note
 RESET, SIGNAL = 0, 1  # kinds of samples
 WHITE = 1023  # of 10 bits
 NONE = -1  # a pixel that was not read
-SURE = 8  # steps of a coordinate by which it is told which is the slower, and which way it goes
+SURE = 8  # coordinate steps that show which coordinate is slower, and its direction
 
 
 class Aps:
-    """Samples, any number at a time, into frames (H, W) float32, on a scale on which the range of
-    the converter is 255. done(frame, its mid-exposure in us) is called for each that is complete.
+    """Builds frames (H, W) float32 from samples, in parts of any length; the converter's full range
+    becomes 255. done(frame, its mid-exposure in us) is called for each complete frame.
     """
 
     def __init__(self, size: Size, done: Callable[[np.ndarray, int], Any]) -> None:
@@ -36,12 +36,12 @@ class Aps:
 
     def _clear(self) -> None:
         self.reads: list[_Reads] = [_Reads(), _Reads()]
-        self.orphaned = False  # were there signals before the resets?
+        self.orphaned = False  # whether signals came before the resets
 
     def add(
         self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
     ) -> None:
-        """Samples (n,) in the order of the file: t int64 us, x and y from the top left."""
+        """Samples (n,) in file order: t int64 us, x and y from the top left."""
         inside = (x >= 0) & (x < self.size[0]) & (y >= 0) & (y < self.size[1])
         self.outside += int((~inside).sum())
         if not inside.all():
@@ -56,7 +56,7 @@ class Aps:
             self._put(kind[part], x[part], y[part], t[part], value[part])
 
     def _starts(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Which of these resets (n,) begin a frame: the column goes back."""
+        """Which of these resets (n,) begin a frame, because the column goes back."""
         if not len(x):
             return np.zeros(0, bool)
         if not self.slow:
@@ -73,7 +73,7 @@ class Aps:
     def _put(
         self, kind: np.ndarray, x: np.ndarray, y: np.ndarray, t: np.ndarray, value: np.ndarray
     ) -> None:
-        if not self.reads[RESET].count:  # signals come of resets that are lost: of another frame
+        if not self.reads[RESET].count:  # signals whose resets are missing: of an earlier frame
             first = int(np.argmax(kind == RESET)) if (kind == RESET).any() else len(kind)
             self.incomplete += first > 0 and not self.orphaned
             self.orphaned |= first > 0
@@ -83,7 +83,7 @@ class Aps:
         for which, reads in enumerate(self.reads):
             of = np.flatnonzero(kind == which)
             over |= len(of) > pixels - reads.count
-            of = of[: pixels - reads.count]  # what is more, is of a frame whose resets are lost
+            of = of[: pixels - reads.count]  # further ones are of a frame whose resets are missing
             if len(of):
                 reads.add(x[of], y[of], t[of], value[of])
         self.incomplete += over
@@ -91,7 +91,7 @@ class Aps:
             self.finish()
 
     def finish(self) -> None:
-        """What was read since the last frame is one, if it is complete: at the end of the file."""
+        """At the end of the file: emit the last frame if it is complete."""
         counts = [reads.count for reads in self.reads]
         complete = min(counts) >= self.size[0] * self.size[1]
         if complete:
@@ -109,11 +109,11 @@ class Aps:
     def notes(self) -> tuple[Note, ...]:
         said = []
         if self.dark:
-            said.append(Note("frames.dark", f"{self.dark:,} values of frames that lay below their "
+            said.append(Note("frames.dark", f"{self.dark:,} frame values below their "
                              "reset are 0"))
         if self.incomplete:
-            said.append(Note("frames.unused", f"{self.incomplete:,} frames of which samples are "
-                             "missing were left out"))
+            said.append(Note("frames.unused", f"{self.incomplete:,} frames with missing samples "
+                             "were left out"))
         if self.outside:
             said.append(Note("events.unread", f"{self.outside:,} APS samples outside the sensor "
                              "were left out"))
@@ -121,7 +121,7 @@ class Aps:
 
 
 class _Reads:
-    """Samples of one kind, and when they were read, us."""
+    """Samples of one kind, and their times in us."""
 
     def __init__(self) -> None:
         self.first = self.last = self.total = self.count = 0
@@ -143,7 +143,7 @@ class _Reads:
 
 
 def _middle(resets: _Reads, signals: _Reads) -> int:
-    """Mid-exposure: between the last reset and the first signal, or on the mean of all columns."""
+    """Mid-exposure: between the last reset and the first signal, or averaged over the columns."""
     if resets.last <= signals.first:
         return (resets.last + signals.first) // 2
     return round((resets.total / resets.count + signals.total / signals.count) / 2)

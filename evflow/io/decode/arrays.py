@@ -1,8 +1,8 @@
-"""Events as a table of an array or data set: four named columns, a structured array, or N x 4
-numbers without names, whose order is judged by their values.
+"""Events in an array or data set: four named columns, a structured array, or N x 4 numbers without
+names, whose order is inferred from the values.
 
-What holds for all: times that are whole are us, and seconds where they have fractions, unless a
-name or attribute tells their unit.
+In all of them, integer times are us and times with fractions are seconds, unless a name or
+attribute gives the unit.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from evflow.io.decode.units import since_1970, written_unit
 from evflow.io.hints import Hints
 from evflow.notes import Note
 
-JUDGED = 1 << 12  # rows by which the order of columns is told
+JUDGED = 1 << 12  # rows from which the order of columns is inferred
 
 Rows = Callable[[slice], tuple[Any, Any, Any, Any]]
 
 
 class Table(NamedTuple):
-    """n events; rows(slice) gives their x, y, t, p. name: for messages; unit: of t, "auto" where
-    nothing tells it; stored: rows of a block of HDF5; notes: what was assumed."""
+    """n events; rows(slice) gives their x, y, t, p. name: for messages; unit: of t, "auto" if
+    unknown; stored: rows per HDF5 chunk; notes: what was assumed."""
 
     name: str
     n: int
@@ -41,7 +41,7 @@ class Table(NamedTuple):
     def gather(
         self, path: Path, hints: Hints, size: Size | None, offset_us: int = 0
     ) -> Gathered:
-        """The events that `hints` ask for, and all notes; raises what `stream.gather` does."""
+        """The events that `hints` ask for, and all notes; raises as `stream.gather`."""
         chunks, native = in_unit(
             path, tables.blocks(self.n, self.rows, self.stored), self.unit, hints)
         found = gather(path, chunks, hints, size, native, offset_us)
@@ -49,14 +49,14 @@ class Table(NamedTuple):
 
 
 def named(name: str, columns_of: dict[str, Any], n: int, unit: str = "auto") -> Table:
-    """Of columns {"t": (n,), "x": ...}."""
+    """The table of columns {"t": (n,), "x": ...}."""
     t, x, y, p = (columns_of[c] for c in "txyp")
     stored = max(map(tables.stored_rows, columns_of.values())) if hasattr(t, "chunks") else 1
     return Table(name, n, lambda part: (x[part], y[part], t[part], p[part]), unit, stored)
 
 
 def structured(name: str, data: Any) -> Table | None:
-    """Of an array (N,) with fields; None where they do not name all four."""
+    """The table of an array (N,) with fields; None if they do not name all four."""
     fields = data.dtype.fields or {}
     simple = [f for f, (kind, *_) in fields.items() if kind.kind in "biuf" and kind.shape == ()]
     chosen = columns.by_name(simple)
@@ -71,7 +71,7 @@ def structured(name: str, data: Any) -> Table | None:
 
 
 def matrix(name: str, data: Any) -> Table | None:
-    """Of numbers (N, 4), or (4, N); None where they cannot be events."""
+    """The table of numbers (N, 4) or (4, N); None if they cannot be events."""
     shape = data.shape
     if len(shape) != 2 or data.dtype.kind not in "biuf" or 4 not in shape:
         return None
@@ -99,7 +99,7 @@ def _stored(data: Any) -> int:
 def in_unit(
     path: Path, chunks: Iterator[Chunk], unit: str, hints: Hints
 ) -> tuple[Iterator[Chunk], str]:
-    """The chunks and the unit of their times; EV003 where fractions come after whole times."""
+    """The chunks and the unit of their times; EV003 if fractions follow integer times."""
     if hints.time_unit != "auto":
         return chunks, hints.time_unit
     if unit != "auto":
@@ -115,17 +115,17 @@ def in_unit(
 
 
 def all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    """Chunks of times that were taken for microseconds; EV003 at the first fraction."""
+    """Chunks whose times were assumed to be microseconds; EV003 at the first fraction."""
     for chunk in chunks:
         if not columns.whole(chunk.t):
             raise EvflowDataError(
-                "EV003", f"{path}: the first times are whole, later ones are not.",
+                "EV003", f"{path}: the first times are integers, later ones are not.",
                 "Microseconds or seconds? Pass time_unit='us' or 's' (--time-unit).", where=path)
         yield chunk
 
 
 def in_us(chunks: Iterable[Chunk], unit: str) -> Iterator[Chunk]:
-    """Chunks whose times are in that unit, with fractions or without, in us."""
+    """Convert chunks whose times are in that unit, integer or not, to us."""
     told = Hints(time_unit=unit)
     for chunk in chunks:
         written.seen(chunk.t, unit)

@@ -1,4 +1,4 @@
-"""The sizes of iniVation's sensors, by the names that their files have."""
+"""Sizes of iniVation's sensors by the names used in their files."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ CHIPS: dict[str, Size] = {
 
 
 def chip_size(name: str | None) -> Size | None:
-    """(width, height) of the sensor of that name, "DAVIS240C" or "Davis346blue"; None where it is
-    not known."""
+    """(width, height) of the sensor of that name, e.g. "DAVIS240C" or "Davis346blue"; None if it is
+    unknown."""
     return next((size for chip, size in CHIPS.items() if name and chip in name.upper()), None)

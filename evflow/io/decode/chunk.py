@@ -1,4 +1,4 @@
-"""A piece of decoded events, as decoders yield it and everything after takes it."""
+"""A block of decoded events, produced by decoders and consumed by all later stages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 class Chunk(NamedTuple):
     """Consecutive events, (n,) each: x, y whole numbers, t in the format's own unit, p bool,
-    {0, 1} or {-1, 1}. Event i is written at `unit` number `where(i)` of the file."""
+    {0, 1} or {-1, 1}. Event i stands at `unit` number `where(i)` of the file."""
 
     x: np.ndarray
     y: np.ndarray
@@ -26,7 +26,7 @@ class Chunk(NamedTuple):
 
 
 def joined(chunks: Sequence[Chunk]) -> Chunk:
-    """Chunks, at least one, one behind the other."""
+    """Concatenate chunks (at least one)."""
     firsts = np.cumsum([0, *(len(chunk.t) for chunk in chunks)])[:-1]
     x, y, t, p = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in "xytp")
 

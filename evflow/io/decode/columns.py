@@ -1,9 +1,9 @@
 """Which column is t, x, y and p: by its name, else by its values.
 
-Names are those of headers, of fields of arrays, of members of archives and of data sets. Values
-are judged where there are no names: the polarity has two values, the time never falls, pixels are
-whole; x is taken to stand before y. Of two orders that fit, `t x y p` comes first, then `x y p t`,
-then the one whose times span most.
+Names may be those of headers, array fields, archive members or data sets. Without names the values
+decide: the polarity has two values, the time never decreases, pixels are integers; x is assumed to
+stand before y. If two orders fit, `t x y p` is preferred, then `x y p t`, then the one whose times
+span most.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from evflow.checks import Size
 from evflow.notes import Note
 
-NAMES = {  # of columns, without their units
+NAMES = {  # column names, without their units
     **dict.fromkeys(("t", "ts", "time", "times", "timestamp", "timestamps"), "t"),
     **dict.fromkeys(("x", "xs", "col", "column", "u"), "x"),
     **dict.fromkeys(("y", "ys", "row", "v"), "y"),
@@ -35,18 +35,18 @@ KNOWN = ("txyp", PROPHESEE)
 OTHERS = tuple(
     "".join(order) for order in itertools.permutations("txyp")
     if order.index("x") < order.index("y") and "".join(order) not in KNOWN)
-TELLING = 10  # rows: by so many, fractions in the coordinates are those of undistorted events
+TELLING = 10  # rows from which fractional coordinates count as undistorted events
 
 
 def meaning(name: str) -> str:
-    """"t", "x", "y" or "p" of a column of this name, "" where that is not known."""
+    """"t", "x", "y" or "p" for a column of this name, "" if unknown."""
     bare = SIDE.sub("", BRACKETS.sub(" ", name.lower()).strip().strip("\"'").strip())
     return NAMES.get(bare) or NAMES.get(UNIT.sub("", bare), "")
 
 
 def by_name(names: Iterable[str]) -> dict[str, str]:
-    """{"t": a name, "x": ...} of the names that mean all four; empty where one is missing, or two
-    mean the same: then the shorter ones, if they mean all four by themselves."""
+    """{"t": a name, "x": ...} from names that cover all four; empty if one is missing or two mean
+    the same, unless the shorter ones cover all four by themselves."""
     found: dict[str, list[str]] = {}
     for name in names:
         if column := meaning(name):
@@ -59,7 +59,7 @@ def by_name(names: Iterable[str]) -> dict[str, str]:
 
 
 def written_size(words: str) -> Size | None:
-    """(width, height) that a header or comment tells: "geometry:1280,720", "x@640,y@480"."""
+    """(width, height) from a header or comment: "geometry:1280,720", "x@640,y@480"."""
     if pair := PAIR.search(words):
         return int(pair[1]), int(pair[2])
     sides: dict[str, str] = {name.lower(): side for name, side in SIDES.findall(words)}
@@ -70,7 +70,7 @@ def written_size(words: str) -> Size | None:
 
 
 def stated_size(get: Callable[[str], Any]) -> Size | None:
-    """(width, height) by values that stand under usual names; get(name): one, or None."""
+    """(width, height) from values stored under usual names; get(name): a value, or None."""
     sides = [_numbers(get(name)) for name in ("width", "height")]
     if len(sides[0]) == len(sides[1]) == 1:
         return sides[0][0], sides[1][0]
@@ -85,14 +85,14 @@ def stated_size(get: Callable[[str], Any]) -> Size | None:
 
 
 def text(value: Any) -> str | None:
-    """A string that an attribute holds, None where it holds something else."""
+    """The string that an attribute holds; None if it holds something else."""
     if isinstance(value, bytes):
         return value.decode("latin-1")
     return str(value) if isinstance(value, str) else None
 
 
 def _numbers(value: Any) -> list[int]:
-    """Whole positive numbers of a value, none where it is something else."""
+    """Positive integers in a value; none if it is something else."""
     found = np.asarray(() if value is None else value).ravel()
     if found.dtype.kind not in "iuf" or not len(found) or len(found) > 4:
         return []
@@ -102,8 +102,8 @@ def _numbers(value: Any) -> list[int]:
 
 
 def order_of(rows: np.ndarray) -> str:
-    """"txyp", "xypt" or another order of the columns of rows (n, 4) of numbers without names;
-    "" where they cannot be events."""
+    """"txyp", "xypt" or another order for rows (n, 4) of unnamed numbers; "" if they cannot be
+    events."""
     with np.errstate(invalid="ignore", over="ignore"):
         fits = {order: _fits(rows, order) for order in (*KNOWN, *OTHERS)}
         sound = [order for order, rising in fits.items() if rising]
@@ -113,7 +113,7 @@ def order_of(rows: np.ndarray) -> str:
 
 
 def _fits(rows: np.ndarray, order: str) -> bool | None:
-    """Can these be events in that order? None: no; else whether their times never fall."""
+    """Whether the rows can be events in that order: None if not, else whether times never fall."""
     t, x, y, p = (rows[:, order.index(name)] for name in "txyp")
     signs = set(p.tolist())
     if not signs <= POLARITIES or min(x.min(), y.min()) < 0 or set(t.tolist()) <= {0.0, 1.0}:
@@ -133,6 +133,6 @@ def whole(values: np.ndarray) -> bool:
 
 
 def inferred(order: Collection[str]) -> Note:
-    """What is said of an order that nothing but the values tells."""
-    return Note("events.layout", f"nothing names the columns: they were taken as "
-                f"{', '.join(order)} after their values")
+    """The note on an order that was inferred from the values."""
+    return Note("events.layout", f"the columns have no names: inferred from their values to be "
+                f"{', '.join(order)}")

@@ -1,15 +1,16 @@
 """ECF, the lossless compression of Prophesee's HDF5 files (HDF5 filter 0x8ECF), undone with NumPy.
 
-A block, little-endian: u32, the number of events << 2 | form; u64, the time from which steps
-count; then runs of equal times: bytes step << 4 | count. A count of 15 is followed by the count as
-u16. A step of 15 is none: it adds its count, the nibbles of a long step one after another, the
-lowest first. Then, by the form:
-2: y, x and polarity as 24 bits, y << 12 | x << 1 | p, in threes of u32 for four events.
-1: runs of y, and x and polarity as 12 bits, x << 1 | p, in threes of u16 for four events.
-0: runs of y, x with those beside it, runs of polarity.
-Runs of y are u16, y << 5 | count, with 31 for a count that follows as u16. x << 5 | mask is an
+A block, little-endian: u32, the number of events << 2 | form; u64, the start time; then runs of
+equal
+times: bytes step << 4 | count. A count of 15 means that the count follows as u16. A step of 15 is
+no
+run: its count is the next nibble of a long step, lowest first. Then, depending on the form:
+2: y, x and polarity as 24 bits, y << 12 | x << 1 | p, four events in three u32.
+1: runs of y, and x and polarity as 12 bits, x << 1 | p, four events in three u16.
+0: runs of y, x with neighbours, runs of polarity.
+Runs of y are u16, y << 5 | count; a count of 31 means that it follows as u16. x << 5 | mask is an
 event at x, and one at x + 1, ..., x + 5 for each bit of the mask from its highest on. Runs of
-polarity are bytes, p << 7 | count, with 127 for a count that follows as u16.
+polarity are bytes, p << 7 | count; a count of 127 means that it follows as u16.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 
 FILTER = 0x8ECF
-MOST = 65535  # events of a block
+MOST = 65535  # events per block
 MASKS = np.concatenate([np.ones((32, 1), np.int64),
                         (np.arange(32)[:, None] >> np.arange(4, -1, -1)) & 1], 1)
-PLACES = np.nonzero(MASKS)[1]  # of the events of each mask, one after another
+PLACES = np.nonzero(MASKS)[1]  # positions of the events of each mask, concatenated
 PLACES_FROM = np.cumsum(MASKS.sum(1)) - MASKS.sum(1)
 
 
@@ -36,7 +37,7 @@ class Block(NamedTuple):
 
 
 def decode(data: bytes) -> Block:
-    """The events of a block; ValueError where it is damaged."""
+    """The events of a block; ValueError if it is damaged."""
     if len(data) < 4:
         raise ValueError(f"a block of {len(data)} bytes")
     info = int.from_bytes(data[:4], "little")
@@ -60,11 +61,11 @@ def decode(data: bytes) -> Block:
 
 
 def _times(data: bytes, n: int) -> tuple[np.ndarray, int]:
-    """Times (n,) int64, and the byte behind them."""
+    """Times (n,) int64, and the offset after them."""
     origin = int.from_bytes(data[4:12], "little", signed=True)
     units = _units(data, 12, "u1")
     codes, index, count = _codes(units[: 2 * n], 4, 0xF0)
-    done = count[codes >> 4 != 15][:-1].sum() >= n  # the last may be cut
+    done = count[codes >> 4 != 15][:-1].sum() >= n  # the last one may be incomplete
     if not done and len(units) > 2 * n:  # long steps: a run may take 19 bytes
         codes, index, count = _codes(units, 4, 0xF0)
     step = (codes >> 4).astype(np.int64)
@@ -81,7 +82,7 @@ def _times(data: bytes, n: int) -> tuple[np.ndarray, int]:
 
 
 def _runs(data: bytes, at: int, n: int, kind: str, bits: int) -> tuple[np.ndarray, int]:
-    """Values (n,) of runs whose count is the low bits of a unit, and the byte behind them."""
+    """Values (n,) of runs whose count is the low bits of a unit, and the offset after them."""
     size = np.dtype(kind).itemsize
     codes, index, count = _codes(_units(data, at, kind)[:n], bits)
     last = _last(count, n)
@@ -90,7 +91,7 @@ def _runs(data: bytes, at: int, n: int, kind: str, bits: int) -> tuple[np.ndarra
 
 
 def _units(data: bytes, at: int, kind: str) -> np.ndarray:
-    """What is left of the block from a byte on."""
+    """The rest of the block from an offset on."""
     count = (len(data) - at) // np.dtype(kind).itemsize
     if count <= 0:
         raise ValueError(f"it ends at byte {len(data):,}, before all of its events")
@@ -100,9 +101,9 @@ def _units(data: bytes, at: int, kind: str) -> np.ndarray:
 def _codes(
     units: np.ndarray, bits: int, never: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Codes among units of which some are counts (u16): the codes (m,), their indices and that
-    behind the last (m + 1,), and the counts (m,). never: codes with all of these bits set have no
-    count behind them."""
+    """Codes among units of which some are counts (u16): the codes (m,), their indices and the index
+    after the last (m + 1,), and the counts (m,). never: codes with all of these bits set have no
+    count after them."""
     full = (1 << bits) - 1
     extra = 2 // units.dtype.itemsize
     escapes = (units & full) == full
@@ -122,8 +123,8 @@ def _codes(
 
 
 def _apart(at: np.ndarray, least: int) -> np.ndarray:
-    """The ascending places (m,) that lie at least so far behind the last that is kept: a count may
-    look like another code."""
+    """The ascending positions (m,) that are at least `least` after the previous one kept, since a
+    count may look like another code."""
     near = np.flatnonzero(np.diff(at) < least) + 1
     if not len(near):
         return at
@@ -146,7 +147,7 @@ def _last(count: np.ndarray, n: int, exact: bool = True) -> int:
 
 
 def _masked(data: bytes, at: int, n: int) -> tuple[np.ndarray, int]:
-    """x (n,) of units with a mask of those beside them, and the byte behind them."""
+    """x (n,) of units with a mask of neighbours, and the offset after them."""
     units = _units(data, at, "<u2")[:n]
     mask = (units & 31).astype(np.int64)
     count = 1 + np.bitwise_count(mask).astype(np.int64)
@@ -164,7 +165,7 @@ def _threes(data: bytes, at: int, n: int, size: int) -> np.ndarray:
     if len(data) < at + 3 * size * groups:
         raise ValueError(f"it ends before its {n:,} events")
     unit = np.frombuffer(data, f"<u{size}", 3 * groups, at).astype(np.uint32).reshape(-1, 3)
-    part = 2 * size  # bits that one value leaves over in its unit
+    part = 2 * size  # bits that one value leaves unused in its unit
     a, b, c = unit.T
     values = (a >> part, a & (1 << part) - 1 | b >> 2 * part << part,
               b & (1 << 2 * part) - 1 | c >> 3 * part << 2 * part, c & (1 << 3 * part) - 1)

@@ -1,7 +1,7 @@
-"""The events of a file that are kept, chunk by chunk, and what is wrong with the others.
+"""Collects a file's events chunk by chunk, and reports what is wrong with the others.
 
-Faults are told with their place: times that go back, coordinates outside the sensor, values that
-no event has. Only what lies in the range that was asked for is judged.
+Faults are reported with their position: times that go back, coordinates outside the sensor, invalid
+values. Only the requested range is checked.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ class Gathering:
         self.path, self.hints, self.size = path, hints, size
         self.native, self.offset = native, offset
         self.columns = {name: Spool(KINDS[name]) for name in COLUMNS}
-        self.signs: set[int] = set()  # values of p kept, where they are not bool
+        self.signs: set[int] = set()  # values of p kept, unless they are bool
         self.seen = self.kept = self.first = self.last = self.outside = 0
         self.reach = (0, 0)
         self.notes: list[Note] = []
         self.start, self.stop = hints.span_us(0)
-        self.begun = hints.start_s is None  # has the range begun?
-        self.passed = False  # has its end been seen? a jump there may still be a wrong time
+        self.begun = hints.start_s is None  # whether the range has begun
+        self.passed = False  # whether its end was seen; a jump there may be a single wrong time
         self.damage: tuple[EvflowDataError, BaseException] | None = None
         self.joint = late.Joint() if hints.late == "join" else None
         self.lateness = late.Lateness() if hints.late == "sort" else None
 
     def add(self, chunk: Chunk) -> bool:
-        """Take what lies in the range; True where the rest of the file lies behind it."""
+        """Keep what lies in the range; True if the rest of the file lies after it."""
         t = self._times(chunk)
         x, y, p = (self._whole(chunk, name) for name in ("x", "y", "p"))
-        if p.dtype != bool:  # its convention is told when all of them are there
+        if p.dtype != bool:  # its convention is decided when all values are known
             if p.min() < -1 or p.max() > 1:
                 raise self._odd(chunk, "p", int(np.argmax((p < -1) | (p > 1))))
             p = p.astype(np.int8)
@@ -71,7 +71,7 @@ class Gathering:
         return t
 
     def _sorted(self, chunk: Chunk, t: np.ndarray) -> bool:
-        """Take what lies in the range as far as it is in order and on the sensor."""
+        """Keep what lies in the range, as far as it is ordered and on the sensor."""
         if self.passed and t[0] >= self.stop:
             return True
         begin = 0 if self.begun else late.begin(t, self.start)
@@ -95,11 +95,11 @@ class Gathering:
         return self.passed and self.kept > 0 and not (jump and len(t) - end <= late.FEW)
 
     def _jumps(self, t: np.ndarray, i: int) -> bool:
-        """Does time jump at event i so far that it may be wrong?"""
+        """Whether time jumps so far at event i that it may be wrong."""
         return int(t[i]) - (int(t[i - 1]) if i else self.last) > RESET_US
 
     def _unsorted(self, chunk: Chunk, t: np.ndarray) -> bool:
-        """Take what lies in the range in whatever order."""
+        """Keep what lies in the range, in any order."""
         assert self.lateness
         self.lateness.see(t)
         if (at := self._first_outside(chunk, 0, len(t))) < len(t):
@@ -112,7 +112,7 @@ class Gathering:
         return bool(t.min() >= self.stop + RESET_US) and self.kept > 0
 
     def _inside(self, chunk: Chunk, t: np.ndarray, size: Size) -> tuple[Chunk, np.ndarray]:
-        """The events on the sensor alone."""
+        """Only the events on the sensor."""
         inside = within(chunk.x, chunk.y, size)
         if inside.all():
             return chunk, t
@@ -121,7 +121,7 @@ class Gathering:
         return chunk.only(kept), t[kept]
 
     def _whole(self, chunk: Chunk, name: str) -> np.ndarray:
-        """A column without fractions as integers or bool."""
+        """A column of whole numbers as integers or bool."""
         column: np.ndarray = getattr(chunk, name)
         if column.dtype.kind in "biu":
             return column
@@ -130,26 +130,27 @@ class Gathering:
                 "EV003", f"{self.path}: {name} has dtype {column.dtype}.", "Expected numbers.",
                 where=self.path)
         with np.errstate(invalid="ignore"):
-            whole = column.astype(np.int64)  # of NaN and infinity some integer, not equal to them
+            whole = column.astype(np.int64)  # NaN and infinity become integers, which differ
         same = whole == column
         if not same.all():
             raise self._odd(chunk, name, int(np.argmin(same)))
         return whole
 
     def _odd(self, chunk: Chunk, name: str, i: int) -> EvflowDataError:
-        """The error for a value that no event has."""
+        """The error for an invalid value."""
         value = getattr(chunk, name)[i]
         code = "EV007" if not np.isfinite(value) else "EV006" if name == "p" else "EV003"
-        fix = {"t": "Times are seconds or whole numbers: export it again.",
-               "p": "Polarity is 0 or 1, or -1 or 1; a -1 stored as unsigned reads 255."}
+        fix = {"t": "Times must be seconds or integers: export the file again.",
+               "p": "Polarity must be 0 or 1, or -1 or 1; a -1 stored as unsigned reads as 255."}
         place = self._place(chunk, i) + self.so_far(chunk, i)
         return EvflowDataError(
             code, f"{self.path}: {name} is {value} at {place}",
-            fix.get(name, "Coordinates are raw integer pixels: were they undistorted? Use the raw "
+            fix.get(name, "Were they undistorted? Use the raw integer pixel "
                     "ones."), where=self.path)
 
     def _first_outside(self, chunk: Chunk, begin: int, end: int) -> int:
-        """Index behind `begin` of the first event outside the sensor; what is left for none."""
+        """Index after `begin` of the first event outside the sensor; the length if there is
+        none."""
         first = len(chunk.t) - begin
         if begin >= end:
             return first
@@ -178,7 +179,7 @@ class Gathering:
             where=self.path)
 
     def _keep(self, chunk: Chunk, t: np.ndarray, a: int, b: int) -> None:
-        """Keep the events from a to b; those before a are passed over."""
+        """Keep the events from a to b and skip those before a."""
         self.seen += b
         if self.size is None and b:
             x, y = self.reach
@@ -192,14 +193,14 @@ class Gathering:
                 self.columns[name].append(column[a:b])
 
     def damaged(self, at: int, seen: str, unit: str, e: BaseException) -> None:
-        """Where the bytes stop making sense: it is told by `check_damage`."""
+        """Record where the bytes stop making sense, for `check_damage`."""
         error = EvflowDataError(
-            "EV009", f"{self.path} is cut off or damaged at {place(self.path, unit, at)}: {seen}",
+            "EV009", f"{self.path} is truncated or damaged at {place(self.path, unit, at)}: {seen}",
             where=self.path)
         self.damage = error, e
 
     def check_damage(self) -> None:
-        """EV009 where there is damage, unless it lies behind the range, or is forgiven."""
+        """Raise EV009 for damage, unless it lies after the range or is forgiven."""
         if self.damage is None or (self.passed and self.kept):
             return
         error, e = self.damage
@@ -210,7 +211,7 @@ class Gathering:
         self.notes.append(self.hints.forgive(error, self.kept > 0))
 
     def so_far(self, chunk: Chunk | None = None, begun: int = 0) -> str:
-        """What was sound; of a chunk that was not kept, its first `begun` events too."""
+        """How much is sound, including the first `begun` events of a chunk that was not kept."""
         first, last = self.first, self.last
         if chunk is not None and begun:
             ends = self.hints.microseconds(chunk.t[[0, begun - 1]], self.native, self.offset)
@@ -219,18 +220,18 @@ class Gathering:
         return f"; {self.seen + begun:,} events up to {span:.3f} s before that are sound."
 
     def sound_part(self) -> str:
-        until = (self.last - self.first) // 1000 / 1000  # rounded down: up to it all is sound
+        until = (self.last - self.first) // 1000 / 1000  # rounded down: all before it is sound
         return (f", or read the sound part: stop_s={until:.3f} (--stop), or --partial."
                 if until > 0 else ".")
 
     def result(self, size: Size | None) -> tuple[Events, tuple[int, int], tuple[Note, ...]]:
-        """The events, the range in us that was asked for, and what obeying cost."""
+        """The events, the requested range in us, and notes on what was left out."""
         if self.seen and not self.kept:
             raise self.hints.empty(self.last - self.first)
         if self.outside and self.size:
             self.notes.append(dropped(self.outside, self.seen + self.outside, self.size))
         size = self.hints.sensor(size, reach=self.reach if self.seen else None)
-        self.hints.on(np.array(sorted(self.signs), np.int8))  # is it one convention?
+        self.hints.on(np.array(sorted(self.signs), np.int8))  # checks that one convention holds
         x, y, t, on = self._columns()
         if self.hints.polarity == "invert":
             np.logical_not(on, out=on)
@@ -247,21 +248,21 @@ class Gathering:
 
 
 def _outside(x: int, y: int, size: Size) -> str:
-    """What it may mean that an event at (x, y) lies outside a sensor."""
+    """Why an event at (x, y) might lie outside the sensor."""
     width, height = size
     if min(x, y) < 0:
-        return ("No pixel is below 0: were they undistorted or moved? Use the raw ones. In AEDAT 2 "
-                "it is a wrong size: pass size=(width, height), --size WxH")
+        return ("No pixel is below 0: were they undistorted or shifted? Use raw ones. In AEDAT 2 "
+                "the size is wrong: pass size=(width, height), --size WxH")
     if x <= width and y <= height:
-        return ("Do coordinates begin at 1, as in MATLAB? Subtract 1; if the sensor is larger, "
+        return ("Do coordinates start at 1, as in MATLAB? Subtract 1; if the sensor is larger, "
                 "pass size=(width, height), --size WxH")
     if x < height and y < width:
         return f"Height before width? Pass size=({height}, {width}), --size {height}x{width}"
-    return ("Wrong size? Pass size=(width, height), --size WxH; if it is right the file is "
+    return ("Wrong size? Pass size=(width, height), --size WxH; if the size is right, the file is "
             "damaged: copy it again")
 
 
 def place(path: Path, unit: str, number: int) -> str:
-    """Where something stands in a file: "byte 12 of 3,456"."""
+    """A position in a file: "byte 12 of 3,456"."""
     total = f" of {os.path.getsize(path):,}" if unit == "byte" else ""
     return f"{unit} {number:,}{total}"

@@ -1,4 +1,4 @@
-"""What every HDF5 format needs: h5py on demand, hostile files kept out, full disks survived."""
+"""What every HDF5 format needs: h5py on demand, protection from hostile files and full disks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from evflow.io.writer import EventWriter
 from evflow.process.signals import uninterrupted
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
-MAX_RATIO = 1040  # DEFLATE cannot expand by more than 1032; a data set that claims more lies
+MAX_RATIO = 1040  # DEFLATE cannot expand by more than 1032
 DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, IndexError,
           MemoryError, OverflowError)  # what h5py raises on a damaged file
 
@@ -37,8 +37,8 @@ def load_h5py() -> Any:
 
 
 def plausible(path: Path, data: Any) -> Any:
-    """The data set, unless it claims more than the file can hold, or blocks of it are missing or
-    expand beyond measure; EV009."""
+    """The data set; EV009 if it claims more than the file can hold, or if blocks of it are missing
+    or expand too far."""
     from evflow.io.decode.hdf5_blocks import check_blocks
     check_expansion(data.nbytes, os.path.getsize(path), f"{path}: {data.name} {data.shape}")
     if data.nbytes > MAX_RATIO * os.path.getsize(path):
@@ -50,14 +50,14 @@ def plausible(path: Path, data: Any) -> Any:
 
 
 def filters_of(data: Any) -> list[int]:
-    """The numbers of the filters that its blocks went through, the first one first."""
+    """The numbers of the filters applied to its blocks, in order."""
     plist = data.id.get_create_plist()
     return [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
 
 
 def need_filters(path: Path, data: Any, own: int | None = None) -> None:
-    """Load hdf5plugin where a compression filter is not built in; EV010. own: one that the caller
-    undoes, which must be the only one."""
+    """Load hdf5plugin if a compression filter is not built in; EV010. own: a filter that the caller
+    undoes itself, which must be the only one."""
     h5py = load_h5py()
     filters = filters_of(data)
     if all(h5py.h5z.filter_avail(number) for number in filters) or filters == [own]:
@@ -72,16 +72,16 @@ def need_filters(path: Path, data: Any, own: int | None = None) -> None:
         raise EvflowDataError(
             "EV010", f"{path}: {data.name} is compressed by HDF5 filter {missing[0]}, which HDF5 "
             "and hdf5plugin lack.", "Name its plugin's folder in HDF5_PLUGIN_PATH, or repack "
-            "the file where it was written: h5repack -f GZIP=1 in.h5 out.h5.", where=path)
+            "the file on the machine that wrote it: h5repack -f GZIP=1 in.h5 out.h5.", where=path)
 
 
 class Disk(io.FileIO):
-    """The file under HDF5, which cannot live with a failed call: it reports some in destructors,
-    where they are lost, and crashes at exit. So no call raises; the first error, KeyboardInterrupt
-    included, is kept here, what follows it is not written, and `check` raises it.
+    """The file under HDF5, which cannot handle a failed call: it reports some errors in
+    destructors, where they are lost, and crashes at exit. So no call raises; the first error,
+    including KeyboardInterrupt, is kept here, later writes are skipped, and `check` raises it.
 
-    written: byte -> (size, CRC-32) of what was written there last. sought: the byte of a reading
-    or writing that is still to come; where another comes first, that one was lost.
+    written: offset -> (size, CRC-32) of the last write there. sought: offset of the read or write
+    that must come next; if another comes first, that one was lost.
     """
 
     def __init__(self, path: Path) -> None:
@@ -136,7 +136,7 @@ class Disk(io.FileIO):
 
 
 class Hdf5Writer(EventWriter):
-    """A writer of data sets that grow, compressed by gzip, which every HDF5 can read."""
+    """A writer of growing data sets, compressed by gzip, which every HDF5 can read."""
 
     CHUNK = 1 << 16  # events per HDF5 chunk: 256 KiB of t
 
@@ -145,13 +145,13 @@ class Hdf5Writer(EventWriter):
 
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
         h5py = load_h5py()
-        self._shapes: dict[str, tuple[int, ...]] = {}  # of all that was handed over
+        self._shapes: dict[str, tuple[int, ...]] = {}  # of everything appended
         self._columns: dict[str, Column] = {}
         self._disk = Disk(temporary)
         self._file: Any = None
         stack.callback(self._close)
-        # HDF5 1.10 checksums its metadata: of 1,500 damaged files none passed for sound,
-        # where 24 did in the older layout.
+        # HDF5 1.10 checksums its metadata: none of 1,500 damaged files was accepted, against
+        # 24 in the older layout.
         self._file = h5py.File(self._disk, "w", libver=("v110", "v110"))
 
     def _close(self) -> None:
@@ -188,12 +188,12 @@ class Hdf5Writer(EventWriter):
         self._disk.check()
 
     def _settle(self, name: str) -> None:
-        """Write all of a column that was handed over, so that it can be read."""
+        """Write all of a column that was appended, so that it can be read."""
         self._columns[name].settle()
         self._disk.check()
 
     def _store(self, name: str, values: Any, **options: Any) -> Any:
-        """A data set of its final shape."""
+        """Create a data set of its final shape."""
         data = self._file.create_dataset(name, data=values, **options)
         self._shapes[name] = data.shape
         self._disk.check()
@@ -203,12 +203,12 @@ class Hdf5Writer(EventWriter):
 def need_whole(
     path: Path, shapes: Mapping[str, tuple[int, ...]], written: Mapping[int, tuple[int, int]]
 ) -> None:
-    """EV019 unless the file opens, has the data sets of `shapes`, all their chunks are allocated,
-    and each is on the disk as HDF5 wrote it: bytes -> (size, CRC-32).
+    """Raise EV019 unless the file opens, has the data sets of `shapes` with all chunks allocated,
+    and each chunk is on disk as HDF5 wrote it: offset -> (size, CRC-32).
 
-    Against a write, chunk or end that was lost on the way, in what a signal or an error broke off.
-    HDF5 checks its metadata by itself; chunks stay compressed, so that this takes some 3 % of the
-    time of writing. What HDF5 was told and what it compressed are not compared.
+    Detects a write, chunk or end of file that was lost, also when a signal or an error interrupted
+    it. HDF5 checks its metadata itself; chunks stay compressed, so this takes about 3 % of the
+    writing time. The data before compression are not compared.
     """
     try:
         with load_h5py().File(path) as f, open(path, "rb") as raw:
@@ -228,12 +228,12 @@ def need_whole(
 
 
 def _pieces(data: Any) -> list[tuple[int, int]]:
-    """(first byte, size) of all that a data set has in the file."""
+    """(offset, size) of all parts of a data set in the file."""
     if data.chunks is None:
         return [(data.id.get_offset(), data.id.get_storage_size())]
     pieces: list[tuple[int, int]] = []
     if hasattr(data.id, "chunk_iter"):
-        with uninterrupted():  # it, too, calls Python from C
+        with uninterrupted():  # this also calls Python from C
             data.id.chunk_iter(lambda chunk: pieces.append((chunk.byte_offset, chunk.size)))
     else:  # HDF5 before 1.12.3
         chunks = map(data.id.get_chunk_info, range(data.id.get_num_chunks()))

@@ -1,6 +1,6 @@
-"""The blocks of an HDF5 data set, looked at before HDF5 decodes them: one that was never written
-reads as zeros, and a compressed one is unpacked whole, whatever it expands to, before HDF5 asks
-whether that is its size. 20 kB of zeros packed three times over fill a gigabyte.
+"""Checks the blocks of an HDF5 data set before HDF5 decodes them: a block that was never written
+reads as zeros, and HDF5 decompresses a block completely, however large, before it compares the
+result with the expected size. 20 kB of zeros compressed three times fill a gigabyte.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from evflow.errors import EvflowDataError
 from evflow.files.limits import FREE, RATIO, check_expansion
 
 CHECKSUM, DEFLATE, BZIP2, BLOSC, LZ4, BITSHUFFLE, ZSTD = 3, 1, 307, 32001, 32004, 32008, 32015
-UNPACKING_BITSHUFFLE = (2, 3)  # its fifth option, where it packs as well
-HEAD = 18  # bytes of a block, in which the filters of TOLD say what it expands to
+UNPACKING_BITSHUFFLE = (2, 3)  # values of its fifth option with which it also compresses
+HEAD = 18  # bytes of a block in which the filters of TOLD state its decompressed size
 
 
 def _big(head: bytes) -> int:
@@ -32,7 +32,7 @@ def _blosc(head: bytes) -> int:
 
 
 def _zstd(head: bytes) -> int:
-    """Of the frame's header (RFC 8878, 3.1.1.1); 0 where it is not told, which the filter
+    """Size from the frame's header (RFC 8878, 3.1.1.1); 0 if it is not stated, which the filter
     refuses."""
     flag, single = head[4] >> 6, head[4] >> 5 & 1
     size = 1 << flag if flag or single else 0
@@ -42,12 +42,12 @@ def _zstd(head: bytes) -> int:
 
 TOLD: dict[int, Callable[[bytes], int]] = {
     BLOSC: _blosc, LZ4: _big, BITSHUFFLE: _big, ZSTD: _zstd}
-UNPACKED: dict[int, tuple[int, Callable[[], Any]]] = {  # the most that a byte expands to
+UNPACKED: dict[int, tuple[int, Callable[[], Any]]] = {  # maximum expansion per byte
     DEFLATE: (1032, zlib.decompressobj), BZIP2: (1 << 16, bz2.BZ2Decompressor)}
 
 
 def check_blocks(path: Path, data: Any) -> None:
-    """EV009 where blocks of a data set are missing, or expand beyond their size and measure."""
+    """Raise EV009 if blocks of a data set are missing, or expand beyond their size and limits."""
     if not data.size:
         return
     made, stored = data.id.get_create_plist(), os.path.getsize(path)
@@ -67,13 +67,13 @@ def check_blocks(path: Path, data: Any) -> None:
             size = 0 if info.filter_mask & skipped else _expanded(
                 data, info, number, block, FREE + RATIO * stored)
             if size > block:
-                raise _damaged(path, data, f"has a block of {info.size:,} bytes that stands for "
+                raise _damaged(path, data, f"has a block of {info.size:,} bytes that expands to "
                                f"{size:,} or more, not {block:,}")
 
 
 def _packing(path: Path, data: Any, made: Any) -> list[tuple[int, int]]:
-    """The filter that packs, if one does that is known here, with the bit of blocks that skip it;
-    EV009 where others come behind it, which would unpack its blocks first."""
+    """The compression filter, if it is a known one, with the flag of blocks that skip it; EV009 if
+    other filters come after it, whose blocks would be decompressed first."""
     filters = [made.get_filter(i) for i in range(made.get_nfilters())]
     known = [(number, 1 << i) for i, (number, _, options, _) in enumerate(filters)
              if number in {*TOLD, *UNPACKED} and (
@@ -85,7 +85,7 @@ def _packing(path: Path, data: Any, made: Any) -> list[tuple[int, int]]:
 
 
 def _expanded(data: Any, info: Any, number: int, block: int, most: int) -> int:
-    """Bytes that a stored block expands to, as far as that has to be known."""
+    """Decompressed bytes of a stored block, as far as they need to be known."""
     if number not in TOLD and UNPACKED[number][0] * info.size <= most:
         return 0
     _, raw = data.id.read_direct_chunk(info.chunk_offset)
@@ -93,11 +93,11 @@ def _expanded(data: Any, info: Any, number: int, block: int, most: int) -> int:
         return TOLD[number](raw[:HEAD].ljust(HEAD, b"\0"))
     try:
         return len(UNPACKED[number][1]().decompress(raw, max_length=block + 1))
-    except (zlib.error, OSError, EOFError, ValueError):  # as HDF5 will say
+    except (zlib.error, OSError, EOFError, ValueError):  # HDF5 will report it
         return 0
 
 
 def _damaged(path: Path, data: Any, what: str) -> EvflowDataError:
     return EvflowDataError("EV009", f"{path}: {data.name} {what}.",
-                           "Its writer was stopped, or it was made to do harm: write it again.",
+                           "Its writer was interrupted, or it is hostile: write it again.",
                            where=path)

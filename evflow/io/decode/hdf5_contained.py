@@ -1,8 +1,8 @@
-"""HDF5 read as far as one file goes. Links, virtual data sets and external storage lead into other
-files: a missing one reads as zeros, a pipe has no end, and the file itself ends the process.
+"""HDF5 restricted to a single file. Links, virtual data sets and external storage lead to other
+files: a missing one reads as zeros, a pipe never ends, and the file itself crashes the process.
 
-`File` is h5py's, but every part of a path is looked at before HDF5 follows it, and the heap that
-holds text of variable length before HDF5 walks it (`hdf5_heaps`).
+`File` is h5py's, but every part of a path is checked before HDF5 follows it, and so is the heap
+with variable-length text before HDF5 walks it (`hdf5_heaps`).
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ import h5py
 from evflow.errors import EvflowDataError
 from evflow.io.decode.hdf5_heaps import Heaps
 
-MOST_LINKS = 16  # soft links followed for one name, those within links included, as HDF5 does
-FIX = ("Only what is in the file itself is read. Copy it in: with h5py, values = f[name][:]; "
+MOST_LINKS = 16  # soft links followed for one name, including nested ones, as in HDF5
+FIX = ("Only data in the file itself are read. Copy them in: with h5py, values = f[name][:]; "
        "del f[name]; f[name] = values.")
 
 
 class _Contained(h5py.Group):  # type: ignore[misc]
-    """A group whose members, and theirs, lie in its own file; EV009 where one is asked for that
-    does not, KeyError where there is none, ValueError where a link leads nowhere, or to what is
-    damaged."""
+    """A group whose members lie in its own file; EV009 when a member does not, KeyError if there is
+    none, ValueError if a link leads nowhere or to damaged data."""
 
     def __getitem__(self, name: Any) -> Any:
         found = _opened(self.id, self._e(name))
@@ -58,8 +57,8 @@ class Group(_Contained):
 
 
 class Dataset(h5py.Dataset):  # type: ignore[misc]
-    """A data set of a `File`; ValueError where values are asked for that lie in its heap, as those
-    of variable length do: no format has such."""
+    """A data set of a `File`; ValueError on reading values that lie in its heap, as variable-length
+    ones do, which no format has."""
 
     def __getitem__(self, args: Any, new_dtype: Any = None) -> Any:
         if self.dtype.hasobject:
@@ -72,8 +71,8 @@ class Dataset(h5py.Dataset):  # type: ignore[misc]
 
 
 class Attributes(h5py.AttributeManager):  # type: ignore[misc]
-    """The attributes of a group or data set; ValueError where one lies in a heap of which HDF5
-    would not find the end."""
+    """The attributes of a group or data set; ValueError if one lies in a heap in which HDF5 would
+    loop forever."""
 
     def __getitem__(self, name: Any) -> Any:
         kind = h5py.h5a.open(self._id, self._e(name)).get_type()
@@ -90,7 +89,7 @@ class File(_Contained, h5py.File):  # type: ignore[misc]
 
 
 def _of_heap(at: Any, name: Any) -> Any:
-    """An attribute of the object `at`, read with an eye on every heap; ValueError."""
+    """An attribute of the object `at`, read with every heap checked; ValueError."""
     whole = h5py.h5i.get_file_id(at)
     if whole.get_create_plist().get_sizes()[1] != 8:
         raise ValueError(f"attribute {name} has lengths of other than 8 bytes")
@@ -101,7 +100,7 @@ def _of_heap(at: Any, name: Any) -> Any:
 
 
 def _opened(at: Any, path: bytes, links: Iterator[int] | None = None) -> Any:
-    """The object at a path from the group `at` on. links: those that may still be followed."""
+    """The object at a path relative to the group `at`. links: how many may still be followed."""
     links = iter(range(MOST_LINKS)) if links is None else links
     if path.startswith(b"/"):
         at = h5py.h5o.open(at, b"/")
@@ -122,8 +121,8 @@ def _opened(at: Any, path: bytes, links: Iterator[int] | None = None) -> Any:
 
 
 def _linked(at: Any, part: bytes) -> Any:
-    """The object that the group `at` holds as `part`; ValueError where it cannot be opened, which
-    h5py tells by the same KeyError as that it is not there."""
+    """The member `part` of the group `at`; ValueError if it cannot be opened, for which h5py raises
+    the same KeyError as for a missing one."""
     try:
         return h5py.h5o.open(at, part)
     except KeyError as e:
@@ -131,8 +130,8 @@ def _linked(at: Any, part: bytes) -> Any:
 
 
 def _followed(at: Any, part: bytes, links: Iterator[int]) -> Any:
-    """What the soft link `part` stands for; ValueError where it leads nowhere, which is damage: a
-    part that may be absent would be one that was lost unseen."""
+    """The target of the soft link `part`; ValueError if it leads nowhere: for an optional member
+    that would otherwise be a silent loss."""
     try:
         if next(links, None) is not None:
             return _opened(at, at.links.get_val(part), links)
@@ -142,13 +141,13 @@ def _followed(at: Any, part: bytes, links: Iterator[int]) -> Any:
 
 
 def _check_own(found: Any) -> None:
-    """EV009 where the values of a data set are stored in other files."""
+    """Raise EV009 if the values of a data set are stored in other files."""
     if isinstance(found, h5py.h5d.DatasetID):
         made = found.get_create_plist()  # asking for its shape could open them
         if made.get_external_count():
-            raise _elsewhere(found, b"", f"lies outside of it, in {made.get_external(0)[0]!r}")
+            raise _elsewhere(found, b"", f"lies in another file, {made.get_external(0)[0]!r}")
         if made.get_layout() == h5py.h5d.VIRTUAL:
-            raise _elsewhere(found, b"", "is a virtual data set, made of those of other files")
+            raise _elsewhere(found, b"", "is a virtual data set made of other files")
 
 
 def _elsewhere(at: Any, part: bytes, why: str) -> EvflowDataError:

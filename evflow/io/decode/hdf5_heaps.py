@@ -1,9 +1,9 @@
-"""HDF5's global heap, where text of variable length lies, walked before HDF5 walks it.
+"""HDF5's global heap, where variable-length text is stored, checked before HDF5 walks it.
 
 A collection is "GCOL", version u8, 3 bytes, its size u64; then objects {index u16, references u16,
-4 bytes, size u64, data up to a multiple of 8}; index 0 is free space, whose size holds its head
-(HDF5 file format, III.E). HDF5 goes on by the size of each: at free space of size 0 it stays
-forever, and one near 2^64 leads it back.
+4 bytes, size u64, data up to a multiple of 8}; index 0 is free space, whose size includes its
+header (HDF5 file format, III.E). HDF5 advances by each size: it loops forever at free space of size
+0, and goes backwards at one near 2^64.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 SIGNATURE = b"GCOL"
-HEAD = 16  # bytes of the head of a collection, and of an object
-MOST = 1 << 16  # objects of a collection: their index has 16 bits
+HEAD = 16  # bytes of the header of a collection, and of an object
+MOST = 1 << 16  # objects per collection: their index has 16 bits
 
 
 class Heaps(io.FileIO):
-    """A file under HDF5, in which the signature of a collection that does not come to its end is
-    blank, so that HDF5 refuses it."""
+    """A file under HDF5 in which the signature of a collection that never ends is blanked, so that
+    HDF5 refuses it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "r")
@@ -29,7 +29,7 @@ class Heaps(io.FileIO):
     def readinto(self, buffer: Any) -> int:
         view, begin = memoryview(buffer).cast("B"), self.tell()
         count = super().readinto(view)
-        edge = min(begin, len(SIGNATURE) - 1)  # a signature may begin before what is read
+        edge = min(begin, len(SIGNATURE) - 1)  # a signature may begin before the part being read
         seen = os.pread(self.fileno(), count + edge + len(SIGNATURE) - 1, begin - edge)
         at = seen.find(SIGNATURE)
         while at >= 0:
@@ -42,7 +42,7 @@ class Heaps(io.FileIO):
 
 
 def ends(file: int, begin: int) -> bool:
-    """Whether the objects of the collection at a byte of a file, open for reading, lead to its
+    """Whether walking the objects of the collection at an offset of an open file reaches its
     end."""
     head = os.pread(file, HEAD, begin)
     if len(head) < HEAD:

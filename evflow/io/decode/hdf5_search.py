@@ -1,7 +1,7 @@
-"""Where events lie in an HDF5 file of any layout, and the size that stands beside them.
+"""Finds events, and the sensor's size beside them, in an HDF5 file of any layout.
 
-Events are four data sets of one length in one group, by their names (x y t p, xs ys ts ps, x y
-timestamp polarity), a compound data set, or N x 4 numbers.
+Events are four data sets of equal length in one group, with names such as x y t p, xs ys ts ps or
+x y timestamp polarity; a compound data set; or N x 4 numbers.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from evflow.io.decode import arrays, columns, tables
 from evflow.io.decode.hdf5 import DAMAGE
 from evflow.io.decode.units import written_unit
 
-MOST = 2000  # groups and data sets looked at
+MOST = 2000  # groups and data sets examined
 SCALES_MS = {1e3: "s", 1.0: "ms", 1e-3: "us", 1e-6: "ns"}  # eventcv's attribute, in ms
 
 
 def walk(f: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Every group, the outer first, and its data sets by name; what cannot be opened is passed
-    over."""
+    """Every group, outer ones first, and its data sets by name; what cannot be opened is
+    skipped."""
     queue, seen = collections.deque([f]), 0
     while queue:
         group = queue.popleft()
@@ -46,13 +46,13 @@ def walk(f: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
 
 
 def has_columns(f: Any) -> bool:
-    """Does any group name four columns?"""
+    """Whether any group names four columns."""
     return any(columns.by_name(found) for _, found in walk(f))
 
 
 def tables_of(path: Path, f: Any) -> list[tuple[Any, arrays.Table]]:
-    """(the group, the events) of all that may be events: named columns before compounds, those
-    before matrices, the outer before the inner, a left camera before others."""
+    """(group, events) for everything that may be events: named columns before compounds before
+    matrices, outer before inner groups, a left camera before others."""
     ranked: list[tuple[tuple[int, int, bool, str], Any, arrays.Table]] = []
     for group, found in walk(f):
         for kind, table in _in_group(path, f, group, found):
@@ -85,7 +85,7 @@ def _in_group(
 
 
 def _unit(f: Any, name: str, data: Any) -> str:
-    """Of times, by their attributes, else by their name, else by the file."""
+    """The unit of times from their attributes, else their name, else the file."""
     for key in ("unit", "units"):
         if isinstance(told := columns.text(data.attrs.get(key)), str) and told:
             return written_unit(f"[{told}]")
@@ -94,7 +94,7 @@ def _unit(f: Any, name: str, data: Any) -> str:
 
 
 def told_unit(f: Any) -> str:
-    """The unit of times that the file states for all of them, "auto" where it does not."""
+    """The unit that the file states for all times; "auto" if it does not."""
     stated = np.asarray(f.attrs.get("timestamp_scale_ms", 0)).ravel()
     if len(stated) != 1 or stated.dtype.kind not in "iuf":
         return "auto"
@@ -102,7 +102,7 @@ def told_unit(f: Any) -> str:
 
 
 def told_size(f: Any, group: Any) -> Size | None:
-    """(width, height) by the attributes or data sets of the group, its `calib`, or the root."""
+    """(width, height) from attributes or data sets of the group, its `calib`, or the root."""
     calib = group.get("calib")
     places = [group, *([calib] if hasattr(calib, "keys") else []), f]
     for place in places:
@@ -113,7 +113,7 @@ def told_size(f: Any, group: Any) -> Size | None:
 
 
 def _small(group: Any, name: str) -> Any:
-    """The value of a small data set, None where there is none."""
+    """The value of a small data set, None if there is none."""
     if name not in group:
         return None
     data = group[name]

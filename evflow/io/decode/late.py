@@ -1,9 +1,9 @@
-"""Events whose time goes back: what it probably means, and what `--late` makes of them.
+"""Events whose time goes back: the probable cause, and what `--late` does about them.
 
-Late events come behind others of a later time, as packets do that were overtaken. Where a few
-events are ahead of all that follow, these are wrong. Where time goes back for good, another
-clock begins. `dropped` leaves out as few events as make the others ordered, which tells the three
-apart as far as it looks ahead; `order` sorts; a `Joint` puts one clock behind the other.
+Late events follow events of a later time, as when packets were overtaken. If a few events are ahead
+of everything after them, those few are wrong. If time goes back for good, another clock begins.
+`dropped` leaves out the fewest events such that the rest are ordered, which separates the three
+cases as far as it looks ahead; `order` sorts; a `Joint` appends one clock to the other.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from evflow.checks import RESET_US
 from evflow.io.decode.chunk import Chunk, joined
 from evflow.notes import Note
 
-LOOK = 1 << 16  # events looked at behind the first that goes back
-FEW = 16  # so many events ahead of what follows may be wrong
+LOOK = 1 << 16  # events examined after the first that goes back
+FEW = 16  # at most this many events ahead of all later ones count as wrong
 
 
 def back_at(t: np.ndarray, last: float | None = None) -> int:
-    """Index of the first of t (N,) before the one in front of it, of `last` to begin with; N."""
+    """Index of the first of t (N,) that is smaller than its predecessor (initially `last`); else
+    N."""
     if last is not None and len(t) and t[0] < last:
         return 0
     back = t[1:] < t[:-1]
@@ -30,27 +31,27 @@ def back_at(t: np.ndarray, last: float | None = None) -> int:
 
 
 def ahead_of(t: np.ndarray, i: int) -> int:
-    """How many events right before t[i], where time first goes back, are ahead of what follows; 0
-    where event i is the late one."""
+    """How many events directly before t[i], where time first goes back, are ahead of all later
+    ones; 0 if event i itself is late."""
     ahead = i - int(np.searchsorted(t[:i], t[i], "right"))
     behind = int(np.count_nonzero(t[i : i + LOOK] < t[i - 1])) if i else 0
     return ahead if ahead <= min(FEW, i - 1) and ahead < behind else 0
 
 
 def advice(t: np.ndarray, i: int, before: int) -> str:
-    """What it means that t[i] lies before `before`, the time in front of it, and what to do."""
+    """What it means that t[i] is smaller than `before`, its predecessor, and what to do."""
     if ahead := ahead_of(t, i):
-        return (f"The {ahead} before it lie ahead of all that follows: damaged times? Leave them "
-                "out: --late drop (late='drop')")
+        return (f"The {ahead} events before it are ahead of all later ones: damaged times? Leave "
+                "them out: --late drop (late='drop')")
     if before - int(t[i]) > RESET_US and not (t[i : i + LOOK] >= before).any():
-        return ("A camera reset, or two recordings joined? Read one behind the other: --late join "
+        return ("A camera reset, or two recordings joined? Read one after the other: --late join "
                 "(late='join')")
-    return ("Packets that were overtaken? Leave out what is late: --late drop (late='drop'), put "
-            "it in its place: --late sort")
+    return ("Packets that were overtaken? Leave late events out: --late drop (late='drop'), or "
+            "sort them in: --late sort")
 
 
 def begin(t: np.ndarray, start: int) -> int:
-    """Index of the first of t (N,) at or after `start`, single events ahead of the rest apart."""
+    """Index of the first of t (N,) at or after `start`, ignoring single events that are ahead."""
     if back_at(t) == len(t):
         return int(np.searchsorted(t, start))
     reached = np.concatenate([[0], (t >= start).astype(np.int8), [0]])
@@ -60,8 +61,8 @@ def begin(t: np.ndarray, start: int) -> int:
 
 
 class Dropped:
-    """The chunks without the events that must go for the others to be in order, as few as
-    possible among `LOOK`; count: how many went, of `seen`."""
+    """Chunks without the fewest events, among `LOOK`, whose removal leaves the rest ordered; count:
+    how many of `seen` were removed."""
 
     def __init__(self, chunks: Iterable[Chunk]) -> None:
         self.chunks, self.count, self.seen = chunks, 0, 0
@@ -85,7 +86,7 @@ class Dropped:
             yield self._released(block, self._kept(block.t), len(block.t))
 
     def _kept(self, t: np.ndarray) -> np.ndarray:
-        if t.dtype.kind == "f" and np.isnan(t).any():  # what reads them says where
+        if t.dtype.kind == "f" and np.isnan(t).any():  # reported by whatever reads them
             return np.arange(len(t))
         return longest(t, self._last)
 
@@ -104,10 +105,10 @@ class Dropped:
 
 
 def longest(t: np.ndarray, least: float | None = None) -> np.ndarray:
-    """Indices of as many of t (N,) as do not decrease, none below `least`.
+    """Indices of a longest non-decreasing subsequence of t (N,) with no value below `least`.
 
-    A time that is no smaller than all before and no larger than all after belongs to them
-    wherever it stands: only what lies between two such is searched.
+    A time that is no smaller than all before and no larger than all after always belongs to it:
+    only the stretches between such times are searched.
     """
     if back_at(t, least) == len(t):
         return np.arange(len(t))
@@ -126,7 +127,7 @@ def longest(t: np.ndarray, least: float | None = None) -> np.ndarray:
 
 
 def _longest(values: list[float]) -> np.ndarray:
-    """The same by patience sorting: tops[k] ends the lowest of the runs of k + 1."""
+    """The same by patience sorting: tops[k] ends the lowest subsequence of length k + 1."""
     tops: list[float] = []
     places: list[int] = []
     previous = [-1] * len(values)
@@ -146,8 +147,8 @@ def _longest(values: list[float]) -> np.ndarray:
 
 
 class Joint:
-    """Clocks one behind the other: where times go back by more than a late packet would, all that
-    follows is moved to where the clock stood. count: how often."""
+    """Joins clocks: where time goes back further than a late packet would, everything after it is
+    shifted to continue the previous clock. count: how often."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -155,7 +156,7 @@ class Joint:
         self._shift = 0
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
-        """Times (N,) int64 us that continue those of the calls before."""
+        """Times (N,) int64 us that continue those of earlier calls."""
         if not len(t):
             return t
         steps = np.diff(t, prepend=t[0] if self._last is None else self._last)
@@ -170,13 +171,13 @@ class Joint:
     def notes(self) -> tuple[Note, ...]:
         if not self.count:
             return ()
-        return (Note("events.late", f"the clock began anew {self.count:,} times; what lies behind "
-                     "follows on what lies before (--late join)"),)
+        return (Note("events.late", f"the clock restarted {self.count:,} times; later events "
+                     "continue the earlier clock (--late join)"),)
 
 
 class Lateness:
-    """How many events came late, and by how much at most, while they are collected to be sorted.
-    disorder: the first of their rows that is out of order."""
+    """How many events came late, and by how much at most, while they are collected for sorting.
+    disorder: the first row that is out of order."""
 
     def __init__(self) -> None:
         self.count, self.most_us = 0, 0
@@ -192,11 +193,11 @@ class Lateness:
         self._last = int(highest[-1])
 
     def order(self, t: np.ndarray) -> np.ndarray | None:
-        """Indices that sort t; None where it is sorted."""
+        """Indices that sort t; None if it is sorted."""
         return np.argsort(t, kind="stable") if self.count else None
 
     def notes(self) -> tuple[Note, ...]:
         if not self.count:
             return ()
         return (Note("events.late", f"{self.count:,} events that came up to "
-                     f"{self.most_us / 1e3:,.3f} ms late were put in their place (--late sort)"),)
+                     f"{self.most_us / 1e3:,.3f} ms late were sorted in (--late sort)"),)

@@ -1,8 +1,8 @@
 """The text header of Prophesee's files: lines `% key value`, then binary data.
 
-The header ends after `% end`, or before the first line that is not text beginning with `% `.
-What it tells of the sensor: width and height, or a name whose size is known; and the encoding of
-the words, unless these are those of another (`evt_words`).
+The header ends after `% end`, or before the first line that is not text beginning with `% `. It
+gives the sensor's size, directly or by a known name, and the encoding of the words, unless the
+words themselves contradict it (`evt_words`).
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from evflow.notes import Note
 
 MAX_HEADER = 1 << 16  # bytes; real ones have 200 to 600
 TEXT = re.compile(rb"%[ \t][\x20-\x7e\t]*\r?\n|%\r?\n")
-ANY = re.compile(rb"%[^\r\n]*\r?\n")  # where a line `% end` says where the header ends
+ANY = re.compile(rb"%[^\r\n]*\r?\n")  # for headers that a line `% end` closes
 END = re.compile(rb"%[ \t]*end\s*", re.IGNORECASE)
 
 SIDE = re.compile(r"\d{1,5}")  # pixels
 
-SENSORS: tuple[tuple[str, Size], ...] = (  # found in plugin_name, sensor_name or generation
+SENSORS: tuple[tuple[str, Size], ...] = (  # searched in plugin_name, sensor_name or generation
     (r"genx320", (320, 320)),
     (r"gen3|^3\.[01]$", (640, 480)),
     (r"gen4|imx636|^4\.[0-2]$", (1280, 720)),
@@ -33,14 +33,14 @@ SENSORS: tuple[tuple[str, Size], ...] = (  # found in plugin_name, sensor_name o
 
 @dataclasses.dataclass(frozen=True)
 class Header:
-    """fields: the last value of each key, in lower case. start: the byte where data begins."""
+    """fields: the last value of each key, in lower case. start: offset of the data."""
 
     fields: dict[str, str]
     start: int
 
     @property
     def encoding(self) -> str:
-        """"EVT2", "EVT3", "EVT2.1" ... as `% format` or `% evt` has it; "" where neither is."""
+        """"EVT2", "EVT3", "EVT2.1" ... from `% format` or `% evt`; "" if neither is there."""
         named = self.fields.get("format", "").split(";")[0].strip().upper()
         version = self.fields.get("evt", "").strip()
         found = (named or (f"EVT{version}" if version else "")).removesuffix(".0")
@@ -48,11 +48,11 @@ class Header:
 
     @property
     def order(self) -> str:
-        """Byte order of the words, ">" where `% format` says endianness=big."""
+        """Byte order of the words: ">" if `% format` says endianness=big."""
         return ">" if "endianness=big" in self.fields.get("format", "").lower() else "<"
 
     def size(self) -> tuple[Size | None, tuple[Note, ...]]:
-        """(width, height) or None, and a note where it follows from the sensor's name."""
+        """(width, height) or None, and a note if it was inferred from the sensor's name."""
         layout = self.fields.get("format", "").lower()
         told = dict(re.findall(r"(width|height)=(\d{1,5})\b", layout))
         told = {key: self.fields[key] for key in ("width", "height") if key in self.fields} | told
@@ -65,13 +65,13 @@ class Header:
             name = self.fields.get(key, "").strip().lower()
             for pattern, size in SENSORS:
                 if re.search(pattern, name):
-                    return size, (Note("sensor.size", f"the sensor is taken as "
-                                       f"{size[0]}x{size[1]} after {key} {name}"),)
+                    return size, (Note("sensor.size", f"assumed the sensor size of "
+                                       f"{key} {name}, {size[0]}x{size[1]}"),)
         return None, ()
 
 
 def parse(head: bytes) -> Header:
-    """The header at the beginning of these bytes; no fields where there is none."""
+    """The header at the start of these bytes; without fields if there is none."""
     fields: dict[str, str] = {}
     start, line_of = 0, ANY if _ends(head) else TEXT
     while line := line_of.match(head, start):
@@ -84,8 +84,8 @@ def parse(head: bytes) -> Header:
 
 
 def _ends(head: bytes) -> bool:
-    """Does a line `% end` end a header whose lines all begin with `%`? Then names in them may have
-    any letters."""
+    """Whether a line `% end` closes a header whose lines all begin with `%`; names in it may then
+    have any characters."""
     at = 0
     while line := ANY.match(head, at):
         if END.fullmatch(line[0]):
@@ -100,12 +100,12 @@ def read_header(path: Path) -> Header:
 
 
 def sniffed(path: Path, head: bytes) -> str:
-    """The encoding of a RAW file that begins so, "" of what is none: what the header declares,
-    unless the words are those of another, and of that alone."""
+    """The encoding of a RAW file with this beginning, "" if it is none: what the header declares,
+    unless the words fit another encoding only."""
     return _sniffed(path.suffix.lower() == ".raw", head)
 
 
-@functools.lru_cache(maxsize=2)  # of one file, all formats ask
+@functools.lru_cache(maxsize=2)  # all formats ask for the same file
 def _sniffed(is_raw: bool, head: bytes) -> str:
     header = parse(head)
     declared = header.encoding
@@ -118,8 +118,8 @@ def _sniffed(is_raw: bool, head: bytes) -> str:
 
 
 def raw(path: Path) -> tuple[Header, str, tuple[Note, ...]]:
-    """The header of a RAW file, the encoding of its words, and a note where the header does not
-    tell it."""
+    """The header of a RAW file, the encoding of its words, and a note if the header does not state
+    it."""
     header = read_header(path)
     with open(path, "rb") as f:
         encoding = sniffed(path, f.read(HEAD))

@@ -1,10 +1,10 @@
-"""Events decoded chunk by chunk: time range, order, sensor and damage in one place.
+"""Events decoded in chunks: time range, order, sensor and damage are handled in one place.
 
 A decoder yields `Chunk`s and raises `Damage` where the bytes stop making sense; `gather` makes
-`Events` of them. It keeps what lies between start_s and stop_s alone, reads no further than
-stop_s, and names the place of the first event that cannot be right; damage behind stop_s does not
-matter. Memory: the temporaries of a chunk, and of the columns kept, 13 bytes per event, what
-`spool` keeps there.
+`Events` of them. It keeps only what lies between start_s and stop_s, reads no further than stop_s,
+and names the position of the first event that cannot be right; damage after stop_s does not matter.
+Memory: the temporaries of a chunk, and what `spool` keeps in memory of the columns (13 bytes per
+event).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from evflow.io.hints import Hints
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
-CHUNK = 1 << 18  # bytes decoded at a time: the temporaries of 64k words stay in a core's cache
-MOST_RESERVED = 0.125, 16  # of the words of a chunk, and at least; of random ones a third are
+CHUNK = 1 << 18  # bytes decoded at a time: temporaries of 64k words fit a core's cache
+MOST_RESERVED = 0.125, 16  # share of a chunk's words, and minimum; a third of random words are
 
 
 class Gathered(NamedTuple):
-    """events: those that were asked for; span: the range [start, stop) in us that was asked for;
-    notes: what obeying that cost."""
+    """events: those requested; span: the requested range [start, stop) in us; notes: what was left
+    out or assumed."""
 
     events: Events
     span: tuple[int, int]
@@ -37,7 +37,7 @@ class Gathered(NamedTuple):
 
 
 class Damage(Exception):
-    """What a decoder cannot go on from, and the byte (or other unit) where it lies."""
+    """The point from which a decoder cannot continue: what was seen, and its byte or other unit."""
 
     def __init__(self, byte: int, seen: str, unit: str = "byte") -> None:
         super().__init__(seen)
@@ -45,10 +45,10 @@ class Damage(Exception):
 
 
 class Clock:
-    """A counter of `bits` bits as an endless one: int64, carried from chunk to chunk.
+    """Extends a counter of `bits` bits to int64, across chunks.
 
-    The smaller of the two ways round is taken, so a step back (damage, a reset) stays one, and a
-    wraparound is told from it as long as the counter is read twice per turn.
+    The smaller of the two possible steps is assumed, so that a step back (damage, a reset) stays
+    one and a wraparound is recognised as long as the counter is read twice per turn.
     """
 
     def __init__(self, bits: int) -> None:
@@ -56,7 +56,7 @@ class Clock:
         self.value: int | None = None  # the last reading
 
     def unwrap(self, raw: np.ndarray) -> np.ndarray:
-        """Readings (n,) unsigned -> int64 (n,), continuing those of the calls before."""
+        """Readings (n,) unsigned -> int64 (n,), continuing earlier calls."""
         if not len(raw):
             return np.zeros(0, np.int64)
         value = int(raw[0]) if self.value is None else self.value
@@ -72,7 +72,7 @@ class Clock:
 
 
 def words(path: Path, start: int, dtype: Any) -> Iterator[tuple[int, np.ndarray]]:
-    """(byte, whole words) of a file from byte `start`; Damage where it ends inside a word."""
+    """(byte, whole words) of a file from byte `start`; Damage if it ends inside a word."""
     size = np.dtype(dtype).itemsize
     with open(path, "rb") as f:
         f.seek(start)
@@ -80,13 +80,13 @@ def words(path: Path, start: int, dtype: Any) -> Iterator[tuple[int, np.ndarray]
             n = len(data) // size
             yield start, np.frombuffer(data, dtype, n)
             if len(data) % size:
-                raise Damage(start + n * size, f"it ends {len(data) % size} bytes into a "
+                raise Damage(start + n * size, f"the file ends {len(data) % size} bytes into a "
                              f"word of {size} bytes")
             start += len(data)
 
 
 def cut_at(wrong: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
-    """The rows before the first wrong one, and its index (-1 where none is wrong)."""
+    """The rows before the first wrong one, and its index (-1 if none is wrong)."""
     if not wrong.any():
         return table, -1
     first = int(np.argmax(wrong))
@@ -98,7 +98,7 @@ def typed(
     decode: Callable[[np.ndarray, np.ndarray, int], Chunk], unit: str = "byte",
 ) -> Iterator[Chunk]:
     """decode(words, their types, byte) of (byte, words) whose top four bits are a type. Words of
-    reserved types stay among them, for `decode` to pass over."""
+    reserved types are included, and `decode` skips them."""
     for byte, table in source:
         size = table.dtype.itemsize
         kind = (table >> (8 * size - 4)).astype(np.uint8)
@@ -107,16 +107,16 @@ def typed(
         yield decode(table[:sound], kind[:sound], byte)
         if wrong >= 0:
             raise Damage(byte + size * wrong, f"word {table[wrong]:#0{2 * size + 2}x} is of type "
-                         f"{kind[wrong]:#x}, which {reserved.format} does not have, and so are "
-                         "many behind it", unit)
+                         f"{kind[wrong]:#x}, which {reserved.format} does not define; so are "
+                         "many after it", unit)
 
 
 class Reserved:
-    """Words of types that a format reserves or does not define: they are passed over and counted,
-    as firmware pads with them. types: (16,) bool, which they are.
+    """Words of types that a format reserves or does not define: skipped and counted, because
+    firmware pads with them. types: (16,) bool, which types those are.
 
-    Where more than `MOST_RESERVED` of a chunk are such, of several values, this is another format,
-    or damage.
+    If more than `MOST_RESERVED` of a chunk are such, with several values, the file has another
+    format or is damaged.
     """
 
     def __init__(self, types: np.ndarray, format: str) -> None:
@@ -124,7 +124,7 @@ class Reserved:
         self.count, self.example = 0, 0
 
     def seen(self, table: np.ndarray, kind: np.ndarray) -> int:
-        """Count those of a chunk; the index of the first where there are too many, else -1."""
+        """Count those of a chunk; returns the index of the first if there are too many, else -1."""
         odd = self.types[kind]
         if not odd.any():
             return -1
@@ -152,7 +152,7 @@ def collect(
     notes: Callable[[], tuple[Note, ...]] = tuple,
     native: str = "us",
 ) -> Recording:
-    """A recording without frames, as `gather` has it; `notes` is called at the end."""
+    """A recording without frames from `gather`; `notes` is called at the end."""
     found = gather(path, chunks, hints, size, native)
     return Recording.of_events(found.events, (*notes(), *found.notes))
 
@@ -163,8 +163,8 @@ def gather(
 ) -> Gathered:
     """The events that `hints` ask for.
 
-    size: what the file says of its sensor, None where it says nothing. native: unit of t.
-    offset_us: added to t.
+    size: what the file says about its sensor, None if nothing. native: unit of t. offset_us: added
+    to t.
     Raises EV001 (no event in the range), EV003 and EV007 (not whole), EV004 (order), EV005
     (outside the sensor), EV006 (polarity), EV009 (damage), EV015 (size unknown).
     """
@@ -180,7 +180,7 @@ def gather(
 
 
 def _sound(chunks: Iterable[Chunk], gathering: Gathering) -> Iterator[Chunk]:
-    """The chunks before the damage, if there is any."""
+    """The chunks before any damage."""
     try:
         for chunk in chunks:  # noqa: UP028 (`yield from` would close them: others go on reading)
             yield chunk
@@ -189,7 +189,7 @@ def _sound(chunks: Iterable[Chunk], gathering: Gathering) -> Iterator[Chunk]:
 
 
 def hold(carried: int, values: np.ndarray, at: np.ndarray, n: int) -> np.ndarray:
-    """(n,): `carried`, and from entry at[k] on values[k], until the next."""
+    """(n,): `carried`, then values[k] from index at[k] on until the next."""
     held = np.empty(len(values) + 1, values.dtype)
     held[0], held[1:] = carried, values
     return np.repeat(held, np.diff(at, prepend=0, append=n))

@@ -1,6 +1,6 @@
 """Events in columns of HDF5 data sets or of arrays, read in blocks of rows; frames beside them.
 
-Every data set is checked against the size of its file before memory is taken, and whatever h5py
+Every data set is checked against the size of its file before memory is allocated, and whatever h5py
 raises on a damaged file becomes EV009.
 """
 
@@ -26,37 +26,37 @@ from evflow.io.images.times import beside_events
 from evflow.notes import Note
 from evflow.types import Recording
 
-ROWS = 1 << 15  # events read at a time: 1 MiB of four float64 columns, which a cache holds
+ROWS = 1 << 15  # events read at a time: four float64 columns of 1 MiB in total, which fit a cache
 
 
 def holds(head: bytes, path: Path, test: Callable[[Any], bool]) -> bool:
-    """Is it an HDF5 file that can be opened and passes the test, or might if the test had not come
-    upon another file?"""
+    """Whether the path is an HDF5 file that passes the test, or might pass if the test had not led
+    to another file."""
     if not head.startswith(MAGIC):
         return False
     try:
         with _file(path) as f:
             return bool(test(f))
     except EvflowDataError as e:
-        return e.code == "EV009"  # `read` says why
+        return e.code == "EV009"  # `read` explains why
     except DAMAGE:
         return False
 
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The open HDF5 file; EV009 (damaged; what is asked for lies in another), EV010 (no h5py)."""
+    """The open HDF5 file; EV009 (damaged; data in another file), EV010 (no h5py)."""
     try:
         with _file(path) as f:
             yield f
     except DAMAGE as e:
         raise EvflowDataError(
-            "EV009", f"{path} is cut off or damaged ({type(e).__name__}: {e}).",
-            "Copy it again; h5ls and h5dump show what is left.", where=path) from e
+            "EV009", f"{path} is truncated or damaged ({type(e).__name__}: {e}).",
+            "Copy it again; h5ls and h5dump list what is left.", where=path) from e
 
 
 def _file(path: Path) -> Any:
-    """The file, nothing outside of which is followed."""
+    """The file, with nothing outside it followed."""
     load_h5py()
     from evflow.io.decode.hdf5_contained import File
 
@@ -67,11 +67,11 @@ def dataset(
     path: Path, group: Any, name: str, shape: tuple[int | None, ...], own_filter: int | None = None
 ) -> Any:
     """Data set `name` of that shape (None: any length); EV008 (absent), EV009, EV010. own_filter:
-    a compression that the caller undoes by himself."""
+    a compression that the caller undoes itself."""
     if name not in group:
         raise EvflowDataError(
             "EV008", f"{path}: {group.name} holds {sorted(group)[:8]} but not {name!r}.",
-            "Another layout? Convert it to one that `evflow info` names.", where=path)
+            "Another layout? Convert it to a format listed in docs/formats.md.", where=path)
     data = group[name]
     found = getattr(data, "shape", None)
     if found is None or len(found) != len(shape) or any(
@@ -94,8 +94,8 @@ def blocks(
     stored: int = 1,
     begin: int = 0,
 ) -> Iterator[Chunk]:
-    """Chunks of the events begin to n; rows(slice) gives their x, y, t, p. stored: rows of a block
-    of HDF5, which is decoded as a whole: whole ones are read, each once."""
+    """Chunks of events begin to n; rows(slice) gives their x, y, t, p. stored: rows of an HDF5
+    chunk, which is decoded as a whole: whole chunks are read, each once."""
     for part in aligned(begin, n, max(ROWS // stored, 1) * stored):
         yield Chunk(*rows(part), lambda i, first=part.start: first + i,  # type: ignore[misc]
                     "event")
@@ -108,23 +108,23 @@ def aligned(begin: int, end: int, step: int) -> Iterator[slice]:
 
 
 def stored_rows(data: Any) -> int:
-    """Rows in a block of an HDF5 data set; 1 where it is not stored in blocks."""
+    """Rows in a chunk of an HDF5 data set; 1 if it is not chunked."""
     return int(data.chunks[0]) if data.chunks else 1
 
 
 def same_length(path: Path, columns: dict[str, Any]) -> int:
-    """The length that all columns have, or EV009."""
+    """The length of all columns; EV009 if they differ."""
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise EvflowDataError(
-            "EV009", f"{path} has columns of different length: {lengths}.", "Write it again.",
+            "EV009", f"{path} has columns of different lengths: {lengths}.", "Write it again.",
             where=path)
     return next(iter(lengths.values()))
 
 
 class Images(NamedTuple):
-    """Images of a file that are decoded when they are wanted. stream: what they are; load():
-    their times (T,) as stored, and a function that decodes those of a slice."""
+    """Images of a file, decoded on demand. stream: what they are; load(): their times (T,) as
+    stored, and a function that decodes the images of a slice."""
 
     stream: ImageStream
     load: Callable[[], tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]]
@@ -134,10 +134,10 @@ def with_frames(
     path: Path, found: Gathered, hints: Hints, images: Images, native: str,
     notes: tuple[Note, ...] = (), clock: tuple[Note, ...] = (),
 ) -> Recording:
-    """The recording with those of the images that are its frames, at times within its span.
+    """The recording with the images that are its frames, at times within its span.
 
-    native: unit of their times in the format; notes: on the recording; clock: on frames. What is
-    wrong with images keeps nobody from the events: `streams.events_alone`.
+    native: unit of their times in the format; notes: on the recording; clock: on frames. Faulty
+    images never prevent reading the events: see `streams.events_alone`.
     """
     events, span, told = found
     notes = (*notes, *told)
@@ -159,13 +159,13 @@ def with_frames(
 
 
 def stored_frames(data: Any, keep: slice) -> Iterator[np.ndarray]:
-    """Frames of an HDF5 data set one by one, each stored block decoded once."""
+    """Frames of an HDF5 data set one by one; each stored chunk is decoded once."""
     for part in aligned(keep.start, keep.stop, stored_rows(data)):
         yield from data[part]
 
 
 def frame_size(data: Any) -> Size | None:
-    """(width, height) of frames (T, H, W) or (T, H, W, C); None of what is none."""
+    """(width, height) of frames (T, H, W) or (T, H, W, C); None if they have another shape."""
     shape: tuple[int, ...] = getattr(data, "shape", ())
     return (int(shape[2]), int(shape[1])) if len(shape) in (3, 4) and all(shape[1:3]) else None
 

@@ -1,7 +1,7 @@
-"""Text with one event per line, in blocks of whole lines: numbers between blanks or commas, `#`
-comments.
+"""Text with one event per line, in blocks of whole lines: numbers separated by blanks or commas,
+`#` comments.
 
-A line that is not such becomes `Damage` at its byte. Memory: one block and its table of float64.
+Any other line becomes `Damage` at its byte. Memory: one block and its float64 table.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy as np
 from evflow.io.decode.stream import Chunk, Damage
 from evflow.io.decode.units import check_text_seconds
 
-BLANKS = bytes.maketrans(b",;\"", b"   ")  # what else stands between numbers
-HEAD = 1 << 14  # bytes by which a file is recognised, and the order of its columns told
+BLANKS = bytes.maketrans(b",;\"", b"   ")  # other separators become blanks
+HEAD = 1 << 14  # bytes used to recognise a file and its column order
 BLOCK = 1 << 21  # bytes parsed at a time, 75,000 lines
-BINARY = 512  # bytes that tell text from other data, which has zeros among them
-MAX_LINE = 1000  # a longer one is not text
+BINARY = 512  # bytes used to distinguish text from binary data, which contain zeros
+MAX_LINE = 1000  # a longer line is not text
 WORD = re.compile(rb"\b(?:true|false|on|off|pos|neg|positive|negative)\b", re.IGNORECASE)
 ON = (b"true", b"on", b"pos", b"positive")
 
@@ -31,9 +31,9 @@ ON = (b"true", b"on", b"pos", b"positive")
 def events(
     f: IO[bytes], widths: tuple[int, ...], byte: int = 0, order: str = "txyp"
 ) -> Iterator[Chunk]:
-    """Chunks of lines of one of these numbers of columns, whose first are those of `order`, "-" for
-    one that is not looked at; f is at `byte`. What stands before a line that is none comes out
-    before Damage is raised."""
+    """Chunks of lines with one of these numbers of columns, the first of which are those of `order`
+    ("-" for one that is ignored); f is at `byte`. Events before an invalid line are yielded before
+    Damage is raised."""
     line = 0
     read = tuple(i for i, name in enumerate(order) if name != "-") if "-" in order else None
     order = order.replace("-", "")
@@ -47,7 +47,7 @@ def events(
 
 
 def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-    """The chunks; EV003 where the times of the first are no seconds, by `check_text_seconds`."""
+    """The chunks; EV003 if the first times are not seconds (`check_text_seconds`)."""
     seen = False
     for chunk in chunks:
         if not seen and len(chunk.t):
@@ -58,11 +58,11 @@ def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
 
 
 def plain(block: bytes, byte: int) -> bytes:
-    """Lines of as many bytes with blanks between their numbers: no commas, no byte order mark at
-    byte 0, and words for a polarity (True, OFF, pos ...) in any case as 1 and 0."""
+    """Lines of the same length in bytes, with blanks between numbers: without commas and byte order
+    mark, and with polarity words (True, OFF, pos ... in any case) replaced by 1 and 0."""
     if byte == 0 and block.startswith(codecs.BOM_UTF8):
         block = b"   " + block[len(codecs.BOM_UTF8):]
-    if WORD.search(block, 0, MAX_LINE):  # where one line has one, all have
+    if WORD.search(block, 0, MAX_LINE):  # if one line has a word, all have
         for word in set(WORD.findall(block)):
             digit = b"1" if word.lower() in ON else b"0"
             block = re.sub(rb"\b%b\b" % word, digit.ljust(len(word)), block)
@@ -70,7 +70,7 @@ def plain(block: bytes, byte: int) -> bytes:
 
 
 def _blocks(f: IO[bytes], byte: int) -> Iterator[tuple[int, bytes]]:
-    """(its first byte, a block of whole lines); the last line may lack its end."""
+    """(offset, block of whole lines); the last line may lack its line end."""
     rest = b""
     while data := f.read(BLOCK):
         rest += data
@@ -87,16 +87,16 @@ def _blocks(f: IO[bytes], byte: int) -> Iterator[tuple[int, bytes]]:
 def _parse(
     byte: int, block: bytes, widths: tuple[int, ...], read: tuple[int, ...] | None
 ) -> tuple[np.ndarray, tuple[int, ...], Damage | None]:
-    """(rows, columns) float64, the one width that later blocks must have, and what is wrong with
-    the line after those rows, if there is one. read: the columns to read; None: all."""
+    """(rows, columns) float64, the number of columns that later blocks must have, and the Damage of
+    the line after those rows, if any. read: the columns to read; None: all."""
     table = _table(block, widths, read)
     damage = None
     if table is None:
         sound, damage = _before_damage(byte, block, widths, read)
         table = _table(sound, widths, read)
-    if table is None:  # what no line by itself shows
+    if table is None:  # although each line alone looks right
         table, damage = np.zeros((0, len(read or range(widths[0])))), Damage(
-            byte, "what stands here is not plain text")
+            byte, "this is not plain text")
     settled = read is None and (len(table) or damage)
     return table, (table.shape[1],) if settled else widths, damage
 
@@ -104,10 +104,10 @@ def _parse(
 def _table(
     block: bytes, widths: tuple[int, ...], read: tuple[int, ...] | None
 ) -> np.ndarray | None:
-    """The numbers of a block of lines; None where they are none, or not as many a line."""
+    """The numbers of a block of lines; None if they are not numbers, or not equally many a line."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a block of comments holds no data
+            warnings.simplefilter("ignore", UserWarning)  # for a block of comments only
             table = np.loadtxt(io.StringIO(block.decode("ascii", "replace")), ndmin=2, usecols=read)
     except ValueError:
         return None
@@ -120,7 +120,7 @@ def _table(
 def _before_damage(
     byte: int, block: bytes, widths: tuple[int, ...], read: tuple[int, ...] | None
 ) -> tuple[bytes, Damage]:
-    """The lines before the first that is none, and what that one is."""
+    """The valid lines at the start, and the Damage describing the first invalid one."""
     at = 0
     for content in block.split(b"\n"):
         fields = content.partition(b"#")[0].split()
@@ -131,21 +131,21 @@ def _before_damage(
             return block[:at], Damage(byte + at, f"the line {content[:60]!r} is not `t x y p` "
                                       f"({' or '.join(map(str, widths))} numbers)")
         at += len(content) + 1
-    return block, Damage(byte + at, "what stands before is not plain text")
+    return block, Damage(byte + at, "what comes before this is not plain text")
 
 
 def is_binary(head: bytes) -> bool:
-    """Is what begins so no text?"""
+    """Whether data with this beginning are not text."""
     return b"\0" in head[:BINARY]
 
 
 def is_number(field: bytes) -> bool:
-    """Is it a finite number?"""
+    """Whether the field is a finite number."""
     return is_float(field) and bool(np.isfinite(float(field)))
 
 
 def is_float(field: bytes | str) -> bool:
-    """Is it a number, NaN and infinity among them? 1_000 is none in a table."""
+    """Whether the field is a number, including NaN and infinity (1_000 is not)."""
     try:
         float(field)
     except ValueError:

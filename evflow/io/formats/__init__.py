@@ -1,1 +1,1 @@
-"""One module a format: its NAME and EXTENSIONS, `sniff`, `read`, and a writer where it has one."""
+"""One module per format: its NAME and EXTENSIONS, `sniff`, `read`, and a writer if there is one."""

@@ -1,12 +1,12 @@
 """AEDAT 2 (jAER; inivation.com, AEDAT file formats): `#` lines, then big-endian pairs of a 32-bit
 address and a 32-bit time in us.
 
-DAVIS: bit 31 clear, bit 10 clear = an event: y [30:22], x [21:12], ON [11]; bit 31 set = a sample,
-of what [11:10] says: 0 a pixel after its reset, 1 after its exposure (see `decode.aps`), 3 the IMU;
-its value [9:0]. DVS128: y [14:8], x [7:1], OFF [0], bit 15 = sync. jAER counts y from the bottom,
-and x of events, but not of samples, from the right. IMU samples and sync words are counted, not
-read. The chip is in the header; where it is not, `size` tells it: 128x128 is a DVS128, anything
-else a DAVIS. AEDAT 1 is the same of a DVS128, its addresses of 16 bits.
+DAVIS: bit 31 clear, bit 10 clear = an event: y [30:22], x [21:12], ON [11]; bit 31 set = a sample
+with value [9:0] and kind [11:10]: 0 a pixel after its reset, 1 after its exposure (see
+`decode.aps`), 3 the IMU. DVS128: y [14:8], x [7:1], OFF [0], bit 15 = sync. jAER counts y from the
+bottom, and x of events (not of samples) from the right. IMU samples and sync words are counted but
+not read. The chip is named in the header, or else inferred from `size`: 128x128 is a DVS128,
+anything else a DAVIS. AEDAT 1 is the same for a DVS128, with addresses of 16 bits.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NAME = "aedat2"
 EXTENSIONS: tuple[str, ...] = (".aedat", ".aedat2", ".dat")
 
 MAGIC, OLD = b"#!AER-DAT2.0", b"#!AER-DAT1.0"
-LINE = re.compile(rb"#[\x20-\x7e\t\x80-\xff]*\r?\n")  # a `#` that begins data meets a zero soon
+LINE = re.compile(rb"#[\x20-\x7e\t\x80-\xff]*\r?\n")  # data that begin with `#` soon have a zero
 MAX_HEADER = 1 << 22  # bytes; jAER writes its preferences there, 170 kB of them
 RECORD = np.dtype([("address", ">u4"), ("t", ">u4")])
 OLD_RECORD = np.dtype([("address", ">u2"), ("t", ">u4")])
@@ -43,8 +43,8 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV008 (AEDAT 1 of another chip), EV015 (the chip is not known) and what
-    `Aside.collect` raises."""
+    """Raises EV008 (AEDAT 1 of another chip), EV015 (unknown chip) and what `Aside.collect`
+    raises."""
     with open(path, "rb") as f:
         head = f.read(MAX_HEADER)
     start, chip = 0, None
@@ -58,13 +58,13 @@ def read(path: Path, hints: Hints) -> Recording:
     known = chip_size(chip) or (DVS128 if old and chip is None else None)
     if old and known != DVS128:
         raise EvflowDataError(
-            "EV008", f"{path} is AEDAT 1 of the chip {chip!r}; that of a DVS128 is read.",
+            "EV008", f"{path} is AEDAT 1 of the chip {chip!r}; only that of a DVS128 is read.",
             "Open it in jAER, and log it again: that writes AEDAT 2.", where=path)
     size = hints.size or known
     if size is None:
         raise EvflowDataError(
             "EV015", f"the header of {path} ({start:,} bytes) "
-            + (f"names the chip {chip!r}, which is not known." if chip else "names no chip."),
+            + (f"names the chip {chip!r}, which is unknown." if chip else "names no chip."),
             f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.", where=path)
     dvs128 = (known or size) == DVS128
     aside = Aside(path, hints, size)
@@ -77,8 +77,8 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 class Decoder:
-    """The address layout of a chip, its clock, its frames, and what was not read. aps: what makes
-    frames, None where they are not asked for."""
+    """The address layout of a chip, its clock, its frames, and what was not read. aps: the frame
+    builder; None if frames are not wanted."""
 
     def __init__(self, size: Size, dvs128: bool, aside: Aside) -> None:
         self.size, self.dvs128, self.aside = size, dvs128, aside
@@ -127,7 +127,7 @@ class Decoder:
     def _sampled(
         self, aps: Aps, samples: np.ndarray, t: np.ndarray, event: np.ndarray, pixels: np.ndarray
     ) -> None:
-        """Samples (n,) handed on, their times on the clock of the events."""
+        """Samples (n,) passed to the frame builder, with times on the events' clock."""
         if self.sample_clock.value is None:
             near = self.clock.value
             if near is None and event.any():

@@ -4,9 +4,9 @@
 A packet: i16 type, i16 source, i32 size of an event, offset and overflow of its time (t = overflow
 << 31 | time), capacity, number and valid. Type 1: u32 x [31:17], y [16:2], ON [1], valid [0]; i32
 us. Type 2, a frame: u32 valid [0], channels [3:1], colour filter [7:4]; i32 begin and end of the
-frame and of its exposure; width, height, x, y of its place; u16 pixels, on 0..65535. Other types
-are counted, not read. The size is that of the chip that `#Source` names. 3.0 has the origin at the
-bottom, and no end of its header.
+frame and of its exposure; width, height and position x, y; u16 pixels on 0..65535. Other types are
+counted but not read. The size is that of the chip named in `#Source`. Version 3.0 has the origin at
+the bottom and no end-of-header line.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ FRAME = struct.Struct("<Iiiiiiiii")
 EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
 POLARITY, IMAGE = 1, 2
 TYPES = {0: "special events", 3: "IMU samples", 4: "IMU samples"}
-COMPRESSED = 0x8000  # of the type, by formats other than RAW
+COMPRESSED = 0x8000  # flag in the type, for formats other than RAW
 MOST_TYPES, MOST_BYTES = 64, 1 << 26  # of types; of one event
 
 
 class Part(NamedTuple):
-    """Events of a packet, the overflow of their time, and the byte where they begin."""
+    """Events of a packet, their timestamp overflow, and the byte where they begin."""
 
     events: np.ndarray
     overflow: int
@@ -57,7 +57,7 @@ class Part(NamedTuple):
 
 
 class Packet(NamedTuple):
-    """A header, without its offset; begin: the byte behind it."""
+    """A header, without its offset; begin: the first byte after it."""
 
     kind: int
     source: int
@@ -73,7 +73,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV008 (compressed packets), EV009 (damaged), EV015 (the chip is not known) and what
+    """Raises EV008 (compressed packets), EV009 (damaged), EV015 (unknown chip) and what
     `Aside.collect` raises."""
     with open(path, "rb") as f:
         head = f.read(MAX_HEADER)
@@ -98,8 +98,8 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 class _Reading:
-    """Packets decoded in turn: events become chunks, frames are put aside. turned: y counts from
-    the bottom; frames: are they asked for?"""
+    """Decodes packets in order: events become chunks, frames are collected. turned: y counts from
+    the bottom; frames: whether they are wanted."""
 
     def __init__(self, aside: Aside, size: Size, turned: bool, frames: bool) -> None:
         self.aside, self.size, self.turned, self.frames = aside, size, turned, frames
@@ -125,7 +125,7 @@ class _Reading:
             raise damage
 
     def _packet(self, path: Path, f: IO[bytes], found: list[Part]) -> bool:
-        """Read the next packet, its events into `found`; False at the end of the file."""
+        """Read the next packet and append its events to `found`; False at the end of the file."""
         packet = _next(path, f)
         if packet is None:
             return False
@@ -214,10 +214,10 @@ def _next(path: Path, f: IO[bytes]) -> Packet | None:
     if not data:
         return None
     if len(data) < HEADER.size:
-        raise Damage(at, f"it ends {len(data)} bytes into the header of a packet")
+        raise Damage(at, f"the file ends {len(data)} bytes into a packet header")
     packet = _parsed(data, at)
     if not _sound(packet._replace(kind=packet.kind & ~COMPRESSED)):
-        raise Damage(at, f"no packet begins so (type {packet.kind}, {packet.number:,} events of "
+        raise Damage(at, f"not a packet header (type {packet.kind}, {packet.number:,} events of "
                      f"{packet.size:,} bytes)")
     if packet.kind & COMPRESSED:
         raise EvflowDataError(
@@ -237,19 +237,19 @@ def _sound(packet: Packet) -> bool:
 
 
 def _pass(path: Path, f: IO[bytes], packet: Packet) -> None:
-    """Go to the end of a packet; Damage where the file ends before. Some writers fill packets up
-    to their capacity."""
+    """Skip to the end of a packet; Damage if the file ends before it. Some writers pad packets to
+    their capacity."""
     total = os.path.getsize(path)
     end, full = (packet.begin + n * packet.size for n in (packet.number, packet.capacity))
     if end > total:
-        raise Damage(total, f"it ends in a packet of {packet.number:,} events")
+        raise Damage(total, f"the file ends within a packet of {packet.number:,} events")
     if end < full <= total and not _begins(f, end, total) and _begins(f, full, total):
         end = full
     f.seek(end)
 
 
 def _begins(f: IO[bytes], at: int, total: int) -> bool:
-    """Does a packet begin there, or the file end?"""
+    """Whether a packet begins there, or the file ends."""
     f.seek(at)
     data = f.read(HEADER.size)
     return at == total or (len(data) == HEADER.size and _sound(_parsed(data, at)))

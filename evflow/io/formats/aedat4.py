@@ -1,10 +1,9 @@
 """AEDAT 4 (iniVation DV): events, and frames at mid-exposure, through the `aedat` package.
 
-The decoder aborts the whole process on a header that is not UTF-8 XML, or nested too deeply, and
-on a packet that claims more than there is memory; it panics on damaged ones. So the header and the
-sizes of all packets are checked here first, the decoder sees no further than they are sound, and
-whatever it raises becomes EV009 with the byte where it stopped. Damage behind `stop_s` does not
-matter.
+The decoder aborts the whole process if the header is not UTF-8 XML or is nested too deeply, or if a
+packet claims more than the memory; it panics on damaged packets. So the header and the sizes of all
+packets are checked here first, the decoder is given only the sound part, and whatever it raises
+becomes EV009 with the byte where it stopped. Damage after `stop_s` does not matter.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from evflow.types import Recording
 
 NAME = "aedat4"
 EXTENSIONS: tuple[str, ...] = (".aedat4",)
-EXTERNAL = (1, 2, 3)  # sources of triggers: a signal's rising and falling edge, a pulse
+EXTERNAL = (1, 2, 3)  # trigger sources: rising edge, falling edge, pulse of an external signal
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -46,10 +45,9 @@ def sniff(path: Path, head: bytes) -> bool:
 def read(path: Path, hints: Hints) -> Recording:
     """Events (N,) and frames (T, H, W) uint8; colour frames become their luma.
 
-    Of several event streams the first is read, or the one asked for; of several frame streams
-    `streams.choose` takes one, by the names of their outputs in DV. Raises EV008 (no event stream),
-    EV009 (damaged), EV010 (no `aedat`), and what
-    `stream.gather` and `Recording` raise.
+    With several event streams the first is read, or the one requested; with several frame streams
+    `streams.choose` picks one by the names of their outputs in DV. Raises EV008 (no event stream),
+    EV009 (damaged), EV010 (no `aedat`), and what `stream.gather` and `Recording` raise.
     """
     header = read_header(path)
     streams = _decoder(path).id_to_stream()
@@ -57,8 +55,8 @@ def read(path: Path, hints: Hints) -> Recording:
     if not events:
         kinds = ", ".join(f"{i}: {s['type']}" for i, s in sorted(streams.items()))
         raise EvflowDataError(
-            "EV008", f"{path} holds the streams {{{kinds}}}, none of events.",
-            "Record the events too, or pass the file that has them.", where=path)
+            "EV008", f"{path} holds the streams {{{kinds}}}, none of which has events.",
+            "Record the events too, or pass the file that contains them.", where=path)
     frames = {i: s for i, s in streams.items() if s["type"] == "frame"}
     names = stream_names(header.outputs, {*frames, *events})
     camera, told = hints.camera([names[i] for i in sorted(events)])
@@ -76,7 +74,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def triggers(path: Path) -> np.ndarray:
-    """Times (N,) int64 us of the edges and pulses of external signals, up to damage."""
+    """Times (N,) int64 us of edges and pulses of external signals, up to any damage."""
     header = read_header(path)
     found = [np.zeros(0, np.int64)]
     with _before(path, _packets(path, header.packets, header.table)[1]) as sound:
@@ -89,7 +87,7 @@ def triggers(path: Path) -> np.ndarray:
 
 
 def _next(decoder: Iterator[dict[str, Any]]) -> dict[str, Any] | None:
-    """The next packet; None at the end, and where the decoder fails."""
+    """The next packet; None at the end, or if the decoder fails."""
     try:
         return next(decoder, None)
     except (KeyboardInterrupt, SystemExit):
@@ -99,8 +97,8 @@ def _next(decoder: Iterator[dict[str, Any]]) -> dict[str, Any] | None:
 
 
 class _Reading:
-    """Packets decoded in turn: events of the stream `source` become chunks, frames of the streams
-    `taken` are put aside."""
+    """Decodes packets in order: events of the stream `source` become chunks, frames of the streams
+    `taken` are collected."""
 
     def __init__(
         self, sound: Path, starts: Iterable[int], damage: Damage | None, aside: Aside,
@@ -112,7 +110,7 @@ class _Reading:
         self.warned: set[str] = set()
 
     def chunks(self) -> Iterator[Chunk]:
-        """All events up to `stop_s`, and up to the time when frames from before it have come."""
+        """All events up to `stop_s`, until frames from before that time have also arrived."""
         done = 0
         while found := self._some():
             x, y, t, p = (np.concatenate([packet[name] for packet in found]) for name in COLUMNS)
@@ -122,7 +120,7 @@ class _Reading:
             raise self.damage
 
     def _some(self) -> list[np.ndarray]:
-        """The next packets of events; none at the end, and where the damage is next."""
+        """The next packets of events; none at the end or where the damage begins."""
         found: list[np.ndarray] = []
         count = byte = 0
         try:
@@ -163,8 +161,8 @@ class _Reading:
 def _before(path: Path, damage: Damage | None) -> Iterator[Path]:
     """A file that ends where the damage begins; `path` itself without damage.
 
-    The decoder must not meet what it aborts on, and it may read several packets in one step: it
-    skips frames of a kind that it does not know.
+    The decoder must not reach data on which it aborts, and it may read several packets in one step,
+    because it skips frames of unknown kinds.
     """
     if damage is None:
         yield path
@@ -180,9 +178,9 @@ def _before(path: Path, damage: Damage | None) -> Iterator[Path]:
 
 
 def _packets(path: Path, start: int, table: int) -> tuple[array.array[int], Damage | None]:
-    """Where packets begin, each {i32 stream, i32 size, size bytes}, up to the table; and the one
-    that claims more than is left, or expands beyond measure: the decoder would take that much
-    memory."""
+    """Offsets of packets, each {i32 stream, i32 size, size bytes}, up to the table; and the Damage
+    at the first one that claims more bytes than are left, or expands too far: the decoder would
+    allocate that much."""
     total = os.path.getsize(path)
     starts = array.array("q")
     with open(path, "rb") as f:
@@ -190,10 +188,10 @@ def _packets(path: Path, start: int, table: int) -> tuple[array.array[int], Dama
             f.seek(start + 4)
             size = int.from_bytes(f.read(4), "little", signed=True)
             if not 0 <= size <= total - start - 8:
-                return starts, Damage(start, f"a packet of {size:,} bytes where "
+                return starts, Damage(start, f"a packet claims {size:,} bytes, "
                                       f"{total - start - 8:,} are left")
             if (most := most_bytes(f.read(size))) > FREE + RATIO * size:
-                return starts, Damage(start, f"a packet of {size:,} bytes that expand to {most:,}")
+                return starts, Damage(start, f"a packet of {size:,} bytes expands to {most:,}")
             starts.append(start)
             start += 8 + size
     return starts, None
@@ -216,7 +214,7 @@ def _decoder(path: Path) -> Any:
 
 
 def _mid_exposure(frame: dict[str, Any]) -> int:
-    """The middle of the exposure, else of the frame interval, else the packet's time (us)."""
+    """The middle of the exposure (us); without one, of the frame interval, or the packet's time."""
     for begin, end in (("exposure_begin_t", "exposure_end_t"), ("begin_t", "end_t")):
         if 0 < frame[begin] <= frame[end]:
             return (frame[begin] + frame[end]) // 2

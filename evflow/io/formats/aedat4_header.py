@@ -1,4 +1,4 @@
-"""The header of AEDAT 4: where its packets are, and which output of DV each stream was.
+"""The header of AEDAT 4: the location of its packets, and each stream's output in DV.
 
 #!AER-DAT4.0, then a size and a FlatBuffer with the place of the table of packets, and XML that
 describes the streams. It is checked here before any decoder sees it.
@@ -21,8 +21,8 @@ MAX_DEPTH = 64  # of the XML; DV writes 5
 
 
 class Header(NamedTuple):
-    """packets: the byte where they begin; table: where theirs is, -1 for nowhere; outputs: of each
-    stream {"originalModuleName": ..., "originalOutputName": ...}, as far as they are told."""
+    """packets: byte where packets begin; table: byte of their table, -1 for none; outputs: for each
+    stream {"originalModuleName": ..., "originalOutputName": ...}, as far as known."""
 
     packets: int
     table: int
@@ -30,7 +30,7 @@ class Header(NamedTuple):
 
 
 def stream_names(outputs: dict[str, dict[str, str]], streams: Iterable[int]) -> dict[int, str]:
-    """What users call the streams: "accumulator/frames", or "1" where that tells them not apart."""
+    """Names of the streams for users: "accumulator/frames", or "1" if names are not unique."""
     names: dict[int, str] = {}
     for i in sorted(streams):
         told = outputs.get(str(i), {})
@@ -41,7 +41,7 @@ def stream_names(outputs: dict[str, dict[str, str]], streams: Iterable[int]) -> 
 
 
 def read_header(path: Path) -> Header:
-    """EV009 unless the header is a sound one."""
+    """Read and check the header; EV009 if it is damaged."""
     with open(path, "rb") as f:
         magic, size = f.read(len(MAGIC)), int.from_bytes(f.read(4), "little")
         header = f.read(min(size, os.path.getsize(path)))
@@ -59,11 +59,11 @@ def read_header(path: Path) -> Header:
 
 
 def _field(header: bytes, number: int) -> int:
-    """The byte of a field of the header's flatbuffer, root table -> vtable -> field; 0: absent."""
+    """Offset of a field in the header's flatbuffer, root table -> vtable -> field; 0: absent."""
     (table,) = struct.unpack_from("<I", header, 0)
     vtable = table - struct.unpack_from("<i", header, table)[0]
     if vtable < 0:
-        raise ValueError("its table lies before it")
+        raise ValueError("its table position is invalid")
     if struct.unpack_from("<H", header, vtable)[0] < 6 + 2 * number:
         return 0
     (field,) = struct.unpack_from("<H", header, vtable + 4 + 2 * number)
@@ -83,8 +83,8 @@ def _info_node(header: bytes) -> bytes:
 
 
 def _outputs(text: bytes) -> dict[str, dict[str, str]]:
-    """The attributes of each node right below outInfo, of XML. ValueError and ExpatError unless it
-    is UTF-8 XML, of tags in tags to a bounded depth."""
+    """The attributes of each node directly below outInfo. ValueError or ExpatError unless it is
+    UTF-8 XML of bounded depth."""
     nodes: list[str] = []
     key = ""
     found: dict[str, dict[str, str]] = {}

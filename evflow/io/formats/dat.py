@@ -40,14 +40,14 @@ def read(path: Path, hints: Hints) -> Recording:
     version = header.fields.get("version", "2")
     if version not in ("2", "2.0"):
         raise EvflowDataError(
-            "EV008", f"{path} is DAT of version {version[:20]!r}; version 2 is read.",
-            "Its bits have another meaning: convert it with the camera's software.", where=path)
+            "EV008", f"{path} is DAT of version {version[:20]!r}; only version 2 is read.",
+            "Its layout differs: convert it with the camera's software.", where=path)
     with open(path, "rb") as f:
         f.seek(header.start)
         kind = f.read(2)
     if len(kind) < 2 or kind[1] != RECORD.itemsize:
         raise EvflowDataError(
-            "EV009", f"{path}: at byte {header.start:,}, behind its header, are {kind!r}; expected "
+            "EV009", f"{path}: after its header, at byte {header.start:,}, are {kind!r}; expected "
             f"an event type and the size {RECORD.itemsize}.", "Cut off? Copy it again.", where=path)
     if kind[0] not in (0x00, 0x0C):
         raise EvflowDataError(

@@ -1,10 +1,10 @@
-"""HDF5 in the layout of the DSEC data set: the format to exchange events in.
+"""HDF5 in the layout of the DSEC data set: the recommended exchange format for events.
 
 /events/{x u16, y u16, p u8, t u32 us}, /t_offset (i64 us, add it to t), /ms_to_idx (u64; event
-ms_to_idx[m] is the first with t >= 1000 m). Of our own: attributes width and height (absent in
-DSEC, which is 640x480; its ms_to_idx and t_offset tell it from others with such events), and
-/frames, /frame_times (i64 us, without t_offset) where there are any.
-`DsecWriter` takes events chunk by chunk, so that a long simulation never sits in memory.
+ms_to_idx[m] is the first with t >= 1000 m). evflow adds attributes width and height (absent in
+DSEC, which is always 640x480; its ms_to_idx and t_offset identify it), and /frames, /frame_times
+(i64 us, without t_offset) if there are frames. `DsecWriter` takes events in chunks, so that a long
+simulation is never in memory as a whole.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5", "")
 
 EVENTS = "events.h5"
 COLUMNS = ("x", "y", "t", "p")
-RECTIFY = Note("sensor.unrectified", "rectify_map.h5 is not applied: events stay at the sensor's "
-               "own pixels, which have the thresholds")
+RECTIFY = Note("sensor.unrectified", "rectify_map.h5 is not applied: events keep the sensor's raw "
+               "pixel coordinates, because thresholds belong to sensor pixels")
 DSEC_SIZE = (640, 480)
 FLUSH = 1 << 20  # events rewritten at a time where t widens
 INDEX_MS = 1 << 20  # milliseconds indexed at a time: 8 MiB, however long the camera was silent
-AROUND, PLACES = 2, 17  # times looked at around one, and places at which they must rise
+AROUND, PLACES = 2, 17  # neighbours examined around a time; positions at which times must increase
 MAX_MS = 10**8  # 28 hours; beyond that two clocks were joined and ms_to_idx would not fit
 
 
@@ -52,12 +52,12 @@ def sniff(path: Path, head: bytes) -> bool:
             return "events" in f and hasattr(f["events"], "keys") and (
                 "ms_to_idx" in f or all(name in f["events"] for name in COLUMNS))
     except EvflowDataError:
-        return True  # `read` says why
+        return True  # `read` explains what is wrong
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Only the part between start_s and stop_s is read. Of a folder its events.h5; a rectify map
-    beside them is not applied.
+    """Only the part between start_s and stop_s is read. For a folder, its events.h5; a rectify map
+    beside it is not applied.
 
     Raises EV008 (a data set is missing), EV009 (damaged), EV010 (h5py or a filter is missing),
     EV015 (neither width and height nor all of DSEC's own members), and what `stream.gather` and
@@ -81,20 +81,20 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def _size(f: Any) -> tuple[Size | None, Note | None]:
-    """Of the sensor, None where nothing tells; and what was assumed."""
+    """Size of the sensor, None if unknown; and a note on what was assumed."""
     if "width" in f.attrs and "height" in f.attrs:
         return (int(f.attrs["width"]), int(f.attrs["height"])), None
     if size := told_size(f, f["events"]):  # RVT: events/width, events/height
         return size, None
     if "ms_to_idx" in f and "t_offset" in f:
         return DSEC_SIZE, Note(
-            "sensor.size", "the sensor is taken as {}x{}, as DSEC's are: pass --size where it is "
+            "sensor.size", "assumed DSEC's sensor size, {}x{}: pass --size if it is "
             "another".format(*DSEC_SIZE))
     return None, None
 
 
 class DsecWriter(Hdf5Writer):
-    """Write events (and frames) chunk by chunk; t is u32 and widens to i64 past 71 minutes."""
+    """Write events (and frames) in chunks; t is u32 and is widened to i64 past 71 minutes."""
 
     NAME = NAME
     LABELS = True
@@ -113,14 +113,14 @@ class DsecWriter(Hdf5Writer):
         self._store("t_offset", np.int64(self.offset_us or 0))
 
     def _check(self, events: Events) -> None:
-        """EV004 where the events span more than ms_to_idx should."""
+        """Raise EV004 if the events span more than ms_to_idx can hold."""
         if self.offset_us is None:
             self.offset_us = int(events.t[0])
         span = int(events.t[-1]) - self.offset_us
         if span > MAX_MS * 1000:
             raise EvflowDataError(
                 "EV004", f"events span {span / 3.6e9:,.0f} hours.",
-                "Were recordings of different clocks joined?")
+                "Were recordings with different clocks joined?")
 
     def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
         if "frames" not in self._file:
@@ -150,7 +150,7 @@ class DsecWriter(Hdf5Writer):
             self._extend("ms_to_idx", self.n_events + np.searchsorted(t, ms * 1000))
 
     def _widen(self, last_us: int) -> None:
-        """Turn t into int64 once it no longer fits u32 (71.6 minutes)."""
+        """Convert t to int64 once it no longer fits u32 (71.6 minutes)."""
         group = self._file["events"]
         if last_us < 2**32 or group["t"].dtype == np.int64:
             return
@@ -163,7 +163,7 @@ class DsecWriter(Hdf5Writer):
 
 
 def _columns(path: Path, f: Any) -> dict[str, Any]:
-    """The four data sets, 1-D, of one length and decodable; EV008, EV009, EV010."""
+    """The four data sets, 1-D, of equal length and decodable; raises EV008, EV009, EV010."""
     group = f["events"]
     missing = [name for name in ("x", "y", "t", "p") if name not in group]
     if missing:
@@ -176,16 +176,16 @@ def _columns(path: Path, f: Any) -> dict[str, Any]:
 
 
 def _scalar(path: Path, f: Any, name: str) -> Any:
-    """The one value of a data set of shape () or (1,); EV009."""
+    """The single value of a data set of shape () or (1,); raises EV009."""
     if getattr(f[name], "size", None) != 1:
-        raise EvflowDataError("EV009", f"{path}: {name} is no single number.", "Write it again.",
+        raise EvflowDataError("EV009", f"{path}: {name} is not a single number.", "Write it again.",
                               where=path)
     return plausible(path, f[name])[()]
 
 
 def _chunks(columns: dict[str, Any], hints: Hints) -> Iterator[Chunk]:
-    """Chunks of the events between start_s and stop_s, found by binary search in the file, and
-    before them the very first event, from which those count."""
+    """Chunks of the events between start_s and stop_s, located by binary search in the file,
+    preceded by the very first event, from which both are counted."""
     x, y, t, p = columns.values()
     first, last = _range(t, hints)
 
@@ -199,8 +199,8 @@ def _chunks(columns: dict[str, Any], hints: Hints) -> Iterator[Chunk]:
 
 
 def _range(t: Any, hints: Hints) -> tuple[int, int]:
-    """The first event to read, and the first not to; `gather` finds the very ones among them. All
-    where times go back on the whole, or may."""
+    """The range of events to read; `gather` selects the exact ones among them. All events if times
+    are not increasing overall."""
     if hints.whole or not len(t) or hints.late != "stop" or not _rises(t):
         return 0, len(t)
 
@@ -216,7 +216,7 @@ def _range(t: Any, hints: Hints) -> tuple[int, int]:
 
 
 def _rises(t: Any) -> bool:
-    """Do times rise from place to place, evenly spread?"""
+    """Whether times increase over positions spread evenly through the file."""
     places = np.unique(np.linspace(0, len(t) - 1, PLACES).astype(int))
     medians = [np.median(t[max(at - AROUND, 0) : at + AROUND + 1]) for at in places.tolist()]
     return bool((np.diff(medians) >= 0).all())

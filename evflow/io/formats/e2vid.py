@@ -1,5 +1,5 @@
-"""Text of E2VID (rpg_e2vid): the first line `width height`, then a line `t[s] x y p` per event; as
-a .txt file, or alone in a zip. Written with all six decimals, so that no microsecond is lost.
+"""Text of E2VID (rpg_e2vid): the first line `width height`, then a line `t[s] x y p` per event, in
+a .txt file or in a zip by itself. Written with all six decimals, so that no microsecond is lost.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def sniff(path: Path, head: bytes) -> bool:
         with _opened(path) as f:
             return _is_text(f.readline(100) + f.readline(100))
     except EvflowDataError as e:
-        return e.code == "EV009"  # `read` says what is damaged
+        return e.code == "EV009"  # `read` explains the damage
 
 
 def read(path: Path, hints: Hints) -> Recording:
@@ -62,7 +62,7 @@ def _is_text(head: bytes) -> bool:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[IO[bytes]]:
-    """The text, of the file or of the one .txt in the zip."""
+    """The text file, or the only .txt in the zip."""
     with open(path, "rb") as f:
         if f.read(2) != b"PK":
             f.seek(0)
@@ -74,14 +74,14 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
         if len(names) != 1:
             raise EvflowDataError(
                 "EV008", f"{path} holds {len(names)} texts: {sorted(names)[:5]}.",
-                "Pass a zip with one text of events.", where=path)
+                "Pass a zip with one text file of events.", where=path)
         with archive.open(names[0]) as inner:
             yield inner
 
 
 class E2vidWriter(EventWriter):
-    """Events alone: pandas, with which E2VID reads the zip, wants one file in it. Where the output
-    ends in .txt, that text itself."""
+    """Events only: E2VID reads the zip through pandas, which wants a single file in it. If the
+    output ends in .txt, the text itself is written."""
 
     NAME = NAME
     DEPTHS = ()

@@ -1,7 +1,7 @@
 """HDF5 of the E2VID family (event_utils, event_cnn_minimal, the ECOCO and HQF data sets).
 
 /events/{xs, ys, ts, ps}: ts float64 s (integers: us), ps bool, {0, 1} or {-1, 1};
-/images/image000000000 ... with an attribute `timestamp` in s; attribute sensor_resolution,
+/images/image000000000 ... with an attribute `timestamp` in s; attribute sensor_resolution is
 (height, width) by its authors, though files with (width, height) exist: the images decide, and
 without images the order in which all events fit.
 """
@@ -66,7 +66,7 @@ def _names(f: Any) -> list[str]:
 
 
 def _image_size(f: Any) -> Size | None:
-    """(width, height) of the first image; None without one, or of none."""
+    """(width, height) of the first image; None if there is none or it is no image."""
     shape: tuple[int, ...] = getattr(f["images"][_names(f)[0]], "shape", ()) if _names(f) else ()
     return (int(shape[1]), int(shape[0])) if len(shape) in (2, 3) and all(shape[:2]) else None
 
@@ -85,21 +85,21 @@ def _time(path: Path, image: Any) -> Any:
 
 
 def _pixels(image: np.ndarray) -> np.ndarray:
-    """One channel becomes none; the writers' OpenCV orders three B, G, R."""
+    """Drop a single channel; three are in OpenCV's order B, G, R."""
     return image[..., 0] if image.ndim == 3 and image.shape[-1] == 1 else image
 
 
 def _size(
     f: Any, images: Size | None, columns: dict[str, Any]
 ) -> tuple[Size | None, tuple[Note, ...]]:
-    """Of the sensor: of the images, unless sensor_resolution tells another in either order."""
+    """Size of the sensor: that of the images, unless sensor_resolution differs in either order."""
     told = np.asarray(f.attrs.get("sensor_resolution", ())).ravel()
     if len(told) < 2 or told.dtype.kind not in "iuf" or not (told[:2] > 0).all():
         return images, ()
     height, width = (int(v) for v in told[:2])
     if images in ((width, height), (height, width)):
         return images, ()
-    if height <= width:  # as sensors are: no event can tell, and two columns need not be read twice
+    if height <= width:  # the usual case: events cannot contradict it, so columns are read once
         return (width, height), ()
     reach = [0, 0]
     for first in range(0, len(columns["xs"]), tables.ROWS):
@@ -113,8 +113,8 @@ def _size(
 
 
 class EventUtilsWriter(Hdf5Writer):
-    """xs, ys int16 as their loaders want them; ts float64 s; ps bool. Every image has `timestamp`
-    and `event_idx`, the last event before it."""
+    """xs, ys int16, as their loaders expect; ts float64 s; ps bool. Every image has `timestamp` and
+    `event_idx`, the last event before it."""
 
     NAME = NAME
     MAX_SIDE = 2**15

@@ -1,8 +1,8 @@
 """The folder of an EVIMO2v2 sequence of one event camera (better-flow/evimo): dataset_events_t.npy
 (N, 1) s, dataset_events_xy.npy (N, 2), dataset_events_p.npy (N, 1).
 
-Its Samsung camera writes polarity the other way round than its Prophesee cameras: where a folder
-of the path names samsung_mono it is turned, so that ON is brighter, and a note says so. Depth,
+Its Samsung camera stores polarity the other way round than its Prophesee cameras: if a folder in
+the path names samsung_mono, polarity is inverted so that ON is brighter, and a note says so. Depth,
 masks, poses (pickles) and the frames of another camera are not read.
 """
 
@@ -42,12 +42,12 @@ def read(path: Path, hints: Hints) -> Recording:
     if camera != "samsung_mono":
         return Recording.of_events(events, notes)
     turned = Note("events.turned",
-                  "polarity was turned: EVIMO2's Samsung camera stores brighter as 0")
+                  "polarity was inverted: EVIMO2's Samsung camera stores brighter as 0")
     return Recording.of_events(_turned(events), (turned, *notes))
 
 
 def _turned(events: Events) -> Events:
-    """The events with ON and OFF changed, block by block: p may lie on disk."""
+    """The events with ON and OFF exchanged, in blocks, as p may be memory-mapped."""
     on = Spool(bool)
     for first in range(0, len(events), tables.ROWS):
         on.append(~events.p[first : first + tables.ROWS])

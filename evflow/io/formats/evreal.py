@@ -71,13 +71,13 @@ def _images(path: Path) -> np.ndarray:
 
 
 def _image_size(path: Path) -> Size | None:
-    with contextlib.suppress(EvflowDataError):  # `load` says what is wrong with them
+    with contextlib.suppress(EvflowDataError):  # `load` explains what is wrong
         return tables.frame_size(_images(path))
     return None
 
 
 def _size(path: Path, images: Size | None) -> Size | None:
-    """Of the sensor: what metadata.json tells, in whichever order the images have; else theirs."""
+    """Size of the sensor from metadata.json, in whichever order fits the images; else theirs."""
     try:
         told = _told_size(path)
     except EvflowDataError:
@@ -96,7 +96,7 @@ def _told_size(path: Path) -> Size | None:
         return int(width), int(height)
     except (ValueError, KeyError, TypeError) as e:
         raise EvflowDataError(
-            "EV009", f"{file} does not tell sensor_resolution = [height, width] ({e}).",
+            "EV009", f"{file} does not contain sensor_resolution = [height, width] ({e}).",
             "Correct it, or move it away and pass size=(width, height), --size WxH.",
             where=file) from e
 
@@ -140,7 +140,7 @@ class EvrealWriter(EventWriter):
         self._arrays["images_ts"].append(times[:, None] / 1e6)
 
     def _verify(self, temporary: Path) -> None:
-        """Each array has looked at its own file."""
+        """Each array has already been checked when its file was written."""
 
     def _finish(self) -> None:
         for array in self._arrays.values():

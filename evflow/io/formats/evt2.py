@@ -2,7 +2,7 @@
 32-bit words, their type in bits 31-28.
 
 0, 1: an event, OFF or ON: time [27:22] (the low 6 bits), x [21:11], y [10:0]. 8: the high 28 bits
-of time, in 64 us; they wrap after 4.8 hours. A: trigger; E, F: other: counted, not read. Other
+of time, in 64 us; they wrap after 4.8 hours. A: trigger; E, F: other: counted but not read. Other
 types are reserved: counted and skipped. Times stay on the sensor's clock. Events before the first
 time word have no time and are left out.
 """
@@ -30,7 +30,7 @@ RESERVED = np.array([kind not in (0, 1, TIME, TRIGGER, 0xE, 0xF) for kind in ran
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """EVT 2.0, and the encodings that no reader knows: `read` names them."""
+    """EVT 2.0, and encodings without a reader, which `read` names in its error."""
     return prophesee.sniffed(path, head) not in ("", "EVT2.1", "EVT3")
 
 
@@ -39,7 +39,7 @@ def read(path: Path, hints: Hints) -> Recording:
     header, encoding, told = prophesee.raw(path)
     if encoding != "EVT2":
         raise EvflowDataError(
-            "EV008", f"{path} is Prophesee RAW of encoding {encoding}; read are EVT2, "
+            "EV008", f"{path} is Prophesee RAW of encoding {encoding}; supported are EVT2, "
             "EVT2.1 and EVT3.", "Convert it with Metavision: metavision_file_to_dat or "
             "metavision_file_to_csv.", where=path)
     size, notes = header.size()
@@ -50,13 +50,13 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def triggers(path: Path) -> np.ndarray:
-    """Times (N,) int64 us of the trigger words, of rising and falling edges."""
+    """Times (N,) int64 us of the trigger words, for rising and falling edges."""
     header = prophesee.raw(path)[0]
     return trigger_times(words(path, header.start, f"{header.order}u4"))
 
 
 def trigger_times(source: Iterator[tuple[int, np.ndarray]]) -> np.ndarray:
-    """Of words of 32 bits, up to damage."""
+    """Trigger times from 32-bit words, up to any damage."""
     decoder, found = Decoder(), [np.zeros(0, np.int64)]
     with contextlib.suppress(Damage):
         for _, table in source:
@@ -67,7 +67,7 @@ def trigger_times(source: Iterator[tuple[int, np.ndarray]]) -> np.ndarray:
 
 
 class Decoder:
-    """The state between chunks: the high bits of time, and what was not read."""
+    """The state between chunks: the high time bits, and what was not read."""
 
     def __init__(self) -> None:
         self.clock = Clock(28)
@@ -86,8 +86,8 @@ class Decoder:
     def timed(
         self, table: np.ndarray, kind: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Indices (n,) of the words of events, these words (n,), their times (n,) int64 us, and
-        indices of those that come before the first time."""
+        """Indices (n,) of event words, these words (n,), their times (n,) int64 us, and indices of
+        events before the first time word."""
         marks = np.flatnonzero(kind == TIME)
         rows = np.flatnonzero(kind < 2)
         before = self.clock.value
@@ -109,17 +109,17 @@ class Decoder:
 
 
 def fields(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y and polarity of words (n,) of events."""
+    """x, y and polarity of event words (n,)."""
     return ((words >> 11) & 0x7FF).astype(np.uint16), (words & 0x7FF).astype(np.uint16), (
         words >= 1 << 28)
 
 
 def leftovers(timeless: int, triggers: int) -> tuple[Note, ...]:
-    """Notes on what a RAW stream holds that is not in the recording."""
+    """Notes on the content of a RAW stream that the recording does not contain."""
     notes = []
     if timeless:
         notes.append(Note("events.timeless", f"{timeless:,} events before the first time or row "
-                          "word were left out: the recording began amid the stream"))
+                          "word were left out: the file begins in the middle of the stream"))
     if triggers:
         notes.append(Note("events.unread", f"{triggers:,} external triggers were not read"))
     return tuple(notes)

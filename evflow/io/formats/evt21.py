@@ -1,10 +1,10 @@
 """Prophesee RAW, encoding EVT 2.1 (docs.prophesee.ai, data encoding formats): a `% ` header, then
 64-bit words, whose upper half is a word of EVT 2.0.
 
-Types 0 and 1 stand for up to 32 events of one row, time and polarity: at x + i where bit i of the
-lower half is set. The GenX320 sends a word as a whole, the IMX636 its upper half first
-("endianness=legacy"); where the header does not say, the order that makes sense of the first words
-is taken.
+Types 0 and 1 stand for up to 32 events of one row, time and polarity: at x + i for each bit i set
+in the lower half. The GenX320 sends each word as a whole, the IMX636 its upper half first
+("endianness=legacy"); if the header does not say, the order in which the first words make sense is
+used.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ NAME = "evt2.1"
 EXTENSIONS: tuple[str, ...] = (".raw",)
 
 HALF = np.uint64(32)
-TRIED = 1 << 15  # words by which the order of halves is told
+TRIED = 1 << 15  # words that decide the order of halves
 
-# The places of the bits set in each byte, one after another, and where a byte's begin.
+# The positions of the bits set in each byte, concatenated, and where those of a byte begin.
 _BITS = (np.arange(1 << 8)[:, None] >> np.arange(8)) & 1
 PLACES = np.nonzero(_BITS)[1].astype(np.uint16)
 PLACES_FROM = np.cumsum(_BITS.sum(1)) - _BITS.sum(1)
@@ -49,7 +49,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def triggers(path: Path) -> np.ndarray:
-    """Times (N,) int64 us of the trigger words, of rising and falling edges."""
+    """Times (N,) int64 us of the trigger words, for rising and falling edges."""
     header = prophesee.raw(path)[0]
     swapped = _halves_swapped(path, header)[0]
     source = _whole(words(path, header.start, f"{header.order}u8"), swapped)
@@ -57,7 +57,7 @@ def triggers(path: Path) -> np.ndarray:
 
 
 class Decoder(evt2.Decoder):
-    """That of EVT 2.0, for words that stand for several events."""
+    """The decoder of EVT 2.0, for words that stand for several events."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,8 +73,8 @@ class Decoder(evt2.Decoder):
 
 
 def _bits_set(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each bit set in masks (n,) uint32, the lowest first: of which mask it is, and its place
-    (uint16). Byte by byte, as most are 0."""
+    """For each bit set in masks (n,) uint32, lowest first: the index of its mask and its position
+    (uint16). Works byte by byte, as most bytes are 0."""
     parts = mask.astype("<u4").view(np.uint8)
     some = np.flatnonzero(parts)
     count = np.bitwise_count(parts[some])
@@ -88,7 +88,7 @@ def _bits_set(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _whole(
     source: Iterator[tuple[int, np.ndarray]], swapped: bool
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """The words, whose halves stand the other way round in the file."""
+    """Words whose halves are exchanged in the file."""
     for byte, table in source:
         yield byte, _swap(table) if swapped else table
 
@@ -99,8 +99,8 @@ def _swap(table: np.ndarray) -> np.ndarray:
 
 
 def _halves_swapped(path: Path, header: prophesee.Header) -> tuple[bool, tuple[Note, ...]]:
-    """Does the upper half of each word come first? And a note, where the words tell it against
-    the header, of which OpenEB takes silence for no, or without one."""
+    """Whether the upper half of each word comes first; and a note if the words contradict the
+    header (OpenEB reads its silence as no) or there is none."""
     layout = header.fields.get("format", "").lower()
     if "endianness=" in layout:
         return "endianness=legacy" in layout, ()
@@ -112,13 +112,13 @@ def _halves_swapped(path: Path, header: prophesee.Header) -> tuple[bool, tuple[N
     if layout and not swapped:
         return False, ()
     order = "legacy (IMX636)" if swapped else "little"
-    return swapped, (Note("events.layout", "the header does not tell which half of a word comes "
-                          f"first: taken as {order} after the first words"),)
+    return swapped, (Note("events.layout", "the header does not say which half of a word comes "
+                          f"first: inferred from the first words to be {order}"),)
 
 
 def _sense(table: np.ndarray) -> tuple[int, int]:
-    """How steadily time advances by words of time (among the bits of masks, it does not), and how
-    many words have a type that there is."""
+    """How steadily the words of type time advance (those made of mask bits do not), and how many
+    words have a known type."""
     kind = (table >> np.uint64(60)).astype(np.uint8)
     high = (table[kind == evt2.TIME] >> HALF) & np.uint64(0xFFFFFFF)
     back = int((high[1:] < high[:-1]).sum())

@@ -31,11 +31,11 @@ RESERVED = np.array([kind in (1, 9, 11, 12, 13) for kind in range(16)])
 EMITS = np.array([kind in (SINGLE, VECTOR_12, VECTOR_8) for kind in range(16)])
 ADVANCE = np.array([12 * (kind == VECTOR_12) + 8 * (kind == VECTOR_8) for kind in range(16)])
 MASK = np.array([{VECTOR_12: 0xFFF, VECTOR_8: 0xFF}.get(kind, 0) for kind in range(16)], np.uint16)
-UNKNOWN = -(1 << 24)  # a row or base that was not told yet; a chunk's advance leaves it negative
-NEVER = np.iinfo(np.int64).min  # a time that was not told yet
-FAR = 1 << 20  # a base beyond every sensor: where vectors without a base word run to
+UNKNOWN = -(1 << 24)  # row or base not yet known; stays negative however far a chunk advances it
+NEVER = np.iinfo(np.int64).min  # time not yet known
+FAR = 1 << 20  # a base beyond any sensor, for vectors without a base word
 
-# The places of the bits set in each 12-bit mask, one after another, and where a mask's begin.
+# The positions of the bits set in each 12-bit mask, concatenated, and where those of a mask begin.
 _BITS = (np.arange(1 << 12)[:, None] >> np.arange(12)) & 1
 PLACES = np.nonzero(_BITS)[1].astype(np.int16)
 PLACES_FROM = (np.cumsum(_BITS.sum(1)) - _BITS.sum(1)).astype(np.int32)
@@ -56,7 +56,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def triggers(path: Path) -> np.ndarray:
-    """Times (N,) int64 us of the trigger words, of rising and falling edges."""
+    """Times (N,) int64 us of the trigger words, for rising and falling edges."""
     header = prophesee.raw(path)[0]
     decoder, found = Decoder(), [np.zeros(0, np.int64)]
     with contextlib.suppress(Damage):
@@ -71,7 +71,7 @@ def triggers(path: Path) -> np.ndarray:
 
 class Decoder:
     """The state between chunks: time, row, vector base, and what was not read. unit: what the
-    places of the source count."""
+    source's positions count."""
 
     def __init__(self, unit: str = "byte") -> None:
         self.clock, self.unit = Clock(12), unit

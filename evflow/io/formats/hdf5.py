@@ -1,8 +1,8 @@
 """HDF5 of any layout that names its columns, or holds N x 4 numbers: M3ED (prophesee/left/{x, y, t,
 p}, calib/resolution), e2calib and other flat files, compound data sets. See `hdf5_search`.
 
-Times that are whole are us, seconds where they have fractions, unless a name or an attribute tells
-the unit; a data set t_offset is added. Images are not read: their clock is each file's own.
+Times are us if they are integers and seconds if they have fractions, unless a name or an attribute
+gives the unit; a data set t_offset is added. Images are not read: every layout has its own clock.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Any: what other formats do not claim, `read` lists."""
+    """True for any HDF5: `read` lists what it holds if no format claims it."""
     return tables.holds(head, path, lambda f: True)
 
 
@@ -31,7 +31,7 @@ def read(path: Path, hints: Hints) -> Recording:
         found = hdf5_search.tables_of(path, f)
         if not found:
             raise EvflowDataError(
-                "EV008", f"{path} is HDF5 without a layout that is known. It holds "
+                "EV008", f"{path} is HDF5 in an unknown layout. It holds "
                 f"{hdf5_search.listing(f)}.",
                 "Name the events x, y, t, p in one group, in Python: with h5py.File(path, 'a') as "
                 "f: f['events/x'] = f['its/name'], and so for y, t (us) and p. No data is copied.",

@@ -1,9 +1,9 @@
 """The text folder of the IJRR 2017 / ECD event-camera data sets, or a zip of it.
 
-events.txt has a line `t[s] x y p` per event, or what its header says (`plain_text`); images.txt,
-where there is one, a line `t[s] path` per image. Times become int64 us by round(t * 1e6). An
-image's time is used as it stands: the data set does not say where in the exposure it lies.
-calib.txt, imu.txt and poses are not read.
+events.txt has a line `t[s] x y p` per event, or what its header says (`plain_text`); images.txt, if
+present, has a line `t[s] path` per image. Times become int64 us by round(t * 1e6). Image times are
+used unchanged: the data set does not say where in the exposure they lie. calib.txt, imu.txt and
+poses are not read.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ def sniff(path: Path, head: bytes) -> bool:
             with zipfile.ZipFile(path) as archive:
                 return any(_is_events(name) for name in archive.namelist())
         except DAMAGE:
-            return path.suffix.lower() == ".zip"  # cut off: the extension decides
+            return path.suffix.lower() == ".zip"  # truncated: the extension decides
     if text.is_binary(head):
         return False
     lines = [line for line in text.plain(head, 0).split(b"\n")
              if line.strip() and not line.startswith(b"#")]
-    if path.name == EVENTS:  # any numbers may be events; `text` says what is wrong with them
+    if path.name == EVENTS:  # `text` explains what is wrong
         fields = lines[0].split() if lines else []
         return plain_text.sniff(path, head) or (
             len(fields) == 4 and all(map(text.is_number, fields)))
@@ -64,8 +64,8 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """A folder, a zip with that folder at any depth, or events.txt itself (then images.txt is
-    looked for beside it).
+    """A folder, a zip with that folder at any depth, or events.txt itself (images.txt is then
+    expected beside it).
 
     Raises EV008 (not that layout), EV009 (damaged text, image or zip), EV016 (an image is
     missing), and what `stream.gather` and `Recording` raise.
@@ -95,7 +95,7 @@ def _is_events(name: str) -> bool:
 
 
 def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
-    """path: what messages name."""
+    """path: the name used in messages."""
     indexed = name == EVENTS and is_there(root / IMAGES)
     seen = _size(root, hints) if indexed else None
     with (root / name).open("rb") as f:
@@ -114,8 +114,8 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
 
 
 def _size(root: Root, hints: Hints) -> Size | None:
-    """Of the first image, from which alone the sensor's is known; raises what is wrong with it
-    unless it is not needed."""
+    """Size of the first image, the only source for the sensor's size; raises what is wrong with
+    that image, unless the size is not needed."""
     try:
         with events_alone():
             _, names = _read_index(root / IMAGES)
@@ -130,7 +130,7 @@ def _size(root: Root, hints: Hints) -> Size | None:
 def _some(
     path: Path, chunks: Iterable[Chunk], hints: Hints, size: Size | None
 ) -> Iterator[Chunk]:
-    """The chunks; EV001 where there is neither event nor size."""
+    """The chunks; EV001 if there is neither an event nor a size."""
     seen = False
     for chunk in chunks:
         seen = seen or len(chunk.t) > 0
@@ -158,10 +158,10 @@ def _read_index(index: Root) -> tuple[np.ndarray, list[str]]:
     back = np.flatnonzero(np.diff(seconds) <= 0)
     if len(back):
         raise EvflowDataError(
-            "EV004", f"{index}: time {seconds[back[0] + 1]:.9g} comes after {seconds[back[0]]:.9g} "
-            f"({len(back):,} such).", "Times must increase: lines out of order, or repeated?",
+            "EV004", f"{index}: time {seconds[back[0] + 1]:.9g} follows {seconds[back[0]]:.9g} "
+            f"({len(back):,} in all).", "Times must increase: lines out of order, or repeated?",
             where=index)
-    if len(set(names)) < len(names):  # each would be decoded: little text, much memory
+    if len(set(names)) < len(names):  # each would be decoded: a small text could fill the memory
         raise EvflowDataError("EV009", f"{index} has {len(names):,} lines for {len(set(names)):,} "
                               "images.", "Give each time its own image.", where=index)
     return np.array(seconds), names
@@ -171,7 +171,7 @@ def _image(root: Root, name: str) -> np.ndarray:
     """One image file at its full bit depth, grey or B, G, R; EV008, EV009, EV016."""
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts:
-        raise EvflowDataError("EV008", f"images.txt names {name}, which leaves the recording.")
+        raise EvflowDataError("EV008", f"images.txt names {name}, which is outside of it.")
     file = root.joinpath(*parts.parts)
     if not file.is_file():
         raise EvflowDataError(

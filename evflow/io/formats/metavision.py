@@ -1,6 +1,6 @@
 """HDF5 of Prophesee's Metavision (docs.prophesee.ai, HDF5 event files): /CD/events, a compound of
-x, y, p and t in us, compressed by ECF or not. The size is that of the attribute `geometry`, or of
-the sensor's name. Triggers (/EXT_TRIGGER) are not read.
+x, y, p and t in us, with or without ECF compression. The size comes from the attribute `geometry`
+or the sensor's name. Triggers (/EXT_TRIGGER) are not read.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def _unpacked(data: Any, path: Path) -> Iterator[Chunk]:
-    """The events, block by block; Damage at the first event of one that is damaged."""
+    """The events in blocks; Damage at the first event of a damaged block."""
     rows, total = data.chunks[0], len(data)
     for first in range(0, total, rows):
         try:

@@ -39,7 +39,7 @@ def read(path: Path, hints: Hints) -> Recording:
         if not sides:
             raise EvflowDataError(
                 "EV008", f"{path}: /davis holds {sorted(davis)} without events.",
-                "The ground truth of MVSEC? Events are in the file *_data.hdf5.", where=path)
+                "If this is MVSEC's ground truth: events are in the file *_data.hdf5.", where=path)
         side, told = hints.camera(sides)
         camera = davis[side]
         data = tables.dataset(path, camera, "events", (None, 4))

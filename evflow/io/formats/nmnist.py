@@ -1,6 +1,6 @@
-"""The .bin of N-MNIST and N-Caltech101 (Orchard et al. 2015): 5 bytes an event, x, y, then 24 bits
-of which the highest is ON and the others are us, the highest byte first. An event at y = 240 is
-none: it adds 2^13 us to the times behind it.
+"""The .bin of N-MNIST and N-Caltech101 (Orchard et al. 2015): 5 bytes per event, x, y, then 24
+bits: the highest is the polarity (ON), the others are us, most significant byte first. An event at
+y = 240 is not an event: it adds 2^13 us to all later times.
 
 There is no header: N-MNIST has 34x34 pixels, N-Caltech101 at most 240x180.
 """
@@ -25,11 +25,11 @@ EXTENSIONS: tuple[str, ...] = (".bin",)
 RECORD = np.dtype([("x", "u1"), ("y", "u1"), ("t", "u1", (3,))])
 OVERFLOW, STEP_US = 240, 1 << 13
 NMNIST, NCALTECH = (34, 34), (240, 180)
-RISING = 0.9  # of the steps of time; a half of those of random bytes
+RISING = 0.9  # of the time steps; in random bytes, half of them rise
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """By its name and its times, which seldom fall."""
+    """Recognised by its name and by times that rarely decrease."""
     if path.suffix.lower() not in EXTENSIONS or len(head) < 2 * RECORD.itemsize:
         return False
     table = np.frombuffer(head, RECORD, len(head) // RECORD.itemsize)
@@ -66,12 +66,12 @@ def _times(table: np.ndarray) -> np.ndarray:
 
 
 def _size(path: Path) -> tuple[Size, Note]:
-    """The smaller of the two sizes in which all events fit, and the note that says so."""
+    """The smaller of the two sizes that fits all events, and the note that says so."""
     reach = 0
-    with contextlib.suppress(Damage):  # of which the reading tells
+    with contextlib.suppress(Damage):  # `read` reports it
         for _, table in words(path, 0, RECORD):
             kept = table[table["y"] != OVERFLOW]
             reach = max([reach, *(int(kept[name].max()) for name in "xy" if len(kept))])
     size, name = (NMNIST, "N-MNIST") if reach < NMNIST[0] else (NCALTECH, "N-Caltech101")
-    return size, Note("sensor.size", f"the sensor is taken as {size[0]}x{size[1]}, that of {name}: "
+    return size, Note("sensor.size", f"assumed the sensor size of {name}, {size[0]}x{size[1]}: "
                       f"events reach {reach}")

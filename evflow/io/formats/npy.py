@@ -1,5 +1,5 @@
-"""Events in one .npy: records with fields (tonic, Metavision, dv-processing), or N x 4 numbers, of
-which the values tell the order. Neither tells the size of the sensor.
+"""Events in one .npy: records with fields (tonic, Metavision, dv-processing), or N x 4 numbers,
+whose order is inferred from the values. The file does not contain the size of the sensor.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAGIC = b"\x93NUMPY"
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Records that name the columns, and N x 4 numbers, whatever they are: `read` says."""
+    """True for records that name the columns, and for any N x 4 numbers; `read` checks them."""
     if not head.startswith(MAGIC):
         return False
     try:
@@ -36,8 +36,8 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV008 (no events), EV009 (damaged), EV015 (the size is not told) and what
-    `stream.gather` raises."""
+    """Raises EV008 (no events), EV009 (damaged), EV015 (unknown size) and what `stream.gather`
+    raises."""
     with open(path, "rb") as f:
         _, _, dtype = npy_header(f)
     data = mapped(path, (None,) if dtype.fields else (None, None), fields=bool(dtype.fields))
@@ -45,7 +45,7 @@ def read(path: Path, hints: Hints) -> Recording:
     if table is None:
         first = np.array2string(data[:2], precision=6, max_line_width=10**6)
         raise EvflowDataError(
-            "EV008", f"{path} holds {data.dtype} {data.shape}, no events: {first[:120]} ...",
+            "EV008", f"{path} holds {data.dtype} {data.shape}, not events: {first[:120]} ...",
             "Columns are t, x, y and p: whole pixels, times that never fall, a polarity of two "
             "values.", where=path)
     found = table.gather(path, hints, None)

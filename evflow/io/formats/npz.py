@@ -1,9 +1,9 @@
-"""evflow's own .npz: t (int64 us), x, y, p, size = (width, height); frames and frame_times beside
-them where there are any. Read are other names of these, too (`decode.columns`), and one array of
-records or N x 4 numbers (`decode.arrays`). Pickles are never loaded.
+"""evflow's own .npz: t (int64 us), x, y, p, size = (width, height), and optionally frames and
+frame_times. Other names of these (`decode.columns`) and a single array of records or N x 4 numbers
+(`decode.arrays`) are read too. Pickles are never loaded.
 
-Members are checked against the bytes that the archive really holds before memory is taken, and
-columns are decompressed side by side, block by block.
+Members are checked against the bytes that the archive really holds before memory is allocated, and
+columns are decompressed in parallel, in blocks.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ def sniff(path: Path, head: bytes) -> bool:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith(".npy") for name in archive.namelist())
     except DAMAGE:
-        return path.suffix.lower() in EXTENSIONS  # cut off: the extension decides
+        return path.suffix.lower() in EXTENSIONS  # truncated: the extension decides
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Events are read to the end also where stop_s comes before it: checksums are compared there.
+    """Events are read to the end even if stop_s comes before it, to verify their checksums.
 
     Raises EV002 (shapes), EV008 (a column is missing), EV009 (damaged), and what `stream.gather`
     and `Recording` raise.
@@ -67,7 +67,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def _size(found: dict[str, Member]) -> Any:
-    """Of the sensor, as the archive has it: `size` says (width, height) even where that is odd."""
+    """Size of the sensor as stored: `size` is (width, height), even if that looks odd."""
     for name in ("size", "wh"):
         if name in found:
             return tuple(found[name].whole().ravel().tolist())
@@ -80,7 +80,7 @@ def _size(found: dict[str, Member]) -> Any:
 
 
 def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
-    """The one array that may be events; EV008 where there is none, or several."""
+    """The only array that may hold events; EV008 if there is none or several."""
     fit = []
     for name, member in found.items():
         many = len(member.shape) == 2 and 4 in member.shape and member.dtype.kind in "biuf"
@@ -92,8 +92,8 @@ def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
         return fit[0]
     if {"theta_on", "eta_on"} <= set(found):
         raise EvflowDataError(
-            "EV008", f"{path} is a camera, not a recording.", "`evflow simulate VIDEO --camera` "
-            "takes it, and so do `evflow export` and, of two of them, `evflow compare`.",
+            "EV008", f"{path} is a camera, not a recording.", "Use it in `evflow simulate VIDEO "
+            "--camera` or `evflow export`, or compare two of them with `evflow compare`.",
             where=path)
     held = ", ".join(f"{name} {member.dtype} {member.shape}" for name, member in found.items())
     missing = [c for c in ("t", "x", "y", "p") if c not in map(columns.meaning, found)]
@@ -101,7 +101,7 @@ def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
         "EV008", f"{path} holds {held[:400] or 'nothing'}, but not {missing}." if not fit else
         f"{path} holds several arrays that may be events: {', '.join(t.name for t in fit)}.",
         "Expected the keys t, x, y, p, size, and optionally frames, frame_times; or one array of "
-        "events alone.", where=path)
+        "events only.", where=path)
 
 
 def _with_frames(
@@ -128,7 +128,7 @@ def _with_frames(
 def _events(
     path: Path, found: dict[str, Member], hints: Hints, size: Size | None, unit: str
 ) -> Gathered:
-    """What `gather` makes of the columns; damage is told before what it makes of them."""
+    """`gather` on the columns; damage is reported before errors in their values."""
     members = [found[name] for name in COLUMNS]
     check_columns(*(np.broadcast_to(np.int8(0), member.shape) for member in members))
 
@@ -153,8 +153,8 @@ def _finish(members: list[Member]) -> None:
 
 
 class NpzWriter(EventWriter):
-    """The columns grow as .npy files in a folder beside the output, which goes with them; at the
-    end they are compressed one after the other, and no array is ever in memory."""
+    """Columns grow as .npy files in a temporary folder beside the output; at the end they are
+    compressed one by one, and no whole array is ever in memory."""
 
     NAME = NAME
     LABELS = True

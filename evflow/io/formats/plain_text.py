@@ -1,12 +1,13 @@
-"""Text of four columns, as any tool writes it: comma separated files, what NumPy and pandas save,
-the `x,y,p,t` of Prophesee's converter. IJRR's events.txt is read by it too.
+"""Text of four columns, as many tools write it: CSV, what NumPy and pandas save, the `x,y,p,t` of
+Prophesee's converter. IJRR's events.txt is read by it too.
 
-The order is that of a header (a comment or the first line: `t x y p`, `timestamp,x,y,polarity`,
-`row,col,p,t`, faery's `t,x@640,y@480,on`; columns of other names are left out), else that of the
-first lines (`decode.columns`). The size is the header's (OpenEB's `%geometry:1280,720`), where it
-has one. Times are in the unit that the header tells ("t[us]", "timestamp_ns"); else they are
-seconds where they have fractions, and microseconds where they are whole and the file is of a tool
-that writes those: Prophesee's order or geometry, faery's header. Other whole ones are refused.
+The column order comes from a header (a comment or the first line: `t x y p`,
+`timestamp,x,y,polarity`, `row,col,p,t`, faery's `t,x@640,y@480,on`; columns with other names are
+ignored), else from the values of the first lines (`decode.columns`). The size comes from the header
+(OpenEB's `%geometry:1280,720`), if it has one. The unit of times comes from the header ("t[us]",
+"timestamp_ns"); otherwise times with fractions are seconds, and integers are microseconds if the
+file is from a tool that writes those (Prophesee's order or geometry, faery's header). Other
+integers are refused.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ NAME = "text"
 EXTENSIONS: tuple[str, ...] = (".csv", ".txt", ".tsv", ".dat", ".log")
 
 COMMAS = str.maketrans(",;", "  ")
-COMMA = re.compile(  # within a number: quoted, or where something else stands between numbers
+COMMA = re.compile(  # within a number: quoted, or if another separator stands between numbers
     rb'"-?\d{1,3}(?:,\d{3})+(?:\.\d+)?"|'
     rb"(?=.*\d,\d)-?[\d.]+(?:,\d+)*(?:[;\t ]+-?[\d.]+(?:,\d+)*)+$")
 OTHERS = (b"#!AER-DAT", b"#ROSBAG")  # data behind lines that look like comments
@@ -46,8 +47,8 @@ TOOL = re.compile(r"^geometry:|@\d", re.MULTILINE)  # by headers of OpenEB and f
 
 class Layout(NamedTuple):
     """order: of the columns, "txyp" or another, "-" for one that is not read; unit: of the times,
-    "auto" where no header tells it, "whole": us where they are whole; begin: the byte at which the
-    header ends; size: (width, height), where the header tells it; notes: what was assumed."""
+    "auto" if no header gives it, "whole": us if they are integers; begin: the byte at which the
+    header ends; size: (width, height), if the header gives it; notes: what was assumed."""
 
     order: str
     unit: str
@@ -59,13 +60,13 @@ class Layout(NamedTuple):
 def sniff(path: Path, head: bytes) -> bool:
     try:
         return layout(head) is not None
-    except EvflowDataError:  # `read` says what is unclear
+    except EvflowDataError:  # `read` explains what is unclear
         return True
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV003 (times without a unit), EV008 (a header that is not understood), EV015 (text
-    does not tell the size) and what `stream.gather` raises."""
+    """Raises EV003 (times without a unit), EV008 (unclear header), EV015 (unknown size) and what
+    `stream.gather` raises."""
     with open(path, "rb") as f:
         chunks, native, found = events(path, f, hints)
         return collect(path, chunks, hints, found.size,
@@ -73,17 +74,17 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def _unended(path: Path, f: IO[bytes], order: str) -> tuple[Note, ...]:
-    """What to say where the last line lacks its end: of a polarity no digit can be missing."""
+    """A note if the last line has no line end; a polarity cannot lack digits."""
     f.seek(-1, os.SEEK_END)
     if order[-1] in "p-" or f.read(1) in b"\r\n":
         return ()
-    return (Note("events.unended", f"{path} does not end with the end of a line: if it was cut off "
+    return (Note("events.unended", f"{path} does not end with a line break: if it was truncated "
                  f"there, the {order[-1]} of its last event may lack digits"),)
 
 
 def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str, Layout]:
-    """Chunks of the events of a text open at its beginning, the unit of their times, and the
-    layout. Where nothing tells the order it is `t x y p`. Raises as `read`."""
+    """Chunks of the events of a text opened at its beginning, the unit of their times, and the
+    layout. The default order is `t x y p`. Raises as `read`."""
     found = layout(f.read(text.HEAD)) or Layout("txyp", "auto", 0)
     f.seek(found.begin)
     chunks = text.events(f, (len(found.order),), found.begin, found.order)
@@ -95,17 +96,17 @@ def events(path: Path, f: IO[bytes], hints: Hints) -> tuple[Iterator[Chunk], str
     return text.in_seconds(path, chunks) if native == "s" else chunks, native, found
 
 
-@functools.lru_cache(maxsize=2)  # it is recognised by it, then read
+@functools.lru_cache(maxsize=2)  # used to recognise a file, then to read it
 def layout(head: bytes) -> Layout | None:
-    """What a file that begins so holds; None where it is no text of events. EV008 where a header
-    names some of the columns, but not which is which."""
+    """The layout of a file with this beginning; None if it is no text of events. EV008 if a header
+    names some of the columns but does not identify all."""
     rows: list[list[float]] = []
     headers: list[str] = []
     told, said, odd, byte, begin = "", "", b"", 0, 0
     if text.is_binary(head) or head.startswith(OTHERS):
         return None
     if b"\r" in head.strip() and b"\n" not in head:
-        return None  # `unread_text` says why
+        return None  # `unread_text` explains
     whole = head if len(head) < text.HEAD else head[: head.rfind(b"\n") + 1]
     for line in whole.splitlines(keepends=True):
         words, comment = "" if rows else _decoded(line), line.lstrip().startswith((b"#", b"%"))
@@ -122,7 +123,7 @@ def layout(head: bytes) -> Layout | None:
         elif fields:
             if not all(map(text.is_number, fields)) or (rows and len(fields) != len(rows[0])):
                 odd = b"" if _told(fields, headers) else line
-                break  # damage, of which `text.events` tells where it is
+                break  # damage, which `text.events` locates
             rows.append(list(map(float, fields)))
     if told and not headers and sum(map(bool, map(columns.meaning, _fields(told)))) >= 2:
         raise EvflowDataError(
@@ -130,8 +131,8 @@ def layout(head: bytes) -> Layout | None:
             "Name four columns t, x, y, p (timestamp, polarity, row, col are known too).")
     if headers and odd and not rows:
         raise EvflowDataError(
-            "EV008", f"below its header {headers[-1][:80]!r} stands {odd.strip()[:60]!r}.",
-            "Every line is numbers: t in seconds or whole microseconds, polarity 0 and 1, -1 and "
+            "EV008", f"after its header {headers[-1][:80]!r} comes {odd.strip()[:60]!r}.",
+            "Lines must be numbers: t in seconds or integer microseconds, polarity 0 and 1, -1 and "
             "1, or a word (true, false, on, off, pos, neg).")
     default = Layout("", "whole" if TOOL.search(said) else "auto", begin,
                      columns.written_size(said))
@@ -139,7 +140,7 @@ def layout(head: bytes) -> Layout | None:
 
 
 def _told(fields: list[bytes], headers: list[str]) -> bool:
-    """Are the fields that the last header names numbers, NaN among them?"""
+    """Whether the fields that the last header names are numbers (NaN included)."""
     order = _order(headers[-1]) if headers else ""
     return all(text.is_float(field) for field, name in zip(fields, order, strict=False)
                if name != "-")
@@ -147,17 +148,17 @@ def _told(fields: list[bytes], headers: list[str]) -> bool:
 
 def _commas(seen: bytes) -> EvflowDataError:
     return EvflowDataError(
-        "EV008", f"its numbers have commas inside: {seen[:40].decode('ascii', 'replace')}.",
-        "Write them without separators of thousands." if seen.startswith(b'"') else
-        "Decimal commas become points by sed 's/,/./g', separators of thousands go by "
+        "EV008", f"its numbers contain commas: {seen[:40].decode('ascii', 'replace')}.",
+        "Write them without thousands separators." if seen.startswith(b'"') else
+        "Convert decimal commas to points with sed 's/,/./g'; remove thousands separators with "
         "sed 's/,//g'.")
 
 
 def _laid_out(
     headers: list[str], rows: list[list[float]], told: bool, default: Layout
 ) -> Layout | None:
-    """The layout by the last header that fits the rows, else by the rows; told: no comment names
-    the columns, but a line of their own; default: what the header says of the rest."""
+    """The layout by the last header that fits the rows, else by the rows; told: a line of its own,
+    not a comment, names the columns; default: what the header says about the rest."""
     for words in reversed(headers):
         order = _order(words)
         if rows and len(rows[0]) == len(order) + 1 and _counts([row[0] for row in rows]):
@@ -173,7 +174,7 @@ def _laid_out(
     order = columns.order_of(np.array(rows)) if rows and len(rows[0]) == 4 and not told else ""
     if order and default.unit == "whole" and len(rows) < columns.TELLING and (
             {row[2] for row in rows} <= columns.POLARITIES):
-        order = columns.PROPHESEE  # few values tell little, but the tool has this order
+        order = columns.PROPHESEE  # few values say little, but the tool uses this order
     if not order:
         return None
     notes = () if order in columns.KNOWN else (columns.inferred(order),)
@@ -181,12 +182,12 @@ def _laid_out(
 
 
 def _unit(order: str, default: Layout) -> str:
-    """How times without a unit are read."""
+    """The unit of times for which none is given."""
     return "whole" if order == columns.PROPHESEE else default.unit
 
 
 def _decoded(line: bytes) -> str:
-    """A line of a header as text: whatever its encoding, micro is one."""
+    """A header line as text; the micro sign is understood in any encoding."""
     line = line.removeprefix(codecs.BOM_UTF8)
     try:
         words = line.decode("utf-8")
@@ -201,8 +202,8 @@ def _fields(words: str) -> list[str]:
 
 
 def _order(words: str) -> str:
-    """Which column is which, of a header that names all four, "-" where another is; else "". A
-    comment is a header if it names nothing else."""
+    """Which column is which, if a header names all four ("-" for others); else "". A comment counts
+    as a header only if it names nothing else."""
     fields = _fields(words)
     chosen = columns.by_name(fields)
     if not chosen or len(fields) > MOST or len(set(fields)) < len(fields):

@@ -1,4 +1,4 @@
-"""Files that are known, but not read: what they are, and what to do with them."""
+"""Known file types that are not read: what they are, and what to do with them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAGICS: tuple[tuple[int, bytes, Known], ...] = (  # at a byte of the file
     (0, b"MATLAB 7.3 MAT-file", Known(
         "a MATLAB file of version 7.3, which is HDF5", "In Python, h5py.File(path) has its arrays: "
         f"write {NPZ}.")),
-    (0, b"#!AER-DAT", Known("AEDAT of a version that is not known",
+    (0, b"#!AER-DAT", Known("AEDAT of an unknown version",
                             "Versions 1 to 4 are read: log it again with DV or jAER.")),
     (0, b"\x1f\x8b", Known("compressed by gzip", "Unpack it first: gunzip.")),
     (0, b"\x28\xb5\x2f\xfd", Known("compressed by zstd", "Unpack it first: zstd -d.")),
@@ -40,7 +40,7 @@ MAGICS: tuple[tuple[int, bytes, Known], ...] = (  # at a byte of the file
     (0, b"\x80\x04", Known("a pickle of Python", "It could run any program, and is never opened: "
                            f"where it was made, write {NPZ}.")),
     (0, b"SQLite format 3\0", Known(
-        "an SQLite database without ROS 2 messages", "Of a ROS 2 bag pass the folder, or the .db3 "
+        "an SQLite database without ROS 2 messages", "For a ROS 2 bag pass the folder, or the .db3 "
         "with its metadata.yaml.")),
     (0, b"\x89PNG\r\n", VIDEO), (0, b"\xff\xd8\xff", VIDEO), (0, b"GIF8", VIDEO),
     (0, b"II*\0", VIDEO), (0, b"MM\0*", VIDEO), (4, b"ftyp", VIDEO), (0, b"\x1aE\xdf\xa3", VIDEO),
@@ -50,7 +50,7 @@ PICKLES = tuple(bytes([0x80, version]) for version in (2, 3, 5))
 
 
 def known(path: Path, head: bytes) -> Known | None:
-    """What a file is that begins so and that no format claims; None where that is not known."""
+    """What a file with this beginning is, if no format claims it; None if unknown."""
     for at, magic, found in MAGICS:
         if head.startswith(magic, at):
             return _of(path, found)
@@ -61,19 +61,19 @@ def known(path: Path, head: bytes) -> Known | None:
     if head.startswith(b"PK"):
         return _archive(path)
     if path.suffix.lower() == ".raw":
-        return Known("no Prophesee RAW: neither do lines `% evt 3.0` or `% format EVT3` begin it, "
-                     "nor are its words of EVT2, EVT2.1 or EVT3",
+        return Known("not a Prophesee RAW: it does not begin with lines `% evt 3.0` or `% format "
+                     "EVT3`, nor are its words EVT2, EVT2.1 or EVT3",
                      "Was it exported without its header, or is it raw video? Record it again, or "
-                     "put the header of another recording of the camera before it.")
+                     "prepend the header of another recording of this camera.")
     if path.suffix.lower() in (".aedat", ".dat") and b"\0" in head[:64]:
-        return Known("data without a header, as AEDAT 1 of old jAER may be",
+        return Known("data without a header, possibly AEDAT 1 of an old jAER",
                      "Open it in jAER, and log it again: that writes AEDAT 2.")
     words = unread_text.known(head)
     return None if words is None else _of(path, words)
 
 
 def _of(path: Path, found: Known) -> Known:
-    """With the names of the file and of one beside it."""
+    """Fill in the names of the file and of one beside it."""
     return found._replace(fix=found.fix.replace(" IN ", f" {path} ").replace(
         "OUT", str(path.with_suffix(""))))
 
@@ -82,7 +82,7 @@ def _array(head: bytes) -> Known | None:
     try:
         shape, _, dtype = npy_header(io.BytesIO(head))
     except ValueError as e:
-        return Known(f"a damaged .npy ({e})", "Copy or export it again; of Python objects save "
+        return Known(f"a damaged .npy ({e})", "Copy or export it again; save Python objects as "
                      "arrays of numbers.")
     return Known(f"an array {shape} of {dtype}", "Events are N x 4 numbers, or records with t, x, "
                  "y and p; frames (T, H, W) go to evflow simulate, or beside a recording "

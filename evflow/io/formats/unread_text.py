@@ -1,4 +1,4 @@
-"""Text that holds no events as they are read: what it is instead, and what to do with it."""
+"""Text that cannot be read as events: what it is instead, and what to do with it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from evflow.io.decode import text
 
-MOST = 200  # lines looked at
+MOST = 200  # lines examined
 
 
 class Known(NamedTuple):
@@ -18,7 +18,7 @@ class Known(NamedTuple):
 
 
 def known(head: bytes) -> Known | None:
-    """What text that begins so is; None of what is none."""
+    """What text with this beginning is; None if it is not text."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return Known("text in UTF-16, as Windows' PowerShell writes it",
                      "Convert it: iconv -f UTF-16 -t UTF-8 IN > OUT.txt.")
@@ -33,7 +33,7 @@ def known(head: bytes) -> Known | None:
 
 
 def _numbers(head: bytes) -> Known | None:
-    """Of lines of as many numbers each, which can be no events."""
+    """For lines of equally many numbers that cannot be events."""
     rows: list[list[float]] = []
     for line in text.plain(head, 0).split(b"\n")[:MOST]:
         fields = line.partition(b"#")[0].split()
@@ -45,7 +45,7 @@ def _numbers(head: bytes) -> Known | None:
     few = [f"number {i} holds {', '.join(f'{v:g}' for v in sorted(set(column)))}"
            for i, column in enumerate(columns, 1) if len(set(column)) <= 3]
     return Known(
-        f"text of {len(columns)} columns of numbers, which are no t, x, y and p by their values"
+        f"text of {len(columns)} columns of numbers, which by their values are not t, x, y and p"
         + (f" ({'; '.join(few)})" if few else ""),
         "Events need a polarity, a fourth column: 0 and 1, or -1 and 1." if len(columns) < 4 else
         "Name the columns in a first line (t x y p, others may stand beside them); polarity is 0 "

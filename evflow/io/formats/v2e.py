@@ -1,8 +1,8 @@
 """HDF5 as the simulator v2e writes it (v2ecore/emulator.py, --dvs_h5 and --ddd_output).
 
-/events uint32 (N, 4): t us, x, y, p in {0, 1}; of other tools in another order, which the values
-tell. With frames: /frame uint8 (T, H, W), /frame_ts uint32 us. Without them the file does not tell
-the sensor's size.
+/events uint32 (N, 4): t us, x, y, p in {0, 1}; other tools use other orders, inferred from the
+values. With frames: /frame uint8 (T, H, W), /frame_ts uint32 us. Without them the file does not
+contain the sensor's size.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ EXTENSIONS: tuple[str, ...] = (".h5", ".hdf5")
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Integers; floats of that shape have another order."""
+    """Integers only; floats of that shape have another order."""
     return tables.holds(head, path, lambda f: getattr(f.get("events"), "shape", ())[1:] == (4,)
                         and f["events"].dtype.kind != "f")
 

@@ -1,6 +1,6 @@
 """Text as the simulator v2e writes it (v2ecore/output/ae_text_output.py): `#` lines that name v2e,
 then a line `t[s] x y p` per event, and with --label_signal_noise a fifth number, 1 = signal,
-0 = noise, which is not read. Such lines without a header are read as well.
+0 = noise, which is not read. Such lines are read without a header too.
 """
 
 from __future__ import annotations
@@ -29,6 +29,6 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV015 (text does not tell the size) and what `stream.gather` raises."""
+    """Raises EV015 (unknown size) and what `stream.gather` raises."""
     with open(path, "rb") as f:
         return collect(path, text.events(f, (4, 5)), hints, None, native="s")

@@ -1,4 +1,4 @@
-"""AEDAT 2 as jAER reads it: the events of the chips that it knows (see `aedat2` for the layout)."""
+"""AEDAT 2 as jAER reads it, for the chips that it knows (see `aedat2` for the layout)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHIPS: dict[Size, str] = {  # jAER's classes, by the sensor's size
 
 
 class Aedat2Writer(EventWriter):
-    """Events alone; times of 31 bits, as jAER has them signed."""
+    """Events only; times of 31 bits, as jAER's are signed."""
 
     NAME = NAME
     DEPTHS = ()
@@ -35,8 +35,8 @@ class Aedat2Writer(EventWriter):
         if self.size not in CHIPS:
             sizes = ", ".join(f"{width}x{height}" for width, height in CHIPS)
             raise EvflowDataError(
-                "EV003", f"jAER has no chip of {size[0]}x{size[1]} pixels; aedat2 is written for "
-                f"{sizes}.", "Write aedat4, which has any size; or simulate with --sensor-size "
+                "EV003", f"jAER has no chip of {size[0]}x{size[1]} pixels; aedat2 is for "
+                f"{sizes}.", "Write aedat4, which takes any size; or simulate with --sensor-size "
                 "davis346.")
 
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:

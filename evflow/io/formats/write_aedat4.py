@@ -1,9 +1,9 @@
 """AEDAT 4 (iniVation DV) written by hand: three small FlatBuffers, no package needed.
 
 The file is the version line; {u32 size, IOHE: compression i32, table position i64, XML}; packets
-{i32 stream, i32 size, EVTS or FRME}; and at the end the FTAB, an entry per packet with its place
-and times, by which DV seeks and readers notice a file that is cut off. Every buffer is a FlatBuffer
-that begins with its own size. Packets are not compressed: 16 bytes per event.
+{i32 stream, i32 size, EVTS or FRME}; and at the end the FTAB, an entry per packet with its position
+and times, which DV uses to seek and by which readers notice truncation. Every buffer is a
+FlatBuffer that begins with its own size. Packets are not compressed: 16 bytes per event.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ATTR = '<attr key="{}" type="{}">{}</attr>'
 
 
 class Aedat4Writer(EventWriter):
-    """Events and grey frames of 8 bits, whose time is the begin and the end of their exposure."""
+    """Events and 8-bit grey frames, whose time is both begin and end of their exposure."""
 
     NAME = "aedat4"
     DEPTHS = ("uint8",)
@@ -51,7 +51,7 @@ class Aedat4Writer(EventWriter):
             self._packet(EVENTS, buffer, len(part), part.t)
 
     def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
-        self._flush()  # the file is in the order of time, as readers expect
+        self._flush()  # the file is ordered by time, as readers expect
         for frame, t in zip(frames, times, strict=True):
             self._packet(FRAMES, _frame(frame, int(t)), 1, np.array([t]))
 
@@ -72,7 +72,7 @@ class Aedat4Writer(EventWriter):
 
 
 def _header(size: tuple[int, int], table: int) -> bytes:
-    """IOHE, not compressed; table: the byte where the FTAB begins."""
+    """IOHE, not compressed; table: offset of the FTAB."""
     width, height = size
     streams = "".join(
         f'<node name="{stream}" path="/outInfo/{stream}/">'
@@ -97,7 +97,7 @@ def _frame(frame: np.ndarray, t: int) -> bytes:
 
 
 def _table(entries: np.ndarray) -> bytes:
-    """FTAB: a vector of offsets, from each to its entry; then the entries and their one vtable."""
+    """FTAB: a vector of offsets to entries; then the entries and their one vtable."""
     n, index = len(entries), np.arange(len(entries))
     start = _padded(4 * n) + 16
     entries["vtable"] = 16 + ENTRY.itemsize * index
@@ -110,11 +110,11 @@ def _table(entries: np.ndarray) -> bytes:
 def _buffer(
     identifier: bytes, scalars: Sequence[tuple[str, int]], count: int, vector: bytes
 ) -> bytes:
-    """A FlatBuffer of one table: scalars (struct code, value) in the order of the schema, and
-    behind them a vector of `count` elements, aligned to 8.
+    """A FlatBuffer of one table: scalars (struct code, value) in the order of the schema, followed
+    by a vector of `count` elements, aligned to 8.
 
     size u32 | root u32 | identifier | vtable | table | count u32 | elements: the table and the
-    count begin 4 behind a multiple of 8, so that what follows them is aligned.
+    count begin 4 bytes after a multiple of 8, so that what follows them is aligned.
     """
     sizes = [*(struct.calcsize(f"<{code}") for code, _ in scalars), 4]
     places, end = [0] * len(sizes), 4

@@ -1,1 +1,1 @@
-"""Images in time: folders, videos and NumPy stacks as frames, and the times that belong to them."""
+"""Image sequences: folders, videos and NumPy stacks as frames, and their times."""

@@ -1,7 +1,7 @@
-"""Frames that stand among the events of a file, put aside while the events are read.
+"""Frames stored among the events of a file, collected while the events are read.
 
-A frame lies behind the events of its time, by less than `LATE_US`: so much further than `stop_s`
-a file is read.
+A frame may follow events of its time by up to `LATE_US`: a file is read that much further than
+`stop_s`.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ class Aside:
         self.last, self.stop, self.begun = 0, sys.maxsize, False
 
     def append(self, image: np.ndarray, time_us: int, origin: tuple[int, int] = (0, 0)) -> None:
-        """A frame, as `FrameStack` has it."""
+        """Add a frame, as in `FrameStack`."""
         with events_alone():
             self.stack.append(image, time_us, origin)
 
     def follow(self, t: np.ndarray) -> None:
-        """Follow the time of events t (n,) us as far as `stop_s` needs it."""
+        """Note the time of events t (n,) us, if `stop_s` is set."""
         if self.hints.stop_s is not None and len(t):
-            self.last = self.hints.instant(t[len(t) // 2], "us")  # a single one may be wrong
+            self.last = self.hints.instant(t[len(t) // 2], "us")  # robust to a single wrong time
             if not self.begun:
                 self.begun, self.stop = True, self.hints.span_us(self.hints.instant(t[0], "us"))[1]
 
     @property
     def done(self) -> bool:
-        """Have the frames from before `stop_s` come?"""
+        """Whether all frames from before `stop_s` have arrived."""
         return self.last >= self.stop + LATE_US
 
     def collect(
         self, chunks: Iterator[Chunk], notes: Callable[[], tuple[Note, ...]] = tuple
     ) -> Recording:
-        """The recording of events and frames. `chunks` calls `append` and `follow`, and ends where
-        it is `done`; `notes` is called at the end. Raises what `gather` and `Recording` raise."""
+        """The recording of events and frames. `chunks` calls `append` and `follow`, and ends once
+        `done`; `notes` is called at the end. Raises what `gather` and `Recording` raise."""
         found = gather(self.path, chunks, self.hints, self.size)
         if self.last >= found.span[1]:
             with contextlib.suppress(Damage):

@@ -1,10 +1,10 @@
-"""When frames were filmed that a converter between frame rates shows again at regular places.
+"""When frames were filmed if a frame-rate converter repeats some of them at regular positions.
 
-Of 24 frames a second that are shown at 30, every fourth is shown twice: without the repeats one gap
-in four is twice as long, though the frames were filmed evenly. A converter shows a frame at its
-first chance, so the filmed times lie on a line from which the shown ones are late by less than one
-frame. A camera that had no new frame and showed the last again is another thing: there as much
-happens in twice the time, and the times are right.
+When 24 frames a second are shown at 30, every fourth is shown twice: without the repeats every
+fourth gap is twice as long, though the frames were filmed evenly. A converter shows a frame as
+early as it can, so the filmed times lie on a line, and the shown ones are later by less than one
+frame. It is different if a camera had no new frame and repeated the last one: then the scene moves
+twice as far in the double gap, and the times are right.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 
 Array = np.ndarray
 
-LEAST_REPEATS, LEAST_FRAMES = 3, 16  # in a stretch: fewer tell no cadence
+LEAST_REPEATS, LEAST_FRAMES = 3, 16  # in a stretch: fewer do not show a cadence
 ROUNDED_US = 1_000  # containers round times to the millisecond
-SLACK = 1.02  # frames: the most that a converter is late, and its clock's rounding
-LEAST_STEP = 0.5  # frames between two of the found times
+SLACK = 1.02  # frames: maximum delay by a converter, with rounding of its clock
+LEAST_STEP = 0.5  # frames between two of the recovered times
 
 
 def evened(times: Array, changes: Array, frame_us: float) -> Array | None:
-    """Times (K,) in us, int64, at which frames were filmed that are first shown at `times`; None
-    where no stretch of them has the cadence of a converter.
+    """Times (K,) in us, int64, at which the frames first shown at `times` were filmed; None if no
+    stretch of them has the cadence of a converter.
 
-    changes: (K - 1,) how much happens from frame to frame. frame_us: length of a frame of the video
-    as it is shown. No time is moved by more than that, and its rounding.
+    changes: (K - 1,) amount of change from frame to frame. frame_us: duration of a frame of the
+    video as shown. No time is moved by more than that, plus rounding.
     """
     even, begin, free = times.astype(np.float64), 0, 0
     while begin < len(times) - 1:
@@ -35,11 +35,11 @@ def evened(times: Array, changes: Array, frame_us: float) -> Array | None:
         if _regular(times[begin:end + 1], changes[begin:end], frame_us):
             line = first + step * (np.arange(len(times)) - begin)
             while begin > free and 0 <= times[begin - 1] - line[begin - 1] <= _most(frame_us):
-                begin -= 1  # what a stretch before took for its own
+                begin -= 1  # part of the previous stretch
             while 0 < begin < end and line[begin] - even[begin - 1] < LEAST_STEP * frame_us:
                 begin += 1
             if begin == 1 and times[0] > line[0]:
-                begin = 0  # shown before the video was cut out of another
+                begin = 0  # the first frame was shown before the video's start
             even[begin:end + 1], free = line[begin:end + 1], end + 1
         begin = end + 1
     if not free or np.diff(even).min() < LEAST_STEP * frame_us:
@@ -48,12 +48,12 @@ def evened(times: Array, changes: Array, frame_us: float) -> Array | None:
 
 
 def _most(frame_us: float) -> float:
-    """How late a frame is shown at most, in us."""
+    """The maximum delay of a frame, in us."""
     return SLACK * frame_us + ROUNDED_US
 
 
 def _reach(times: Array, begin: int, frame_us: float) -> int:
-    """The last frame (index) of the longest stretch from `begin` that may be evenly filmed."""
+    """Index of the last frame of the longest stretch from `begin` that may be evenly filmed."""
 
     def even(end: int) -> bool:
         part = times[begin:end + 1]
@@ -74,8 +74,7 @@ def _reach(times: Array, begin: int, frame_us: float) -> int:
 
 
 def _line(times: Array) -> tuple[float, float]:
-    """First value and step of the line below times (K,) that touches them on both sides of the
-    middle."""
+    """Value and step of the line below times (K,) that touches them on both sides of the middle."""
     hull: list[tuple[int, float]] = []
     for k, t in enumerate(times.tolist()):
         while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (k - hull[-2][0]) >= (
@@ -89,8 +88,8 @@ def _line(times: Array) -> tuple[float, float]:
 
 
 def _regular(times: Array, changes: Array, frame_us: float) -> bool:
-    """Whether a stretch has repeats, unevenly, and as much happens in its long gaps as in its short
-    ones, not as much more as they are longer."""
+    """Whether a stretch has repeats at uneven positions, and its long gaps contain as much change
+    as its short ones, rather than proportionally more."""
     gaps = np.rint(np.diff(times) / frame_us)
     long = gaps > gaps.min(initial=np.inf)
     few = len(gaps) < LEAST_FRAMES or (gaps - 1).clip(0).sum() < LEAST_REPEATS

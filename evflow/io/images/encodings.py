@@ -1,9 +1,9 @@
-"""Encodings of images in messages of ROS (sensor_msgs/image_encodings), in one table: what their
-bytes are, and how they become grey frames.
+"""Image encodings of ROS messages (sensor_msgs/image_encodings) in one table: the meaning of their
+bytes, and how they become grey frames.
 
-Depths stay as they are, 8 or 16 bits. Colour becomes luma, as does a Bayer mosaic by the pattern
-that its encoding names, unless the mosaic itself is asked for. `8UC3` and the like are OpenCV's, in
-B, G, R. Numbers that are measures (32FC1: depth, flow) are no frames.
+Depths of 8 and 16 bits are kept. Colour becomes luma, and so does a Bayer mosaic, by the pattern
+that its encoding names, unless the mosaic itself is requested. `8UC3` etc. are OpenCV's, in B, G,
+R. Physical quantities (32FC1: depth, flow) are not frames.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from evflow.notes import Note
 
 
 class Encoding(NamedTuple):
-    """dtype of a value, values of a pixel, their order ("grey", "bgr", "rgb") or a pattern."""
+    """dtype of a value; values per pixel; their order ("grey", "bgr", "rgb") or a pattern."""
 
     dtype: str
     channels: int
@@ -38,26 +38,26 @@ GREYS = ("grey", "bgr", "rgb")
 
 
 def unreadable(encoding: str) -> str:
-    """Why images of an encoding are no frames; "" where they are."""
+    """Why images of an encoding cannot be frames; "" if they can."""
     if encoding.lower() in ENCODINGS:
         return ""
     name = encoding[:20]
     if "FC" in encoding.upper():
-        return f"{name}: floats, as depth and flow have"
-    return f"encoded as {name!r}, which is not known"
+        return f"{name}: floats, as for depth and flow"
+    return f"unknown encoding {name!r}"
 
 
 def notes(encoding: str, seen: str = "luma") -> tuple[Note, ...]:
-    """What is to be said of frames that were so encoded and are converted here, unless pixels see
-    (`Hints.colour`) the mosaic."""
+    """Notes on the conversion of frames in this encoding; none if the mosaic itself is kept
+    (`Hints.colour`)."""
     known = ENCODINGS.get(encoding.lower())
     mosaic = known is not None and known.order not in GREYS and seen == "luma"
     return (mosaic_note(known.order),) if known and mosaic else ()
 
 
 def unpacked(encoding: str, image: np.ndarray, seen: str = "luma") -> np.ndarray:
-    """An image (H, W) or (H, W, C) that had an encoding before it was compressed: a mosaic is
-    compressed as it is."""
+    """Convert an image (H, W) or (H, W, C) that was in `encoding` before it was compressed; mosaics
+    are compressed unchanged."""
     known = ENCODINGS.get(encoding)
     if known is None or known.order in GREYS or image.ndim != 2 or min(image.shape) < 2:
         return image
@@ -65,7 +65,7 @@ def unpacked(encoding: str, image: np.ndarray, seen: str = "luma") -> np.ndarray
 
 
 def _of_mosaic(values: np.ndarray, pattern: str, seen: str) -> np.ndarray:
-    """What pixels see of a mosaic; EV020 where they are said to see another."""
+    """What pixels see of a mosaic; EV020 if another pattern was requested."""
     if seen == "luma":
         return mosaic_luma(values, pattern)
     if seen != pattern:
@@ -81,7 +81,7 @@ def decode(
 ) -> np.ndarray:
     """Pixels (H, W), or (H, W, 3) in B, G, R, u8 or u16, of rows of `step` bytes.
 
-    size: (width, height). ValueError where the bytes are not those of such an image.
+    size: (width, height). ValueError if the bytes do not match.
     """
     kind, channels, order = ENCODINGS[encoding.lower()]
     width, height = size
@@ -93,7 +93,7 @@ def decode(
     values = rows.view((">" if big_endian else "<") + kind).astype(kind)
     if order not in GREYS:
         if min(size) < 2:
-            raise ValueError(f"a mosaic of {width}x{height} has no cell")
+            raise ValueError(f"a mosaic of {width}x{height} is smaller than a cell")
         return _of_mosaic(values, order, seen)
     if channels == 1:
         return values

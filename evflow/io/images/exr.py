@@ -1,7 +1,7 @@
 """OpenEXR images of scan lines, uncompressed or by RLE, ZIPS or ZIP: half and float channels.
 
-Many builds of OpenCV read no EXR. What is of another kind (tiles, PIZ, several parts) `unread`
-names. Light is linear in EXR, and colours are multiplied by their opacity already.
+Many builds of OpenCV do not read EXR. Other kinds (tiles, PIZ, several parts) are named by
+`unread`. EXR values are linear in light, and colours are already multiplied by their opacity.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 MAGIC = b"\x76\x2f\x31\x01"
 TILES, DEEP, PARTS = 0x200, 0x800, 0x1000  # bits of the version
 COMPRESSIONS = ("none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
-LINES = {"none": 1, "RLE": 1, "ZIPS": 1, "ZIP": 16}  # of a block
+LINES = {"none": 1, "RLE": 1, "ZIPS": 1, "ZIP": 16}  # rows per block
 KINDS = (np.dtype("<u4"), np.dtype("<f2"), np.dtype("<f4"))
 
 
@@ -26,7 +26,7 @@ class Channel(NamedTuple):
 
 
 class Header(NamedTuple):
-    """first: row at which the picture begins; end: byte at which the header does."""
+    """first: row at which the image begins; end: offset of the end of the header."""
 
     size: tuple[int, int]
     first: int
@@ -37,7 +37,7 @@ class Header(NamedTuple):
 
 
 def header(data: bytes) -> Header:
-    """Raises ValueError, struct.error or IndexError where it is damaged."""
+    """Raises ValueError, struct.error or IndexError if it is damaged."""
     flags = struct.unpack_from("<I", data, 4)[0] & ~0xFF
     at, found = 8, dict[str, bytes]()
     while data[at] != 0:
@@ -58,7 +58,7 @@ def claimed_size(data: bytes) -> tuple[int, int]:
 
 
 def unread(head: Header) -> str:
-    """What of this image `decode` does not read, in words; "" where it reads all."""
+    """Which feature of this image `decode` does not support; "" if it supports all."""
     for bit, what in ((TILES, "tiles"), (DEEP, "deep pixels"), (PARTS, "several parts")):
         if head.flags & bit:
             return what
@@ -68,8 +68,8 @@ def unread(head: Header) -> str:
 
 
 def decode(data: bytes, head: Header) -> np.ndarray:
-    """float32 (H, W), or (H, W, 3) in B, G, R. Raises ValueError, struct.error or zlib.error where
-    it is damaged."""
+    """float32 (H, W), or (H, W, 3) in B, G, R. Raises ValueError, struct.error or zlib.error if it
+    is damaged."""
     width, height = head.size
     row = np.dtype([(f"c{i}", c.dtype, (width,)) for i, c in enumerate(head.channels)])
     lines = LINES[head.compression]
@@ -90,7 +90,7 @@ def decode(data: bytes, head: Header) -> np.ndarray:
 
 
 def _attribute(data: bytes, at: int) -> tuple[str, int, int]:
-    """Name and size of an attribute, and where its value is."""
+    """Name and size of an attribute, and the offset of its value."""
     words = []
     for _ in range(2):
         end = data.index(b"\0", at, at + 256)
@@ -113,8 +113,8 @@ def _channels(data: bytes) -> list[Channel]:
 
 
 def _shown(names: list[str]) -> list[int]:
-    """Which channels are blue, green and red of the first layer that has them; else of Y, or the
-    only one."""
+    """Indices of the blue, green and red channel of the first layer that has them; else of Y, or of
+    the only channel."""
     layers = dict.fromkeys(name.rpartition(".")[0] for name in names)
     for layer in sorted(layers, key=len):
         of = {name.rpartition(".")[2].upper(): i for i, name in enumerate(names)
@@ -124,11 +124,11 @@ def _shown(names: list[str]) -> list[int]:
                 return [of[c] for c in colours]
     if len(names) == 1:
         return [0]
-    raise ValueError(f"channels {', '.join(names[:6])}, of which none is R, G, B or Y")
+    raise ValueError(f"channels {', '.join(names[:6])}, none of which is R, G, B or Y")
 
 
 def _unpacked(packed: bytes, compression: str, length: int) -> bytes:
-    """`length` bytes of rows; what does not become shorter is stored as it is."""
+    """`length` bytes of rows; data that compression does not shorten are stored raw."""
     if compression == "none" or len(packed) == length:
         raw = packed
     else:
@@ -137,14 +137,14 @@ def _unpacked(packed: bytes, compression: str, length: int) -> bytes:
         else:
             coded = zlib.decompressobj().decompress(packed, length)
         steps = np.frombuffer(coded, np.uint8).astype(np.uint8)
-        steps[1:] -= np.uint8(128)  # differences, and even bytes before odd ones
+        steps[1:] -= np.uint8(128)  # stored as differences, even bytes before odd ones
         values = np.cumsum(steps, dtype=np.uint8)
         order = np.empty_like(values)
         half = (len(values) + 1) // 2
         order[0::2], order[1::2] = values[:half], values[half:]
         raw = order.tobytes()
     if len(raw) != length:
-        raise ValueError(f"a block of {len(raw)} bytes where {length} belong")
+        raise ValueError(f"a block of {len(raw)} bytes instead of {length}")
     return raw
 
 

@@ -1,4 +1,4 @@
-"""Folders of images as a video: natural order, one decoded at a time, at their full bit depth."""
+"""Folders of images as a video: in natural order, decoded one at a time, at full bit depth."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from evflow.io.images.pictures import claimed_bytes
 from evflow.io.images.times import read_times
 from evflow.notes import Note
 
-RADIANCE = (".hdr", ".exr", ".pfm")  # whose numbers have no white
+RADIANCE = (".hdr", ".exr", ".pfm")  # formats without a defined white
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RADIANCE)
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
-EXIF, HEAD = (b"Exif\0\0", b"eXIf"), 1 << 16  # what may tell which side is up, and where
-UPRIGHT = 6  # OpenCV's IMREAD_ANYCOLOR | IMREAD_ANYDEPTH: as it is, but as EXIF turns it
-MADE = "made from the events by"  # how `evflow reconstruct` marks images in their file of times
+EXIF, HEAD = (b"Exif\0\0", b"eXIf"), 1 << 16  # markers of EXIF orientation, and bytes to search
+UPRIGHT = 6  # OpenCV's IMREAD_ANYCOLOR | IMREAD_ANYDEPTH: unchanged, but rotated as EXIF says
+MADE = "made from the events by"  # mark of `evflow reconstruct` in its file of times
 TIMES = ("timestamps.txt", "images.txt", "image_timestamps.txt", "timestamp.txt", "times.txt",
          "info.txt", "rgb.txt", "data.csv", "timestamps.csv", "timestamps.npy")
 
@@ -48,7 +48,7 @@ class ImageFolder:
 def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     """The images of a folder, or of its only subfolder with images, and their times.
 
-    Times are those of `hints.timestamps`, of `hints.fps`, or of a file in `TIMES` beside them.
+    Times come from `hints.timestamps`, from `hints.fps`, or from a file in `TIMES` beside them.
     Raises EV008 (no images), EV002 (counts differ), EV016 (an image is missing), EV020 (no
     times), and what `read_times` raises.
     """
@@ -63,21 +63,21 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     missing = [name for name in names if name not in by_name]
     if missing:
         raise EvflowDataError(
-            "EV016", f"{source} names {missing[0]}, which is not in {folder} "
-            f"({len(missing)} of {len(names)} are not).", "Restore the images or remove the lines.",
+            "EV016", f"{source} names {missing[0]}, which is missing in {folder} "
+            f"({len(missing)} of {len(names)} are).", "Restore the images or remove the lines.",
             where=source)
     if len(us) != len(files) or len(set(names)) != len(names):
         raise EvflowDataError(
             "EV002", f"{folder} holds {len(files)} images, {source} times for "
             f"{len(set(names)) if names else len(us)}.",
-            "Images lost, or of another recording? Give each image one time, or pass --fps.",
+            "Images lost, or from another recording? Give each image one time, or pass --fps.",
             where=folder)
     files = [by_name[name] for name in names] if names else files
     return ImageFolder(tuple(files), us, notes + made)
 
 
 def _gaps(files: list[Path]) -> tuple[Note, ...]:
-    """What is said where the only number that differs between names jumps."""
+    """A note if the running number in the file names skips values."""
     parts = [natural(file.name)[0] for file in files]
     alike = len({len(part) for part in parts}) == 1
     varying = [i for i, same in enumerate(zip(*parts, strict=False)) if len(set(same)) > 1]
@@ -88,14 +88,14 @@ def _gaps(files: list[Path]) -> tuple[Note, ...]:
     jumps = np.flatnonzero(steps > np.median(steps))
     if not len(jumps):
         return ()
-    many = f", and {len(jumps) - 1} more times" if len(jumps) > 1 else ""
-    return (Note("frames.gaps", f"the numbers of the images jump from {files[jumps[0]].name} to "
-                 f"{files[jumps[0] + 1].name}{many}: images lost? They are taken as evenly spaced; "
-                 "--timestamps keeps gaps in time."),)
+    many = f", and in {len(jumps) - 1} more places" if len(jumps) > 1 else ""
+    return (Note("frames.gaps", f"image numbers jump from {files[jumps[0]].name} to "
+                 f"{files[jumps[0] + 1].name}{many}: are images missing? They are assumed to be "
+                 "evenly spaced; --timestamps keeps gaps in time."),)
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder in natural order (img2 before img10), hidden ones left out."""
+    """The image files of a folder in natural order (img2 before img10), without hidden ones."""
     try:
         entries = list(folder.iterdir())
     except OSError as e:
@@ -106,7 +106,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def natural(name: str) -> tuple[list[str | int], str]:
-    """A sort key by which the numbers in names count as numbers."""
+    """A sort key that compares digits in names as numbers."""
     parts = re.split(r"([0-9]+)", name.lower())
     return [int(p) if i % 2 else p for i, p in enumerate(parts)], name
 
@@ -114,12 +114,12 @@ def natural(name: str) -> tuple[list[str | int], str]:
 def decode(file: Path | zipfile.Path) -> np.ndarray:
     """One image at its full bit depth: (H, W) or (H, W, 3 or 4) in B, G, R(, A).
 
-    Raises EV008 (an EXR that this OpenCV does not read), EV009 (damaged, cut off), EV016 (not
-    there).
+    Raises EV008 (an EXR that this OpenCV does not read), EV009 (damaged, truncated), EV016 (not
+    found).
     """
     try:
-        if not file.is_file():  # a pipe has no end
-            raise OSError(0, "it is no regular file")
+        if not file.is_file():  # a pipe might never end
+            raise OSError(0, "it is not a regular file")
         data = read_whole(file)
     except OSError as e:
         raise EvflowDataError("EV016", f"{file} cannot be read ({e.strerror}).", where=file) from e
@@ -127,12 +127,12 @@ def decode(file: Path | zipfile.Path) -> np.ndarray:
 
 
 def decoded(data: bytes, where: object) -> np.ndarray:
-    """The same of the bytes of an image; EV009. where: names them in messages."""
+    """The same from the bytes of an image; EV009. where: name for messages."""
 
     claimed = claimed_bytes(data)
     if claimed is not None:
         check_expansion(claimed, len(data), where)
-    # OpenCV fills what is missing of a cut-off JPEG or PNG with grey and says nothing.
+    # OpenCV silently fills the missing part of a truncated JPEG or PNG with grey.
     jpeg, png = data.startswith(b"\xff\xd8"), data.startswith(b"\x89PNG")
     whole = not ((jpeg and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
                  or (png and b"IEND" not in data))
@@ -140,7 +140,7 @@ def decoded(data: bytes, where: object) -> np.ndarray:
              _exr(data, where) if data.startswith(exr.MAGIC) else _by_opencv(data))
     if image is None or not whole:
         raise EvflowDataError(
-            "EV009", f"{where} ({len(data):,} bytes) is {'not a sound' if whole else 'a cut-off'} "
+            "EV009", f"{where} ({len(data):,} bytes) is {'a damaged' if whole else 'a truncated'} "
             "image.", "Copy it again.", where=where)
     return image
 
@@ -159,27 +159,27 @@ def _by_opencv(data: bytes) -> np.ndarray | None:
 
 
 def _exr(data: bytes, file: object) -> np.ndarray | None:
-    """An EXR, None where it is damaged; EV008 where nothing here reads its kind."""
+    """An EXR, None if it is damaged; EV008 if nothing here supports its kind."""
     try:
         head = exr.header(data)
         if not (kind := exr.unread(head)):
             return exr.decode(data, head)
     except (ValueError, IndexError, struct.error, zlib.error):
         return None
-    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # what reads it is off by default
+    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # off by default
     image = _by_opencv(data)
     if image is None:
         import cv2
 
         raise EvflowDataError(
             "EV008", f"{file} is an EXR with {kind}, which this OpenCV ({cv2.__version__}) does "
-            "not read.", "Save it as scan lines with ZIP or no compression, or as .hdr; or take "
+            "not read.", "Save it as scan lines with ZIP or no compression, or as .hdr; or use "
             "Debian's python3-opencv, which reads it.", where=file)
     return image[..., :3] if image.ndim == 3 else image
 
 
 def _find(root: Path) -> tuple[Path, list[Path]]:
-    """The folder that holds the images, and them."""
+    """The folder that holds the images, and their paths."""
     files = list_images(root)
     if files:
         return root, files
@@ -192,14 +192,14 @@ def _find(root: Path) -> tuple[Path, list[Path]]:
     video = next((p for p in sorted(root.iterdir()) if p.suffix.lower() in VIDEOS), None)
     raise EvflowDataError(
         "EV008", f"{root} {seen}.", f"Take videos one by one: {video}, ..." if video and not below
-        else "Pass the one folder that has the frames.", where=root)
+        else "Pass the folder that has the frames.", where=root)
 
 
 def _made(folder: Path) -> tuple[Note, ...]:
-    """What the file of times that `evflow reconstruct` writes says at its head, wherever the times
-    are taken from: that the images were made from events."""
+    """The note at the head of the file of times that `evflow reconstruct` writes: the images were
+    made from events. It applies wherever the times are taken from."""
     path = folder / TIMES[0]
-    if not path.is_file():  # a pipe has no end
+    if not path.is_file():  # a pipe might never end
         return ()
     try:
         with path.open(encoding="utf-8", errors="replace") as lines:
@@ -218,5 +218,5 @@ def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:
         return found[0]
     near = [str(p) for name in TIMES if (p := folder.parent / name).is_file()]
     raise EvflowDataError(
-        "EV020", f"{folder} has images but no file of their times ({', '.join(TIMES[:3])}, ...).",
+        "EV020", f"{folder} has images but no file with their times ({', '.join(TIMES[:3])}, ...).",
         f"Pass --fps, or --timestamps {near[0] if near else 'FILE'}.", where=folder)

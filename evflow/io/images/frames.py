@@ -1,7 +1,8 @@
-"""Decoded images of one camera as frames in DN: what a user may tell, and how it is obeyed.
+"""Decoded images of one camera as frames in DN, with the user's hints applied.
 
-A source decodes `Image`s in OpenCV's channel order; `converted` turns them, one by one, into
-frames of one shape and dtype: uint8 as it is, all else float32 on 0..255. Nothing is clipped.
+A source decodes `Image`s in OpenCV's channel order; `converted` turns them, one by one, into frames
+of one shape and dtype: uint8 stays as it is, all else becomes float32 on 0..255. Nothing is
+clipped.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ Array = np.ndarray
 
 
 class Image(NamedTuple):
-    """pixels (H, W) or (H, W, 1, 3 or 4) in B, G, R(, A); its time in us; where it came from."""
+    """pixels (H, W) or (H, W, 1, 3 or 4) in B, G, R(, A); its time in us; its origin for
+    messages."""
 
     pixels: np.ndarray
     time_us: int
@@ -50,17 +52,18 @@ class FrameHints:
     timestamps: a file with one time per frame; time_unit: "s", "ms", "us", "ns", or "auto".
     colour: "luma", or a Bayer pattern: then colour frames stay (H, W, 3), for `colour.mosaic`.
     full_scale: DN of white; None = 255 for uint8 and floats, 65535 for uint16.
-    partial: use what can be read of a damaged or cut-off file.
-    bayer: pattern of the raw mosaic that the frames are; they become its luma.
-    flip: mirror them. response: how they code light (see `light.response`), or "auto": as the
-        source usually does, see `io.source`.
+    partial: use what can be read of a damaged or truncated file.
+    bayer: pattern of the raw mosaic in the frames, which is converted to luma.
+    flip: mirror them. response: how they encode light (see `light.response`), or "auto": as is
+        usual for their source, see `io.source`.
     background: what transparent images are laid over, "black" or "white".
-    start_s, stop_s: frames with start <= time < stop, in seconds from the first; of a recording
+    start_s, stop_s: frames with start <= time < stop, in seconds from the first; for a recording
         from its first event.
-    frames_topic: of a recording, the images to take (see `Hints`).
+    frames_topic: which image stream of a recording to use (see `Hints`).
     repeated: "keep" or "drop" frames that repeat the one before (`repeats`). picture: the source
-        may be one picture.
-    clip: take what is brighter than full_scale as white and what is negative as black, as in
+        may be a single picture.
+    clip: treat values above full_scale as white and negative ones as black, for radiance, which has
+        no upper limit, instead of refusing them.
         radiance, which has no upper end, instead of refusing it.
     """
 
@@ -88,23 +91,24 @@ class FrameHints:
         Hints(start_s=self.start_s, stop_s=self.stop_s, frames_topic=self.frames_topic)  # EV020
         if self.bayer is not None and parse_pattern(self.bayer) and self.colour != "luma":
             raise EvflowDataError(
-                "EV020", f"bayer={self.bayer} makes luma of a mosaic, colour={self.colour} wants "
-                "the mosaic itself.", "Give one of them.")
+                "EV020", f"bayer={self.bayer} converts a mosaic to luma, colour={self.colour} "
+                "keeps the mosaic itself.", "Give only one of them.")
         for name in ("fps", "full_scale"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise EvflowDataError("EV020", f"{name}={value}.", "It must be > 0.")
         if self.fps is not None and not 1e-6 <= self.fps <= 1e6:
-            raise EvflowDataError("EV020", f"fps={self.fps:g}.", "Times are whole microseconds: "
+            raise EvflowDataError("EV020", f"fps={self.fps:g}.", "Times are integer microseconds: "
                                   "give 1e-6 to 1e6.")
         if self.fps is not None and self.timestamps is not None:
             raise EvflowDataError(
-                "EV020", f"fps={self.fps:g} and timestamps={self.timestamps} contradict.",
-                "Give one of them.")
+                "EV020", f"fps={self.fps:g} and timestamps={self.timestamps} contradict each "
+                         "other.",
+                "Give only one of them.")
 
     @staticmethod
     def parse(given: dict[str, Any]) -> FrameHints:
-        """Hints of keyword arguments; an unknown one raises EV020."""
+        """Hints from keyword arguments; an unknown one raises EV020."""
         return FrameHints(**known(given, FrameHints, "Videos"))
 
     def at_rate(self, index: int) -> int:
@@ -115,10 +119,10 @@ class FrameHints:
 
 @dataclasses.dataclass(frozen=True)
 class FrameSource:
-    """size (width, height); count: frames expected (0 = unknown); open(): a fresh iterator of
-    (frame, time in us), one decoded at a time. notes: what was assumed; it may grow while
-    frames are read. recorded: by a camera that recorded events too. Frames are (H, W), or (H, W,
-    3) where a mosaic was asked for of colour input, uint8 or float32 DN on 0..255."""
+    """size (width, height); count: frames expected (0 = unknown); open(): a new iterator of (frame,
+    time in us), decoded one at a time. notes: what was assumed; may grow while frames are read.
+    recorded: by a camera that also recorded events. Frames are (H, W), or (H, W, 3) if a mosaic of
+    colour input was requested, uint8 or float32 DN on 0..255."""
 
     size: tuple[int, int]
     count: int
@@ -127,17 +131,17 @@ class FrameSource:
     recorded: bool = False
 
     def watched(self, progress: Callable[[int, int], None]) -> Frames:
-        """The frames, with progress(done, total) called after each."""
+        """The frames; progress(done, total) is called after each."""
         for index, pair in enumerate(self.open(), 1):
             yield pair
             progress(index, max(self.count, index))
 
 
 def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> Frames:
-    """(frame, time in us) of decoded images, one at a time.
+    """(frame, time in us) from decoded images, one at a time.
 
     Raises EV002 (shape), EV003 (dtype, values above `full_scale`, floats on 0..1), EV004 (time
-    does not advance), EV007 (NaN), EV015 (the size changes), each with the frame it is about.
+    does not advance), EV007 (NaN), EV015 (the size changes); each message names the frame.
     """
     first: tuple[np.ndarray, np.dtype] | None = None
     last, bright = 0, False
@@ -146,20 +150,21 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
         depth = image.pixels.dtype
         if first is None:
             first = frame, depth
-            said = {note.code for note in notes}  # of the response already, where it was left open
+            said = {note.code for note in notes}  # may include the response already
             said |= {"frames.linearised"} if "frames.response" in said else set()
             notes += [n for n in _seen_first(image, frame, hints) if n not in notes and not (
                 n.code in ("frames.linearised", "frames.raw") and n.code in said)]
         elif image.time_us <= last:
             raise EvflowDataError(
-                "EV004", f"{image.where} is at {image.time_us} us, the frame before at {last} us.",
+                "EV004", f"{image.where} is at {image.time_us} us, the previous frame at {last} "
+                         "us.",
                 "Frame times must increase: pass --fps, or correct --timestamps.",
                 where=image.where)
         if frame.shape[:2] != first[0].shape[:2]:
             raise EvflowDataError(
                 "EV015", f"{image.where} is {frame.shape[1]}x{frame.shape[0]}, the first frame "
                 f"{first[0].shape[1]}x{first[0].shape[0]}.",
-                "All frames must be of one size: sort out the others.", where=image.where)
+                "All frames must have the same size: remove the others.", where=image.where)
         if depth != first[1] or frame.ndim != first[0].ndim:
             raise EvflowDataError(
                 "EV003", f"{image.where} is {'grey' if frame.ndim == 2 else 'colour'} {depth}, the "
@@ -170,7 +175,7 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
 
 
 def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> tuple[Array, bool]:
-    """The frame as light, and `bright` as `values.as_dn` has it."""
+    """The frame as light, and the updated `bright` (see `values.as_dn`)."""
     pixels, where = image.pixels, image.where
     if hints.bayer is not None:
         pixels = mosaic_luma(pixels, hints.bayer, where)
@@ -187,7 +192,7 @@ def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> t
     if pixels.ndim == 3 and pixels.shape[-1] == 4:
         pixels, through = values.opaque(pixels, hints.background)
         if through and not any(note.code == "frames.alpha" for note in notes):
-            notes.append(Note("frames.alpha", f"images are transparent in part: laid over "
+            notes.append(Note("frames.alpha", f"images are partly transparent: laid over "
                               f"{hints.background} (--background black|white)."))
     frame, bright = values.as_dn(
         np.ascontiguousarray(pixels), where, full_scale=hints.full_scale,
@@ -196,7 +201,7 @@ def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> t
 
 
 def _seen_first(image: Image, frame: np.ndarray, hints: FrameHints) -> list[Note]:
-    """What the user should know about the first frame."""
+    """Notes for the user about the first frame."""
     notes = [] if hints.bayer is None else [mosaic_note(hints.bayer)]
     if hints.response != "linear":
         notes.append(response.linearised(hints.response))
@@ -206,18 +211,18 @@ def _seen_first(image: Image, frame: np.ndarray, hints: FrameHints) -> list[Note
         notes.append(seen_note(hints.colour, colour=False))
     peak = int(image.pixels.max()) if image.pixels.dtype == np.uint16 else 0
     if hints.full_scale is None and 0 < peak < 2**14:
-        notes.append(Note("frames.depth", f"16-bit frames, white at 65535, but the first reaches "
-                          f"{peak} only; for 10-, 12- or 14-bit data pass --full-scale 1023, 4095 "
-                          "or 16383."))
+        notes.append(Note("frames.depth", "16-bit frames with white at 65535, but the first one "
+                          f"only reaches {peak}; for 10-, 12- or 14-bit data pass --full-scale "
+                          "1023, 4095 or 16383."))
     return notes
 
 
 def existing(path: str | os.PathLike) -> Path:
-    """`path`, or EV016 where there is nothing, or what is no file or folder."""
+    """`path`; EV016 if nothing is there, or something that is neither file nor folder."""
     path = Path(path)
-    if not os.path.exists(path):  # false, not an error, for an impossible path
+    if not os.path.exists(path):  # False, not an error, for an impossible path
         pattern = any(c in path.name for c in "%*?")
         raise EvflowDataError(
             "EV016", f"no file or folder at {path}.",
-            "For a sequence of images pass their folder." if pattern else "", where=path)
+            "For an image sequence pass its folder." if pattern else "", where=path)
     return need_regular(path)

@@ -1,6 +1,6 @@
-"""Frames laid on a sensor: cropped and scaled; and their times, where a video shows life slower.
+"""Frames cropped and scaled to a sensor, and times of slow-motion videos corrected.
 
-What is scaled is light: averages over the area of a new pixel, which is what a pixel collects.
+Scaling averages light over the area of each new pixel, as a sensor pixel does.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True)
 class Lay:
-    """Columns and rows of a frame that are used, and the size that they are scaled to."""
+    """The part of a frame that is used, and the size to which it is scaled."""
 
     left: int
     top: int
@@ -31,7 +31,7 @@ class Lay:
     size: Size
 
     def __call__(self, frame: Array) -> Array:
-        """The frame (H, W) or (H, W, 3), float32 where it is scaled."""
+        """The frame (H, W) or (H, W, 3); float32 if it is scaled."""
         part = frame[self.top : self.top + self.used[1], self.left : self.left + self.used[0]]
         return np.ascontiguousarray(part) if self.used == self.size else scaled(part, self.size)
 
@@ -40,15 +40,15 @@ def laid(
     source: FrameSource, *, crop: str | None = None, resize: str | None = None,
     sensor_size: str | None = None,
 ) -> FrameSource:
-    """The source with its frames cropped ("WxH" of the middle, or "WxH+X+Y"), then scaled ("WxH");
-    or scaled and cropped to fill a sensor (a name, or "WxH"). Raises EV020 where that is no part,
-    or a raw mosaic would be scaled."""
+    """The source with its frames cropped ("WxH" from the middle, or "WxH+X+Y") and then scaled
+    ("WxH"); or scaled and cropped to fill a sensor (a name, or "WxH"). Raises EV020 if the crop
+    does not fit, or if a raw mosaic would be scaled."""
     lay = lay_of(source.size, crop, resize, sensor_size)
     if lay == Lay(0, 0, source.size, source.size):
         return source
-    note = Note("frames.laid", f"of {source.size[0]}x{source.size[1]} pixels "
-                f"{lay.used[0]}x{lay.used[1]} from column {lay.left}, row {lay.top} are seen by "
-                f"{lay.size[0]}x{lay.size[1]} pixels.")
+    note = Note("frames.laid", f"of {source.size[0]}x{source.size[1]} pixels, "
+                f"{lay.used[0]}x{lay.used[1]} from column {lay.left}, row {lay.top} are mapped to "
+                f"{lay.size[0]}x{lay.size[1]} sensor pixels.")
 
     def frames() -> Frames:
         for frame, time in source.open():
@@ -60,32 +60,32 @@ def laid(
 
 
 def lay_of(size: Size, crop: str | None, resize: str | None, sensor_size: str | None) -> Lay:
-    """Which part of frames of this size (width, height) is seen by how many pixels; EV020."""
+    """Which part of frames of this size (width, height) is mapped to how many pixels; EV020."""
     left, top, *used = (0, 0, *size) if crop is None else _part(crop, size)
     if resize is not None and sensor_size is not None:
         raise EvflowDataError("EV020", f"--resize {resize} and --sensor-size {sensor_size} are "
-                              "two sizes.", "Give one of them.")
+                              "two sizes.", "Give only one of them.")
     if sensor_size is None:
         wanted = (used[0], used[1]) if resize is None else _size(resize, "--resize")
         return Lay(left, top, (used[0], used[1]), wanted)
     wanted = _sensor(sensor_size)
-    ratio = min(used[0] / wanted[0], used[1] / wanted[1])  # the largest part of its proportions
+    ratio = min(used[0] / wanted[0], used[1] / wanted[1])  # the largest part with its aspect ratio
     part = [max(1, min(n, round(ratio * w))) for n, w in zip(used, wanted, strict=True)]
     return Lay(left + (used[0] - part[0]) // 2, top + (used[1] - part[1]) // 2,
                (part[0], part[1]), wanted)
 
 
 def check_mosaic(lay: Lay, frame: Array, notes: list[Note]) -> None:
-    """EV020 where a raw mosaic would be scaled, or cut between its cells."""
+    """Raise EV020 if a raw mosaic would be scaled, or cut within a cell."""
     raw = any(note.code == "frames.raw" for note in notes) and frame.ndim == 2
     if raw and (lay.used != lay.size or lay.left % 2 or lay.top % 2):
         raise EvflowDataError(
             "EV020", "a raw mosaic cannot be scaled, nor cropped from an odd column or row.",
-            "Crop from an even one, or take its luma: --bayer instead of --colour.")
+            "Crop from an even one, or convert it to luma: --bayer instead of --colour.")
 
 
 def scaled(frame: Array, size: Size) -> Array:
-    """float32 (H, W) or (H, W, 3) of another size (width, height): area means of what shrinks."""
+    """float32 (H, W) or (H, W, 3) resized to (width, height), by area averages when shrinking."""
     light = frame.astype(np.float32)
     shrinks = size[0] <= frame.shape[1] and size[1] <= frame.shape[0]
     out: Array = cv2.resize(light, size, interpolation=cv2.INTER_AREA if shrinks else
@@ -94,11 +94,11 @@ def scaled(frame: Array, size: Size) -> Array:
 
 
 def slowed(source: FrameSource, factor: float) -> FrameSource:
-    """The source with its times divided by `factor`, by which a video shows life slower. Raises
-    EV004 (frames less than a microsecond apart), EV020."""
+    """The source with its times divided by the slow-motion factor of the video. Raises EV004
+    (frames less than a microsecond apart), EV020."""
     if not 1e-6 <= factor <= 1e6:
         raise EvflowDataError("EV020", f"--slow-motion {factor:g}.", "Give a factor from 1e-6 to "
-                              "1e6; 10 where the video is ten times slower than life.")
+                              "1e6; 10 if the video is ten times slower than life.")
 
     def frames() -> Frames:
         first, last = None, -1
@@ -113,12 +113,12 @@ def slowed(source: FrameSource, factor: float) -> FrameSource:
             yield frame, now
 
     source.notes.append(Note("frames.slowed", f"the video is {factor:g} times slower than life: "
-                             "its times were divided by that."))
+                             "its times were divided by this factor."))
     return dataclasses.replace(source, open=frames)
 
 
 def _part(text: str, size: Size) -> tuple[int, int, int, int]:
-    """(left, top, width, height) of "WxH" or "WxH+X+Y"."""
+    """(left, top, width, height) from "WxH" or "WxH+X+Y"."""
     match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})(?:\+(\d{1,6})\+(\d{1,6}))?", text)
     if match is None:
         raise EvflowDataError("EV020", f"--crop {text!r}.", "Give it as WxH or WxH+X+Y: 346x260, "
@@ -129,7 +129,7 @@ def _part(text: str, size: Size) -> tuple[int, int, int, int]:
     if min(width, height) < 1 or min(left, top) < 0 or (
             left + width > size[0] or top + height > size[1]):
         raise EvflowDataError("EV020", f"--crop {text} reaches beyond frames of "
-                              f"{size[0]}x{size[1]}.", "Give a part of them.")
+                              f"{size[0]}x{size[1]}.", "The crop must lie within the frame.")
     return left, top, width, height
 
 

@@ -1,7 +1,7 @@
 """When the pictures of a Matroska or WebM file begin.
 
-OpenCV counts stamps from the first picture, but frames from 0: of a film that begins late it claims
-more frames than there are. Read are the sizes of elements, up to the first block of the film.
+OpenCV counts times from the first picture but frames from 0: for a film that begins late it claims
+more frames than there are. Only element headers are read, up to the film's first block.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ EBML, SEGMENT, INFO, SCALE, TRACKS, TRACK, NUMBER, KIND, CLUSTER, STAMP, GROUP =
     0x1A45DFA3, 0x18538067, 0x1549A966, 0x2AD7B1, 0x1654AE6B, 0xAE, 0xD7, 0x83, 0x1F43B675, 0xE7,
     0xA0)
 BLOCKS = (0xA3, 0xA1)  # simple, or in a group
-INSIDE = (SEGMENT, INFO, TRACKS, TRACK, CLUSTER, GROUP)  # what is looked into
+INSIDE = (SEGMENT, INFO, TRACKS, TRACK, CLUSTER, GROUP)  # elements that are entered
 VIDEO = 1
 MOST_ELEMENTS = 10_000  # before the first block: a film has some dozens
 
 
 def first_stamp_s(path: Path) -> float:
-    """Seconds before the first block of the film; 0 where the file is none of these, or unclear."""
+    """Time in seconds of the film's first block; 0 if the file is of another format, or unclear."""
     with open(path, "rb") as f:
         if int.from_bytes(f.read(4), "big") != EBML:
             return 0.0
         f.seek(0)
         try:
             return max(0.0, _first(f))
-        except (EOFError, ValueError, OSError):  # OSError: a size that no file has
+        except (EOFError, ValueError, OSError):  # OSError: an impossible seek
             return 0.0
 
 
@@ -54,8 +54,9 @@ def _first(f: IO[bytes]) -> float:
 
 
 def _number(f: IO[bytes], *, marked: bool) -> int:
-    """A number of 1 to 8 bytes, of which the leading zeros of the first tell how many there are;
-    marked: with the bit that ends these, as names of elements are written."""
+    """A variable-length number of 1 to 8 bytes; the leading zeros of the first byte give its
+    length.
+    marked: keep the marker bit after them, as in element ids."""
     first = f.read(1)
     if not first or not first[0]:
         raise EOFError

@@ -1,8 +1,8 @@
-"""What the header of a picture claims, before a decoder takes memory for it.
+"""What the header of a picture claims, before a decoder allocates memory for it.
 
-OpenCV takes memory for as many pixels as a header names, up to 2^30, whatever follows it. Known
-are the formats of `images.SUFFIXES`: PNG, JPEG, TIFF, BMP, PGM and PPM, WebP, and of radiance HDR,
-EXR and PFM.
+OpenCV allocates as many pixels as a header names, up to 2^30, whatever follows it. Supported are
+the formats of `images.SUFFIXES`: PNG, JPEG, TIFF, BMP, PGM and PPM, WebP, and the radiance formats
+HDR, EXR and PFM.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from evflow.io.images import exr
 
 Size = tuple[int, int]
 
-PIXEL, PIXEL_OF_FLOATS = 8, 16  # bytes at most: four channels
-# A comment right behind a number begins another one to some decoders: blanks come first.
+PIXEL, PIXEL_OF_FLOATS = 8, 16  # maximum bytes: four channels
+# Some decoders take `#` directly after a number for a comment: blanks must come first.
 NETPBM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})\s(?:\s+|#[^\n]*\n)*(\d{1,9})\s")
 PFM = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
 RADIANCE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
@@ -26,7 +26,7 @@ JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 
 
 def claimed_size(data: bytes) -> Size | None:
-    """(width, height) that the header names; None where it is none of these, or cut off."""
+    """(width, height) in the header; None for other formats or a truncated header."""
     for magic, read in READERS.items():
         if data.startswith(magic):
             try:
@@ -37,7 +37,7 @@ def claimed_size(data: bytes) -> Size | None:
 
 
 def claimed_bytes(data: bytes) -> int | None:
-    """Memory that the decoded picture may take."""
+    """Memory that the decoded picture may need."""
     size = claimed_size(data)
     pixel = PIXEL_OF_FLOATS if data.startswith(FLOATS) else PIXEL
     return None if size is None else size[0] * size[1] * pixel
@@ -84,7 +84,7 @@ def _webp(data: bytes) -> Size | None:
 
 
 def _jpeg(data: bytes) -> Size | None:
-    """Of the last frame header before the pixels. As decoders do, pass over what is no marker."""
+    """Size from the last frame header before the pixels; skips non-markers, as decoders do."""
     at, found = 2, None
     while (at := data.find(b"\xff", at)) >= 0 and at + 9 <= len(data):
         kind = data[at + 1]

@@ -1,4 +1,4 @@
-"""Frames that a recording brings along: one by one as they are decoded, then beside its events."""
+"""Frames that are part of a recording: collected as they are decoded, then joined to its events."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from evflow.types import Events, Recording
 
 
 class FrameStack:
-    """Images (H, W) or (H, W, 3) in B, G, R that come one by one, as the frames of a recording:
-    colour becomes luma, or what pixels see of it. Kept as `Spool` does it.
+    """Images (H, W) or (H, W, 3) in B, G, R that arrive one by one, as the frames of a recording:
+    colour becomes luma, or what pixels see of it. Stored in a `Spool`.
 
-    where: names their file in messages; size: (width, height) of the sensor: images of another one,
-    a region of it among them, are left out and counted. seen: what pixels see, as `Hints.colour`.
+    where: names their file in messages; size: (width, height) of the sensor: images of another
+    size, such as a region of it, are left out and counted. seen: what pixels see, as
+    `Hints.colour`.
     """
 
     def __init__(self, where: object, size: Size, seen: str = "luma") -> None:
@@ -32,7 +33,7 @@ class FrameStack:
         self._spool: Spool | None = None
 
     def append(self, image: np.ndarray, time: int, origin: tuple[int, int] = (0, 0)) -> None:
-        """An image, its time, and the pixel of the sensor where it begins (x, y).
+        """Add an image, its time, and the sensor pixel (x, y) of its top left corner.
 
         Raises EV002 (no image), EV003 (the dtype changes), EV019 (disk full).
         """
@@ -53,22 +54,22 @@ class FrameStack:
         if grey.dtype != self._spool.dtype:
             raise EvflowDataError(
                 "EV003", f"{self.where} has frames of {self._spool.dtype} and {grey.dtype}.",
-                "Use those of one bit depth.", where=self.where)
+                "Use frames of one bit depth.", where=self.where)
         self._spool.append(grey.ravel())
         self.colour |= image.ndim == 3
         self.times.append(time)
 
     def beside(self, events: Events, hints: Hints, notes: tuple[Note, ...]) -> Recording:
-        """The recording of these events and all frames; raises what it raises."""
+        """The recording of these events and all frames; raises as `Recording`."""
         return self.at(np.array(self.times, np.int64), events, hints, notes)
 
     def at(
         self, times: np.ndarray, events: Events, hints: Hints, notes: tuple[Note, ...]
     ) -> Recording:
-        """The same, at other times (T,) int64 us."""
+        """The same with other times (T,) int64 us."""
         if self.left:
             sizes = ", ".join(f"{n:,} of {what}" for what, n in self.left.most_common(4))
-            notes = (*notes, Note("frames.unused", f"images of another size than the sensor's "
+            notes = (*notes, Note("frames.unused", f"images whose size differs from the sensor's "
                      f"{self.size[0]}x{self.size[1]} were left out: {sizes}"))
         if self._spool is None:
             return Recording.of_events(events, notes)
@@ -84,23 +85,23 @@ class FrameStack:
 
 
 def in_order(times: np.ndarray, hints: Hints) -> tuple[np.ndarray | None, tuple[Note, ...]]:
-    """Indices that make frame times (T,) rise as `hints.late` wants it, and what is to be said;
-    None where they do, or are left to be refused."""
+    """Indices that make frame times (T,) increase as `hints.late` says, and a note; None if they
+    already do, or are to be refused."""
     if hints.late not in ("drop", "sort") or bool((np.diff(times) > 0).all()):
         return None, ()
     if hints.late == "sort":
         order = np.unique(times, return_index=True)[1]
-        return order, (Note("frames.late", "frames came late and were put in their place; "
-                            f"{len(times) - len(order):,} of the same time were left out "
+        return order, (Note("frames.late", "late frames were sorted in; "
+                            f"{len(times) - len(order):,} with equal times were left out "
                             "(--late sort)"),)
     kept = longest(times)
     kept = kept[np.diff(times[kept], prepend=times[kept[0]] - 1) > 0]
     return kept, (Note("frames.late", f"{len(times) - len(kept):,} of {len(times):,} frames whose "
-                       "time goes back, or repeats, were left out (--late drop)"),)
+                       "time goes back or repeats were left out (--late drop)"),)
 
 
 def cut(recording: Recording, span: tuple[int, int]) -> Recording:
-    """The recording with those frames alone that lie in [start, stop) us."""
+    """The recording with only those frames that lie in [start, stop) us."""
     keep = slice(*np.searchsorted(recording.frame_times, np.array(span)))
     return dataclasses.replace(
         recording, frames=recording.frames[keep], frame_times=recording.frame_times[keep])

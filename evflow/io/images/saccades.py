@@ -1,9 +1,9 @@
-"""One picture as a video: the sensor looks at it and makes three saccades, as in N-Caltech101
-(Orchard et al. 2015), where a camera before a screen moves along a triangle, 100 ms a side.
+"""One picture as a video: the sensor makes three saccades over it, as in N-Caltech101 (Orchard et
+al. 2015), where a camera in front of a screen moves along a triangle, 100 ms a side.
 
-Each starts and ends at rest, with the velocity of a raised cosine. The picture is shifted on a grid
-four times as fine as the sensor's, whose pixels average: a shift of a fraction of a pixel does not
-blur. What lies beyond its edges is the picture mirrored.
+Each saccade starts and ends at rest, with a raised-cosine velocity. The picture is shifted on a
+grid four times finer than the sensor's pixels, which average over it, so that a subpixel shift does
+not blur. Beyond its edges the picture is mirrored.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from evflow.notes import Note
 Array = np.ndarray
 
 SACCADE_US = 100_000
-FINE = 4  # of the grid on which the picture is shifted
-STEP_PX = 0.5  # the farthest from frame to frame
+FINE = 4  # grid cells per pixel for shifting the picture
+STEP_PX = 0.5  # maximum shift from frame to frame
 LONGEST_PX = 1000.0
 CORNERS = ((0.0, 0.0), (0.5, math.sqrt(3) / 2), (1.0, 0.0), (0.0, 0.0))  # of a triangle of side 1
 
@@ -32,14 +32,14 @@ def swept(
     source: FrameSource, side_px: float, *, crop: str | None = None, resize: str | None = None,
     sensor_size: str | None = None,
 ) -> FrameSource:
-    """The video of a source of one frame; its parts as in `laying.laid`. Raises EV020 (several
-    frames, a side out of range, or a raw mosaic)."""
+    """The video for a source with one frame; other arguments as in `laying.laid`. Raises EV020
+    (several frames, a side out of range, or a raw mosaic)."""
     if not STEP_PX <= side_px <= LONGEST_PX:
         raise EvflowDataError("EV020", f"--saccades {side_px:g}.",
                               f"Give a side from {STEP_PX:g} to {LONGEST_PX:g} pixels.")
     if source.count != 1:
         raise EvflowDataError("EV020", f"--saccades over {source.count or 'several'} frames.",
-                              "It takes one picture: a video moves by itself.")
+                              "It needs a single picture: a video has its own motion.")
     lay, path = lay_of(source.size, crop, resize, sensor_size), saccades(side_px)
 
     def frames() -> Frames:
@@ -47,7 +47,7 @@ def swept(
         check_mosaic(lay, picture, source.notes)
         if any(note.code == "frames.raw" for note in source.notes):
             raise EvflowDataError("EV020", "a raw mosaic cannot be shifted.",
-                                  "Take its luma: --bayer instead of --colour.")
+                                  "Convert it to luma: --bayer instead of --colour.")
         seen = dataclasses.replace(lay, size=(FINE * lay.size[0], FINE * lay.size[1]))
         fine = seen(picture).astype(np.float32)
         for (x, y), time in zip(path.at_px, path.times_us.tolist(), strict=True):
@@ -70,7 +70,7 @@ class Path:
 
 def saccades(side_px: float) -> Path:
     """Three saccades along a triangle with sides of `side_px`."""
-    steps = math.ceil(2 * side_px / STEP_PX)  # the fastest goes at twice the mean
+    steps = math.ceil(2 * side_px / STEP_PX)  # the peak velocity is twice the mean
     s = np.arange(steps + 1) / steps
     gone = s - np.sin(2 * np.pi * s) / (2 * np.pi)
     at, times = [np.zeros((1, 2))], [np.zeros(1)]
@@ -81,7 +81,7 @@ def saccades(side_px: float) -> Path:
 
 
 def _shifted(fine: Array, x: float, y: float) -> Array:
-    """What the sensor sees that looks (x, y) fine pixels away."""
+    """What a sensor sees that is displaced by (x, y) fine pixels."""
     move = np.array([[1, 0, x], [0, 1, y]], np.float64)
     height, width = fine.shape[:2]
     moved = cv2.warpAffine(fine, move, (width, height), borderMode=cv2.BORDER_REFLECT_101,

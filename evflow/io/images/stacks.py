@@ -1,7 +1,7 @@
-"""Videos in NumPy files: .npy stacks, mapped, and .npz, decompressed frame by frame.
+"""Videos in NumPy files: memory-mapped .npy stacks, and .npz stacks decompressed frame by frame.
 
 A stack is (T, H, W) or (T, H, W, 3) in R, G, B. In an .npz it is called frames (or images, imgs,
-video, arr_0) and its times, if there, frame_times (or timestamps, times, t).
+video, arr_0), and its times, if any, frame_times (or timestamps, times, t).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TIMES = ("frame_times", "timestamps", "times", "t")
 
 
 def is_stack(path: Path) -> bool:
-    """An .npy, or an .npz that holds frames and no events."""
+    """Whether it is an .npy, or an .npz with frames and no events."""
     if path.suffix.lower() == ".npy":
         return True
     if path.suffix.lower() != ".npz" or not is_zip(path):
@@ -36,13 +36,13 @@ def is_stack(path: Path) -> bool:
         with zipfile.ZipFile(path) as archive:
             return not {"t.npy", "x.npy", "y.npy", "p.npy"} <= set(archive.namelist())
     except DAMAGE:
-        return True  # `open_stack` says why
+        return True  # `open_stack` explains why
 
 
 @dataclasses.dataclass(frozen=True)
 class Stack:
-    """A stack of `shape` on the disk; member: its name in an .npz, "" for an .npy. count: frames
-    to read, shape[0] unless the file is cut off. times_us (count,) int64."""
+    """A stack of `shape` on disk; member: its name in an .npz, "" for an .npy. count: frames to
+    read, shape[0] unless the file is truncated. times_us (count,) int64."""
 
     path: Path
     member: str
@@ -58,7 +58,7 @@ class Stack:
         return self.shape[2], self.shape[1]
 
     def images(self, partial: bool = False) -> Iterator[Image]:
-        """The frames in OpenCV's channel order; EV009 where an .npz ends early."""
+        """The frames in OpenCV's channel order; EV009 if an .npz ends early."""
         read = self._members(partial) if self.member else self._mapped()
         times = self.times_us.tolist()
         for index, (pixels, time) in enumerate(zip(read, times, strict=not partial)):
@@ -82,16 +82,16 @@ class Stack:
                     data = f.read(count * self.dtype.itemsize)
                     yield np.frombuffer(data, self.dtype, count).reshape(self.shape[1:])
                     done += 1
-                while f.read(BLOCK):  # a damaged header may claim less: the checksum is at the end
+                while f.read(BLOCK):  # to the checksum, in case a damaged header claims less
                     pass
-        except Exception as e:  # zip, zlib, lzma, ValueError: half a dozen kinds
+        except Exception as e:  # zip, zlib, lzma, ValueError: many types
             if not (partial and done):
                 raise cut_off(self.path, done, self.shape[0], str(e)) from e
 
 
 def open_stack(path: Path, hints: FrameHints) -> Stack:
     """Raises EV001 (no frames), EV002 (shape, number of times), EV003 (dtype), EV009 (damaged or
-    cut off, unless `hints.partial`), EV020 (no times)."""
+    truncated, unless `hints.partial`), EV020 (no times)."""
     try:
         if path.suffix.lower() == ".npz":
             stack, times = _open_npz(path)
@@ -99,7 +99,7 @@ def open_stack(path: Path, hints: FrameHints) -> Stack:
             stack, times = _open_npy(path, hints.partial), None
     except (OSError, EOFError, ValueError) as e:
         raise EvflowDataError(
-            "EV009", f"{path} is not a sound .npy ({e or type(e).__name__}).",
+            "EV009", f"{path} is not a valid .npy ({e or type(e).__name__}).",
             "Copy or save it again.", where=path) from e
     _check(stack)
     us, notes = _times(stack, hints, times)
@@ -107,11 +107,11 @@ def open_stack(path: Path, hints: FrameHints) -> Stack:
 
 
 def cut_off(path: object, read: int, promised: int, why: str) -> EvflowDataError:
-    """EV009 that says how many frames can be read."""
+    """EV009 with the number of frames that can be read."""
     return EvflowDataError(
         "EV009", f"{read:,} of the {promised:,} frames of {path} can be read"
         f"{f' ({why})' if why else ''}.",
-        "Cut off or damaged: copy it again"
+        "Truncated or damaged: copy it again"
         + (", or pass --partial (partial=True) to use those." if read else "."), where=path)
 
 
@@ -143,7 +143,7 @@ def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
             times = Member(archive, archive.getinfo(clock + ".npy")).whole()
     if fortran and len(shape) > 1:
         raise EvflowDataError(
-            "EV009", f"{path} holds {member} in Fortran order, whose frames are not together.",
+            "EV009", f"{path} holds {member} in Fortran order, in which frames are not contiguous.",
             "Save np.ascontiguousarray(frames).", where=path)
     stack = Stack(path, member + ".npy", shape, dtype, False, 0, np.zeros(0, np.int64), ())
     return stack, times

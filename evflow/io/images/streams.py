@@ -1,10 +1,10 @@
 """Which images of a recording are the frames of its events: the one place that decides.
 
-A recording may hold several streams of images: the camera's own, copies of them that were blurred
-or rectified, depth, flow, and pictures that are made of the events. What a stream shows is told by
-its name (a topic, a data set, an output of DV), its size and its encoding. Frames are the raw
-images that lie nearest to the events; what was taken, and what was not, is said in notes. Nothing
-here keeps events from being read: without a stream that can be their frames there are none.
+A recording may hold several image streams: the camera's own, blurred or rectified copies, depth,
+flow, and pictures made from the events. What a stream shows is judged by its name (a topic, a data
+set, an output of DV), its size and its encoding. The frames are the raw images whose name is
+nearest to that of the events; notes say what was used and what was not. Faulty images never prevent
+reading the events: if no stream can be their frames, there are none.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from evflow.errors import EvflowDataError
 from evflow.io.hints import Hints
 from evflow.notes import Note
 
-# What the words of a name begin with that tells what its images are.
+# Words in a name (by their beginnings) that say what its images are.
 MADE = re.compile("recon|accum|render|visuali|viz|surface|timesurface|sae|iwe|firenet|"
-                  "histogram|voxel|edge|polarit")  # of the events
-MADE_LAST = re.compile("event|dvs")  # in the last place alone: namespaces of cameras are called so
+                  "histogram|voxel|edge|polarit")  # made from the events
+MADE_LAST = re.compile("event|dvs")  # in the last part only: camera namespaces have such names
 OTHER = re.compile("depth|dispar|flow|normals?(map)?$|segment|semantic|mask|label|instance|"
                    "confidence|thermal|infrared|debug|overlay|heatmap|preview")  # no brightness
 CHANGED = re.compile("corrupt|blur|nois|denois|rect|undist|crop|resiz|downs|warp")
@@ -32,9 +32,8 @@ WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 @dataclasses.dataclass(frozen=True)
 class ImageStream:
-    """Images of one source. name: as a user names it; size: of its first image, None where that
-    is not known; unusable: why they can be no frames, "" where they can; notes: what is to be said
-    of frames that are these."""
+    """Images of one source. name: as users refer to it; size: of its first image, None if unknown;
+    unusable: why they cannot be frames, "" if they can; notes: what to say if they are used."""
 
     name: str
     size: Size | None = None
@@ -44,7 +43,7 @@ class ImageStream:
 
 @dataclasses.dataclass(frozen=True)
 class Chosen:
-    """stream: the frames, or None; notes: what was taken and what was left, and why."""
+    """stream: the frames, or None; notes: what was used, what was not, and why."""
 
     stream: ImageStream | None
     notes: tuple[Note, ...] = ()
@@ -53,16 +52,16 @@ class Chosen:
 def choose(
     streams: Sequence[ImageStream], hints: Hints, sensor: Size, events: str = ""
 ) -> Chosen:
-    """The stream that belongs to the events of a sensor (width, height).
+    """The image stream that belongs to the events of a sensor (width, height).
 
-    events: their name, as `ImageStream.name`. Raises EV020 (no stream of the name asked for) and
+    events: their name, as `ImageStream.name`. Raises EV020 (no stream of the requested name), and
     EV015 or EV008 (that one cannot be their frames).
     """
     if hints.no_frames:
         return Chosen(None)
     if hints.late == "join" and streams:
-        return Chosen(None, (Note("frames.unused", "frames were not read: --late join moves the "
-                                  "clock of the events"),))
+        return Chosen(None, (Note("frames.unused", "frames were not read, because --late join "
+                                  "changes the clock of the events"),))
     if hints.frames_topic is not None:
         return _named(streams, hints.frames_topic, sensor, events)
     why = {stream.name: _against(stream, sensor, events) for stream in streams}
@@ -82,53 +81,52 @@ def choose(
 
 @contextlib.contextmanager
 def events_alone() -> Iterator[None]:
-    """While frames are read: what is wrong with them keeps nobody from the events, and how to read
-    these is told."""
+    """While frames are read: add to any error how to read the events without them."""
     try:
         yield
     except EvflowDataError as e:
         late = " Late frames: --late drop, or sort." if e.code == "EV004" else ""
         raise EvflowDataError(
             e.code, e.seen,
-            f"{e.fix}{late} The events alone: --no-frames (no_frames=True).".lstrip(),
+            f"{e.fix}{late} To read only the events: --no-frames (no_frames=True).".lstrip(),
             where=e.where) from e
 
 
 def _named(
     streams: Sequence[ImageStream], name: str, sensor: Size, events: str
 ) -> Chosen:
-    """The stream of that name, or of the only one that ends so."""
+    """The stream of that name, or the only one whose name ends so."""
     ends = [s for s in streams if s.name == name] or [
         s for s in streams if ("/" + s.name).endswith("/" + name.strip("/"))]
     there = ", ".join(s.name for s in streams) or "none"
     if len(ends) != 1:
         raise EvflowDataError(
-            "EV020", f"frames_topic={name!r} names {len(ends)} streams of images.",
-            f"There are: {there}. Or read the events alone: --no-frames (no_frames=True).")
+            "EV020", f"frames_topic={name!r} matches {len(ends)} image streams.",
+            f"There are: {there}. Or read only the events: --no-frames (no_frames=True).")
     stream = ends[0]
     if stream.unusable:
         raise EvflowDataError(
-            "EV008", f"images of {stream.name} can be no frames: {stream.unusable}.",
-            f"There are: {there}. Or read the events alone: --no-frames (no_frames=True).")
+            "EV008", f"images of {stream.name} cannot be frames: {stream.unusable}.",
+            f"There are: {there}. Or read only the events: --no-frames (no_frames=True).")
     if stream.size not in (None, sensor):
         raise EvflowDataError(
             "EV015", f"images of {stream.name} are {_size(stream.size)}, the sensor has "
             f"{_size(sensor)}.", "Frames and events must come from the same pixels. Is --size "
-            "right? Or read the events alone: --no-frames (no_frames=True).")
+            "right? Or read only the events: --no-frames (no_frames=True).")
     made = _kind(stream.name, events) == "made"
-    notes = (Note("frames.made", f"images of {stream.name} are made of the events, by their "
+    notes = (Note("frames.made", f"images of {stream.name} are made from the events, by their "
                   "name"),) if made else ()
     others = {s.name: "" for s in streams if s is not stream}
     return Chosen(stream, (*_left(streams, others, stream), *notes, *stream.notes))
 
 
 def _against(stream: ImageStream, sensor: Size, events: str) -> str:
-    """Why the images are not taken for the frames of these events; "" where nothing is."""
+    """Why the images are not used as frames of these events; "" if nothing speaks against it."""
     kind = _kind(stream.name, events)
     if kind == "made":
-        return "by its name made of the events"
+        return "made from the events, by its name"
     if kind == "other":
-        return "by its name no brightness"
+        return "not brightness, by its name"
     if stream.unusable:
         return stream.unusable
     if stream.size not in (None, sensor):
@@ -140,17 +138,17 @@ def _against(stream: ImageStream, sensor: Size, events: str) -> str:
 def _left(
     streams: Sequence[ImageStream], why: dict[str, str], best: ImageStream | None
 ) -> tuple[Note, ...]:
-    """What was not taken, and what instead."""
+    """Notes on what was not used, and what was used instead."""
     others = [s.name + (f" ({why[s.name]})" if why.get(s.name) else "")
               for s in streams if s is not best]
     if not others:
-        return () if best is None else (Note("frames.stream", f"frames are those of {best.name}"),)
+        return () if best is None else (Note("frames.stream", f"frames are from {best.name}"),)
     left = ", ".join(others)
     if best is None:
-        other = "; --frames-topic NAME takes one" if len(streams) > 1 else ""
+        other = "; --frames-topic NAME uses one of them" if len(streams) > 1 else ""
         return (Note("frames.unused", f"images were not read as frames: {left}{other}"),)
-    return (Note("frames.stream", f"frames are the images of {best.name}; not taken: {left}; "
-                 "--frames-topic NAME takes another"),)
+    return (Note("frames.stream", f"frames are from {best.name}; not used: {left}; "
+                 "--frames-topic NAME uses another"),)
 
 
 def _parts(name: str) -> tuple[str, ...]:
@@ -158,7 +156,7 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _shared(name: str, events: str) -> int:
-    """How many places the name has in common with that of the events, from the first on."""
+    """How many leading parts the name has in common with that of the events."""
     common = 0
     for one, other in zip(_parts(name)[:-1], _parts(events)[:-1], strict=False):
         if one != other:
@@ -168,18 +166,18 @@ def _shared(name: str, events: str) -> int:
 
 
 def _distance(name: str, events: str) -> tuple[int, int]:
-    """The smaller, the nearer to the events: first by shared places, then by further ones."""
+    """A smaller value is nearer to the events: first by shared parts, then by further ones."""
     return -_shared(name, events), len(_parts(name))
 
 
 def _own(name: str, events: str) -> list[str]:
-    """The words of a name, in lower case, but of the places that it shares with the events."""
+    """The words of a name, in lower case, without the parts it shares with the events."""
     own = "/".join(_parts(name)[_shared(name, events):])
     return [word.lower() for word in WORD.findall(own)]
 
 
 def _kind(name: str, events: str) -> str:
-    """"made" of the events, "other" than brightness, a "changed" image, or an "image"."""
+    """"made" from the events, "other" than brightness, a "changed" image, or an "image"."""
     words, last = _own(name, events), _own(_parts(name)[-1] if _parts(name) else "", "")
     if "e2vid" in name.lower() or any(map(MADE.match, words)) or any(map(MADE_LAST.match, last)):
         return "made"
@@ -189,7 +187,7 @@ def _kind(name: str, events: str) -> str:
 
 
 def _another_camera(name: str, events: str) -> bool:
-    """Do two names differ by a number, or left and right, alone: /cam0/events and /cam1/image?"""
+    """Whether two names differ only by a number, or left and right: /cam0/events, /cam1/image."""
     one, other = _parts(name)[:-1], _parts(events)[:-1]
     return one != other and [_numberless(part) for part in one] == [
         _numberless(part) for part in other]

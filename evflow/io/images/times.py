@@ -1,10 +1,10 @@
 """Files of frame times: one time per line, alone, before or after the frame's name.
 
-Read are the layouts in use: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time`
-(DVS-Voltmeter), `index time`, begin and end of the exposure (DSEC), of which the middle is taken;
-with blanks, tabs, commas or semicolons between; and .npy arrays.
-Lines that begin with # are comments. A unit written in a comment or header counts ("[ns]",
-"timestamp_us"); else the only one that makes the numbers a plausible video is taken and noted.
+Supported layouts: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time` (DVS-Voltmeter),
+`index time`, begin and end of the exposure (DSEC; the middle is used); separated by blanks, tabs,
+commas or semicolons; and .npy arrays. Lines that begin with # are comments. A unit written in a
+comment or header is used ("[ns]", "timestamp_us"); otherwise the only unit that makes the numbers a
+plausible video, with a note.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from evflow.notes import Note
 from evflow.types import Events
 
 MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
-TELL = "pass --timestamps-unit beside --frames (simulate: --time-unit)"
+TELL = "pass --timestamps-unit with --frames (simulate: --time-unit)"
 
 Notes = tuple[Note, ...]
 Times = tuple[np.ndarray, list[str], Notes]  # int64 us (T,); names (T,) or none
 
 
 def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> Times:
-    """Frame times of a file, the frames' names where it has them, and what was assumed.
+    """Frame times of a file, the frames' names if it has them, and what was assumed.
 
-    names: those of the images at hand, by which a column of names is told from one of times.
-    Raises EV008 (columns of unclear meaning), EV009 (damaged), EV001 (none), EV003 (the unit is
-    not clear), EV004 (not increasing), EV007 (NaN), EV016 (not there).
+    names: of the images at hand, to distinguish a column of names from one of times.
+    Raises EV008 (columns of unclear meaning), EV009 (damaged), EV001 (none), EV003 (unclear unit),
+    EV004 (not increasing), EV007 (NaN), EV016 (not found).
     """
     if existing(path).suffix == ".npy":
         us, notes = to_us(np.array(mapped(path, (None,))), path, unit)
@@ -57,7 +57,7 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> T
 
 
 def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndarray, Notes]:
-    """Strictly increasing times (T,) as int64 us, and a note where the unit was inferred.
+    """Strictly increasing times (T,) as int64 us, and a note if the unit was inferred.
 
     Raises EV001, EV002, EV003, EV004, EV007.
     """
@@ -76,7 +76,8 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
         at = int(back[0]) + 1
         raise EvflowDataError(
             "EV004", f"{where}: time {at:,} is {times[at]}, the one before {times[at - 1]} "
-            f"({len(back):,} such).", "Frame times must increase: lines out of order, or repeated?",
+            f"({len(back):,} in all).", "Frame times must increase: lines out of order, or "
+                                        "repeated?",
             where=where)
     notes: Notes = ()
     if unit == "auto":
@@ -89,12 +90,12 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
 def beside_events(
     times: np.ndarray, where: object, native: str, hints: Hints, events: Events
 ) -> tuple[np.ndarray, Notes]:
-    """Times (T,) of the frames that a recording brings along with its events, as int64 us, and a
-    note where their unit was inferred.
+    """Times (T,) of the frames stored with a recording's events, as int64 us, and a note if their
+    unit was inferred.
 
-    native: their unit in the format. That of `hints` is the events'; frames share it unless
-    another makes them last as the events do: where clocks contradict each other it is passed.
-    Fractions where whole numbers belong are of the unit that does. Raises as `to_us`.
+    native: their unit in the format. The unit in `hints` is that of the events; frames share it,
+    unless another unit makes their span agree with the events'. Fractions in a unit of integers
+    indicate the unit that allows them. Raises as `to_us`.
     """
     told = hints.time_unit
     odd = times.dtype.kind == "f" and native != "s"
@@ -112,12 +113,12 @@ def beside_events(
 
 
 def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
-    """The unit in which the times are those of a video, and the note that says so; EV003."""
+    """The unit in which the times are those of a video, with a note; EV003 if unclear."""
     unit, rates = video_unit(times)
     if unit is not None:
         rate = f"{rates[unit]:.4g} frames/s"
-        return unit, (Note("frames.unit", f"times of {where} were read in {unit} ({rate}); "
-                           f"else {TELL}."),)
+        return unit, (Note("frames.unit", f"times of {where} were read in {unit} ({rate}); if that "
+                           f"is wrong, {TELL}."),)
     would = ", ".join(f"{rate:.4g} frames/s in {u}" for u, rate in rates.items())
     raise EvflowDataError(
         "EV003", f"{where}: steps of {usual_step(times):g} (from {times[0]}) have no clear unit"
@@ -126,7 +127,7 @@ def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
 
 
 def _rows(path: Path) -> tuple[list[list[str]], str]:
-    """The fields of every line with data, all of one length, and the unit written, or "auto"."""
+    """The fields of every line with data, equally many, and the written unit, or "auto"."""
     try:
         text = read_whole(path, MAX_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
@@ -144,7 +145,7 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
         if rows and len(fields) != len(rows[0]):
             raise EvflowDataError(
                 "EV009", f"{path}, line {number:,} is {line[:60]!r}; lines before it have "
-                f"{len(rows[0])} columns.", "Cut off or damaged? Copy it again.", where=path)
+                f"{len(rows[0])} columns.", "Truncated or damaged? Copy it again.", where=path)
         rows.append(fields)
     return rows, written_unit(words)
 
@@ -152,14 +153,14 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
 def _columns(
     path: Path, rows: list[list[str]], names: Collection[str]
 ) -> tuple[np.ndarray, list[str]]:
-    """The column of times (T,), int64 or float64, and that of the names, if there is one."""
+    """The column of times (T,), int64 or float64, and that of the names, if any."""
     columns = list(zip(*rows, strict=True))
     if len(columns) <= 1:
         return _numbers(path, rows, 0), []
     known = {key: name for name in names for key in (PurePosixPath(name).stem, name)}
     label = [all(PurePosixPath(f.replace("\\", "/")).name in known for f in column)
              for column in columns]
-    if sum(label) != 1:  # not the images at hand: a name is what is no number, or counts up
+    if sum(label) != 1:  # not the images at hand: names are non-numbers, or count up
         label = [not all(map(is_float, column)) or _counts(column) for column in columns]
     clock = [i for i, named in enumerate(label) if not named]
     times = (_numbers(path, rows, clock[0]) if len(clock) == 1 else
@@ -176,7 +177,7 @@ def _columns(
 
 
 def _middle(path: Path, rows: list[list[str]], clock: list[int]) -> np.ndarray | None:
-    """Mid-exposure (T,) of columns of begin and end; None where they are something else."""
+    """Mid-exposure (T,) from columns of begin and end; None if they are something else."""
     begin, end = (_numbers(path, rows, column) for column in clock)
     if (end < begin).any() or (end[:-1] > begin[1:]).any():
         return None
@@ -185,13 +186,13 @@ def _middle(path: Path, rows: list[list[str]], clock: list[int]) -> np.ndarray |
 
 
 def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
-    """A column as int64 where all are whole (exact, also in ns since 1970), else float64."""
+    """A column as int64 if all are integers (exact, also for ns since 1970), else float64."""
     fields = [row[column] for row in rows]
     for number, field in enumerate(fields):
         if not is_float(field):
             raise EvflowDataError(
                 "EV009", f"{path}: {field[:40]!r} at time {number:,} is not a number.",
-                "Cut off or damaged? Copy it again.", where=path)
+                "Truncated or damaged? Copy it again.", where=path)
     try:
         return np.array([int(f) for f in fields], np.int64)
     except (ValueError, OverflowError):
@@ -199,7 +200,7 @@ def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
 
 
 def _counts(column: tuple[str, ...]) -> bool:
-    """Whole numbers that count up by one: an index, not times (from 2 lines on)."""
+    """Integers that count up by one: an index, not times (from 2 lines on)."""
     if len(column) < 2 or not all(f.isdecimal() and len(f) < 19 for f in column):
         return False
     return bool((np.diff(np.array([int(f) for f in column])) == 1).all())

@@ -1,8 +1,7 @@
-"""The curve by which an HDR video codes light, as its container tells: PQ or HLG (ITU-R BT.2100).
+"""The transfer curve of an HDR video, from its container: PQ or HLG (ITU-R BT.2100).
 
-OpenCV 5 maps such a video to an ordinary picture, OpenCV 4 takes its codes as they are, and neither
-tells. Read are the colour boxes of MP4 and MOV and the
-colour elements of Matroska.
+OpenCV 5 tone-maps such a video, OpenCV 4 uses its code values unchanged, and neither says so. The
+colour boxes of MP4 and MOV and the colour elements of Matroska are read.
 """
 
 from __future__ import annotations
@@ -15,24 +14,24 @@ import cv2
 from evflow.notes import Note
 
 CURVES = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273
-BOXES = (b"colrnclx", b"colrnclc")  # before primaries, transfer, matrix: each u16
+BOXES = (b"colrnclx", b"colrnclc")  # followed by primaries, transfer, matrix: u16 each
 MATROSKA, ELEMENT = b"\x1a\x45\xdf\xa3", b"\x55\xba\x81"  # TransferCharacteristics of one byte
-HEAD, INDEX = 1 << 18, 1 << 26  # bytes in which these lie
+HEAD, INDEX = 1 << 18, 1 << 26  # bytes to search for them
 
 
 def hdr_note(path: Path) -> tuple[Note, ...]:
-    """What is said of an HDR video."""
+    """The note on an HDR video; none for others."""
     curve = hdr_curve(path)
     return () if curve is None else (Note(
         "frames.hdr", f"{path} is HDR ({curve}), which OpenCV {cv2.__version__} decodes to 8 bits "
-        + ("and maps to an ordinary picture" if int(cv2.__version__.split(".")[0]) > 4 else
-           "without its curve") + f": light is approximate. Exactly: ffmpeg -i {path.name} -vf "
-        "zscale=transfer=linear:npl=1000,format=gbrpf32le,format=gray16le frames/%06d.png, and "
+        + ("and tone-maps" if int(cv2.__version__.split(".")[0]) > 4 else
+           "without undoing its curve") + f": light is approximate. Exactly: ffmpeg -i {path.name} "
+        "-vf zscale=transfer=linear:npl=1000,format=gbrpf32le,format=gray16le frames/%06d.png, and "
         "the folder with --fps."),)
 
 
 def hdr_curve(path: Path) -> str | None:
-    """ "PQ", "HLG", or None where the container names none of them."""
+    """ "PQ", "HLG", or None if the container names neither."""
     with open(path, "rb") as f:
         head = f.read(HEAD)
         if head.startswith(MATROSKA):
@@ -53,7 +52,7 @@ def _of_boxes(f: IO[bytes]) -> str | None:
 
 
 def _box(f: IO[bytes], name: bytes) -> bytes:
-    """What a box of the file holds, its first INDEX bytes; nothing where there is none."""
+    """The first INDEX bytes of a box of the file; empty if there is none."""
     at = 0
     while True:
         f.seek(at)

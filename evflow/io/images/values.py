@@ -1,7 +1,7 @@
-"""Pixel values of a decoded image -> light on 0..255 DN, as one sensor pixel after the other sees
-it: uint8 as it is where that is what it says, all else float32. Nothing is clipped.
+"""Pixel values of a decoded image -> light on 0..255 DN: uint8 stays if it already is that, all
+else becomes float32. Nothing is clipped.
 
-The response is undone before colours are added up: a pixel adds light, not code values.
+The response is undone before colours are summed: a pixel adds light, not code values.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from evflow.light.ranges import meaning
 from evflow.light.response import linear_light
 from evflow.notes import Note
 
-WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # DN of a saturated pixel unless told
+WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # default DN of a saturated pixel
 WHITE_PERCENT = 99.0
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 
@@ -25,15 +25,15 @@ def as_dn(
     pixels: np.ndarray, where: str, *, full_scale: float | None, response: str, colour: str,
     bright: bool,
 ) -> tuple[np.ndarray, bool]:
-    """The frame (H, W), or (H, W, 3) unless colour is "luma", and whether any float frame so far
-    was plainly one in DN (`bright` says so of those before).
+    """The frame (H, W), or (H, W, 3) unless colour is "luma"; and whether any float frame so far
+    was clearly in DN (`bright` says so for earlier ones).
 
-    pixels: (H, W) or (H, W, 3) in B, G, R, of a depth in `WHITE`; where: names it in messages.
+    pixels: (H, W) or (H, W, 3) in B, G, R, of a dtype in `WHITE`; where: names it in messages.
     Raises EV003 (range), EV007 (NaN).
     """
     seen: Callable[[np.ndarray], np.ndarray] = (
         luma if pixels.ndim == 3 and colour == "luma" else _as_it_is)
-    if response == "linear":  # integers are rounded as OpenCV rounds them
+    if response == "linear":  # integers are rounded as by OpenCV
         return _scaled(seen(pixels), where, full_scale, bright)
     if response == "log":
         light = _exponential(pixels, where, full_scale)
@@ -43,33 +43,33 @@ def as_dn(
 
 
 def white_of(dtype: np.dtype, where: str) -> float:
-    """DN of a saturated pixel; EV003 where images have no such depth."""
+    """DN of a saturated pixel; EV003 for an unsupported dtype."""
     if dtype.str[1:] not in WHITE:
         raise EvflowDataError(
             "EV003", f"{where} is {dtype}.", "Expected uint8, uint16 or floats: "
             + ("255 * frames.astype(np.uint8)." if dtype.kind == "b" else
-               "frames.astype(np.float32), with white at --full-scale where that is not 255."),
+               "frames.astype(np.float32), with --full-scale if white is not 255."),
             where=where)
     return WHITE[dtype.str[1:]]
 
 
 def white_of_radiance(pixels: np.ndarray, full_scale: float | None) -> tuple[float, Note]:
-    """What is white where numbers are radiance, without an upper end: `full_scale`, or what all
-    but a hundredth of the first image's pixels stay below. With what is said of it."""
+    """White for images of radiance, which have no upper limit: `full_scale`, or a value that all
+    but a hundredth of the first image's pixels stay below; and the note on it."""
     if full_scale is not None:
-        return full_scale, Note("frames.white", f"radiance of {full_scale:g} is white; what is "
-                                "brighter is taken as white.")
+        return full_scale, Note("frames.white", f"radiance of {full_scale:g} is white; brighter "
+                                "values are treated as white.")
     grey = luma(pixels[..., :3].astype(np.float32)) if pixels.ndim == 3 else pixels
     finite = grey[np.isfinite(grey) & (grey > 0)]
     white = float(np.percentile(finite, WHITE_PERCENT)) if finite.size else 1.0
     return white, Note(
         "frames.white", f"radiance of {white:.4g} is white: {WHITE_PERCENT:g} % of the first image "
-        "is darker, and what is brighter is taken as white; --full-scale tells another.")
+        "is darker; brighter values are treated as white; --full-scale sets another value.")
 
 
 def opaque(pixels: np.ndarray, background: str) -> tuple[np.ndarray, bool]:
-    """(H, W, 3) of (H, W, 4), laid over a background ("black" or "white") as image viewers do, and
-    whether any of it shows through."""
+    """(H, W, 3) from (H, W, 4), laid over a background ("black" or "white") as image viewers do,
+    and whether any of it shows through."""
     colour, alpha = np.ascontiguousarray(pixels[..., :3]), pixels[..., 3:]
     whole = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else (
         1.0 if alpha.max(initial=0) <= 1 else 255.0)
@@ -88,7 +88,7 @@ def _as_it_is(pixels: np.ndarray) -> np.ndarray:
 def _scaled(
     pixels: np.ndarray, where: str, full_scale: float | None, bright: bool
 ) -> tuple[np.ndarray, bool]:
-    """Pixels as DN on 0..255, in range, and `bright` as `as_dn` has it."""
+    """Pixels as DN on 0..255, checked, and the updated `bright` (see `as_dn`)."""
     white = full_scale or white_of(pixels.dtype, where)
     if pixels.dtype == np.uint8 and white == 255:
         return pixels, True
@@ -97,7 +97,7 @@ def _scaled(
     floats = pixels.dtype == np.float32
     told = meaning(pixels) if (floats and full_scale is None and not bright) or low < 0 else None
     if told:
-        raise EvflowDataError("EV003", f"{where} spans {low:g}..{high:g} where white is "
+        raise EvflowDataError("EV003", f"{where} spans {low:g}..{high:g}, with white at "
                               f"{white:g}: {told.what}?", told.fix, where=where)
     if high > white * 1.001:
         raise EvflowDataError(
@@ -108,9 +108,9 @@ def _scaled(
 
 
 def _exponential(pixels: np.ndarray, where: str, full_scale: float | None) -> np.ndarray:
-    """Light of natural logarithms of it."""
+    """Light from its natural logarithms."""
     if pixels.dtype.kind != "f":
-        raise EvflowDataError("EV003", f"{where} is {pixels.dtype}: whole numbers are no "
+        raise EvflowDataError("EV003", f"{where} is {pixels.dtype}: integers are not "
                               "logarithms.", "Leave out --response log.", where=where)
     _check_finite(pixels, where)
     white = full_scale or 255.0
@@ -127,10 +127,10 @@ def _check_finite(pixels: np.ndarray, where: str) -> None:
     if not finite.all():
         raise EvflowDataError(
             "EV007", f"{where} holds {(~finite).sum():,} NaN or infinite values.",
-            "The log of dark pixels? Give linear intensity.", where=where)
+            "A log of dark pixels? Use linear intensity.", where=where)
 
 
 def _likely_white(high: float, floats: bool) -> float:
-    """The smallest usual white that is not below."""
+    """The smallest usual white that is not below `high`."""
     usual = [float(2**bits - 1) for bits in (8, 10, 12, 14, 16)]
     return high if floats else next((white for white in usual if high <= white), high)

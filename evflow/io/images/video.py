@@ -1,7 +1,7 @@
 """Video files through OpenCV: colour frames and their times, one by one.
 
-A video begins at 0 us. Its clock is `fps` or `timestamps` where the user gave one, else the
-container's, which knows of variable frame rates. OpenCV decodes to 8 bits per channel.
+A video begins at 0 us. Its times come from `fps` or `timestamps` if the user gave one, else from
+the container, which knows variable frame rates. OpenCV decodes to 8 bits per channel.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from evflow.io.images.times import read_times
 from evflow.io.images.transfer import hdr_note
 from evflow.notes import Note
 
-SLACK = 1.5  # frames; containers without a count have it from their duration, rounded
+SLACK = 1.5  # frames; containers without a count derive it from their rounded duration
 SLACK_SHARE = 0.001
 REST = "the rest is missing, damaged, or trimmed away by an edit list"
-BLACK, NOT_BLACK = 2, 1e-3  # codes; share of the bytes of a black picture that may be brighter
+BLACK, NOT_BLACK = 2, 1e-3  # code value; share of bytes of a black picture that may exceed it
 TICK_US = 1000.5  # Matroska and WebM round times to the millisecond
 
 
 @dataclasses.dataclass(frozen=True)
 class Video:
     """A video file: size (width, height), fps and the frame count that its header claims (0 =
-    unknown); times_us (T,) where the user gave them."""
+    unknown); times_us (T,) if the user gave them."""
 
     path: Path
     size: tuple[int, int]
@@ -93,11 +93,11 @@ class Video:
 
 
 class Clock:
-    """Times of frames in us from the container's, in ms, which may be coarse or absent.
+    """Times of frames in us from the container's in ms, which may be coarse or absent.
 
-    Times that are all whole milliseconds and within one of the nominal rate's are the nominal
-    ones, rounded; the rate then gives them exactly. A container whose second frame is not
-    later than its first keeps no time, and the rate alone counts.
+    If all times are whole milliseconds within 1 ms of the nominal rate's, they are the nominal
+    ones, rounded, and the exact rate is used. A container whose second frame is not later than its
+    first keeps no times, and only the rate is used.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -107,7 +107,7 @@ class Clock:
         self.steps = (float("inf"), 0.0)
 
     def time(self, index: int, stamp_ms: float) -> int:
-        """The time of frame `index`; EV004 where it does not follow the one before."""
+        """The time of frame `index`; EV004 if it does not follow the previous one."""
         nominal = index * 1e6 / self.fps
         if index == 0:
             self.first_us = stamp_ms * 1e3
@@ -119,7 +119,7 @@ class Clock:
         now = nominal if not self.trusted or (self.coarse and self.steady) else stamp
         if index and now <= self.last_us:
             raise EvflowDataError(
-                "EV004", f"frame {index} of {self.path} is at {now:.0f} us, the one before at "
+                "EV004", f"frame {index} of {self.path} is at {now:.0f} us, the previous one at "
                 f"{self.last_us:.0f} us: its container's times do not increase.",
                 f"Pass --fps {self.fps:.6g} to count frames instead.", where=self.path)
         if index:
@@ -129,7 +129,7 @@ class Clock:
         return round(now)
 
     def notes(self) -> list[Note]:
-        """A note where the frame rate varied by more than rounding."""
+        """A note if the frame rate varied by more than rounding."""
         shortest, longest = self.steps
         if longest <= 1.1 * shortest + 2 * TICK_US:
             return []
@@ -138,25 +138,25 @@ class Clock:
 
 
 def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Video:
-    """Open a video; nothing but its first frame is decoded where it is sound.
+    """Open a video; only its first frame is decoded unless it is damaged.
 
-    Raises EV008 (no video, one picture), EV009 (nothing can be decoded; cut off, unless
-    `hints.partial`), EV016 (not there), EV020 (no frame rate), and what `read_times` raises.
+    Raises EV008 (no video, a single picture), EV009 (nothing can be decoded; truncated, unless
+    `hints.partial`), EV016 (not found), EV020 (no frame rate), and what `read_times` raises.
     """
     path, hints = existing(path), hints or FrameHints()
     if path.suffix.lower() in SUFFIXES:
         raise EvflowDataError(
-            "EV008", f"{path} is one picture.", "For a sequence of images pass their folder; to "
+            "EV008", f"{path} is a single picture.", "For an image sequence pass its folder; to "
             "move a sensor over one picture, --saccades 10 (evflow simulate).", where=path)
     with _capture(path) as capture:
         if not capture.isOpened():
             raise EvflowDataError(
                 "EV008", f"{path} is neither a recording nor a video that OpenCV can open.",
-                "A cut-off mp4 has lost its index: copy it again. Other kinds: convert them to mp4 "
+                "A truncated mp4 has lost its index: copy it again. Convert other formats to mp4 "
                 "(H.264) or avi (MJPG).", where=path)
         rate = capture.get(cv2.CAP_PROP_FPS)
         claimed = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if claimed > 0 and 0 < rate < 1e6:  # counted from 0, where a film may begin later
+        if claimed > 0 and 0 < rate < 1e6:  # counted from 0, although a film may begin later
             claimed -= math.floor(first_stamp_s(path) * rate + 0.5)
         claimed = max(0, claimed)
         good, first = capture.read()
@@ -165,7 +165,7 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
             raise EvflowDataError(
                 "EV009", f"no frame of {path} can be decoded; its codec is "
                 f"{codec.decode('ascii', 'replace')}, which OpenCV may not know here.",
-                f"Convert it: ffmpeg -i {path.name} -c:v libx264 -crf 12 new.mp4; or, where it is "
+                f"Convert it: ffmpeg -i {path.name} -c:v libx264 -crf 12 new.mp4; or, if it is "
                 "damaged, copy it again.", where=path)
         _check_converted(path, capture, claimed, first)
         if not hints.partial and claimed > 1:
@@ -183,8 +183,8 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
 
 
 def _check_converted(path: Path, capture: Any, claimed: int, first: np.ndarray) -> None:
-    """EV009 where all frames are the same black: OpenCV does not convert interlaced ones, and says
-    so on the terminal alone."""
+    """Raise EV009 if all frames are identically black: OpenCV fails to convert some interlaced
+    video and says so only on the terminal."""
     if claimed < 2 or np.median(first) > BLACK or (first > BLACK).mean() > NOT_BLACK:
         return
     for share in (0.25, 0.5, 0.75):
@@ -195,19 +195,19 @@ def _check_converted(path: Path, capture: Any, claimed: int, first: np.ndarray) 
     raise EvflowDataError(
         "EV009", f"all frames of {path} are decoded to the same black picture: interlaced video "
         "that OpenCV does not convert here?",
-        f"Make whole frames of its fields: ffmpeg -i {path.name} -vf bwdif new.mp4.", where=path)
+        f"Deinterlace it: ffmpeg -i {path.name} -vf bwdif new.mp4.", where=path)
 
 
 def _still(path: Path, count: int) -> Note:
-    return Note("frames.still", f"all {count:,} frames of {path} are the same to the byte: nothing "
-                "moves; or it is interlaced, which OpenCV does not convert in some versions: make "
-                f"whole frames of its fields (ffmpeg -i {path.name} -vf bwdif new.mp4).")
+    return Note("frames.still", f"all {count:,} frames of {path} are identical: nothing moves, or "
+                "it is interlaced, which some versions of OpenCV do not convert: deinterlace it "
+                f"(ffmpeg -i {path.name} -vf bwdif new.mp4).")
 
 
 def _check_end(path: Path, capture: Any, claimed: int) -> None:
-    """EV009 at once where the end is missing, not after an hour of simulation.
+    """Raise EV009 at once if the end is missing, rather than after an hour of simulation.
 
-    Only where the last frame cannot be sought are the frames counted, by decoding them all.
+    The frames are counted, by decoding them all, only if the last one cannot be sought.
     """
     slack = int(_slack(claimed))
     capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, claimed - 1 - slack))
@@ -224,7 +224,7 @@ def _check_end(path: Path, capture: Any, claimed: int) -> None:
 
 
 def _check_bytes(path: Path) -> None:
-    """EV009 where an AVI or an mp4 claims more bytes than the file has: OpenCV would fill the rest
+    """Raise EV009 if an AVI or mp4 claims more bytes than the file has: OpenCV would fill the rest
     of its last frame with grey."""
     total = path.stat().st_size
     with open(path, "rb") as f:
@@ -238,11 +238,11 @@ def _check_bytes(path: Path) -> None:
     if end > total:
         raise EvflowDataError(
             "EV009", f"{path} ends {end - total:,} bytes early, at byte {total:,}.",
-            "Cut off: copy it again, or pass --partial (partial=True).", where=path)
+            "It is truncated: copy it again, or pass --partial (partial=True).", where=path)
 
 
 def _boxes_end(f: IO[bytes], total: int) -> int:
-    """Where the last box of an mp4 ends: {u32 size, name}, size 1: u64 size, 0: to the end."""
+    """The end of the last box of an mp4: {u32 size, name}, size 1: u64 size, 0: to the end."""
     at = 0
     while at + 8 <= total:
         f.seek(at)

@@ -91,13 +91,13 @@ DAMAGED: dict[str, tuple[Callable[[Any], None], str]] = {
     "never": (unwritten(), "was never written"),
     "holes": (unwritten(chunks=(100,)), "has 3 of its 10 blocks"),
     "large": (stored(b"x", chunks=(1 << 29,), maxshape=(None,)), "claims 536,870,912 bytes"),
-    "gzip": (stored(LONG, compression="gzip"), "stands for 1,001 or more"),
-    "skips": (stored(LONG, 2, compression="gzip", fletcher32=True), "stands for 1,001 or more"),
+    "gzip": (stored(LONG, compression="gzip"), "expands to 1,001 or more"),
+    "skips": (stored(LONG, 2, compression="gzip", fletcher32=True), "expands to 1,001 or more"),
     "twice": (twice, "went through filter 1"),
-    "blosc": (stored(BLOSC, **hdf5plugin.Blosc()), "stands for 2,147,483,648"),
-    "lz4": (stored(LZ4, **hdf5plugin.LZ4()), "stands for 8,589,934,592"),
-    "zstd": (stored(ZSTD, **hdf5plugin.Zstd()), "stands for 8,589,934,592"),
-    "bits": (stored(LZ4, **hdf5plugin.Bitshuffle()), "stands for 8,589,934,592")}
+    "blosc": (stored(BLOSC, **hdf5plugin.Blosc()), "expands to 2,147,483,648"),
+    "lz4": (stored(LZ4, **hdf5plugin.LZ4()), "expands to 8,589,934,592"),
+    "zstd": (stored(ZSTD, **hdf5plugin.Zstd()), "expands to 8,589,934,592"),
+    "bits": (stored(LZ4, **hdf5plugin.Bitshuffle()), "expands to 8,589,934,592")}
 
 
 @pytest.mark.parametrize("name", DAMAGED)

@@ -134,7 +134,7 @@ def advised(path: Path) -> list[Events]:
 @each
 @pytest.mark.parametrize(("times", "said", "counts"), [
     (changed(_1000=901_000), "overtaken", [1999, 2000, 999, 1000]),
-    (changed(_1000=9_000_000), "The 1 before it lie ahead", [1999, 999, 1001]),
+    (changed(_1000=9_000_000), "The 1 events before it are ahead", [1999, 999, 1001]),
     (np.concatenate([T + 5_000_000, T]), "joined", [4000, 1999, 2000])])
 def test_the_message_fits_the_cause_and_its_advice_works(
     tmp_path: Path, kind: str, times: np.ndarray, said: str, counts: list[int]
@@ -155,7 +155,7 @@ def test_clocks_are_put_one_behind_the_other(tmp_path: Path, kind: str) -> None:
                   columns["p"], SIZE)
     got = read_recording(path, late="join")
     equal(got.events, want)
-    assert "began anew 1 times" in got.notes[0].text
+    assert "restarted 1 times" in got.notes[0].text
     equal(read_events(path, late="join", start_s=2.0), want.slice(7_000_000, 2**60))
 
 
@@ -200,7 +200,7 @@ def test_frames_whose_time_goes_back(tmp_path: Path) -> None:
     path = npz(tmp_path, columns)
     error = refused(path)
     assert error.code == "EV004"
-    assert "--late drop, or sort. The events alone: --no-frames" in error.fix
+    assert "--late drop, or sort. To read only the events: --no-frames" in error.fix
     got = read_recording(path, late="sort")
     assert got.frame_times.tolist() == [0, 50_000, 100_000, 200_000, 300_000]
     np.testing.assert_array_equal(got.frames, frames[[0, 2, 1, 3, 4]])

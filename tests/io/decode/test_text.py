@@ -208,7 +208,7 @@ def test_the_order_is_judged_and_told(tmp_path: Path, order: str) -> None:
     assert found.events.t.tolist() == US[:12]
     assert found.events.x.tolist() == [3 + i for i in range(12)]
     assert [note.code for note in found.notes] == ["events.layout"]
-    assert f"taken as {', '.join(order)}" in found.notes[0].text
+    assert f"to be {', '.join(order)}" in found.notes[0].text
 
 
 NO_EVENTS = {
@@ -232,16 +232,16 @@ def test_other_numbers_are_no_events(tmp_path: Path, kind: str) -> None:
     ("t,x,y,p\n" + "1500000000123.5,3,4,1\n" * 3, "EV003", "since 1970"),
     ("t,x,y,p\nnan,3,4,1\n0.2,3,4,1\n", "EV009", "nan"),
     ("0.1,3,4,1\n0.2,3,garb,1\n", "EV009", "garb"),
-    ("t,x,y,p\n0.1,3,4,+\n0.2,3,4,-\n", "EV008", "below its header 't,x,y,p' stands"),
+    ("t,x,y,p\n0.1,3,4,+\n0.2,3,4,-\n", "EV008", "after its header 't,x,y,p' comes"),
     ("t,x,y,p\n2022-01-27T00:00:00.5,3,4,1\n", "EV008", "2022-01-27T"),
-    ("t;x;y;p\n0,1;3;4;1\n0,2;3;4;0\n", "EV008", "points by sed 's/,/./g'"),
-    ("0,1\t3\t4\t1\n0,2\t3\t4\t0\n", "EV008", "commas inside: 0,1"),
-    ("t_us x y p\n1,000 3 4 1\n2,000 3 4 0\n", "EV008", "by sed 's/,//g'"),
-    ('t_us,x,y,p\n999,3,4,1\n"1,000",3,4,1\n', "EV008", "without separators of thousands"),
+    ("t;x;y;p\n0,1;3;4;1\n0,2;3;4;0\n", "EV008", "points with sed 's/,/./g'"),
+    ("0,1\t3\t4\t1\n0,2\t3\t4\t0\n", "EV008", "contain commas: 0,1"),
+    ("t_us x y p\n1,000 3 4 1\n2,000 3 4 0\n", "EV008", "with sed 's/,//g'"),
+    ('t_us,x,y,p\n999,3,4,1\n"1,000",3,4,1\n', "EV008", "without thousands separators"),
     ("t_us x y p\n1_000 3 4 1\n", "EV008", "1_000"),
     ("0.1, 3, 4, 1\n0.2, 70, 4, 0\n", "EV005", "Wrong size?"),
     ("t x y p\n0.1 3 -4 1\n0.2 7 4 0\n", "EV005", "No pixel is below 0"),
-    ("0.1 64 48 1\n0.2 1 1 0\n", "EV005", "begin at 1"),
+    ("0.1 64 48 1\n0.2 1 1 0\n", "EV005", "start at 1"),
     ("0.1 40 60 1\n0.2 7 4 0\n", "EV005", "--size 48x64"),
 ])
 def test_unclear_text_is_told(tmp_path: Path, content: str, code: str, seen: str) -> None:

@@ -163,7 +163,7 @@ def test_text_in_seconds_that_are_milliseconds(tmp_path: Path) -> None:
     path.write_text("".join(f"{float(t) * 1e3!r} {x} {y} {p}\n" for t, x, y, p in rows))
     error = refused(path, size=(64, 48))  # read in s they lie on ticks of 1 ms, too
     assert error.code == "EV023"
-    assert error.fix.startswith("Pass --time-unit ms; if they are right")
+    assert error.fix.startswith("Pass --time-unit ms, or, if they are right")
 
 
 def test_a_jump_of_the_clock_is_no_unit() -> None:
@@ -195,8 +195,8 @@ def test_floats_that_do_not_hold_their_times(
              p=np.arange(4000) % 2, size=(64, 48))
     assert np.spacing(kind(t[-1])) * 1e6 == pytest.approx(apart, rel=.1)
     if apart > 1e4:
-        assert ("digits behind were lost" if zero > 1e9 else "float32, which at such numbers is "
-                "exact to 0.0312 s only") in refused(path).seen
+        assert ("decimals were lost" if zero > 1e9 else "float32, which resolves such values "
+                "to 0.0312 s") in refused(path).seen
         return
     notes = read_recording(path, time_unit="s").notes
     assert [n.code for n in notes] == ["events.coarse"] * (apart > 1)
@@ -206,7 +206,7 @@ def test_seconds_that_lost_their_digits(tmp_path: Path) -> None:
     lines = (f"{1643243628 + i / 4000:.6g} {i % 64} {i % 48} {i % 2}" for i in range(4000))
     (tmp_path / "a.txt").write_text("\n".join(lines))
     for told in ({}, {"time_unit": "s"}):
-        assert "digits behind were lost" in refused(tmp_path / "a.txt", size=(64, 48), **told).seen
+        assert "decimals were lost" in refused(tmp_path / "a.txt", size=(64, 48), **told).seen
 
 
 def test_few_events_of_a_large_sensor_are_not_taken_for_nanoseconds(tmp_path: Path) -> None:

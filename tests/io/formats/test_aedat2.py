@@ -50,7 +50,7 @@ def test_words_beside_the_events(tmp_path: Path) -> None:
     assert listed(got.events) == [(345 - 20, 259 - 10, 9, 1)]
     assert got.events.size == (346, 260)
     assert tuple(texts(got.notes)) == (
-        "1 frames of which samples are missing were left out", "1 IMU samples were not read",
+        "1 frames with missing samples were left out", "1 IMU samples were not read",
         "1 sync or special words were not read")
     assert tuple(texts(read_recording(path, no_frames=True).notes)) == (
         "2 APS samples were not read", "1 IMU samples were not read",
@@ -131,7 +131,7 @@ def test_frames_of_a_davis(
     assert got.frame_times.tolist() == [2000 + middle, 52_000 + middle]
     np.testing.assert_allclose(got.frames, np.maximum(light, 0) * 255 / 1023, rtol=1e-6)
     assert texts(got.notes) == ["frame times are mid-exposure",
-                                "1 values of frames that lay below their reset are 0"]
+                                "1 frame values below their reset are 0"]
     assert len(read_recording(path, size=SMALL, stop_s=0.02).frames) == 1
     assert not read_recording(path, size=SMALL, no_frames=True).has_frames
 
@@ -145,7 +145,7 @@ def test_frames_across_the_turn_of_the_clock_and_cut_off(tmp_path: Path) -> None
         davis(tmp_path, [(address, t % turn) for address, t in words]), size=SMALL)
     assert got.frame_times.tolist() == [turn - 1000 + (470 + 5000) // 2]
     assert got.events.t.tolist() == [turn - 3000, turn + 9000]
-    assert texts(got.notes)[1] == "1 frames of which samples are missing were left out"
+    assert texts(got.notes)[1] == "1 frames with missing samples were left out"
 
 
 @pytest.mark.parametrize("lost", [slice(0, 100), slice(0, 36 * 48), slice(0, 36 * 48 + 100),
@@ -161,7 +161,7 @@ def test_signals_are_not_joined_with_resets_of_another_frame(tmp_path: Path, los
     whole = [i for i in range(3) if i != at]
     assert got.frame_times.tolist() == [7235 + 50_000 * i for i in whole]
     np.testing.assert_allclose(got.frames, light[whole] * 255 / 1023, rtol=1e-6)
-    assert texts(got.notes)[1] == "1 frames of which samples are missing were left out"
+    assert texts(got.notes)[1] == "1 frames with missing samples were left out"
 
 
 def test_aedat1_of_a_dvs128(tmp_path: Path) -> None:

@@ -121,10 +121,10 @@ def test_packets_filled_up_to_their_capacity(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("tail", "code", "seen"), [
-    (aedat3_packet(1, 8, event(1, 1, 5000))[:-3], "EV009", "ends in a packet of 1 events"),
-    (aedat3_packet(1, 8, b"")[:9], "EV009", "ends 9 bytes into the header"),
-    (bytes(28), "EV009", "no packet begins so"),
-    (b"\xff" * 28, "EV009", "no packet begins so"),
+    (aedat3_packet(1, 8, event(1, 1, 5000))[:-3], "EV009", "ends within a packet of 1 events"),
+    (aedat3_packet(1, 8, b"")[:9], "EV009", "ends 9 bytes into a packet header"),
+    (bytes(28), "EV009", "not a packet header"),
+    (b"\xff" * 28, "EV009", "not a packet header"),
     (aedat3_packet(1, 12, bytes(24)), "EV009", "events of 12 bytes"),
     (aedat3_packet(2, 20, bytes(20)), "EV009", "frames of 20 bytes"),
     (aedat3_packet(2, 40, struct.pack("<Iiiiiiiii", 3, 1, 2, 1, 2, 9999, 9999, 0, 0) + bytes(4)),

@@ -47,7 +47,7 @@ def test_the_size_is_that_of_the_frames(tmp_path: Path) -> None:
     equal(got.events, WANT.events)
     assert len(got.frames) == len(WANT.frames)
     note, = (n for n in got.notes if n.code == "sensor.size")
-    assert "64x48 after the images of /dvs/image_raw" in note.text
+    assert "images of /dvs/image_raw, 64x48" in note.text
     got = read_recording(tmp_path / "a.bag", no_frames=True)
     equal(got.events, WANT.events)
     for topic in ("/dvs_rendering", "/cam1/depthmap"):  # no frames of these events

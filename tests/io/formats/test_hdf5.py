@@ -129,7 +129,7 @@ def test_layouts(tmp_path: Path, kind: str) -> None:
 
 def test_the_camera_that_was_read_is_named(tmp_path: Path) -> None:
     note, = read_recording(write(tmp_path, "m3ed")).notes
-    assert "those of /prophesee/left; not read: /prophesee/right" in note.text
+    assert "/prophesee/left were read; not read: /prophesee/right" in note.text
 
 
 def test_other_layouts_are_listed_and_the_advice_holds(tmp_path: Path) -> None:

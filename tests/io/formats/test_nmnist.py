@@ -22,7 +22,7 @@ def test_bits_by_hand(tmp_path: Path) -> None:
         (33, 2, 0x12345, 1), (4, 33, 0x12346, 0), (0, 0, 0x12347 + 8192, 1)]
     assert found.events.size == (34, 34)
     assert texts(found.notes) == [
-        "the sensor is taken as 34x34, that of N-MNIST: events reach 33"]
+        "assumed the sensor size of N-MNIST, 34x34: events reach 33"]
     assert read_recording(path, size=(64, 48)).notes == ()
 
 

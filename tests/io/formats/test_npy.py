@@ -70,7 +70,7 @@ def test_the_order_of_columns_is_judged(tmp_path: Path, kind: str) -> None:
     note, = found.notes
     order = {"mvsec": "xytp", "vid2e": "xytp", "fortran": "xytp"}.get(
         kind, kind if len(kind) == 4 else "txyp")
-    assert f"taken as {', '.join(order)} after" in note.text
+    assert f"to be {', '.join(order)}" in note.text
     equal(read_events(path, size=SIZE, start_s=0.1, stop_s=0.2), ZERO.slice(10**5, 2 * 10**5))
     np.savez_compressed(tmp_path / "b.npz", events=MATRICES[kind], size=np.array(SIZE))
     equal(read_events(tmp_path / "b.npz"), ZERO)

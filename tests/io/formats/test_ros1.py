@@ -91,7 +91,7 @@ def test_several_topics_and_none(tmp_path: Path) -> None:
                  + array_messages(make(50).events, "/right/events"))
     got = read_recording(path)
     equal(got.events, want.events)
-    assert got.notes == (Note("sensor.camera", "events are those of /left/events; not read: "
+    assert got.notes == (Note("sensor.camera", "events of /left/events were read; not read: "
                               "/right/events; --events-topic NAME reads another"),)
     error = refused(write(path, image_messages(want)))
     assert error.code == "EV008"

@@ -43,14 +43,14 @@ FILES = {  # name: bytes, and what the message says
     "a.npy": (npy(np.zeros((5, 4, 3), np.uint8)), "an array (5, 4, 3) of uint8"),
     "b.npy": (npy(np.array([None])), "Python objects"),
     "a.zip": (zipped("left/a.raw", "right/b.raw"), "a zip archive of left/a.raw, right/b.raw"),
-    "a.raw": (bytes(range(99)), "lines `% evt 3.0` or `% format EVT3` begin it"),
+    "a.raw": (bytes(range(99)), "begin with lines `% evt 3.0`"),
     "old.dat": (b"\0\1\0\2\0\3" * 9, "AEDAT 1"),
     "utf16.csv": ("t,x,y,p\n0.1,3,4,1\n".encode("utf-16"), "iconv -f UTF-16 -t UTF-8"),
     "mac.csv": (b"t,x,y,p\r0.1,3,4,1\r0.2,3,4,1\r", "tr '\\r' '\\n' <"),
     "a.json": (b'{"t": 0.1, "x": 3}\n' * 9, "is JSON"),
     "half.txt": (b"0.1 3 4 2\n0.2 3 4 1\n0.3 5 4 1\n" * 9, "number 4 holds 1, 2"),
     "three.txt": (b"0.1 3 4\n0.2 7 4\n0.3 5 4\n" * 9, "Events need a polarity"),
-    "new.aedat": (b"#!AER-DAT5.0\r\n" + bytes(99), "version that is not known"),
+    "new.aedat": (b"#!AER-DAT5.0\r\n" + bytes(99), "unknown version"),
 }
 
 

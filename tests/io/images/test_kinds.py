@@ -57,7 +57,7 @@ def test_images_stand_as_they_were_seen(
 
 @pytest.mark.parametrize(("numbers", "said"), [
     (range(6), ""), (range(0, 60, 10), ""), ([0, 1, 2, 23, 24, 25], "a02x.png to a23x.png:"),
-    ([0, 1, 2, 4, 5, 9], "a02x.png to a04x.png, and 1 more times:")])
+    ([0, 1, 2, 4, 5, 9], "a02x.png to a04x.png, and in 1 more places:")])
 def test_missing_numbers_are_told(tmp_path: Path, numbers: list[int], said: str) -> None:
     for number, frame in zip(numbers, FRAMES, strict=True):
         cv2.imwrite(str(tmp_path / f"a{number:02d}x.png"), frame)

@@ -157,8 +157,8 @@ def test_every_encoding_becomes_grey_of_its_depth(tmp_path: Path) -> None:
 
 @needs_rosbags
 @pytest.mark.parametrize(("encoding", "size", "said"), [
-    ("32FC1", SENSOR, "floats"), ("yuv422", SENSOR, "'yuv422', which is not known"),
-    ("mono8", (32, 24), "32x24, the sensor has 64x48"), ("", SENSOR, "not known")])
+    ("32FC1", SENSOR, "floats"), ("yuv422", SENSOR, "encoding 'yuv422'"),
+    ("mono8", (32, 24), "32x24, the sensor has 64x48"), ("", SENSOR, "unknown encoding")])
 def test_images_that_are_no_frames_leave_the_events(
     tmp_path: Path, encoding: str, size: tuple[int, int], said: str
 ) -> None:
@@ -301,7 +301,7 @@ def test_several_frame_outputs_of_dv_and_regions(tmp_path: Path) -> None:
     got = read_recording(path)
     np.testing.assert_array_equal(got.frames, sound.frames)
     said = " ".join(note.text for note in got.notes)
-    assert "frames are the images of capture/frames; not taken: accumulator/frames" in said
+    assert "frames are from capture/frames; not used: accumulator/frames" in said
     assert "left out: 1 of 40x20 from x=20, y=10" in said
     assert not read_recording(path, no_frames=True).has_frames
     other = read_recording(path, frames_topic="accumulator/frames")
@@ -324,7 +324,7 @@ def test_the_commands_choose_and_do_without(
         assert facts["frames"] == count
         assert ("image_corrupted" in str(facts["notes"])) == (count > 0)
     assert main(["check", str(path)]) == 0
-    assert "note: frames are the images of /dvs/image_raw; not taken: /dvs/image_corrupted" in (
+    assert "note: frames are from /dvs/image_raw; not used: /dvs/image_corrupted" in (
         capsys.readouterr().err)
     assert main(["info", str(path), "--no-frames", "--frames", "a.mp4"]) == 2
     with pytest.raises(EvflowDataError, match="EV020"):

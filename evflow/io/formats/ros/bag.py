@@ -1,10 +1,10 @@
-"""Recordings out of bags of ROS 1 and ROS 2: one topic of events, and the images beside it.
+"""Recordings from ROS 1 and ROS 2 bags: one topic of events, and the images beside it.
 
-sensor_msgs/Image and CompressedImage become frames, at their header's time, or when they were
-recorded where no header has one, where the events are on ROS time; of several topics of images
-`streams.choose` takes one. Of several topics the first with events is read, or the one asked for,
-and the others are named in a note. Where no message of events tells the sensor's size, it is that
-of the only images that can be their frames.
+sensor_msgs/Image and CompressedImage become frames at their header time (or at the time of
+recording, if no header has one), provided that the events are on ROS time; with several image
+topics `streams.choose` picks one. With several event topics the first one that has events is read,
+or the one requested, and a note names the others. If no event message contains the sensor's size,
+it is that of the only images that can be their frames.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.notes import Note
 from evflow.types import Recording
 
-LOOKED = 16  # messages by which an encoding and a size are told
+LOOKED = 16  # messages examined for encoding and size
 
 
 def read_bag(bag: Bag, hints: Hints) -> Recording:
@@ -59,7 +59,7 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
         if images and own_clock and hints.frames_topic is None:
             return Recording.of_events(events, (*notes, Note(
                 "frames.unused", f"images of {', '.join(s.name for s in images)} were not read: "
-                "events are on another clock; --frames-topic NAME takes them as they are")))
+                "events are on another clock; --frames-topic NAME uses them anyway")))
         chosen = choose(images, hints, events.size, topic)
         notes += chosen.notes
         if chosen.stream is None:
@@ -71,7 +71,7 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
 class Bag:
     """A bag, read message by message; whatever its reader raises becomes EV009.
 
-    open_reader: gives an open reader, as those of `rosbags` are; aligned: messages are those of
+    open_reader: returns an open reader like those of `rosbags`; aligned: messages are those of
     ROS 2; mend: the command that repairs a bag."""
 
     def __init__(
@@ -94,12 +94,12 @@ class Bag:
         self.reader.close()
 
     def _failed(self, e: Exception) -> EvflowDataError:
-        """What the reader's exception says of the bag, or of the packages that are there."""
+        """What the reader's exception says about the bag, or about a missing package."""
         if isinstance(e, ImportError):
             return EvflowDataError("EV010", f"reading {self.path} needs the package 'rosbags'.",
                                    'pip install "evflow-jax[ros]"', where=self.path)
         return EvflowDataError(
-            "EV009", f"{self.path} is cut off or damaged ({e or type(e).__name__}).",
+            "EV009", f"{self.path} is truncated or damaged ({e or type(e).__name__}).",
             f"Copy it again; if its recording was interrupted, run `{self.mend}` on it.",
             where=self.path)
 
@@ -107,13 +107,13 @@ class Bag:
         return [f"{c.topic} ({c.msgtype})" for c in self.reader.connections]
 
     def topics(self, kinds: Iterable[str]) -> list[tuple[str, str]]:
-        """(topic, message type) of these types, by name, those with messages first."""
+        """(topic, message type) of these types, sorted by name, those with messages first."""
         found = {(c.topic, c.msgtype): c.msgcount for c in self.reader.connections
                  if c.msgtype in kinds}
         return sorted(found, key=lambda pair: (found[pair] == 0, *pair))
 
     def image_streams(self, hints: Hints) -> list[ImageStream]:
-        """The topics of images that have messages, by name; none where none are wanted."""
+        """Image topics that have messages, by name; none if no frames are wanted."""
         found = [] if hints.no_frames else self.reader.connections
         kinds = {c.topic: c.msgtype for c in found if c.msgtype in IMAGES and c.msgcount}
         return [self._image_stream(*pair, hints.colour) for pair in sorted(kinds.items())]
@@ -125,7 +125,7 @@ class Bag:
             if kind == COMPRESSED:
                 encoding, data = message.compressed()
                 size = claimed_size(data)
-                return ImageStream(topic, size, "" if size else "compressed as is not known",
+                return ImageStream(topic, size, "" if size else "an unknown compression",
                                    encodings.notes(encoding, seen))
             size, encoding = message.picture()
         except Damage as e:
@@ -152,8 +152,8 @@ class Bag:
             index += 1
 
     def packets(self, topic: str, kind: str) -> Iterator[Packet]:
-        """The messages of events, all of one encoding and size, where they tell it; but empty
-        ones, which some drivers send before they know either."""
+        """The event messages, which must agree in encoding and size (if given); empty messages are
+        skipped, because some drivers send them before they know either."""
         encoding = size = None
         for message in self.messages(topic):
             packet = message.events(kind)
@@ -168,8 +168,8 @@ class Bag:
             yield packet
 
     def first(self, topic: str, kind: str) -> Packet:
-        """The first packet of a topic that holds events, with the size that it or one of those
-        behind tells; EV001 (no message), EV009."""
+        """The first packet of a topic that holds events, with the size that it or a later one
+        contains; EV001 (no message), EV009."""
         found: list[Packet] = []
         try:
             found += itertools.islice(self.packets(topic, kind), LOOKED)
@@ -183,8 +183,8 @@ class Bag:
         return dataclasses.replace(full[0], size=next((p.size for p in full if p.size), None))
 
     def sized(self, first: Packet, topic: str, hints: Hints) -> tuple[Packet, tuple[Note, ...]]:
-        """The packet with the size of the only images that can be its topic's frames, where it
-        has none itself, and a note that says so."""
+        """The packet; if it has no size, with that of the only images that can be its topic's
+        frames and a note that says so."""
         if first.size or hints.size:
             return first, ()
         streams = self.image_streams(dataclasses.replace(hints, no_frames=False))
@@ -194,8 +194,8 @@ class Bag:
             return first, ()
         (size, name), = fits.items()
         return dataclasses.replace(first, size=size), (Note(
-            "sensor.size", f"the sensor is taken as {size[0]}x{size[1]} after the images of "
-            f"{name}: messages of events have no size"),)
+            "sensor.size", f"assumed the size of the images of "
+            f"{name}, {size[0]}x{size[1]}: event messages have no size"),)
 
     def _wrong(self, topic: str, e: Damage) -> EvflowDataError:
         return EvflowDataError(
@@ -220,11 +220,11 @@ class Bag:
         return found
 
     def stamped(self, topic: str) -> bool:
-        """Do headers of a topic have times? The first alone may have 0, of a simulation."""
+        """Whether headers of a topic have times (the first alone may be 0, in simulations)."""
         return any(message.stamp_ns() for message in itertools.islice(self.messages(topic), 2))
 
     def clock(self, topic: str) -> Note:
-        """What the times of the frames of a topic are."""
+        """The note on what the frame times of a topic are."""
         return Note("frames.clock", f"frame times are the header times of {topic}"
                     if self.stamped(topic) else f"frame times are those at which {topic} was "
                     "recorded: its headers have none")

@@ -1,8 +1,8 @@
 """SQLite databases of ROS 2 (rosbag2_storage_sqlite3): tables `topics` and `messages`.
 
-A database is a program as well: views, generated columns and virtual tables make rows that are not
-in the file. Only plain tables are asked, and for the types and lengths of their values before the
-values. ValueError and sqlite3.Error where they are not those of a bag.
+A database is a program as well: views, generated columns and virtual tables produce rows that are
+not in the file. Only plain tables are queried, and types and lengths are checked before values are
+read. ValueError and sqlite3.Error if it is not a bag.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from urllib.parse import quote
 MAGIC = b"SQLite format 3\0"
 LARGEST = 1 << 28  # bytes of one message
 MOST_TOPICS, LONGEST_NAME = 1 << 14, 1 << 12
-STEPS = 10_000  # of SQLite's machine, between two looks at how many there were
-LEAST_STEPS, BYTES_A_LOOK = 1000, 200  # looks, and more of them for more bytes: 50 steps a byte
-LARGEST_PAGE = 65536  # which two bytes of a header can't say
+STEPS = 10_000  # of SQLite's virtual machine between two progress checks
+LEAST_STEPS, BYTES_A_LOOK = 1000, 200  # checks; one more per so many bytes: 50 steps a byte
+LARGEST_PAGE = 65536  # encoded specially, as it does not fit the header's two bytes
 
 
 class Database:
@@ -28,7 +28,7 @@ class Database:
 
     def __init__(self, path: Path) -> None:
         _check_whole(path)
-        # Immutable: nothing beside the file is looked at or made. Quoted: `?` and `%` are names.
+        # Immutable: SQLite opens and creates nothing beside the file. Quoted for `?` and `%`.
         self._open = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1",
                                      uri=True, check_same_thread=False)
         try:
@@ -55,7 +55,7 @@ class Database:
         self._open.close()
 
     def messages(self, topics: Collection[str]) -> Iterator[bytes]:
-        """Those of the topics, in the order of their times."""
+        """Messages of the topics, in order of time."""
         wanted = [number for number, (name, _) in self._topics.items() if name in topics]
         rows = self._open.execute(
             "SELECT data FROM messages WHERE topic_id IN "
@@ -64,8 +64,9 @@ class Database:
             yield data
 
     def _bound(self, looks: int) -> None:
-        """End, with an error, what takes more steps: pages that have themselves as children stand
-        for rows without end. In C, as an exception, Ctrl-C too, would be lost in a callback."""
+        """Stop with an error whatever takes more steps: pages that are their own children yield
+        rows without end. SQLite counts in C, because an exception in a callback, even Ctrl-C, is
+        lost."""
         allowed = itertools.chain(itertools.repeat(0, looks), itertools.repeat(1))
         self._open.set_progress_handler(allowed.__next__, STEPS)
 
@@ -82,13 +83,13 @@ class Database:
                 raise ValueError(f"its table of {table} has columns that are computed")
 
     def _check_values(self, stored: int) -> None:
-        """ValueError where a value is of another kind than a bag's, or longer than the file."""
+        """ValueError if values have types that a bag's have not, or are longer than the file."""
         odd, many = self._open.execute(
             "SELECT total(typeof(id) != 'integer' OR typeof(name) != 'text' OR typeof(type) != "
             "'text' OR length(name) > ?1 OR length(type) > ?1 OR serialization_format != 'cdr'), "
             "count(*) FROM topics", (LONGEST_NAME,)).fetchone()
         if odd or many > MOST_TOPICS:
-            raise ValueError(f"of its {many:,} topics {int(odd):,} are not those of a bag")
+            raise ValueError(f"{int(odd):,} of its {many:,} topics do not have the types of a bag")
         odd, longest, total = self._open.execute(
             "SELECT total(typeof(topic_id) != 'integer' OR typeof(timestamp) != 'integer' OR "
             "typeof(data) != 'blob'), max(length(data)), total(length(data)) FROM messages"
@@ -101,8 +102,8 @@ class Database:
 
 
 def _check_whole(path: Path) -> None:
-    """ValueError where a database ends before its last page, of which SQLite says nothing: rows
-    are missing, or stand in for others. Its header: www.sqlite.org/fileformat.html, 1.3."""
+    """ValueError if a database ends before its last page, which SQLite does not report: rows would
+    be missing or replaced by others. Header: www.sqlite.org/fileformat.html, 1.3."""
     with path.open("rb") as file:
         head = file.read(100)
     page, changed, pages, valid = (int.from_bytes(head[a:b], "big") for a, b in (

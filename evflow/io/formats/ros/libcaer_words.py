@@ -16,7 +16,7 @@ from evflow.io.decode.stream import Damage, hold
 from evflow.io.formats.ros.messages import Packet
 
 HIGH, LOW, COLUMN, SINGLE, BASE, VECTOR = range(6)
-ROWS = 8  # of a vector
+ROWS = 8  # per vector
 PLACE, ON = 0x7FF, 0x800
 
 
@@ -52,7 +52,7 @@ class Decoder:
         return x[at], y[order], packet.base_ns() + 1000 * time[at], p[order]
 
     def _bases(self, kind: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row of bit 0 and polarity of each vector word (at the others: of no meaning)."""
+        """Row of bit 0 and polarity of each vector word (undefined at other words)."""
         is_base = kind == BASE
         advanced = ROWS * np.cumsum(kind == VECTOR)
         base = _told(is_base, (value & PLACE) - advanced, self.base) + advanced
@@ -62,6 +62,6 @@ class Decoder:
 
 
 def _told(tells: np.ndarray, values: np.ndarray, before: int) -> np.ndarray:
-    """For each word the value of the last one that tells it; `before` where none has."""
+    """For each word, the value of the last word for which `tells` holds; `before` if none."""
     marks = np.flatnonzero(tells)
     return hold(before, values[marks], marks, len(values))

@@ -1,8 +1,8 @@
-"""MCAP files of ROS 2 (mcap.dev/spec): records {u8 kind, u64 size, size bytes}, messages in them or
-in chunks of them, packed by LZ4 or zstd.
+"""MCAP files of ROS 2 (mcap.dev/spec): records {u8 kind, u64 size, size bytes}; messages are
+records or lie in chunks, compressed by LZ4 or zstd.
 
-What records claim is compared with the file before it is believed: no index is, as all records
-are passed once. ValueError, struct.error and what decoders raise, for every kind of damage.
+What a record claims is checked against the file; indices are not used, as all records are scanned
+once. Any damage raises ValueError, struct.error or a decoder's error.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from evflow.files.limits import RATIO, check_expansion
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x01, 0x03, 0x04, 0x05, 0x06, 0x0B
-LARGEST = 1 << 28  # bytes of a record that is taken into memory
-LARGEST_CHUNK = 1 << 26  # bytes, beyond which it must not expand more than recordings do
-Timed = tuple[int, bytes | None]  # in ns
+LARGEST = 1 << 28  # bytes of a record that is read into memory
+LARGEST_CHUNK = 1 << 26  # bytes above which it must not expand more than recordings do
+Timed = tuple[int, bytes | None]  # time in ns, message
 
 
 class Chunk(NamedTuple):
-    """first: its earliest time in ns; start, stored: byte and size of its packed records."""
+    """first: its earliest time in ns; start, stored: offset and size of its compressed records."""
 
     first: int
     start: int
@@ -66,7 +66,7 @@ class Mcap:
         self._file.close()
 
     def messages(self, topics: Collection[str]) -> Iterator[bytes]:
-        """Those of the topics, in the order of their times."""
+        """Messages of the topics, in order of time."""
         wanted = {channel for channel, (topic, _) in self._channels.items() if topic in topics}
         parts = [self._part(chunk, wanted) for chunk in self._chunks]
         for _, raw in heapq.merge(self._single(wanted), *parts, key=operator.itemgetter(0)):
@@ -74,7 +74,7 @@ class Mcap:
                 yield raw
 
     def _single(self, wanted: set[int]) -> Iterator[Timed]:
-        """The messages outside of chunks, in order."""
+        """The messages outside chunks, in order."""
         times, starts, sizes = (np.asarray(column) for column in self._loose)
         for index in np.argsort(times, kind="stable").tolist():
             body = self._take(int(starts[index]), int(sizes[index]))
@@ -82,8 +82,8 @@ class Mcap:
                 yield pair
 
     def _part(self, chunk: Chunk, wanted: set[int]) -> Iterator[Timed]:
-        """A chunk's messages in order; before them its first time, so that it is unpacked when
-        that has come."""
+        """A chunk's messages in order, preceded by its first time alone, so that it is unpacked
+        only when that time is reached."""
         yield chunk.first, None
         found = [pair for kind, body in self._unpacked(chunk) if kind == MESSAGE
                  and (pair := self._message(body, wanted)) is not None]
@@ -100,7 +100,7 @@ class Mcap:
         if chunk.compression:
             data = unpack(data, chunk.compression, chunk.size)
         if len(data) != chunk.size or (chunk.crc and zlib.crc32(data) != chunk.crc):
-            raise ValueError("a chunk is not what was written")
+            raise ValueError("a chunk has a wrong checksum")
         at = 0
         while at < len(data):
             kind, size = struct.unpack_from("<BQ", data, at)
@@ -111,16 +111,16 @@ class Mcap:
             at += size
 
     def _scan(self) -> Counter[int] | None:
-        """Note all records; the messages by channel where the file has statistics of them."""
+        """Index all records; returns the messages by channel if the file has statistics."""
         if self._take(0, len(MAGIC)) != MAGIC or self._take(
                 self._total - len(MAGIC), len(MAGIC)) != MAGIC:
-            raise ValueError("it does not begin and end as MCAP does")
+            raise ValueError("it lacks MCAP's first or last bytes")
         at, end, said, chunks = len(MAGIC), self._total - len(MAGIC), None, 0
         while at < end:
             kind, size = struct.unpack("<BQ", self._take(at, 9))
             at += 9
             if size > end - at:
-                raise ValueError(f"a record of {size:,} bytes where {end - at:,} are left")
+                raise ValueError(f"a record claims {size:,} bytes, {end - at:,} are left")
             if kind == MESSAGE:
                 _, _, time, _ = struct.unpack("<HIQQ", self._take(at, 22))
                 for column, value in zip(self._loose, (time, at, size), strict=True):
@@ -150,13 +150,13 @@ class Mcap:
             self._channels[channel] = topic, schema
 
     def _described(self, counts: Counter[int]) -> bool:
-        """Whether the file says of these channels what they are, outside of its chunks."""
+        """Whether the file describes these channels outside its chunks."""
         known = {channel for channel, (_, schema) in self._channels.items()
                  if schema in self._schemas}
         return counts.keys() <= known
 
     def _counted(self) -> Counter[int]:
-        """The messages by channel, of a file without statistics: its channels may be in chunks."""
+        """Messages by channel, for a file without statistics, whose channels may be in chunks."""
         counts: Counter[int] = Counter()
         for chunk in self._chunks:
             for kind, body in self._unpacked(chunk):
@@ -179,7 +179,7 @@ class Mcap:
         return Chunk(first, start, stored, whole, crc, compression)
 
     def _take(self, start: int, size: int) -> bytes:
-        """Bytes of the file."""
+        """Bytes of the file at an offset."""
         if not 0 <= size <= min(LARGEST, self._total - start):
             raise ValueError(f"a record claims {size:,} bytes")
         self._file.seek(start)
@@ -190,7 +190,7 @@ class Mcap:
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
-    """The string at byte `at`, and where it ends."""
+    """The string at byte `at`, and its end."""
     (size,) = struct.unpack_from("<I", body, at)
     if size > len(body) - at - 4:
         raise ValueError("a string reaches beyond its record")
@@ -198,7 +198,7 @@ def _text(body: bytes, at: int) -> tuple[str, int]:
 
 
 def _statistics(body: bytes) -> tuple[Counter[int], int]:
-    """Messages by channel, and the chunks of the file."""
+    """Messages by channel, and the number of chunks."""
     *_, chunks, _, _, size = struct.unpack_from("<QHIIIIQQI", body)
     if size % 10 or size != len(body) - 46:
         raise ValueError("its statistics are damaged")

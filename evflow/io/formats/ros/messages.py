@@ -1,8 +1,8 @@
-"""Messages of event cameras as bytes, of ROS 1 and ROS 2.
+"""Messages of event cameras as bytes, for ROS 1 and ROS 2.
 
-ROS 1: little-endian fields one after another, strings and arrays behind their u32 length
-(wiki.ros.org/msg). ROS 2: the same fields as XCDR1 (OMG DDS-XTypes): behind four bytes that say so,
-each number at a multiple of its size, strings with a final NUL. A field beyond its message is
+ROS 1: little-endian fields in sequence, strings and arrays after their u32 length
+(wiki.ros.org/msg). ROS 2: the same fields as XCDR1 (OMG DDS-XTypes): after a four-byte header, each
+number at a multiple of its size, strings with a final NUL. A field beyond the end of its message is
 `Damage`.
 """
 
@@ -43,7 +43,7 @@ class Packet:
     data: bytes
 
     def whole(self, itemsize: int) -> np.ndarray:
-        """The data as uint8, or Damage where it is no multiple of itemsize."""
+        """The data as uint8; Damage if it is not a multiple of itemsize."""
         if len(self.data) % itemsize:
             raise Damage(self.index, f"{len(self.data)} bytes of events are no multiple of "
                          f"{itemsize}", "message")
@@ -56,8 +56,8 @@ class Packet:
 
 
 class Message:
-    """The bytes of message number `index` of its topic, and how far they are read. aligned: those
-    of ROS 2; recorded_ns: when it was recorded."""
+    """The bytes of message number `index` of its topic, with a read position. aligned: a ROS 2
+    message; recorded_ns: when it was recorded."""
 
     def __init__(
         self, raw: bytes, index: int, aligned: bool = False, recorded_ns: int = 0
@@ -69,7 +69,7 @@ class Message:
                          "message")
 
     def fields(self, layout: str) -> tuple[Any, ...]:
-        """Numbers, a letter of `struct` each."""
+        """Numbers; one `struct` letter each."""
         return tuple(self._number(code) for code in layout)
 
     def _number(self, code: str) -> Any:
@@ -96,7 +96,7 @@ class Message:
         return self.raw[self.at - size : self.at]
 
     def stamp_ns(self) -> int:
-        """The header's time in ns; read once, before anything else."""
+        """The header's time in ns; call it once, before reading anything else."""
         if not self.aligned:
             self.fields("I")  # seq
         seconds, nanoseconds = self.fields("II")
@@ -104,7 +104,7 @@ class Message:
         return int(seconds) * 10**9 + int(nanoseconds)
 
     def events(self, kind: str) -> Packet:
-        """An event message from its beginning."""
+        """An event message, read from its beginning."""
         self.stamp_ns()
         height, width = self.fields("II")
         size = (width, height) if 0 < width <= 65536 and 0 < height <= 65536 else None
@@ -118,10 +118,10 @@ class Message:
         return Packet(self.index, encoding, size, base, self.block())
 
     def _aligned_events(self) -> bytes:
-        """The events of an EventArray, packed as those of ROS 1.
+        """The events of an EventArray, packed as in ROS 1.
 
-        Behind each polarity's byte one is spare, and before all seconds but the first event's two
-        are: with these two added, an event takes 16 bytes."""
+        One byte after each polarity is padding, and so are two before all seconds but those of the
+        first event; with two added there, every event takes 16 bytes."""
         (count,) = self.fields("I")
         if not count:
             return b""
@@ -138,12 +138,12 @@ class Message:
         return (width, height), self.text()
 
     def compressed(self) -> tuple[str, bytes]:
-        """The encoding that an image had before it was compressed (image_transport: "bayer_rggb8;
-        png compressed "), and its file, of a CompressedImage whose header was read."""
+        """For a CompressedImage whose header was read: the encoding of the image before compression
+        (image_transport: "bayer_rggb8; png compressed "), and its file."""
         return self.text().partition(";")[0].strip().lower(), self.block()
 
     def image(self, kind: str, seen: str = "luma") -> np.ndarray:
-        """The pixels of an image whose header was read, as `encodings.decode` has them."""
+        """The pixels of an image whose header was read, as returned by `encodings.decode`."""
         if kind == COMPRESSED:
             encoding, data = self.compressed()
             return encodings.unpacked(encoding, decoded(data, f"message {self.index:,}"), seen)
@@ -151,7 +151,7 @@ class Message:
         big_endian, step = self.fields("BI")
         data = self.block()
         if why := encodings.unreadable(encoding):
-            raise Damage(self.index, f"it is {why}, as others of its topic are not", "message")
+            raise Damage(self.index, f"it is {why}, unlike others of its topic", "message")
         try:
             return encodings.decode(
                 encoding, data, size, step, big_endian=bool(big_endian), seen=seen)

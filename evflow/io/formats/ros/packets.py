@@ -1,4 +1,4 @@
-"""Events out of the packets of ROS messages.
+"""Events from the packets of ROS messages.
 
 dvs_msgs/EventArray (uzh-rpg/rpg_dvs_ros; prophesee_event_msgs has the same bytes): 13-byte events
 on ROS time. event_camera_msgs/EventPacket: `evt3` (the sensor's clock), `mono` (64-bit words: ns
@@ -23,12 +23,12 @@ from evflow.io.formats.ros.messages import EVENT, Packet
 from evflow.notes import Note
 
 CAER = np.dtype([("data", "<u4"), ("t", "<u4")])
-LEAST = 1 << 11  # events of a chunk, where there are as many
-OTHER_CLOCK = ("evt3", "mono")  # encodings whose times are not those of other topics
+LEAST = 1 << 11  # events of a chunk, if there are as many
+OTHER_CLOCK = ("evt3", "mono")  # encodings whose times are on another clock than other topics
 
 
 class Decoded(NamedTuple):
-    """chunks of events, the unit of their times, and what was left out, told at the end."""
+    """chunks of events, the unit of their times, and notes on what was left out, at the end."""
 
     chunks: Iterator[Chunk]
     native: str
@@ -36,7 +36,7 @@ class Decoded(NamedTuple):
 
 
 def decoded(path: Path, first: Packet, packets: Iterable[Packet]) -> Decoded:
-    """The packets, of the encoding of the first."""
+    """Decode the packets, all in the encoding of the first."""
     if first.encoding == "evt3":
         evt = evt3.Decoder("payload byte")
         return Decoded(evt.chunks(_words(packets)), "us", evt.notes)
@@ -50,7 +50,7 @@ def decoded(path: Path, first: Packet, packets: Iterable[Packet]) -> Decoded:
 
 
 def _counted(parts: Iterable[tuple[np.ndarray, ...]]) -> Iterator[Chunk]:
-    """Chunks of the events of several messages: one alone may hold two."""
+    """Merge the events of several messages into chunks: a single message may hold only two."""
     done = count = 0
     waiting: list[tuple[np.ndarray, ...]] = []
     try:
@@ -74,7 +74,7 @@ def _chunk(parts: list[tuple[np.ndarray, ...]], done: int) -> Chunk:
 
 
 def _words(packets: Iterable[Packet]) -> Iterator[tuple[int, np.ndarray]]:
-    """EVT3 words of many packets at once: a packet alone holds some thousand. Their place is that
+    """EVT3 words of many packets at once, since a packet holds only some thousand; positions count
     in the joined payload."""
     waiting, done = bytearray(), 0
     for packet in packets:

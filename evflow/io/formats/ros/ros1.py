@@ -35,13 +35,13 @@ def _open(path: Path) -> Any:
 
     reader = Reader(BoundedPath(path))
     reader.open()
-    for place, chunk in reader.chunks.items():  # bombs are unpacked no further
+    for place, chunk in reader.chunks.items():  # bounds the expansion of every chunk
         reader.chunks[place] = chunk._replace(decompressor=_bounded(chunk.decompressor))
     return reader
 
 
 def _bounded(unpack: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """The same for a chunk that expands within `limits`; ValueError for others."""
+    """The same function for chunks that expand within `limits`; ValueError for others."""
     from lz4.frame import decompress
 
     kinds: dict[Any, str] = {bz2.decompress: "bz2", decompress: "lz4"}

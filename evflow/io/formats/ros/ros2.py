@@ -1,7 +1,7 @@
-"""ROS 2 bags, see bag.py: a folder with its metadata.yaml, or one of its files alone.
+"""ROS 2 bags, see bag.py: a folder with metadata.yaml, or a single one of its files.
 
-Of the metadata only the names of the files are read: all else is in the files themselves, packed
-whole or message by message, or not, as their first bytes tell.
+Only the file names are read from the metadata: everything else is in the files themselves, which
+may be compressed as a whole, message by message or not at all, as their first bytes show.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ EXTENSIONS: tuple[str, ...] = (".mcap", DATABASE)
 
 METADATA, LIST = "metadata.yaml", "relative_file_paths:"
 MOST_METADATA = 1 << 24  # bytes; a recording of a thousand files has 300 kB
-LARGEST_MESSAGE = 1 << 26  # bytes, beyond which it must not expand more than recordings do
+LARGEST_MESSAGE = 1 << 26  # bytes above which it must not expand more than recordings do
 BLOCK = 1 << 20
 
 
@@ -43,13 +43,13 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, hints: Hints) -> Recording:
-    """Raises EV010 (no `rosbags`, for what is compressed) and what `read_bag` raises."""
+    """Raises EV010 (no `rosbags`, for compressed bags) and what `read_bag` raises."""
     with Bag(path, Reader, aligned=True, mend="ros2 bag reindex") as bag:
         return read_bag(bag, hints)
 
 
 class Connection(NamedTuple):
-    """A topic, its type of message and how many there are, as `Bag` asks for them."""
+    """A topic, its message type and count, in the form that `Bag` expects."""
 
     topic: str
     msgtype: str
@@ -57,7 +57,7 @@ class Connection(NamedTuple):
 
 
 class Reader:
-    """All files of a bag, one after the other."""
+    """All files of a bag in sequence."""
 
     def __init__(self, path: Path) -> None:
         with contextlib.ExitStack() as stack:
@@ -75,7 +75,7 @@ class Reader:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection | None, int, bytes]]:
-        """(None, 0, the message) of these, as `Bag` takes them."""
+        """(None, 0, message) for each message, in the form that `Bag` expects."""
         topics = {connection.topic for connection in connections}
         for storage in self.storages:
             for raw in storage.messages(topics):
@@ -85,7 +85,7 @@ class Reader:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files that the metadata list, which rosbag2 writes one a line; ValueError where one is
+    """The files listed in the metadata, which rosbag2 writes one per line; ValueError if one is
     missing or none is listed."""
     text = _begin(folder / METADATA, MOST_METADATA).decode("utf-8", "replace")
     listed = text.partition(LIST)[2]
@@ -102,12 +102,12 @@ def _files(folder: Path) -> list[Path]:
         raise ValueError(f"{METADATA} lists no files")
     files = [folder / PurePath(name).name for name in names]
     if missing := [file.name for file in files if not is_there(file)]:
-        raise ValueError(f"{', '.join(missing[:5])} of its files are not there")
+        raise ValueError(f"{', '.join(missing[:5])} of its files are missing")
     return files
 
 
 def _storage(path: Path, stack: contextlib.ExitStack) -> Database | Mcap:
-    """The open file, unpacked into a temporary one where it is packed."""
+    """The open file, first decompressed to a temporary one if necessary."""
     head = _begin(path, 16)
     if head.startswith(ZSTD):
         path = _unpacked(path, stack)
@@ -120,7 +120,7 @@ def _storage(path: Path, stack: contextlib.ExitStack) -> Database | Mcap:
 
 
 def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
-    """A temporary file of what a packed one holds; EV019 where the disk is full."""
+    """A temporary file with the decompressed content; EV019 if the disk is full."""
     out = tempfile.NamedTemporaryFile(prefix="evflow-", suffix=path.stem)  # noqa: SIM115
     stack.enter_context(out)
     left = FREE + RATIO * path.stat().st_size
@@ -129,7 +129,7 @@ def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
             for part in _parts(packed):
                 left -= len(part)
                 if left < 0:
-                    raise ValueError(f"{path.name} expands beyond measure")
+                    raise ValueError(f"{path.name} expands too far")
                 out.write(part)
         out.flush()
     except OSError as e:
@@ -137,12 +137,12 @@ def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
             raise
         raise EvflowDataError(
             "EV019", f"{tempfile.gettempdir()}, where {path} is unpacked, is full.",
-            "Set TMPDIR to a folder with room, or unpack it: zstd -d.", where=path) from e
+            "Set TMPDIR to a folder with more space, or unpack it: zstd -d.", where=path) from e
     return Path(out.name)
 
 
 def _parts(packed: IO[bytes]) -> Iterator[bytes]:
-    """What a file of zstd frames holds, block by block; EOFError where it is cut off."""
+    """The content of a file of zstd frames, in blocks; EOFError if it is truncated."""
     decoder, waiting = decoder_of("zstd"), b""
     while block := waiting or packed.read(BLOCK):
         if decoder.eof:
