@@ -151,8 +151,8 @@ def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
             uint16 on 0..65535 (`evflow.light.log_maps.to_dn` for fewer bits).
         frame1: frames at its end, of the same shape.
 
+    Returns:
         float32 (..., H, W), natural-log units, > 0 where the pixel became brighter.
-        float32 (..., H, W), natural-log units, > 0 where it became brighter.
 
     Raises:
         EvflowDataError: EV002 (shapes differ, or colour), EV003 (dtype or range), EV007 (NaN).
