@@ -52,7 +52,7 @@ def read_maps(path: Path) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
     data = load_npz(path)
     missing = [n for n in PARAMETERS if n not in data]
     if missing:
-        recording = " It is a recording:" if {"t", "x", "y", "p"} <= set(data) else ""
+        recording = " It is a recording." if {"t", "x", "y", "p"} <= set(data) else ""
         raise EvflowDataError(
             "EV008", f"{path} holds {', '.join(sorted(data)[:12])} but not "
             f"{', '.join(missing)}.{recording}", EXPECTED if not recording else

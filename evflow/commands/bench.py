@@ -1,5 +1,5 @@
-"""`evflow bench`: the benchmarks, which lie beside the package in its source tree; offered where
-they do."""
+"""`evflow bench`: runs the benchmarks, which lie beside the package in the source tree; offered
+only there."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ import evflow
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """Time evflow on this machine, beside peers.
+    """Time evflow on this machine, next to other tools.
 
     Example: evflow bench --only simulator voxels
     """
 
     options: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Those of the benchmarks: evflow bench --help."""
+    """Options of the benchmarks: see evflow bench --help."""
 
     def run(self) -> None:
-        """Signals, terminal and exit code are the benchmarks' own."""
+        """The benchmarks handle signals, terminal and exit code themselves."""
         path = sys.path[:]
         sys.path.insert(0, str(tree()))
         try:
@@ -39,12 +39,12 @@ def tree() -> Path:
 
 
 def at_hand() -> bool:
-    """Whether that is evflow's source tree, with the benchmarks."""
+    """Whether that folder is evflow's source tree, with the benchmarks."""
     return (tree() / "pyproject.toml").is_file() and (tree() / "benchmarks/harness.py").is_file()
 
 
 def forwarded(arguments: list[str]) -> list[str]:
-    """The command line with all that follows `bench` kept for the benchmarks, --help too."""
+    """The command line with everything after `bench` passed to the benchmarks, including --help."""
     if arguments[:1] == ["bench"] and arguments[1:2] != ["--"]:
         return ["bench", "--", *arguments[1:]]
     return arguments

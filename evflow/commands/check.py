@@ -1,4 +1,4 @@
-"""`evflow check`: what usually goes wrong with a recording."""
+"""`evflow check`: find common faults of recordings."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Check(Reading):
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """File or folder of any known format."""
+    """File or folder in any known format."""
     json: bool = False
     """Print JSON."""
     strict: bool = False
-    """Take warnings for errors."""
+    """Treat warnings as errors."""
 
     def run(self) -> None:
         from evflow.recordings.check import Finding, Report, check

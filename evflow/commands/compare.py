@@ -1,4 +1,4 @@
-"""`evflow compare`: how alike two streams are."""
+"""`evflow compare`: how similar two event streams, or two cameras, are."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ class Compare(Reading):
     """
 
     real: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REAL")]
-    """The recorded events, of any known format. The reading options hold for both; --start and
+    """The recorded events, in any known format. The reading options apply to both; --start and
     --stop count from its first event."""
     synthetic: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SYNTHETIC")]
-    """The events to hold against them, of a sensor of the same size. Or both are cameras."""
+    """The events to compare with them, from a sensor of the same size. Or both are cameras."""
     out: Annotated[Path | None, value("FOLDER", "-o")] = None
     """Folder for compare.json and compare.html (which needs matplotlib)."""
     plots: bool = True
     """Write compare.html."""
     overwrite: bool = False
-    """Replace those files where they exist."""
+    """Replace these files if they exist."""
     json: bool = False
     """Print all numbers as JSON."""
 
     def _streams(self) -> tuple[Events, Events]:
-        """Both streams. A span is REAL's, whose instants are the same in one that shares its
-        clock; of one that does not, as many seconds from its own first event."""
+        """Both streams. A time range refers to REAL; if SYNTHETIC shares its clock the same times
+        are used, otherwise the same number of seconds from its own first event."""
         real = tell(self.read(self.real, with_frames=False)).events
         if (self.start is None and self.stop is None) or not len(real):
             return real, tell(self.read(self.synthetic, with_frames=False)).events
@@ -57,7 +57,7 @@ class Compare(Reading):
         return real, same if len(same) else self.read(self.synthetic, with_frames=False).events
 
     def _cameras(self, *both: tuple[Camera, Camera | None]) -> None:
-        """Two cameras beside each other."""
+        """Compare two cameras."""
         from evflow.camera.optics import read_known
         from evflow.metrics.cameras import compare_cameras, verdict
         from evflow.report.cameras import describe_cameras, write_cameras
@@ -80,14 +80,14 @@ class Compare(Reading):
             print(f"written to {self.out}/", file=sys.stderr)
 
     def _check_targets(self) -> None:
-        """EV010, EV013 before any long work."""
+        """Raise EV010, EV013 before any long work."""
         for name in ("compare.json", *(["compare.html"] if self.plots else [])):
             if self.out:
                 need_absent(self.out / name, self.overwrite)
         need_packages(self.real, self.synthetic, pictures=bool(self.out) and self.plots)
 
     def _compared(self, *labels: str) -> dict[str, str]:
-        """What a page says of the two files, the command and the versions."""
+        """The facts that a page states: the two files, the command and the versions."""
         from evflow.process.provenance import sha256, told
 
         shown = {label: f"{path}, sha256 {sha256(path)}" for label, path in zip(
@@ -105,7 +105,7 @@ class Compare(Reading):
             self._cameras(*cameras)
             return
         self._check_targets()
-        note_idle(self, "streams are compared by their events alone")
+        note_idle(self, "only the events of the streams are compared")
         real, synthetic = self._streams()
         numbers = compare(real, synthetic)
         words = describe_streams(numbers)
@@ -124,12 +124,12 @@ class Compare(Reading):
 
 
 def _short(path: Path) -> str:
-    """What a camera is called beside another: cam/camera.npz is cam."""
+    """A short name for a camera: cam/camera.npz is cam."""
     return path.parent.name if path.stem == "camera" and path.parent.name else path.stem
 
 
 def _cameras(*paths: Path) -> list[tuple[Camera, Camera | None]]:
-    """The cameras, if both are; none if neither is. EV020 where one is and the other is not."""
+    """The two cameras, or none if neither file is one. EV020 if only one of them is."""
     from evflow.camera import Camera
     from evflow.camera.file import holds_camera
 
@@ -139,7 +139,7 @@ def _cameras(*paths: Path) -> list[tuple[Camera, Camera | None]]:
     if any(found):
         camera, other = (paths[found.index(kind)] for kind in (True, False))
         raise EvflowDataError(
-            "EV020", f"{camera} is a camera, {other} is none.",
+            "EV020", f"{camera} is a camera, {other} is not.",
             "Compare two cameras or two event streams. To see whether the camera fits a recording: "
             "evflow simulate RECORDING --camera camera.npz -o synth.h5, and compare the two.")
     return []

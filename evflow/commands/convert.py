@@ -1,4 +1,4 @@
-"""`evflow convert`: a recording in another format."""
+"""`evflow convert`: write a recording in another format."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evflow.notes import Note, as_dicts
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Convert(Reading):
-    """Write a recording of any known format, or a part of it, in another.
+    """Write a recording, or a part of it, in another format.
 
     Example: evflow convert flight.aedat4 flight.h5
 
@@ -26,14 +26,14 @@ class Convert(Reading):
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """File or folder of any known format."""
+    """File or folder in any known format."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
+    """Output. Its extension selects the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
     aedat4, .aedat aedat2 (jAER), none (a folder) evreal."""
     format: Format = "auto"
-    """Format of the output, where its extension leaves a choice (event_utils in .h5)."""
+    """Format of the output, if its extension leaves a choice (event_utils in .h5)."""
     overwrite: bool = False
-    """Replace the output where it exists."""
+    """Replace the output if it exists."""
     json: bool = False
     """Print JSON."""
 
@@ -52,7 +52,7 @@ class Convert(Reading):
         if recording.has_frames and (why := writer.refuses(recording.frames.dtype)):
             notes.append(Note(
                 "frames.unused", f"{why}: the {len(recording.frames)} frames were left out; .h5 "
-                "and .npz hold them."))
+                "and .npz can hold them."))
             recording = Recording.of_events(recording.events)
         io.write_recording(self.out, recording, writer.NAME, overwrite=self.overwrite)
         for note in notes:

@@ -1,4 +1,4 @@
-"""`evflow estimate`: a recording's camera."""
+"""`evflow estimate`: measure a camera from a recording."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 FILES = ("camera.npz", "camera.json", "report.html", *(
     f"{name}.{kind}" for name in ("maps", "histograms") for kind in ("png", "pdf", "svg")))
-READ = ("effort", "budget_s", "on_interrupt")  # options of how much is read
-SHORT = 100 * 346 * 260  # pixels of frames: a recording so short that memory is not what is scarce
-SAID_BELOW = ("EV011", "EV017", "EV030")  # an estimate notes these itself
+READ = ("effort", "budget_s", "on_interrupt")  # options on how much is read
+SHORT = 100 * 346 * 260  # pixels of frames: memory does not matter in recordings this short
+SAID_BELOW = ("EV011", "EV017", "EV030")  # findings that an estimate notes itself
 
 
 @own_first
@@ -57,56 +57,57 @@ class Estimate(Compiling, Reading):
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """A recording with frames; of a static scene without frames the noise alone is measured."""
+    """A recording with frames; without frames only the noise of a static scene can be measured."""
     more: Annotated[tuple[Path, ...], tyro.conf.Positional,
                     tyro.conf.arg(metavar="[MORE ...]")] = ()
-    """Of --protocol static: the same camera at rest in other light, a --lux for each."""
+    """With --protocol static: recordings of the same camera at rest in other light, with one --lux
+    value for each."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for camera.npz, camera.json, the pictures and report.html."""
     protocol: Literal["motion", "step", "static"] = "motion"
-    """How it was recorded. motion: of any kind; step: a screen that fills the view and steps
-    between levels of light (thresholds are the change per event); static: a scene at rest, all of
-    whose events are noise."""
+    """How it was recorded. motion: any moving scene; step: a screen that fills the view and steps
+    between light levels (thresholds follow from the events per step); static: a scene at rest,
+    where all events are noise."""
     effort: Literal["quick", "normal", "full"] = "normal"
-    """How much of a long recording is read. normal: parts spread over it, until the errors stop
+    """How much of a long recording to read. normal: parts spread over it, until the errors stop
     shrinking or a minute's work is done (DAVIS346); quick: a third of that; full: everything."""
     budget_s: Annotated[float | None, value("SECONDS")] = None
-    """Read no more after so many seconds of work; at least one part is read."""
+    """Stop reading after this many seconds of work; at least one part is read."""
     on_interrupt: Literal["stop", "save"] = "stop"
-    """What Ctrl-C does while the recording is read. stop: end, and leave nothing; save: measure the
+    """What Ctrl-C does while the recording is read. stop: end without a result; save: measure the
     camera from what was read (a second Ctrl-C ends)."""
     lux: Annotated[tuple[float, ...], value("LUX ...")] = ()
-    """What a light meter read. static: of each recording, in their order, for noise against
-    illuminance; step: of each level, the darkest first, in place of the frames' own ratios."""
+    """Illuminance from a light meter. static: one value per recording, in the same order, for noise
+    against illuminance; step: one value per level, darkest first, instead of the frames' ratios."""
     triggers: Annotated[Path | None, value("FILE")] = None
-    """Of --protocol step: instants of the light's edges, for latency: one time a line, on the clock
-    of the events, or the recording itself (trigger events of Prophesee RAW or AEDAT 4)."""
+    """With --protocol step: times of the light's edges, for latency: one time per line, on the
+    events' clock, or the recording itself (trigger events of Prophesee RAW or AEDAT 4)."""
     thresholds: Annotated[Path | None, value("FILE")] = None
-    """Of --protocol static: take the thresholds, which a scene at rest does not tell, from this
-    camera.npz: noise and thresholds joined in one camera."""
+    """With --protocol static: take the thresholds, which a scene at rest does not show, from this
+    camera.npz; the result has its thresholds and the measured noise."""
     weights: str = "default"
     """Name of released weights, or a .safetensors path."""
     window_ms: float = 40.0
-    """Shortest window; windows run from frame to frame."""
+    """Minimum length of a window; windows run from frame to frame."""
     reconstruct: bool = False
-    """For a recording without frames: make them from the events (see evflow reconstruct). Their
-    contrast is a network's guess, and the thresholds are no better than that."""
+    """For a recording without frames: reconstruct them from the events (see evflow reconstruct).
+    Their contrast is a network's guess, and the thresholds are no better than that."""
     reconstruct_weights: str = "e2vid-small"
-    """Of that network: a released name, a .safetensors path, or a published checkpoint."""
+    """Weights of that network: a released name, a .safetensors path, or a published checkpoint."""
     plots: bool = True
     """Draw maps and histograms (needs matplotlib)."""
     figures: Literal["png", "pdf", "svg"] = "png"
-    """Format of these, two columns of a paper wide."""
+    """Format of these figures, which fit two columns of a paper."""
     report: bool = True
-    """Write report.html: the recording re-simulated, a held-out half, in panels (needs
-    matplotlib; takes about as long as the estimate), or what a bench shows, level by level."""
+    """Write report.html: the recording and its re-simulation on a held-out half, in panels (needs
+    matplotlib; takes about as long as the estimate), or for a bench the results level by level."""
     simulators: bool = False
-    """Also tell in the report how well the pixels of v2e, ESIM and DVS-Voltmeter, each with its
-    own best constants, foretell the held-out half (takes about as long as the report)."""
+    """Also report how well the pixels of v2e, ESIM and DVS-Voltmeter, each with its own best
+    constants, predict the held-out half (takes about as long as the report)."""
     checks: bool = True
-    """Stop where `evflow check` finds errors."""
+    """Stop if `evflow check` finds errors."""
     overwrite: bool = False
-    """Replace those files where they exist."""
+    """Replace these files if they exist."""
     json: bool = False
     """Print the summary as JSON."""
 
@@ -125,21 +126,21 @@ class Estimate(Compiling, Reading):
         self._check_light()
         if not moving:
             refuse(self, ("weights", "window_ms", "reconstruct", *READ),
-                   "of use with --protocol motion only")
+                   "only useful with --protocol motion")
         if not (moving and self.report):
-            refuse(self, ("simulators",), "of use in the report of --protocol motion only")
+            refuse(self, ("simulators",), "only useful in the report of --protocol motion")
         if not self.reconstruct:
-            refuse(self, ("reconstruct_weights",), "of use with --reconstruct only")
+            refuse(self, ("reconstruct_weights",), "only useful with --reconstruct")
         for name, protocol in (("thresholds", "static"), ("triggers", "step")):
             if self.protocol != protocol:
-                refuse(self, (name,), f"of use with --protocol {protocol} only")
+                refuse(self, (name,), f"only useful with --protocol {protocol}")
         need_packages(self.recording, *self.more, pictures=self.plots or self.report)
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording, checked, doubts = self._recorded(self.recording)
             if recording.frames.size <= SHORT:
                 keep()
             made, facts = self._estimated(recording) if moving else self._on_the_bench(recording)
-            words = describe(made.found)  # the doubts are on the terminal already
+            words = describe(made.found)  # doubts were already printed to the terminal
             found = dataclasses.replace(made.found, notes=(*doubts, *made.found.notes))
             found.save(out / "camera.npz")
             facts = {**found.as_dict(), "recording": str(self.recording),
@@ -160,26 +161,26 @@ class Estimate(Compiling, Reading):
         print(f"written to {self.out}/", file=sys.stderr)
 
     def _check_light(self) -> None:
-        """EV020 where --lux, or a second recording, goes with nothing else, or not with it."""
+        """Raise EV020 if --lux or a second recording does not fit the protocol."""
         count = 1 + len(self.more)
         if (self.more and self.protocol != "static") or (self.lux and self.protocol == "motion"):
             what = f"{count} recordings" if self.more else "--lux"
             raise EvflowDataError(
                 "EV020", f"{what} with --protocol {self.protocol}.",
-                "Noise against illuminance, of one recording at rest for each --lux, is "
-                f"--protocol static{' or, of one screen, step' if not self.more else ''}.")
+                "Noise against illuminance needs --protocol static and one --lux per recording"
+                f"{', or --protocol step with a single recording' if not self.more else ''}.")
         if not all(0 < v < math.inf for v in self.lux):
             raise EvflowDataError("EV020", f"--lux {' '.join(f'{v:g}' for v in self.lux)}.",
                                   "Give numbers > 0.")
         if self.protocol == "static" and (self.more or self.lux) and len(self.lux) != count:
             raise EvflowDataError(
                 "EV020", f"{len(self.lux)} values of --lux for {count} recording"
-                f"{'s' if self.more else ''}.", "Give one of each, in the same order: evflow "
+                f"{'s' if self.more else ''}.", "Give one for each, in the same order: evflow "
                 "estimate A B --protocol static --lux 5 200.")
 
     def _recorded(self, path: Path) -> tuple[Recording, Report, list[Note]]:
-        """A recording, what `evflow check` says, and what it doubts; raises its errors, unless told
-        not to."""
+        """A recording, the findings of `evflow check`, and its doubts; raises its errors unless
+        told not to."""
         from evflow.files.spool import SOME, on_disk
         from evflow.process.terminal import bar
         from evflow.recordings.check import check
@@ -205,22 +206,22 @@ class Estimate(Compiling, Reading):
         return recording, report, doubts
 
     def _stepping(self, recording: Recording) -> Note | None:
-        """What to do with a recording of a bench, if it is one."""
+        """A note that recommends --protocol step, if the recording looks like one of a bench."""
         from evflow.estimation.bench.rests import steps_of_light
 
         steps = steps_of_light(recording)
-        return Note("scene.steps", f"the light of the whole view steps, {steps} times in the first "
-                    "frames, and rests in between: --protocol step measures such a recording "
-                    "better, without a path between frames.") if steps else None
+        return Note("scene.steps", f"the light of the whole view changes in steps ({steps} in the "
+                    "first frames) and is constant in between: --protocol step measures such a "
+                    "recording better, without estimating motion.") if steps else None
 
     def _reconstructed(self, recording: Recording) -> Recording:
-        """The recording with frames made from its events; EV020 where it has frames."""
+        """The recording with frames reconstructed from its events; EV020 if it has frames."""
         from evflow.downstream.video import with_reconstructed_frames
         from evflow.process.terminal import bar
 
         if recording.has_frames:
             raise EvflowDataError("EV020", f"--reconstruct, but {self.recording} has frames.",
-                                  "Leave it out: they measure what a network would guess.")
+                                  "Leave it out: real frames are better than a network's guess.")
         with bar("reconstructing") as progress:
             return with_reconstructed_frames(
                 recording, self.reconstruct_weights, progress=progress)
@@ -251,7 +252,7 @@ class Estimate(Compiling, Reading):
                        "weights_steps": trained_steps(model_card(self.weights))}
 
     def _interrupted(self) -> contextlib.AbstractContextManager[list[int]]:
-        """A list that is no longer empty once the user wants what is known so far."""
+        """A list that becomes non-empty once the user asks for what is known so far."""
         from evflow.process.signals import stop_requests
 
         return stop_requests() if self.on_interrupt == "save" else contextlib.nullcontext([])
@@ -280,7 +281,7 @@ class Estimate(Compiling, Reading):
         self, out: Path, found: CameraEstimate, recording: Recording, first: First | None,
         checked: Report,
     ) -> dict[str, Any]:
-        """report.html, and its numbers."""
+        """Write report.html and return its numbers."""
         from evflow.process.terminal import Stages, bar
         from evflow.report.bench import Source, write_bench_report
         from evflow.report.camera import write_report
@@ -299,6 +300,6 @@ class Estimate(Compiling, Reading):
 
 
 def so_far(summary: Summary, std: Summary) -> str:
-    """The thresholds while the recording is read."""
+    """The thresholds so far, while the recording is read."""
     return ", ".join(f"θ {side.upper()} {float(getattr(summary, f'theta_{side}')):.3f} ± "
                      f"{float(getattr(std, f'theta_{side}')):.3f}" for side in ("on", "off"))

@@ -1,4 +1,4 @@
-"""`evflow export`: a measured camera for another simulator."""
+"""`evflow export`: a measured camera as settings of another simulator."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from evflow.commands.writing import need_absent, need_folder
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """A measured camera for another simulator: its maps, the nearest settings, a script, and what
-    that program cannot represent.
+    """Export a measured camera to another simulator: its maps, the nearest settings, a script, and
+    what that program cannot represent.
 
     Example: evflow export cam/camera.npz --to v2e -o cam/v2e
     """
@@ -28,7 +28,7 @@ class Export:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for maps.npz, README.txt and the script."""
     overwrite: bool = False
-    """Replace the folder where it holds an export and nothing else."""
+    """Replace the folder if it holds an export and nothing else."""
     json: bool = False
     """Print JSON."""
 

@@ -26,23 +26,23 @@ if TYPE_CHECKING:
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Flow(Windowed):
-    """Show the optical flow, by EV-FlowNet: the hue says where to, the saturation how fast, where
-    there are events; and measure how much it sharpens them (FWL; above 1 is better than none).
+    """Show the optical flow, by EV-FlowNet: hue for direction, saturation for speed, at pixels with
+    events; and measure how much it sharpens them (FWL: above 1 is better than no flow).
 
     Example: evflow flow flight.aedat4 -o flow.mp4
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """File or folder of any known format."""
+    """File or folder in any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """.mp4, .avi or .gif."""
     weights: str = "evflownet-small"
     """Name of released weights, a .safetensors path, or a published checkpoint (.pth.tar)."""
     truth: Annotated[Path | None, value("FILE")] = None
     """True flow, .npz: flow (T, 2, H, W) = (x, y) px over each window, edges_us (T + 1,) of the
-    windows, which replace --sync, and valid (T, H, W) where not all of it is."""
+    windows, which replace --sync, and valid (T, H, W) if not all of it is."""
     full_px: Annotated[float | None, value("PX")] = None
-    """Motion in a window that has full colour; without it that which 1 % of the pixels exceed."""
+    """Motion per window that is shown in full colour; by default 1 % of the pixels exceed it."""
 
     def run(self) -> None:
         from evflow.downstream.flow import FlowScores, flow_of, full_motion, window_flows
@@ -63,7 +63,7 @@ class Flow(Windowed):
         result = scores.result()
         notes = list(recording.notes)
         if truth is not None and result.get("aee") is None:
-            notes.append(Note("truth.none", f"{self.truth} has no known flow at a pixel with "
+            notes.append(Note("truth.none", f"{self.truth} has no known flow at any pixel with "
                               "events: nothing was measured against it"))
         facts = {"out": str(self.out), "weights": self.weights, "weights_sha256": trained.sha256,
                  "full_px": full_px,
@@ -75,31 +75,32 @@ class Flow(Windowed):
              *_described(result))))
 
     def _check(self) -> None:
-        """EV013, EV020 before any long work."""
+        """Raise EV013, EV020 before any long work."""
         from evflow.report.video import SUFFIXES
 
         self.check_film()
         kind = self.out.suffix.lower()
         if kind not in SUFFIXES:
-            raise EvflowDataError("EV020", f"{self.out.name} is none of {', '.join(SUFFIXES)}.",
-                                  "The ending says what is made.")
+            raise EvflowDataError("EV020", f"{self.out.name} does not end in "
+                                           f"{', '.join(SUFFIXES)}.",
+                                  "The extension selects the format.")
         if kind != ".mp4":
-            refuse(self, ("codec",), f"nothing that a {kind} has")
+            refuse(self, ("codec",), f"does not apply to a {kind}")
         if self.truth is not None:
-            refuse(self, ("sync", "window_events", "window_ms"), "the windows are those of --truth")
+            refuse(self, ("sync", "window_events", "window_ms"), "--truth defines the windows")
         if self.full_px is not None and self.full_px <= 0:
             raise EvflowDataError("EV020", f"--full-px {self.full_px}.", "It must be > 0.")
         need_absent(self.out, self.overwrite, self.recording, self.frames,
                     self.timestamps, self.truth)
 
     def _read(self) -> tuple[Recording, np.ndarray, FlowTruth | None]:
-        """The recording, the edges (T + 1,) of the windows, and the true flow if there is one."""
+        """The recording, the edges (T + 1,) of the windows, and the true flow, if given."""
         from evflow.downstream.flow import load_truth
         from evflow.downstream.sync import window_edges
 
         seen = self.sync in ("auto", "frames") and self.truth is None
         if not seen:
-            note_idle(self, "the frames are not looked at")
+            note_idle(self, "frames are not used")
         recording = self.read(self.recording, with_frames=seen)
         if self.truth is not None:
             truth = load_truth(self.truth, recording.events.size)
@@ -133,19 +134,19 @@ class Flow(Windowed):
 
 
 def _require_overlap(recording: Recording, edges: np.ndarray, truth: Path) -> None:
-    """EV012 unless some event lies within the windows of the true flow."""
+    """Raise EV012 unless an event lies within the windows of the true flow."""
     t = recording.events.t
     if not len(recording.events.slice(int(edges[0]), int(edges[-1]))):
         covered = f"events cover {t[0]:,}..{t[-1]:,} us" if len(t) else "there are no events"
         raise EvflowDataError(
             "EV012", f"{covered}, but the windows of {truth} {edges[0]:,}..{edges[-1]:,} us.",
-            "edges_us are microseconds of the events' clock: is it another one, or another unit?")
+            "edges_us are microseconds of the events' clock: is it another clock, or another unit?")
 
 
 def _watched(
     flows: Iterator[np.ndarray], scores: Any, count: int, progress: Any
 ) -> Iterator[np.ndarray]:
-    """The flows on their way, each scored."""
+    """The flows as they pass, each one scored."""
     for i, flow in enumerate(flows):
         scores.add(flow)
         yield flow
@@ -153,7 +154,7 @@ def _watched(
 
 
 def _described(result: dict[str, Any]) -> list[str]:
-    """The scores as a line for people."""
+    """The scores as a line of text."""
     names = {"fwl": "FWL", "rsat": "RSAT", "aee": "AEE [px]", "outlier_percent": "outliers [%]",
              "fwl_truth": "FWL of the truth"}
     numbers = [f"{said} {result[name]:.3f}" for name, said in names.items()

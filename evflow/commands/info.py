@@ -1,4 +1,4 @@
-"""`evflow info`: what is in a recording."""
+"""`evflow info`: what a recording contains."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(Reading):
-    """What is in a recording: events, frames, size, duration, usable windows.
+    """Show what a recording contains: events, frames, size, duration, usable windows.
 
     Example: evflow info flight.aedat4
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """File or folder of any known format."""
+    """File or folder in any known format."""
     json: bool = False
     """Print JSON."""
 

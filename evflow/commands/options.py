@@ -1,9 +1,8 @@
-"""Options that several commands share, how they are told from idle ones, and how results are
-written.
+"""Options that several commands share, how idle ones are reported, and how results are written.
 
-An option of `Reading` that can do nothing, because there are no frames or the command looks at
-none, is named in a note on stderr: the same options go with every command. What contradicts is
-refused, EV020.
+An option of `Reading` that has no effect, because there are no frames or the command does not use
+them, is named in a note on stderr, so that one set of options can be passed to every command.
+Contradictions are refused, EV020.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-LARGEST = 1e13  # of any number: as milliseconds since 1970 until 2286, and whole microseconds
+LARGEST = 1e13  # limit of any number: as ms since 1970 it is in 2286, and fits integer microseconds
 
-ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # of --frames
-CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer", "colour")  # of any frames
-OWN = ("frames_topic", "no_frames")  # of the recording's
+ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # for --frames
+CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer", "colour")  # for any frames
+OWN = ("frames_topic", "no_frames")  # for the recording's own
 
 
 def value(metavar: str, *aliases: str) -> Any:
-    """Of an option that may be left out: what its value is called in the help."""
+    """An optional option: the name of its value in the help."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="", aliases=aliases or None)
 
 
 def own_first(command: type[T]) -> type[T]:
-    """Class decorator: a command's help names its own options before those that it inherits, and
-    those of a near base before those of a far one."""
+    """Class decorator: the help lists a command's own options before inherited ones, nearer bases
+    before farther ones."""
     depth = {name: i for i, base in enumerate(command.__mro__)
              for name in getattr(base, "__dataclass_fields__", ())}
     fields = command.__dataclass_fields__  # type: ignore[attr-defined]
@@ -50,86 +49,86 @@ def own_first(command: type[T]) -> type[T]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Compiling:
-    """What a command that compiles programs inherits."""
+    """Options of commands that compile programs."""
 
     compile_cache: bool = True
-    """Keep compiled programs in the user's cache folder (~/.cache/evflow), so that later runs start
-    sooner; JAX_COMPILATION_CACHE_DIR names another."""
+    """Cache compiled programs in the user's cache folder (~/.cache/evflow), so that later runs
+    start faster; JAX_COMPILATION_CACHE_DIR names another folder."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How a recording is read; what a command that reads one inherits."""
+    """Options on how a recording is read, inherited by commands that read one."""
 
     start: Annotated[float | None, value("SECONDS")] = None
     """Use the recording from here (seconds from its first event)."""
     stop: Annotated[float | None, value("SECONDS")] = None
     """... to here."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of the event times; auto takes the format's own."""
+    """Unit of the event times; auto uses the format's own."""
     polarity: Literal["auto", "01", "pm1", "invert"] = "auto"
-    """What the file's polarities are; invert swaps ON and OFF."""
+    """Polarity convention of the file; invert swaps ON and OFF."""
     size: Annotated[str | None, value("WxH")] = None
-    """Sensor size (346x260), where the file does not tell it or is wrong."""
+    """Sensor size (346x260), if the file does not contain it or is wrong."""
     partial: bool = False
-    """Use what lies before the damage of a damaged or cut-off file (of HDF5 and npz only what lies
-    before a time that goes back)."""
+    """Of a damaged or truncated file, use what lies before the damage (of HDF5 and npz only what
+    lies before a time that goes back)."""
     drop_outside: bool = False
     """Leave out events outside the sensor instead of refusing them."""
     late: Literal["stop", "drop", "sort", "join"] = "stop"
-    """Events whose time goes back: stop refuses them (with --partial, ends there); drop leaves out
-    as few events as make the others ordered; sort puts them in their place; join takes them for
-    another clock, which is put behind the first."""
+    """Events whose time goes back: stop refuses them (with --partial, reading ends there); drop
+    leaves out the fewest events such that the rest are ordered; sort sorts them in; join treats
+    them as a second clock and appends it to the first."""
     frames_topic: Annotated[str | None, value("NAME")] = None
-    """The recording's images that are the frames of its events, where it holds several: a topic of
-    a bag, an output of DV. Without it raw images near the events, which a note names."""
+    """Which image stream holds the frames, if the recording has several: a bag's topic, an output
+    of DV. By default raw images near the events, which a note names."""
     events_topic: Annotated[str | None, value("NAME")] = None
-    """Of several cameras in one file the one whose events are read: a topic of a bag, a group of
-    HDF5, an output of DV. Without it the first, and a note names the others."""
+    """Which camera's events to read, if the file has several: a bag's topic, an HDF5 group, an
+    output of DV. By default the first; a note names the others."""
     no_frames: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Read the events alone, whatever the recording's frames are."""
+    """Read only the events, not the recording's frames."""
     frames: Annotated[Path | None, value("PATH")] = None
-    """Frames from elsewhere: a folder of images, a video, a stack (.npy, .npz)."""
+    """Frames from another file: a folder of images, a video, a stack (.npy, .npz)."""
     timestamps: Annotated[Path | None, value("FILE")] = None
-    """Times of --frames on the events' clock: one a line, alone, beside the image's name, or begin
-    and end of the exposure."""
+    """Times of --frames on the events' clock: one per line, alone, beside the image's name, or
+    begin and end of the exposure."""
     timestamps_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of those times; auto takes the one that gives a plausible frame rate."""
+    """Unit of these times; auto takes the one that gives a plausible frame rate."""
     frames_fps: Annotated[float | None, value("HZ")] = None
     """Frames per second of --frames, the first at 0 (see --frames-offset-ms)."""
     full_scale: Annotated[float | None, value("DN")] = None
-    """White of --frames; without it 255, or 65535 in 16-bit images. 12-bit data: 4095."""
+    """White of --frames; the default is 255, or 65535 for 16-bit images. 12-bit data: 4095."""
     frames_offset_ms: Literal["auto"] | float = 0.0
-    """Added to the frame times; auto finds what makes events and frames agree."""
+    """Added to the frame times; auto finds the offset at which events and frames agree."""
     flip_frames: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirror the frames."""
     response: Literal["linear", "gamma", "srgb"] = "linear"
-    """How the frames code light; gamma is 2.2. Thresholds are measured against linear light."""
+    """How the frames encode light; gamma is 2.2. Thresholds refer to linear light."""
     bayer: Annotated[str | None, value("RGGB|BGGR|GRBG|GBRG")] = None
-    """The frames are a raw colour mosaic whose cells begin so: turn it into luma. Not where the
-    events come from behind the same filters: there a pixel's own value is what it sees."""
+    """The frames are a raw colour mosaic with this pattern: convert it to luma. Not if the events
+    come from behind the same filters: then a pixel sees its own value."""
     colour: Colour = "luma"
-    """What a pixel sees of colour: luma, or its own under this Bayer mosaic, where the events come
-    from behind it (a colour DAVIS): raw mosaics stay as they are, colour frames are laid under."""
+    """What a pixel sees of colour: luma, or one colour under this Bayer mosaic, if the events come
+    from behind it (a colour DAVIS): raw mosaics are kept, colour frames are sampled by it."""
 
     def read(self, path: Path, *, with_frames: bool = True) -> Recording:
-        """The recording at `path`, these options obeyed. with_frames: False where the command looks
-        at no frames: then none are read from elsewhere or changed (see `note_idle`)."""
+        """The recording at `path`, read with these options. with_frames: False if the command does
+        not use frames: then none are read from elsewhere or changed (see `note_idle`)."""
         from evflow import io
 
         check_finite(self)
         if self.frames is None and (told := given(self, ELSEWHERE)):
             raise EvflowDataError(
-                "EV020", f"{told} without --frames: of frames from elsewhere.",
+                "EV020", f"{told} without --frames: it applies to frames from another file.",
                 "Pass --frames too.")
         if self.frames is not None and (told := given(self, OWN)):
             raise EvflowDataError(
-                "EV020", f"{told} with --frames, which takes the place of the recording's own.",
-                "Give one of them.")
+                "EV020", f"{told} with --frames, which replaces the recording's own.",
+                "Give only one of them.")
         if self.bayer is not None and self.colour != "luma":
             raise EvflowDataError(
-                "EV020", f"--bayer {self.bayer} makes luma of a mosaic, --colour {self.colour} "
-                "leaves it.", "Give one of them.")
+                "EV020", f"--bayer {self.bayer} converts a mosaic to luma, --colour {self.colour} "
+                "keeps it.", "Give only one of them.")
         own = with_frames and self.frames is None
         recording = io.read_recording(
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
@@ -144,7 +143,7 @@ class Reading:
         return recording
 
     def _seeing(self, recording: Recording) -> Recording:
-        """The recording with the frames asked for, put right."""
+        """The recording with the requested frames, corrected as requested."""
         from evflow.recordings import adjust
 
         offset = 0 if self.frames_offset_ms == "auto" else round(self.frames_offset_ms * 1000)
@@ -171,22 +170,22 @@ def _aligned(recording: Recording) -> Recording:
 
 
 def given(options: Any, names: Iterable[str]) -> str:
-    """Those of the named options that are not at their default, as they are typed: "--fps, --slow";
-    "" where all are."""
+    """Those of the named options that are not at their default, as typed: "--fps, --slow"; "" if
+    none."""
     defaults = {field.name: field.default for field in dataclasses.fields(options)}
     return ", ".join(flag(name, no=defaults[name] is True) for name in names
                      if getattr(options, name) != defaults[name])
 
 
 def note_idle(options: Reading, why: str) -> None:
-    """Say which options of frames do nothing."""
+    """Report which frame options have no effect."""
     if idle := given(options, ("frames_topic", "frames", *ELSEWHERE, *CHANGES)):
         print(f"note: {idle} without effect: {why}.", file=sys.stderr)
 
 
 def tell(recording: Recording, beside: object = "") -> Recording:
-    """The recording, after its notes are printed to stderr: by commands that do not print them
-    with their own. beside: what is printed as well, whose sentences are not repeated."""
+    """The recording, after printing its notes to stderr, for commands that do not print them with
+    their own. beside: other output, whose sentences are not repeated."""
     for note in recording.notes:
         if note.text.rstrip(".") not in str(beside):
             print(f"note: {note}", file=sys.stderr)
@@ -194,19 +193,19 @@ def tell(recording: Recording, beside: object = "") -> Recording:
 
 
 def flag(name: str, *, no: bool = False) -> str:
-    """An option as it is typed: "--frames-fps"."""
+    """An option as typed: "--frames-fps"."""
     return f"--{'no-' if no else ''}{name.replace('_', '-')}"
 
 
 def refuse(options: Any, names: Iterable[str], why: str) -> None:
-    """EV020 where any of the command's own options is given that contradicts the rest."""
+    """Raise EV020 if any of the command's own options is given that contradicts the others."""
     if wrong := given(options, names):
         raise EvflowDataError("EV020", f"{wrong}: {why}.", "Leave it out.")
 
 
 def check_finite(options: Any) -> None:
-    """EV020 where a number among the options is NaN, infinite, larger than whole microseconds
-    can be told or, of a seed, beyond the 32 bits that a key is made of."""
+    """Raise EV020 if a number among the options is NaN, infinite, too large for integer
+    microseconds or, for a seed, beyond 32 bits."""
     for field in dataclasses.fields(options):
         number = getattr(options, field.name)
         if field.name == "seed" and not -2**31 <= number < 2**32:
@@ -217,7 +216,7 @@ def check_finite(options: Any) -> None:
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
-    """(width, height) of "346x260"; EV020 on anything else."""
+    """(width, height) from "346x260"; raises EV020 for anything else."""
     if text is None:
         return None
     width, _, height = text.lower().partition("x")
@@ -227,17 +226,17 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 
 def write_json(path: Path, facts: dict[str, Any]) -> None:
-    """`facts` as an indented JSON file, replaced whole or not at all."""
+    """Write `facts` as an indented JSON file, completely or not at all."""
     from evflow.files.atomic import atomic_text
 
     atomic_text(path, json.dumps(facts, indent=2) + "\n", overwrite=True)
 
 
 def warn_of_prior(undetermined: Sequence[str], done: str) -> None:
-    """A word on stderr where a camera's thresholds were never measured. done: what happens to them
-    all the same."""
+    """Warn on stderr if a camera's thresholds were never measured. done: what happens with them
+    nevertheless."""
     if undetermined:
         print(f"warning: {' and '.join(undetermined)} of this camera were not measured: they are "
-              f"{done} with the value of the prior. Estimate them from a recording with frames in "
+              f"{done} with the prior's value. Estimate them from a recording with frames in "
               "which something moves, or join two estimates: evflow estimate --thresholds.",
               file=sys.stderr)

@@ -1,5 +1,5 @@
-"""Optional packages that a command needs: all that are missing are named at once, before any long
-work."""
+"""Optional packages that a command needs: all missing ones are named at once, before any long work.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from pathlib import Path
 
 from evflow.errors import EvflowDataError
 
-# What a format is read by.
+# The package that reads a format.
 READERS = {"dsec": "h5py", "v2e": "h5py", "mvsec": "h5py", "event_utils": "h5py",
            "aedat4": "aedat", "rosbag": "rosbags", "rosbag2": "rosbags"}
 EXTRAS = {"h5py": "io", "aedat": "io", "rosbags": "ros", "matplotlib": "viz"}
 
 
 def need_packages(*recordings: Path, pictures: bool) -> None:
-    """Raise EV010, naming all packages that are missing for these recordings and, if wanted, for
-    pictures; before it EV008, EV009, EV016 where a recording is none."""
+    """Raise EV010 with all packages missing for these recordings and, if wanted, for pictures;
+    before it EV008, EV009, EV016 if a path is not a recording."""
     from evflow.io.registry import find_format
 
     uses = {READERS[name]: f"to read {path}" for path in recordings

@@ -1,4 +1,4 @@
-"""Options of the camera whose pixels see a video: measured or not, its circuit, thresholds and
+"""Options on the simulated camera: a measured camera or a known sensor, its circuit, thresholds and
 noise."""
 
 from __future__ import annotations
@@ -24,54 +24,55 @@ CHOICES = ("cutoff_by_light", "noise_resets_memory")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pixels:
-    """Whose pixels see; what a command that simulates inherits."""
+    """Options on the camera, inherited by commands that simulate."""
 
     camera: Annotated[Path | None, value("FILE")] = None
-    """camera.npz from evflow estimate, with its cutoff, dead time, leak and shot noise, and, where
-    VIDEO is a recording, the light that its frames lack; without it the thresholds below, or the
+    """camera.npz from evflow estimate, with its cutoff, dead time, leak and shot noise and, if
+    VIDEO is a recording, the light that its frames lack; by default the thresholds below, or the
     sensor's own."""
     draw: bool = False
-    """Draw the camera's pixels from their estimates and errors: as uneven as the camera is, where
-    the most likely values are too even."""
+    """Draw the camera's pixels from their estimates and errors, which makes them as uneven as the
+    real ones; the most likely values are too uniform."""
     sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
     """Pixel circuit. clean, noisy: v2e's presets; v2e: its defaults; esim; dvs346, dvs240:
     DVS-Voltmeter's; paper: the paper's. The options below change parts of it."""
     theta_on: Annotated[float | None, value("THETA")] = None
-    """ON threshold of every pixel (natural log); without it the sensor's, with its mismatch."""
+    """ON threshold of every pixel (natural log); by default the sensor's, with its mismatch."""
     theta_off: Annotated[float | None, value("THETA")] = None
     """OFF threshold of every pixel."""
     mismatch: Annotated[float | None, value("SIGMA")] = None
     """Standard deviation of both thresholds over pixels; v2e's default is .03."""
     eta_on: Annotated[float | None, value("HZ")] = None
-    """Noise events per second and pixel, ON, added to the sensor's own."""
+    """ON noise events per second and pixel, added to the sensor's own."""
     eta_off: Annotated[float | None, value("HZ")] = None
     """The same, OFF."""
     cutoff_hz: Annotated[float | None, value("HZ", "--cutoff")] = None
-    """Corner of the photoreceptor's low-pass at white; 0: none."""
+    """Corner frequency of the photoreceptor's low-pass at white; 0: none."""
     cutoff_by_light: bool = True
-    """The corner goes with intensity, as in v2e; else it is the same everywhere."""
+    """The corner is proportional to intensity, as in v2e; otherwise it is the same at any light."""
     photoreceptor: Literal["first-order", "second-order"] = "first-order"
-    """How the photoreceptor follows light: as v2e's low-pass, or as that of Deblur e-NeRF, which
-    may ring in bright light, with a source follower and an amplifier that events reset. Of the
-    same --cutoff-hz in the dark, or the camera's, or 199 Hz."""
+    """How the photoreceptor follows light: v2e's low-pass, or that of Deblur e-NeRF, which may ring
+    in bright light, with a source follower and an amplifier that events reset. Its corner in the
+    dark is --cutoff-hz, or the camera's, or 199 Hz."""
     refractory_s: Annotated[float | None, value("SECONDS", "--refractory")] = None
-    """Time after an event in which a pixel sends no other (v2e: .0005)."""
+    """Time after an event during which a pixel sends no other (v2e: .0005)."""
     leak_hz: Annotated[float | None, value("HZ", "--leak")] = None
-    """ON events per second and pixel that leak without light; of a measured camera, on top of all
-    its noise."""
+    """ON leak events per second and pixel, without light changes; for a measured camera they come
+    on top of all its noise."""
     leak_jitter: Annotated[float | None, value("SHARE")] = None
     """Relative jitter of the leak (v2e: .1)."""
     leak_fpn_decades: Annotated[float | None, value("DECADES")] = None
     """Spread of the leak over pixels (v2e: .1)."""
     shot_hz: Annotated[float | None, value("HZ", "--shot")] = None
-    """Shot noise of v2e's pixel in the dark, both polarities together; a quarter in white."""
+    """Shot noise of v2e's pixel in the dark, both polarities together; a quarter of it at white."""
     noise_resets_memory: bool = True
-    """A noise event stores the present intensity, as in real pixels (v2e's sensors)."""
+    """A noise event resets the pixel's memory to the present intensity, as in real pixels (and in
+    v2e's sensors)."""
     seed: int = 0
-    """Of noise, and of what is drawn: the same seed gives the same events."""
+    """Seed of noise and of drawn parameters: the same seed gives the same events."""
 
     def model(self) -> SensorModel:
-        """The pixels' circuit; EV020 where it has no such part."""
+        """The pixels' circuit; EV020 if it has no such part."""
         from evflow.camera.sensors import known_sensor
         from evflow.simulator.photoreceptor import as_measured
 
@@ -91,17 +92,17 @@ class Pixels:
     def _second_order(self, model: SensorModel) -> SensorModel:
         from evflow.camera.sensors import SecondOrder
 
-        refuse(self, ("cutoff_by_light",), "a photoreceptor of second order goes with light")
+        refuse(self, ("cutoff_by_light",), "a second-order photoreceptor always depends on light")
         if self.cutoff_hz == 0:
             raise EvflowDataError("EV020", "--photoreceptor second-order and --cutoff-hz 0.",
-                                  "Give the corner that it has in the dark, or leave it out.")
+                                  "Give the corner frequency in the dark, or leave it out.")
         cutoff_hz = model.cutoff_hz or self._circuit()[0].cutoff_hz
         receptor = SecondOrder().at(cutoff_hz) if cutoff_hz else SecondOrder()
         return dataclasses.replace(model, cutoff_hz=0.0, photoreceptor=receptor)
 
     def seen_by(self, recorded: bool) -> Photoreceptor:
-        """The measured camera's photoreceptor, unless options name another; of its light and
-        clock only in front of frames that a camera recorded beside its events."""
+        """The measured camera's photoreceptor, unless options choose another; its light and clock
+        are used only for frames that the camera recorded with its events."""
         from evflow.camera.optics import Optics
         from evflow.simulator.photoreceptor import Photoreceptor
 
@@ -111,7 +112,7 @@ class Pixels:
         return Photoreceptor.of(sensor, optics if recorded else Optics())
 
     def _circuit(self) -> tuple[SensorModel, Optics]:
-        """Of the measured camera; ideal without one, or beside another sensor."""
+        """The measured camera's circuit; ideal without a camera, or with another sensor."""
         from evflow.camera.optics import Optics, read_sensor
         from evflow.camera.sensors import SensorModel
 
@@ -125,16 +126,16 @@ class Pixels:
         return self.camera is not None and self.sensor == "clean"
 
     def pixels(self, size: tuple[int, int]) -> Camera:
-        """The camera asked for; EV015 where its size is not (width, height) of the video."""
+        """The camera to simulate; EV015 if its size is not (width, height) of the video."""
         if self.draw and not self.camera:
             raise EvflowDataError("EV020", "--draw without --camera.",
-                                  "It draws a measured camera.")
+                                  "It draws the pixels of a measured camera.")
         camera = self._measured(self.camera) if self.camera else self._drawn((size[1], size[0]))
         if camera.shape != size[::-1]:
             width, height = camera.shape[::-1]
             raise EvflowDataError(
                 "EV015", f"the video is {size[0]}x{size[1]}, the camera {width}x{height}.",
-                f"Pass --sensor-size {width}x{height}: the video is scaled and cropped to it.")
+                f"Pass --sensor-size {width}x{height}to scale and crop the video.")
         return camera
 
     def _measured(self, path: Path) -> Camera:
@@ -143,7 +144,7 @@ class Pixels:
         from evflow.camera import Camera
         from evflow.camera.optics import read_undetermined
 
-        refuse(self, THRESHOLDS, "the camera's own are those of --camera")
+        refuse(self, THRESHOLDS, "--camera has its own")
         if self.sensor != "clean":
             print(f"note: --sensor {self.sensor} adds its own noise and limits to the camera's "
                   "measured noise.", file=sys.stderr)
@@ -157,8 +158,8 @@ class Pixels:
         return camera
 
     def _drawn(self, shape: tuple[int, int]) -> Camera:
-        """Thresholds of the sensor with its mismatch; those that are told are the same everywhere,
-        unless --mismatch is."""
+        """The sensor's thresholds with its mismatch; given thresholds are the same at every pixel,
+        unless --mismatch is given."""
         import jax
         import jax.numpy as jnp
 
@@ -177,7 +178,7 @@ class Pixels:
             return dataclasses.replace(drawn, **even).validate()
         if not self.mismatch >= 0:
             raise EvflowDataError("EV020", f"--mismatch {self.mismatch}.", "It must be >= 0.")
-        Camera.constant((1, 1), **told)  # EV014, before they are spread
+        Camera.constant((1, 1), **told)  # raises EV014 for the values themselves
         values = {"theta_on": known.theta, "theta_off": known.theta, "eta_on": 0.0, "eta_off": 0.0,
                   **told, "sigma_on": self.mismatch, "sigma_off": self.mismatch}
         nominal = Summary(**{name: jnp.float32(number) for name, number in values.items()})

@@ -1,4 +1,4 @@
-"""`evflow reconstruct`: events as video."""
+"""`evflow reconstruct`: video from events."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reconstruct(Windowed):
-    """Turn events into video, by E2VID or FireNet. Where the recording has frames the images are
-    made at their times and scored against them.
+    """Turn events into video, by E2VID or FireNet. If the recording has frames, images are made at
+    their times and compared with them.
 
     Example: evflow reconstruct flight.aedat4 -o flight.mp4
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """File or folder of any known format."""
+    """File or folder in any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """.mp4, .avi or .gif; or a folder for .png images with timestamps.txt, as --frames of other
-    commands reads it."""
+    """.mp4, .avi or .gif; or a folder for .png images with timestamps.txt, which --frames of other
+    commands reads."""
     weights: str = "e2vid-small"
     """Name of released weights, a .safetensors path, or a published checkpoint (.pth.tar)."""
     protocol: Literal["evreal", "etnet", "global"] = "evreal"
-    """How images are scored: which SSIM, clipped or not."""
+    """How images are scored: which SSIM, and whether values are clipped."""
 
     def run(self) -> None:
         from evflow.downstream.released import load_network
@@ -81,20 +81,21 @@ class Reconstruct(Windowed):
             (f"{said} -> {self.out}", *_described(result))))
 
     def _kind(self) -> str:
-        """The suffix of a film, "" for a folder; EV020 for anything else."""
+        """The extension of a film, "" for a folder; EV020 for anything else."""
         from evflow.report.video import SUFFIXES
 
         refuse_stdout(self.out)
         kind = self.out.suffix.lower()
         if kind not in ("", *SUFFIXES):
-            raise EvflowDataError("EV020", f"{self.out.name} is none of {', '.join(SUFFIXES)}, and "
-                                  "a folder has no such ending.", "The ending says what is made.")
+            raise EvflowDataError("EV020", f"{self.out.name} does not end in "
+                                  f"{', '.join(SUFFIXES)}, and a folder has no extension.",
+                                  "The extension selects the format.")
         refuse(self, {"": ("fps", "scale", "codec"), ".mp4": ()}.get(kind, ("codec",)),
-               f"nothing that a {kind or 'folder of images'} has")
+               f"does not apply to a {kind or 'folder of images'}")
         return kind
 
     def _scores(self, frames: int) -> FrameScores:
-        """Of so many frames by the protocol, with LPIPS where its weights are installed."""
+        """Scores of `frames` frames by the protocol, with LPIPS if its weights are installed."""
         from evflow.downstream.video import WARM_UP, FrameScores
         from evflow.metrics.image_scores import PROTOCOLS
         from evflow.metrics.perceptual import load_lpips
@@ -126,7 +127,7 @@ def _watched(
     images: Iterator[np.ndarray], recording: Recording, scores: FrameScores | None, scored: range,
     count: int, progress: Any,
 ) -> Iterator[np.ndarray]:
-    """The images on their way, those `scored` of `count` scored against their frames."""
+    """The images as they pass; those `scored` of `count` are compared with their frames."""
     for i, image in enumerate(images):
         if scores and i in scored:
             scores.add(image, recording.frame_dn(i))
@@ -135,7 +136,7 @@ def _watched(
 
 
 def _described(result: dict[str, Any] | None) -> list[str]:
-    """The scores as a line for people."""
+    """The scores as a line of text."""
     if result is None:
         return []
     numbers = [f"{name} {result[name]:.4f}" for name in ("mse", "ssim", "lpips")

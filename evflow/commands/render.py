@@ -1,4 +1,4 @@
-"""`evflow render`: events as a film or a picture."""
+"""`evflow render`: a film or picture of events."""
 
 from __future__ import annotations
 
@@ -18,36 +18,37 @@ from evflow.notes import as_dicts
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(Reading):
-    """Show events: a film (.mp4, .gif), or a sheet of one instant (.png). Red: ON. Blue: OFF.
+    """Show events: a film (.mp4, .gif), or a sheet for one instant (.png). Red: ON. Blue: OFF.
 
     Example: evflow render flight.aedat4 -o flight.mp4 --slow 10
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """File or folder of any known format."""
+    """File or folder in any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """.mp4, .gif, or .png."""
     fps: float = 30.0
     """Pictures per second of the film (.mp4, .gif)."""
     window_ms: float = 33.0
-    """How long a picture gathers events."""
+    """Time over which a picture collects events."""
     window_events: Annotated[int | None, value("N")] = None
-    """Instead, how many events a picture gathers: a film shows so many after each other, --fps
-    times a second."""
+    """Instead: number of events per picture; a film shows consecutive pictures, --fps times a
+    second."""
     slow: float = 1.0
     """How many times slower than life (.mp4, .gif)."""
     over_frames: bool = False
-    """Draw the events over the frames nearest in time (a .png shows both as they are, too)."""
+    """Draw the events over the frames nearest in time (a .png also shows both separately)."""
     at: Annotated[float | None, value("SECONDS")] = None
-    """Instant of the .png, seconds from the first event; without it the busiest."""
+    """Time of the .png, seconds from the first event; by default the busiest."""
     scale: Annotated[int | None, value("N")] = None
-    """Screen pixels per pixel; without it as many as make the film 640 wide."""
+    """Screen pixels per pixel; by default the film is about 640 wide."""
     caption: bool = True
-    """Print time, length and colours in a line beneath."""
+    """Print time, duration and colours in a line below."""
     codec: Literal["mpeg4", "vp9"] = "mpeg4"
-    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
+    """For .mp4: mpeg4 plays in video players; vp9 also in browsers, and takes some 50 times
+    longer."""
     overwrite: bool = False
-    """Replace the output where it exists."""
+    """Replace the output if it exists."""
     json: bool = False
     """Print JSON."""
 
@@ -60,13 +61,13 @@ class Render(Reading):
                     over_frames=self.over_frames, scale=self.scale, codec=self.codec,
                     window_events=self.window_events, caption=self.caption)
         if self.window_events is not None:
-            refuse(self, ("window_ms", "slow"), "the pictures go by --window-events")
+            refuse(self, ("window_ms", "slow"), "--window-events defines the pictures")
         film.check_target(self.out, overwrite=self.overwrite)
         need_absent(self.out, self.overwrite, self.recording, self.frames,
                     self.timestamps)
         kind = self.out.suffix.lower()
         refuse(self, {".png": ("fps", "slow", "codec"), ".gif": ("at", "codec"),
-                      ".mp4": ("at",)}[kind], f"nothing that a {kind} has")
+                      ".mp4": ("at",)}[kind], f"does not apply to a {kind}")
         seen = self.over_frames or kind == ".png"
         if not seen:
             note_idle(self, "the film shows no frames without --over-frames")

@@ -1,4 +1,4 @@
-"""`evflow simulate`: a video as a camera would see it."""
+"""`evflow simulate`: simulate the events that a camera would record of a video."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
 
 Pair = tuple[np.ndarray, int]  # frame, time in us
-PREVIEW_S = 2.0  # a film is at least so long
-STEPS = 3  # at work beside each one: motion, pictures, simulation and writing
-SMALL = 1 << 17  # pixels; of larger frames a second thread for OpenCV shortens the wait by a tenth,
-# of smaller ones it takes up to a sixth of the CPU time to itself
-DEPTH = 8  # frames made ahead of the simulation, and blocks of events that wait to be written
+PREVIEW_S = 2.0  # minimum duration of a film
+STEPS = 3  # threads beside each one: motion, pictures, simulation and writing
+SMALL = 1 << 17  # pixels; for larger frames a second OpenCV thread shortens the run by a tenth, for
+# smaller ones it only costs up to a sixth of the CPU time
+DEPTH = 8  # frames prepared ahead of the simulation, and event blocks waiting to be written
 
 
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Simulate(Pixels, Footage, Compiling):
-    """Simulate a video, a folder of images, or a recording's frames, as a camera would see it.
+    """Simulate the events that a camera would record of a video, an image folder or a recording.
 
     Example: evflow simulate ride.mp4 --camera cam/camera.npz -o synth.h5
 
@@ -48,27 +48,27 @@ class Simulate(Pixels, Footage, Compiling):
 
     video: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
     """A video file; a folder of images (png, jpg, tif, bmp, pgm; 8 or 16 bits; hdr, exr: radiance);
-    a stack of frames (.npy, .npz); or a recording of any known format, whose frames are used at
+    a stack of frames (.npy, .npz); or a recording in any known format, whose frames are used at
     their own times."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Output. Its extension tells the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
+    """Output. Its extension selects the format: .h5 dsec, .zip or .txt e2vid, .npz npz, .aedat4
     aedat4, .aedat aedat2 (jAER), none (a folder) evreal."""
     format: Format = "auto"
-    """Format of the output, where its extension leaves a choice (event_utils in .h5)."""
+    """Format of the output, if its extension leaves a choice (event_utils in .h5)."""
     frames_too: bool = False
-    """Write the video's frames beside the events: grey, at their own times."""
+    """Write the video's frames with the events: grey, at their own times."""
     labels: bool = False
-    """Write which events are noise (.h5: events/noise, .npz: noise): those of the camera's η and
+    """Write which events are noise (.h5: events/noise, .npz: noise): those from the camera's η and
     shot noise."""
     preview: Annotated[Path | None, value("FILE")] = None
-    """Make a film of the events too (.mp4, .gif), slower than life where that is short; more by
-    evflow render."""
+    """Also make a film of the events (.mp4, .gif), in slow motion if they are short; evflow render
+    has more options."""
     interpolate: bool = True
-    """Fill in frames where things move by more than --max-motion-px from frame to frame."""
+    """Interpolate frames where things move more than --max-motion-px from frame to frame."""
     max_motion_px: Annotated[float, tyro.conf.arg(aliases=["--max-motion"])] = 0.5
-    """Longest motion in one step, in pixels; 0 = --no-interpolate."""
+    """Maximum motion per step, in pixels; 0 = --no-interpolate."""
     overwrite: bool = False
-    """Replace the output where it exists."""
+    """Replace the output if it exists."""
     json: bool = False
     """Print JSON."""
 
@@ -124,14 +124,14 @@ class Simulate(Pixels, Footage, Compiling):
             *([f"{facts['preview']} -> {self.preview}"] if self.preview else []))))
 
     def _check(self, writer: type[EventWriter]) -> None:
-        """EV013, EV020 before any long work."""
+        """Raise EV013, EV020 before any long work."""
         if not self.interpolate:
-            refuse(self, ("max_motion_px",), "nothing is filled in with --no-interpolate")
+            refuse(self, ("max_motion_px",), "--no-interpolate adds no frames")
         if self.labels and not writer.LABELS:
-            refuse(self, ("labels",), f"{writer.NAME} has no place for them; dsec (.h5) and npz do")
+            refuse(self, ("labels",), f"{writer.NAME} cannot store them; dsec (.h5) and npz can")
         if self.preview is None:
             return
-        from evflow.report.movie import Film  # which takes as long to load as all else
+        from evflow.report.movie import Film  # takes as long to load as everything else
 
         if self.preview.suffix.lower() == ".png":
             raise EvflowDataError("EV020", f"--preview {self.preview}.",
@@ -142,13 +142,13 @@ class Simulate(Pixels, Footage, Compiling):
     def _frames(
         self, source: FrameSource, shown: Callable[[int, int], None]
     ) -> Iterator[tuple[Pair, list[Pair]]]:
-        """The frames that the pixels are shown; and beside each those of the video up to it, to be
-        written, if they are."""
+        """The frames that the pixels are shown, each with the frames of the video up to it, if
+        these are to be written."""
         from evflow.light.colour import as_seen
         from evflow.simulator.interpolate import upsample
         from evflow.simulator.photoreceptor import seen_frames
 
-        fills = self.interpolate and self.saccades is None  # which move in small steps
+        fills = self.interpolate and self.saccades is None  # saccades move in small steps
         limit = self.max_motion_px if fills else 0.0
         video, came, shown_us = source.watched(shown), deque[Pair](), deque[int]()
         if self.frames_too:
@@ -162,33 +162,33 @@ class Simulate(Pixels, Footage, Compiling):
 
 
 def _timed(pairs: Frames, times: deque[int]) -> Frames:
-    """The frames on their way, their times added to `times`."""
+    """The frames as they pass; their times are appended to `times`."""
     for frame, time in pairs:
         times.append(time)
         yield frame, time
 
 
 def _clocked(pairs: Frames, seen: list[int]) -> Frames:
-    """The frames on their way; `seen` becomes the first time, the last, and how many there were."""
+    """The frames as they pass; `seen` becomes first time, last time, and their number."""
     for frame, time in pairs:
         seen[:] = [*(seen[:1] or [time]), time, seen[2] + 1 if seen else 1]
         yield frame, time
 
 
 def _coarse(sensor: SensorModel, seen: list[int]) -> list[Note]:
-    """What is said where v2e's low-pass is shorter than the frames are apart: it is no low-pass
-    then."""
+    """A note if frames are further apart than the time constant of v2e's low-pass, which then has
+    no effect."""
     if len(seen) < 3 or seen[2] < 2 or not sensor.cutoff_hz or sensor.photoreceptor is not None:
         return []
     apart_s, slow_s = 1e-6 * (seen[1] - seen[0]) / (seen[2] - 1), 0.5 / np.pi / sensor.cutoff_hz
     return [Note(
-        "frames.coarse", f"frames come every {1e3 * apart_s:.3g} ms on average, the low-pass of "
+        "frames.coarse", f"frames are {1e3 * apart_s:.3g} ms apart on average, but the low-pass of "
         f"{sensor.cutoff_hz:g} Hz takes {1e3 * slow_s:.3g} ms at white: bright pixels follow a "
-        "frame at once. Frames that come closer show it.")] if apart_s > slow_s else []
+        "frame at once. A higher frame rate would show it.")] if apart_s > slow_s else []
 
 
 def _kept(video: Frames, colour: str, came: deque[Pair]) -> Frames:
-    """The frames on their way, each added to `came` as the pixels see it."""
+    """The frames as they pass, each appended to `came` as the pixels see it."""
     from evflow.light.colour import as_seen
 
     for frame, time in video:
@@ -199,8 +199,8 @@ def _kept(video: Frames, colour: str, came: deque[Pair]) -> Frames:
 def _fitting(
     writer: EventWriter, notes: list[Note]
 ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """What makes frames (T, H, W) such that the format holds them: where it has whole numbers
-    alone, those that are nearest, which a note says once."""
+    """A function that makes frames (T, H, W) fit the format: rounded if it only has integers, which
+    a note says once."""
     floats, whole = np.dtype(np.float32), np.dtype(np.uint8)
     rounds = bool(writer.refuses(floats)) and not writer.refuses(whole)
     said = Note("frames.depth", f"frames were rounded to 8 bits, which is what {writer.NAME} holds")
@@ -216,7 +216,7 @@ def _fitting(
 
 
 def _filmed(events: Path, film: Path, overwrite: bool) -> str:
-    """Make a film of a file of events; returns what was made, in words."""
+    """Make a film of an event file; returns a description of it."""
     from evflow import io
     from evflow.report.movie import Film, write_film
 
@@ -231,7 +231,7 @@ def _filmed(events: Path, film: Path, overwrite: bool) -> str:
 def _recorded(
     made: Iterator[tuple[Pair, list[Pair]]], write: Callable[[np.ndarray, np.ndarray], None]
 ) -> Frames:
-    """The frames of `Simulate._frames` on their way, those beside them written."""
+    """The frames of `Simulate._frames` as they pass; the video's frames beside them are written."""
     for pair, came in made:
         for frame, time in came:
             write(frame[None], np.array([time]))

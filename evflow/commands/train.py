@@ -1,8 +1,8 @@
-"""`evflow train`: the training of the network, on every device of every process.
+"""`evflow train`: trains the network, on every device of every process.
 
-Every number of a run's configuration is an option, `--loss.flow 0.1`, typed by its dataclass and
-with the preset's value as default. They are made of `TrainConfig` once a command line begins with
-`train`: it imports JAX, which other commands do without.
+Every number of a run's configuration is an option, e.g. `--loss.flow 0.1`, with the type from its
+dataclass and the preset's value as default. These options are built from `TrainConfig` only when a
+command line begins with `train`: it imports JAX, which other commands do without.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import tyro
 from evflow.errors import EvflowDataError
 from evflow.training.options import TrainOptions
 
-PYTHON = ("sensors",)  # of a configuration: too much for a command line
+PYTHON = ("sensors",)  # fields of a configuration that are too large for a command line
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,11 +26,10 @@ class Train(TrainOptions):
     """Train the network on simulated cameras; writes checkpoints, metrics.jsonl, and
     weights.safetensors at the end.
 
-    Ctrl-C saves a checkpoint and stops; the same command goes on, bit for bit on as many devices.
-    All devices there are share the work, also those of several processes (srun, mpirun, or
-    --coordinator), which see the same global batches; --out is a folder that they share. Where a
-    process dies, the others end with an error within half a minute, and the last complete
-    checkpoint counts.
+    Ctrl-C saves a checkpoint and stops; the same command continues, bit for bit on the same number
+    of devices. All available devices share the work, also those of several processes (srun, mpirun,
+    or --coordinator), which see the same global batches and share the folder --out. If a process
+    dies, the others end with an error within half a minute; the last complete checkpoint is kept.
 
     Example: evflow train --preset default --out runs/default --max-seconds 2400
 
@@ -48,7 +47,7 @@ class Train(TrainOptions):
 
 
 def with_configuration(arguments: Sequence[str]) -> type[Train]:
-    """`Train` with an option for every field of the preset that the command line names."""
+    """`Train` with an option for every field of the preset named in the command line."""
     from evflow.training.config import PRESETS, TrainConfig
 
     named = re.search(r"(?:^|\0)--preset[=\0]([^\0]+)", "\0".join(arguments))
@@ -56,9 +55,9 @@ def with_configuration(arguments: Sequence[str]) -> type[Train]:
     _check_names(arguments, config)
     hints, own = typing.get_type_hints(TrainConfig), {f.name for f in dataclasses.fields(Train)}
     preset = next(f for f in dataclasses.fields(Train) if f.name == "preset")
-    explained = tyro.conf.arg(help="default: all parts; pixels: those that see pixels one by one, "
-                              "on many small scenes; paper: the paper's network and losses; "
-                              "literal: all as it printed them; debug: tiny, to see that it "
+    explained = tyro.conf.arg(help="default: all parts; pixels: networks that see pixels one by "
+                              "one, on many small scenes; paper: the paper's network and losses; "
+                              "literal: everything as printed there; debug: tiny, to see that it "
                               "runs.")
     fields: list[tuple[str, Any, Any]] = [
         ("preset", Annotated[Literal[tuple(PRESETS)], explained],  # type: ignore[misc]
@@ -72,7 +71,7 @@ def with_configuration(arguments: Sequence[str]) -> type[Train]:
 
 
 def _check_names(arguments: Sequence[str], config: Any) -> None:
-    """EV020 where a dotted option is no field of the configuration, with those that there are."""
+    """Raise EV020 if a dotted option is not a field of the configuration, and list the fields."""
     for word in arguments:
         name = word.removeprefix("--").partition("=")[0].replace("-", "_")
         if not word.startswith("--") or "." not in name:

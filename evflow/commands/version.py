@@ -1,4 +1,4 @@
-"""`evflow version`: what runs here."""
+"""`evflow version`: the installed versions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import json
 
 @dataclasses.dataclass(frozen=True)
 class Version:
-    """Print the versions of evflow and of what it runs on.
+    """Print the versions of evflow and of its dependencies.
 
     Example: evflow version
     """

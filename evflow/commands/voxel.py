@@ -1,4 +1,4 @@
-"""`evflow voxel`: the voxel grids of a recording's windows."""
+"""`evflow voxel`: voxel grids of a recording's windows."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ if TYPE_CHECKING:
 @own_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Voxel(Reading):
-    """Voxel grids (Eq. 2) of a recording's windows, for a network or a notebook.
+    """Write voxel grids (Eq. 2) of a recording's windows, for a network or a notebook.
 
     The .npz holds voxels (N, H, W, 2 * bins) float32 [ON bins..., OFF bins...], t0_us and
-    window_us (N,) int64, and dlogI (N, H, W) float32, the change of the log intensity from the
+    window_us (N,) int64, and dlogI (N, H, W) float32, the change of log intensity from the
     window's first frame to its last. Windows run from frame to frame as in evflow estimate; a
-    recording without frames is cut into windows of --window-ms, and has no dlogI.
+    recording without frames is cut into windows of --window-ms, without dlogI.
 
     Example: evflow voxel flight.aedat4 -o voxels.npz --stop 10
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """File or folder of any known format."""
+    """File or folder in any known format."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output, .npz (compressed; one grid is in memory at a time)."""
     bins: int = 16
     """Bins per polarity."""
     window_ms: float = 40.0
-    """Shortest window where there are frames, the length of every window where there are none."""
+    """Minimum length of a window; without frames, the length of every window."""
     overwrite: bool = False
-    """Replace the output where it exists."""
+    """Replace the output if it exists."""
     json: bool = False
     """Print JSON."""
 
@@ -57,7 +57,7 @@ class Voxel(Reading):
         check_finite(self)
         if self.bins < 2 or not self.window_ms >= 0.001:
             raise EvflowDataError("EV020", f"--bins {self.bins}, --window-ms {self.window_ms:g}.",
-                                  "Need two bins and 0.001 ms at least.")
+                                  "Need at least two bins and 0.001 ms.")
         need_suffix(self.out, ".npz")
         need_absent(self.out, self.overwrite, self.recording, self.frames,
                     self.timestamps)
@@ -95,9 +95,9 @@ class Voxel(Reading):
 def _windows(
     recording: Recording, window_us: int
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray, np.ndarray, tuple[Note, ...]]:
-    """The frames that bound each window, their begins and lengths (N,) int64 us, and notes.
+    """The frames that bound each window, window starts and lengths (N,) int64 us, and notes.
 
-    Raises EV001, EV011, EV012 as `plan_windows`, EV017 where no window is left.
+    Raises EV001, EV011, EV012 as `plan_windows`, EV017 if no window is left.
     """
     from evflow.recordings.windows import condensed, plan_windows
 
@@ -134,7 +134,7 @@ def _store(
     archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: Any,
     parts: Iterable[np.ndarray],
 ) -> None:
-    """A member of an .npz, written part by part."""
+    """A member of an .npz, written in parts."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as f:
         np.lib.format.write_array_header_1_0(f, {
             "descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False,

@@ -1,5 +1,5 @@
-"""Options of commands that run a network over a recording, window by window, and film what it
-makes."""
+"""Options of commands that run a network over a recording in windows and make a film of its output.
+"""
 
 from __future__ import annotations
 
@@ -17,40 +17,41 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Windowed(Compiling, Reading):
-    """How a recording is read, cut into windows, and filmed."""
+    """Options on how a recording is read, cut into windows, and filmed."""
 
     sync: Literal["auto", "frames", "events", "ms"] = "auto"
     """Where windows end: at the recording's frames, after --window-events, or every --window-ms.
-    auto: frames where there are two or more, else ms."""
+    auto: frames if there are at least two, else ms."""
     window_events: Annotated[int | None, value("N")] = None
-    """Events a window (--sync events); without it .35 a pixel."""
+    """Events per window (--sync events); by default .35 per pixel."""
     window_ms: float = 33.0
     """Length of a window (--sync ms, and auto without frames)."""
     fps: Annotated[float | None, value("HZ")] = None
-    """Pictures per second of the film; without it, it lasts as long as the recording."""
+    """Pictures per second of the film; by default it lasts as long as the recording."""
     scale: Annotated[int | None, value("N")] = None
-    """Screen pixels per pixel of the film; without it as many as make it 640 wide."""
+    """Screen pixels per pixel of the film; by default it is about 640 wide."""
     codec: Literal["mpeg4", "vp9"] = "mpeg4"
-    """Of .mp4: mpeg4 plays in players, vp9 in browsers too and takes some 50 times longer."""
+    """For .mp4: mpeg4 plays in video players; vp9 also in browsers, and takes some 50 times
+    longer."""
     overwrite: bool = False
-    """Replace the output where it exists."""
+    """Replace the output if it exists."""
     json: bool = False
     """Print JSON."""
 
     def check_film(self) -> None:
-        """EV020 where no film can be made so, before any long work."""
+        """Raise EV020 if no such film can be made, before any long work."""
         from evflow.report.video import FPS, SCALES, check_within
 
         check_within(SCALES, "scale", self.scale)
         check_within(FPS, "fps", self.fps)
 
     def times(self, recording: Recording) -> np.ndarray:
-        """The ends (T,) of the windows; EV020 where options contradict each other."""
+        """The ends (T,) of the windows; EV020 if options contradict each other."""
         from evflow.downstream.sync import sync_times
 
         idle = {"frames": ("window_events", "window_ms"), "events": ("window_ms",),
                 "ms": ("window_events",), "auto": ("window_events",)}[self.sync]
-        refuse(self, idle, f"of no use with --sync {self.sync}")
+        refuse(self, idle, f"has no effect with --sync {self.sync}")
         if not self.window_ms > 0:
             raise EvflowDataError("EV020", f"--window-ms {self.window_ms:g}.", "It must be > 0.")
         return sync_times(recording, self.sync, count=self.window_events,
@@ -58,8 +59,8 @@ class Windowed(Compiling, Reading):
 
 
 def frames_amid(recording: Recording, times: np.ndarray) -> range:
-    """Which frames lie amid the events, as without events nothing is to be seen; where all events
-    lie between two frames, the second. EV012 where events and frames do not overlap."""
+    """Which frames lie within the span of the events, since nothing is known without events; if all
+    events lie between two frames, the second one. EV012 if events and frames do not overlap."""
     import numpy as np
 
     t = recording.events.t
@@ -71,13 +72,13 @@ def frames_amid(recording: Recording, times: np.ndarray) -> range:
             "EV012", f"events cover {t[0]:,}..{t[-1]:,} us, but the frames "
             f"{times[0]:,}..{times[-1]:,} us.",
             "Are both on one clock and in one unit? See --time-unit and --frames-offset-ms; or "
-            "pass --sync ms, which does not look at the frames.")
+            "pass --sync ms, which does not use the frames.")
     return range(first, stop)
 
 
 def lasting(pictures: int, duration_us: int) -> float:
-    """Pictures per second of a film that lasts as long as what it shows, within what players can
-    do."""
+    """Pictures per second of a film that lasts as long as what it shows, within the limits of video
+    players."""
     from evflow.report.video import FPS
 
     return float(min(max(1e6 * pictures / max(duration_us, 1), FPS[0]), FPS[1]))

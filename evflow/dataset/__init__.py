@@ -1,7 +1,7 @@
 """Data sets of simulated cameras, made in shards and read as plain NumPy arrays.
 
-Makers use `build` and `verify` (or `python -m experiments.make_dataset`); users of a set
-`iter_sequences` and `read_sequence`, which never import JAX: names load on first use.
+`build` and `verify` make a set (or `python -m experiments.make_dataset`); `iter_sequences` and
+`read_sequence` read it without importing JAX. Names load on first use.
 """
 
 import lazy_loader

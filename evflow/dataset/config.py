@@ -21,18 +21,21 @@ from evflow.scenes.config import SceneConfig
 class DatasetConfig:
     """A set of sequences of hidden cameras that watch moving scenes.
 
-    train, test: how many sequences; those of the test share no texture and no photograph with
-        those of the training.
-    width, height: of the sensor, pixels. seconds: of every sequence, in whole frame
-        intervals (rounded).
-    render_hz: frames that the simulator sees (the paper: 1000 per second); frame_hz: frames that
-        are kept, between which flow and intensity changes are given. It divides render_hz.
+    train, test: number of sequences; those for testing share no texture or photograph with those
+    for
+        training.
+    width, height: of the sensor, pixels. seconds: of every sequence, rounded to whole frame
+        intervals.
+    render_hz: rate of frames that the simulator sees (the paper: 1000 per second); frame_hz: rate
+    of
+        frames that are kept, between which flow and intensity changes are given; divides render_hz.
     lead_s: how long the camera has been running when the sequence begins.
     frame_noise_dn: standard deviation of the frames' noise before rounding to 8 bits.
-    prior, model, scene: cameras, the pixel circuit, and the scenes, of which something always
-        moves, as in the paper; the mismatch reaches from v2e's default to the paper's.
-    textures, photos: drawn for each sequence, which picks its layers among them; texture_px,
-        cutout_px: their sizes in texels.
+    prior, model, scene: cameras, the pixel circuit, and the scenes, in which something always
+    moves,
+        as in the paper; the mismatch ranges from v2e's default to the paper's.
+    textures, photos: number drawn for each sequence, whose layers are chosen among them;
+        texture_px, cutout_px: their sizes in texels.
     """
 
     train: int = 300
@@ -57,8 +60,8 @@ class DatasetConfig:
         for name, least in (("train", 0), ("test", 0), ("width", 8), ("height", 8),
                             ("textures", 0), ("photos", 0), ("texture_px", 16), ("cutout_px", 16)):
             require(self, name, getattr(self, name) >= least, f">= {least}")
-        require(self, "train", self.train + self.test > 0, "> 0 where test is 0")
-        require(self, "textures", self.textures + self.photos > 0, "> 0 where photos is 0")
+        require(self, "train", self.train + self.test > 0, "> 0 if test is 0")
+        require(self, "textures", self.textures + self.photos > 0, "> 0 if photos is 0")
         for name in ("lead_s", "frame_noise_dn"):
             require(self, name, 0 <= getattr(self, name) < math.inf, ">= 0")
         for name, whole in (("render_hz", 1_000_000), ("frame_hz", self.render_hz)):
@@ -79,17 +82,17 @@ class DatasetConfig:
 
     @property
     def every(self) -> int:
-        """Rendered frames per kept one."""
+        """Rendered frames per kept frame."""
         return self.render_hz // self.frame_hz
 
     @property
     def intervals(self) -> int:
-        """Frame intervals of a sequence, a whole number of them."""
+        """Frame intervals of a sequence."""
         return round(self.seconds * self.frame_hz)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All sequences: "train/00000", ..., "test/00000", ..., in the order of their numbers."""
+        """All sequences: "train/00000", ..., "test/00000", ..., ordered by number."""
         return sequence_names(self.train, self.test)
 
     def as_dict(self) -> dict[str, Any]:

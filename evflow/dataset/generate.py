@@ -1,8 +1,8 @@
 """One sequence of a data set, as a pure function of (config, seed, number).
 
-Textures, scene, camera, noise: everything is drawn from fold_in(key(seed), number), so that a
-sequence is the same whoever makes it, and in whatever order. Frames are rendered and simulated
-block by block: of them, only those that are kept stay in memory.
+Textures, scene, camera, noise: everything is drawn from fold_in(key(seed), number), so a sequence
+is the same whoever makes it, and in whatever order. Frames are rendered and simulated in blocks;
+only those that are kept stay in memory.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Array = jax.Array
 
 BLOCK_PIXELS = 32 * 346 * 260  # frames x pixels rendered at a time: 12 MB
 BLOCK_FRAMES = 64
-TEST_PHOTO = 4  # every fourth photograph is for the test sequences alone
+TEST_PHOTO = 4  # every fourth photograph is used only in test sequences
 
 
 def make_sequence(config: DatasetConfig, seed: int, number: int) -> EventSequence:
-    """Sequence `number` of the set, counted through training, then test.
+    """Sequence `number` of the set, counting training sequences first, then test.
 
-    Bytes are equal on machines of one kind with equal versions of the packages; elsewhere the
-    last bits of a logarithm may differ.
+    Bytes are equal on machines of one kind with the same package versions; elsewhere the last bits
+    of a logarithm may differ.
     """
     k_bank, k_scene, k_camera, k_events, k_noise = jax.random.split(
         jax.random.fold_in(jax.random.key(seed), number), 5)
@@ -46,8 +46,8 @@ def make_sequence(config: DatasetConfig, seed: int, number: int) -> EventSequenc
     nominal, camera = _draw_camera(
         *jax.random.split(k_camera), config.prior, config.shape, jnp.float32(film.light[0]))
     events = _events(k_events, film, camera, config)
-    # The simulator takes the noise rates at the first frame's mean intensity; what is told are
-    # those at the sequence's.
+    # The simulator expects rates at the first frame's mean intensity; the ground truth has those
+    # at the sequence's.
     light = np.array(film.light[config.lead :])
     gain = float(watch.noise_gain(config.model, light, film.light[0]))
     video = np.stack(film.kept)
@@ -63,8 +63,8 @@ def make_sequence(config: DatasetConfig, seed: int, number: int) -> EventSequenc
 
 
 class Film:
-    """The rendered frames of a scene, played once; it keeps those of the sequence, and the
-    intensity factor of Eq. 12 of every frame played (from the start, of the first block)."""
+    """The rendered frames of a scene, played once; keeps those of the sequence, and the intensity
+    factor of Eq. 12 of every frame so far (initially, of the first block)."""
 
     def __init__(self, scene: Scene, config: DatasetConfig) -> None:
         self.kept: list[np.ndarray] = []
@@ -101,13 +101,13 @@ def _times_us(config: DatasetConfig) -> np.ndarray:
 
 
 def _instants(config: DatasetConfig) -> np.ndarray:
-    """The same in seconds of the scene, whose reference instant is the middle of the sequence."""
+    """The same in seconds of the scene, whose reference time is the middle of the sequence."""
     times = _times_us(config)
     return ((times - times[-1] // 2) * 1e-6).astype(np.float32)
 
 
 def _events(key: Array, film: Film, camera: Camera, config: DatasetConfig) -> Events:
-    """Those from the first kept frame to just before the last."""
+    """Events from the first kept frame to just before the last."""
     times, length = _times_us(config), block_length(config)
     blocks = (times[first : first + length] for first in range(0, len(times), length))
     parts = simulate_stream(key, film, blocks, camera, model=config.model)

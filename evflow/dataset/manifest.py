@@ -1,9 +1,9 @@
 """Manifests of data sets: contents, hashes, verification.
 
-Every shard keeps a manifest of its own, manifests/00002-of-00004.json, and writes no other's, so
-that no lock is needed. A sequence is recorded there before it is renamed into place: what is in
-place is recorded. manifest.json is their union, written anew at the end of every run. Two records
-of one sequence may differ (made on different machines); the one that fits the files counts.
+Every shard writes only its own manifest, manifests/00002-of-00004.json, so no lock is needed. A
+sequence is recorded there before it is renamed into place: what is in place is recorded.
+manifest.json is their union, rewritten at the end of every run. Two records of one sequence may
+differ (made on different machines); the one that fits the files is used.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ PARTS, MERGED = "manifests", "manifest.json"
 
 
 def identity(config: Mapping[str, Any], seed: int, format: Format) -> Identity:
-    """What makes two data sets the same one, as it is read back from JSON."""
+    """What identifies a data set, in the form read back from JSON."""
     return json.loads(json.dumps({"config": config, "seed": seed, "format": format}))
 
 
 def place(folder: Path, name: str, format: str) -> Path:
-    """Where the sequence `name` lies: an .h5 file or a folder."""
+    """Path of the sequence `name`: an .h5 file or a folder."""
     return folder / f"{name}{SUFFIXES[format]}"  # type: ignore[index]
 
 
 def record(draft: Path, name: str, sequence: EventSequence) -> Record:
-    """The record of a sequence written to `draft`, which will lie at its place."""
+    """The record of a sequence that was written to `draft` and will be moved into place."""
     files = sorted(draft.iterdir()) if draft.is_dir() else [draft]
     inside = {p: f"{name}/{p.name}" if draft.is_dir() else f"{name}{p.suffix}" for p in files}
     on = int(sequence.events.p.sum())
@@ -54,7 +54,7 @@ def record(draft: Path, name: str, sequence: EventSequence) -> Record:
 
 
 class Part:
-    """The manifest that one shard writes, and no other process."""
+    """The manifest of one shard, which no other process writes."""
 
     def __init__(
         self, folder: Path, shard: tuple[int, int], which: Identity, made_by: Mapping[str, Any]
@@ -72,7 +72,7 @@ class Part:
         self.save()
 
     def withdraw(self) -> None:
-        """Take it away again, where nothing is recorded yet."""
+        """Remove it if nothing has been recorded yet."""
         if not self._content["sequences"]:
             self._path.unlink()
 
@@ -82,8 +82,8 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Manifests:
-    """All manifests of a folder: the sets they are of (one, unless something went wrong), the
-    records claimed of each sequence, who made them, and the files that cannot be read."""
+    """All manifests of a folder: the sets they belong to (one, unless something went wrong), the
+    records of each sequence, who made them, and the files that cannot be read."""
 
     folder: Path
     identities: list[Identity]
@@ -109,7 +109,7 @@ class Manifests:
         return found
 
     def check(self, which: Identity) -> None:
-        """EV013 where the folder holds a set of another configuration, seed or format."""
+        """Raise EV013 if the folder holds a set of another configuration, seed or format."""
         for there in self.identities:
             old, new = _flat(there), _flat(which)
             differ = [f"{k}: {old.get(k)} there, {new.get(k)} here"
@@ -118,10 +118,10 @@ class Manifests:
                 raise EvflowDataError(
                     "EV013", f"{self.folder} holds another data set "
                     f"({'; '.join(differ[:5])}{' ...' if differ[5:] else ''}).",
-                    "Go on with the same options, or choose another --out.")
+                    "Continue with the same options, or choose another --out.")
 
     def merge(self, part: str) -> None:
-        """Write manifest.json, the union; `part` names this process among those running."""
+        """Write manifest.json, the union; `part` identifies this process among those running."""
         names = sorted(self.claims)
         entries = {name: self.truest(name) for name in names}
         total = {"sequences": len(names), **{k: sum(e[k] for e in entries.values())
@@ -129,19 +129,19 @@ class Manifests:
         total["bytes"] = sum(f["bytes"] for e in entries.values() for f in e["files"].values())
         content = {"dataset": self.identities[0], "total": total, "made_by": self.made_by,
                    "sequences": entries}
-        # Drafts of its own: two hosts may share a process id.
+        # Own drafts: two hosts may use the same process id.
         draft = self.folder / PARTS / f".{part}.{MERGED}"
         atomic_text(draft, json.dumps(content, indent=1, sort_keys=True) + "\n", overwrite=True)
         os.replace(draft, self.folder / MERGED)
 
     def truest(self, name: str) -> Record:
-        """The record that fits the files, where there are several."""
+        """The record that fits the files, if there are several."""
         claims = self.claims[name]
         sound = (c for c in claims if len(claims) > 1 and not _fault(self.folder, c, deep=True))
         return next(sound, claims[-1])
 
     def fault(self, name: str, format: str, *, deep: bool = True) -> str | None:
-        """What is wrong with a sequence, or None; sizes are compared, and hashes if `deep`."""
+        """What is wrong with a sequence, or None; compares sizes and, if `deep`, hashes."""
         where = place(self.folder, name, format)
         if not where.exists():
             return f"{where.name} is missing"
@@ -152,10 +152,10 @@ class Manifests:
 
 
 def merge(folder: Path, part: str) -> Manifests:
-    """Write manifest.json so that it holds all that any process has recorded by then.
+    """Write manifest.json with everything that any process has recorded by then.
 
-    Another shard may end meanwhile: whoever writes last looks once more, so that no record of
-    a shard that wrote earlier is left out.
+    Another shard may end meanwhile: whoever writes last looks again, so that no earlier record is
+    left out.
     """
     found = Manifests.read(folder)
     while True:
@@ -172,7 +172,7 @@ def verify(
     """Read every file of a data set again; {sequence or manifest: what is wrong with it}.
 
     shard (i, N): only every N-th sequence, from the i-th. progress(done, total).
-    Raises EV016 where there is no data set, EV009 where none of its manifests can be read.
+    Raises EV016 if there is no data set, EV009 if none of its manifests can be read.
     """
     found = Manifests.read(Path(folder))
     faults = {str(p.relative_to(folder)): why for p, why in found.damaged.items()}
@@ -214,7 +214,7 @@ def _fault(folder: Path, entry: Record, *, deep: bool) -> str | None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """One manifest; EV009 where it is cut off or is none."""
+    """One manifest; EV009 if it is truncated or not a manifest."""
     try:
         content = parse_json(read_whole(need_regular(path), FREE))
         shapes = {"dataset": dict, "sequences": dict, "made_by": list}
@@ -222,8 +222,8 @@ def _read(path: Path) -> dict[str, Any]:
             raise TypeError("not a manifest")
     except (ValueError, TypeError, KeyError) as e:
         raise EvflowDataError(
-            "EV009", f"{path} is cut off or no manifest ({type(e).__name__}: {e}).",
-            "--only-missing removes it and makes what no other manifest records.") from e
+            "EV009", f"{path} is truncated or not a manifest ({type(e).__name__}: {e}).",
+            "--only-missing removes it and makes again what no other manifest records.") from e
     return content
 
 

@@ -21,7 +21,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def sequence_names(train: int, test: int) -> tuple[str, ...]:
-    """("train/00000", ..., "test/00000", ...): the sequences of a set, by their numbers."""
+    """("train/00000", ..., "test/00000", ...): the sequences of a set, ordered by number."""
     counts = zip(SPLITS, (train, test), strict=True)
     return tuple(f"{split}/{i:05d}" for split, count in counts for i in range(count))
 
@@ -32,10 +32,10 @@ class EventSequence:
 
     events: sorted, 0 <= t < frame_times[-1]. frames: (T, H, W) uint8. frame_times: (T,) int64 us,
         the first is 0.
-    flow: (T-1, 2, H, W) float32, (x, y): from frame i to frame i+1, where the point that a pixel
-        of frame i shows goes to. flow_visible: (T-1, H, W) bool: it is seen in frame i+1, too.
-    changes: (T-1, H, W) float32, of the true log intensity between the two frames, free of noise
-        and rounding, in the sensor's log map.
+    flow: (T-1, 2, H, W) float32, (x, y): displacement from frame i to frame i+1 of the scene point
+        at each pixel of frame i. flow_visible: (T-1, H, W) bool: also visible in frame i+1.
+    changes: (T-1, H, W) float32, change of true log intensity between the two frames, without noise
+        or rounding, in the sensor's log map.
     camera: theta_on, theta_off, eta_on, eta_off, each (H, W) float32; the noise rates are those at
         the sequence's mean intensity.
     nominal: their medians, and the threshold mismatch sigma_on, sigma_off.
@@ -57,14 +57,14 @@ class EventSequence:
 
     @property
     def truth(self) -> Arrays:
-        """What the user has not, by the names in files."""
+        """The ground truth, which a user lacks, by the names in files."""
         return {"flow": self.flow, "flow_visible": self.flow_visible, "changes": self.changes,
                 **{f"camera/{name}": self.camera[name] for name in CAMERA},
                 "nominal": np.array([self.nominal[name] for name in NOMINAL], np.float64)}
 
     @staticmethod
     def of(recording: Recording, truth: Arrays) -> EventSequence:
-        """The two put together again; EV009 where an array is not what it must be."""
+        """Recording and truth combined; EV009 if an array has the wrong dtype or shape."""
         steps, height, width = recording.frames.shape
         layout = truth_layout(steps, height, width)
         for name, (shape, dtype) in layout.items():

@@ -2,8 +2,8 @@
 
 A sequence is drafted in a hidden folder, recorded in the shard's manifest, then renamed into place:
 a killed process leaves nothing that looks finished. Processes share nothing but the folder, and
-each sequence depends on (config, seed, its number) alone, so any number of shards and workers,
-on any scheduler, makes the same bytes.
+each sequence depends only on (config, seed, its number), so any number of shards and workers, on
+any scheduler, makes the same bytes.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def build(
     only_missing: bool = False, made_by: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> list[str]:
-    """Make what is not there of shard (i, N): every N-th sequence, from the i-th.
+    """Make the missing sequences of shard (i, N): every N-th sequence, from the i-th.
 
-    workers: processes on this machine. only_missing: read the shard's files again, and make also
-    those that are damaged or in no manifest (else they are an error). made_by: what the manifest
-    says of this machine. progress(done, total). Returns the names of what was made; the same call
-    goes on after any interruption. No two processes may make one shard at a time.
+    workers: processes on this machine. only_missing: check the shard's files too, and make again
+    those that are damaged or in no manifest (otherwise an error). made_by: description of this
+    machine for the manifest. progress(done, total). Returns the names of what was made; the same
+    call continues after any interruption. No two processes may make one shard at a time.
 
     Raises EV009 (a damaged file or manifest), EV013 (another set is there), EV019 (the disk is
     full, the folder cannot be written, a worker died), EV020 (shard, workers, seed out of range).
@@ -49,7 +49,7 @@ def build(
         raise EvflowDataError("EV020", f"shard={shard[0]}/{shard[1]}, workers={workers}.",
                               "Shards are 0/N to N-1/N; workers are 1 or more.")
     if not -2**31 <= seed < 2**32:
-        raise EvflowDataError("EV020", f"seed={seed}.", "A key is made of 32 bits.")
+        raise EvflowDataError("EV020", f"seed={seed}.", "It must fit 32 bits.")
     folder, which = Path(folder), manifest.identity(config.as_dict(), seed, format)
     found, part = _begin(folder, shard, which, made_by or {}, only_missing)
     wanted = _wanted(found, config.names[shard[0]::shard[1]], format, only_missing, progress)
@@ -70,7 +70,7 @@ def build(
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A sequence to be made."""
+    """A sequence to make."""
 
     name: str
     number: int
@@ -84,10 +84,10 @@ def _begin(
     folder: Path, shard: tuple[int, int], which: manifest.Identity, made_by: Mapping[str, Any],
     repair: bool,
 ) -> tuple[Manifests, Part]:
-    """What is there, and this shard's own manifest beside it."""
+    """The manifests already there, and this shard's own."""
     _checked(folder, which, repair=repair)
     part = Part(folder, shard, which, made_by)
-    try:  # again: of two sets that begin at once, one sees the other
+    try:  # again: if two sets are begun at once, one sees the other
         return _checked(folder, which), part
     except EvflowDataError:
         part.withdraw()
@@ -96,7 +96,7 @@ def _begin(
 
 @contextlib.contextmanager
 def _drafting(folder: Path, part: Part) -> Iterator[Path]:
-    """A hidden folder of this shard alone, empty, and removed in the end."""
+    """A hidden empty folder for this shard alone, removed in the end."""
     _remove_drafts(folder, part.name)
     try:
         yield folder / f"{DRAFTS}{part.name}"
@@ -110,8 +110,8 @@ def _remove_drafts(folder: Path, part: str) -> None:
 
 
 def _checked(folder: Path, which: manifest.Identity, *, repair: bool = False) -> Manifests:
-    """The folder's manifests, which must be of this data set; damaged ones are removed for
-    repair, else EV009."""
+    """The folder's manifests, which must be of this data set; damaged ones are removed for repair,
+    else EV009."""
     found = Manifests.read(folder)
     found.check(which)
     for path, why in found.damaged.items():
@@ -125,7 +125,7 @@ def _wanted(
     found: Manifests, names: tuple[str, ...], format: Format, repair: bool,
     progress: Progress | None,
 ) -> list[str]:
-    """The sequences to make; EV009, EV013 for one in the way that is not to be repaired."""
+    """The sequences to make; EV009, EV013 for one that is faulty and not to be repaired."""
     wanted = []
     checked = manifest.faults_of(found, names, format, progress if repair else None, deep=repair)
     for name, fault in checked:
@@ -139,7 +139,7 @@ def _wanted(
 
 
 def _commit(draft: Path, final: Path) -> None:
-    """Rename a draft into place; what lies there is damaged."""
+    """Rename a draft into place, over any damaged sequence."""
     with atomic_write(final, overwrite=True) as temporary:
         if final.is_dir():
             shutil.rmtree(final)
@@ -157,7 +157,7 @@ def _draft(job: Job) -> Made:
 
 
 def _drafts(jobs: list[Job], workers: int) -> Generator[Made]:
-    """Every draft, in order."""
+    """All drafts, in order."""
     if workers == 1 or len(jobs) < 2:
         yield from map(_draft, jobs)
         return
@@ -167,4 +167,4 @@ def _drafts(jobs: list[Job], workers: int) -> Generator[Made]:
     except BrokenProcessPool as e:
         raise EvflowDataError(
             "EV019", "a worker process died (out of memory?).",
-            "The same command goes on; fewer --workers need less memory.") from e
+            "The same command continues; fewer --workers need less memory.") from e

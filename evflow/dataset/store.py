@@ -1,10 +1,10 @@
 """Sequences as files. NumPy only: reading never imports JAX, so that PyTorch workers may fork.
 
 "dsec": one HDF5 file, NAME.h5, with events, frames and frame_times in the layout of
-`evflow.io.formats.dsec` (any reader of DSEC takes it), and flow, flow_visible, changes, camera/*,
-nominal.
+`evflow.io.formats.dsec` (any reader of DSEC can read it), and flow, flow_visible, changes,
+camera/*, nominal.
 "npy": a folder NAME of flat arrays: events_x.npy, ..., frames.npy, flow.npy, camera_theta_on.npy.
-Neither holds a time of day: equal sequences are equal bytes.
+Neither contains a time of day: equal sequences have equal bytes.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ SUFFIXES: dict[Format, str] = {"dsec": ".h5", "npy": ""}
 
 
 def sequence_paths(folder: str | os.PathLike, split: str = "train") -> list[Path]:
-    """The finished sequences of one split ("train", "test"), in order; EV016 where there are
-    none. A set that is still being made has fewer."""
+    """The finished sequences of one split ("train", "test"), in order; EV016 if there are none. A
+    set that is still being made has fewer."""
     if split not in SPLITS:
         raise EvflowDataError("EV020", f"split={split!r}.", f"Choose from {SPLITS}.")
     place = Path(folder) / split
@@ -46,7 +46,7 @@ def sequence_paths(folder: str | os.PathLike, split: str = "train") -> list[Path
 def iter_sequences(folder: str | os.PathLike, split: str = "train") -> Iterator[EventSequence]:
     """Read the sequences of one split, in order.
 
-    A data set for PyTorch takes five lines:
+    A PyTorch data set takes five lines:
 
     >>> class Flows(torch.utils.data.Dataset):
     ...     def __init__(self, folder): self.paths = sequence_paths(folder, "train")
@@ -62,8 +62,8 @@ def iter_sequences(folder: str | os.PathLike, split: str = "train") -> Iterator[
 def read_sequence(path: str | os.PathLike) -> EventSequence:
     """One sequence of either format, as plain NumPy arrays.
 
-    Arrays of an .npy folder are mapped, copy on write: what is not used is not read.
-    Raises EV008 (another file), EV009 (damaged), EV010 (no h5py), EV016 (not there).
+    Arrays of an .npy folder are memory-mapped, copy on write: unused ones are not read.
+    Raises EV008 (another file), EV009 (damaged), EV010 (no h5py), EV016 (not found).
     """
     path = Path(path)
     if not path.exists():
@@ -78,9 +78,8 @@ def read_sequence(path: str | os.PathLike) -> EventSequence:
 
 
 def write_sequence(path: str | os.PathLike, sequence: EventSequence, format: Format) -> None:
-    """Write a sequence to `path` (an .h5 file, or a folder that is made), which must not exist.
-
-    Either appears when it is complete.
+    """Write a sequence to `path` (an .h5 file, or a folder to be created), which must not exist; it
+    appears when it is complete.
     Raises EV010 (no h5py), EV013 (exists), EV019 (cannot be written).
     """
     {"dsec": _write_dsec, "npy": _write_npy}[format](Path(path), sequence)
@@ -90,7 +89,7 @@ class _SequenceWriter(DsecWriter):
     """A DSEC file with the truth beside events and frames."""
 
     def append_truth(self, truth: Arrays) -> None:
-        """A chunk is one frame's array, or the whole map."""
+        """A chunk is one frame's array, or a whole map."""
         for name, array in truth.items():
             values = array.astype(np.uint8) if array.dtype == bool else array
             rows = 1 if array.ndim > 2 else len(array)
@@ -128,7 +127,7 @@ def _write_npy(path: Path, sequence: EventSequence) -> None:
 
 
 def _save(path: Path, array: np.ndarray) -> None:
-    """numpy.save, but for the error of a full disk, which tofile raises without its number."""
+    """numpy.save, except that a full disk raises with its errno, which tofile loses."""
     npy = np.lib.format
     with open(path, "wb") as file:
         npy.write_array_header_1_0(file, npy.header_data_from_array_1_0(array))

@@ -119,7 +119,7 @@ def test_what_is_read_is_never_replaced(
     status, _, err = run(capsys, verb, source, *target, "--overwrite")
     assert status == 2
     assert "EV020" in err
-    assert "is what is read" in err
+    assert "is the input" in err
     assert source.read_bytes() == before
 
 
@@ -134,7 +134,7 @@ def test_parts_of_what_is_read_are_never_replaced(
                     ["simulate", folder / "images", "--timestamps", times, "-o", times]):
         status, _, err = run(capsys, *command, "--overwrite")
         assert status == 2
-        assert "is what is read" in err
+        assert "is the input" in err
     assert before == {path: path.read_bytes() for path in before}
 
 

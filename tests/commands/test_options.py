@@ -47,7 +47,7 @@ def test_options_without_effect_are_told(folder: Path, capsys: pytest.CaptureFix
         (f"info bare.npz {moved}", "bare.npz has no frames"),
         (f"voxel bare.npz -o a.npz {moved}", "bare.npz has no frames"),
         (f"render flight.npz -o a.gif {moved}", "shows no frames without --over-frames"),
-        (f"compare flight.npz bare.npz {moved}", "by their events alone"),
+        (f"compare flight.npz bare.npz {moved}", "only the events of the streams are compared"),
     ):
         code, said = run(line, capsys)
         assert code == 0
@@ -100,7 +100,7 @@ def test_what_is_no_camera_is_named(folder: Path, capsys: pytest.CaptureFixture[
     np.savez(folder / "other.npz", gain=1.0)
     for path, code, words in (
         ("other.npz", "EV008", "holds gain but not theta_on"),
-        ("flight.npz", "EV008", "is a recording: make a camera of it"),
+        ("flight.npz", "EV008", "is a recording. Estimate its camera"),
         ("frames.npy", "EV008", "one array"), ("times.txt", "EV008", "begins with b'16432"),
         (".", "EV016", "Pass camera.npz"), ("absent.npz", "EV016", "evflow estimate RECORDING"),
     ):

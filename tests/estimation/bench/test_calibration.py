@@ -296,7 +296,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (["two.npz", "--protocol", "static"], "0 values of --lux for 2 recordings"),
     (["--protocol", "static", "--lux", "1", "2"], "2 values of --lux for 1 recording"),
     (["--protocol", "static", "--lux", "-1"], "--lux -1"),
-    (["--protocol", "static", "--triggers", "t.txt"], "--triggers: of use with --protocol step"),
+    (["--protocol", "static", "--triggers", "t.txt"], "only useful with --protocol step"),
 ])
 def test_illuminances_go_with_recordings(
     words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
