@@ -1,7 +1,8 @@
 """The report's charts as SVG: rates, counts, intervals, histograms, scatter plots.
 
 Text stays text, in the reader's own sans-serif. ON is red and OFF is blue; what was recorded is
-solid, what was simulated dashed. A figure's size is in inches of 96 CSS pixels.
+solid, what was simulated dashed. A figure's size is in inches of 96 CSS pixels. What stands around
+an axis is known beforehand and has a fixed width: to measure it takes as long as to draw it.
 """
 
 from __future__ import annotations
@@ -29,16 +30,24 @@ BINS = 48
 SPIKE = 3.0  # times the 95th percentile: rates above are cut and their height written
 WIDE = 2.5  # a common range of ON and OFF this much wider than their own would hide both
 TICKS = 14  # labels that fit an axis
+NUMBERED = (0.75, 0.1, 0.5, 0.12)  # inches left, right, below and above an axis: labels and numbers
+TITLED = (0.75, 0.1, 0.5, 0.3)
+BAR = 0.85  # inches that a bar of colour takes beside it, with its numbers
 COUNT_TICKS = (0, 1, 2, 4, 10, 30, 100, 300, 1000, 3000, 10_000, 100_000)
 
 
-def svg(draw: Callable[[Any], None], width: float, height: float) -> bytes:
-    """What `draw` makes of the axis of a fresh figure."""
+def svg(
+    draw: Callable[[Any], None], width: float, height: float,
+    around: tuple[float, float, float, float] = NUMBERED,
+) -> bytes:
+    """What `draw` makes of the axis of a fresh figure. around: inches left, right, below, above."""
     import matplotlib
 
     with matplotlib.rc_context(LOOK):
-        figure = new_figure(width, height)
-        draw(figure.subplots())
+        figure = new_figure(width, height, layout=None)
+        left, right, below, above = around
+        draw(figure.add_axes((left / width, below / height, (width - left - right) / width,
+                              (height - below - above) / height)))
         drawn = printed(figure, "svg", 150).decode()
     return re.sub(r"(?<=[ :])'?DejaVu Sans'?(?=[;\"',])[^;\"]*", FONTS, drawn).encode()
 
@@ -57,7 +66,7 @@ def histogram(values: np.ndarray, summary: float, colour: Any, unit: str) -> byt
         axis.set_yticks([])
         axis.spines["left"].set_visible(False)
 
-    return svg(draw, 3.0, 1.5)
+    return svg(draw, 3.0, 1.5, (0.1, 0.1, 0.45, 0.06))
 
 
 def explained(curve: np.ndarray, ideal: float, found_hz: float) -> bytes:
@@ -110,7 +119,11 @@ def _density(
     top = max(2.0, float(cells.max()))
     mesh = axis.pcolormesh(*edges, np.ma.masked_equal(cells.T, 0), cmap=cmap, rasterized=True,
                            norm=LogNorm(0.3, top))  # from .3: a single pixel must be seen
-    bar = axis.figure.colorbar(mesh, ax=axis, pad=0.02, aspect=28)
+    left, bottom, width, height = axis.get_position().bounds
+    inch = 1 / axis.figure.get_figwidth()
+    axis.set_position((left, bottom, width - BAR * inch, height))
+    beside = axis.figure.add_axes((left + width - (BAR - 0.1) * inch, bottom, 0.11 * inch, height))
+    bar = axis.figure.colorbar(mesh, cax=beside)
     bar.ax.set_ylim(1, top)
     ticks = [10**k for k in range(7) if 10**k <= top]
     bar.set_ticks(ticks, labels=[f"{n:,}" for n in ticks])
@@ -140,7 +153,7 @@ def rates(numbers: dict[str, Any], key: str, names: tuple[str, str]) -> bytes:
         axis.margins(x=0)
         axis.legend(loc="upper right", ncols=2)
 
-    return svg(draw, 5.0, 2.7)
+    return svg(draw, 5.0, 2.7, TITLED)
 
 
 def _top(values: np.ndarray) -> float:
@@ -171,7 +184,7 @@ def counts(real: np.ndarray, made: np.ndarray, key: str, names: tuple[str, str])
         axis.set_yticks(at, [f"{n:,}" for n in ticks])
         axis.set(xlabel=f"events of a pixel, {names[0]}", ylabel=f"events of a pixel, {names[1]}")
 
-    return svg(draw, 5.0, 3.9)
+    return svg(draw, 5.0, 3.9, TITLED)
 
 
 def times(numbers: dict[str, Any], names: tuple[str, str], xlabel: str) -> bytes:

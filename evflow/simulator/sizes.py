@@ -1,9 +1,10 @@
 """How many pixels a program steps at a time, and the memory that it takes.
 
 The pixels that may fire in a block are padded to one of a few sizes, as XLA compiles a program for
-each. A short video gains nothing by many: a smaller size gets its program once the padding without
-it has taken a good part of the time to compile it. What the padding does is thrown away, so the
-events are the same.
+each. A short video gains nothing by many: the first has room for twice as many pixels as fire in
+the first block, a larger one comes when it is needed, and a smaller one once the padding without it
+has taken a good part of the time to compile it. What the padding does is thrown away, so the events
+are the same.
 """
 
 from __future__ import annotations
@@ -18,18 +19,22 @@ import numpy as np
 # A call hands work to another thread and back, which costs more than arrays that leave the cache.
 ACTIVE: tuple[int, ...] = (4096, 8192, 12288, 16384, 20480)
 PATIENCE = 1 << 19  # pixels of padding: some .1 s on one core, where a program takes .3 and more
+ROOM = 2  # times the pixels for which a size is chosen
 
 
 class Sizes:
     """The sizes that have a program. pixels: of the sensor."""
 
     def __init__(self, pixels: int) -> None:
-        self.ready = [next((size for size in ACTIVE if size >= pixels), ACTIVE[-1])]
+        self.pixels, self.ready = pixels, list[int]()
         self.padding: Counter[int] = Counter()  # that each size would have saved
 
     def of(self, count: int) -> int:
         """The size for `count` pixels, up to the largest."""
         fits = next(size for size in ACTIVE if size >= count)
+        if fits > max(self.ready, default=0):
+            roomy = max(fits, min(ROOM * count, self.pixels))
+            self.ready.append(next((size for size in ACTIVE if size >= roomy), ACTIVE[-1]))
         size = min(size for size in self.ready if size >= fits)
         self.padding[fits] += size - fits
         if size > fits and self.padding[fits] > PATIENCE:
