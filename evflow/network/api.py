@@ -115,16 +115,16 @@ def summarize(
         voxels: (..., H, W, 32), events per pixel and bin, of `voxelize`.
         dlogI: (..., H, W), natural-log units, of `delta_log_intensity`.
         window_s: length of the window in seconds, a number or (...,).
-        intensity: mean log intensity (lin-log of DN), (..., H, W) or (...,), NaN where it is
-            unknown; None is unknown everywhere.
+        intensity: mean log intensity (lin-log of DN), (..., H, W) or (...,), NaN where unknown;
+            None: unknown everywhere.
 
     Returns:
         Statistics (...,), pooled over (H, W) only.
 
     Raises:
-        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that are no counts, no
-            logarithms), EV007 (NaN), EV018 (weights of the paper's network, which pools nothing,
-            or no weights), EV020 (window_s).
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that cannot be counts or
+            logarithms), EV007 (NaN), EV018 (weights of the paper's network, which does not pool, or
+            not weights), EV020 (window_s).
 
     Example:
         >>> stats = sum(ef.summarize(params, v, d) for v, d in windows)
@@ -141,7 +141,7 @@ def pooling_parts(params: Params) -> tuple[ModelConfig, Params]:
     config, net = parts(params)
     if not config.pool or "summary" not in net:
         raise EvflowDataError(
-            "EV018", "these weights estimate every pixel alone and have no summary.",
+            "EV018", "these weights estimate every pixel separately and have no summary.",
             'Use load_weights("default").')
     return config, net
 
@@ -163,14 +163,14 @@ def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
 
     Returns:
         The summary and its standard deviation, (...,) each, in natural units (natural log, Hz);
-        the std falls with the amount of data.
+        the std shrinks with the amount of data.
 
     Raises:
-        EvflowDataError: EV018 (weights of the paper's network, which has no summary, or no
-            weights), EV020 (no statistics).
+        EvflowDataError: EV018 (weights of the paper's network, which has no summary, or not
+            weights), EV020 (not statistics).
     """
     config, net = pooling_parts(params)
-    need(stats, Stats, "stats", "Give what summarize returns, one or a sum.")
+    need(stats, Stats, "stats", "Pass the result of summarize, or a sum of results.")
     return squashed_summary(*_finish(net["summary"], stats, config=config))
 
 
@@ -189,7 +189,7 @@ def encode(
         params: of `load_weights`.
         voxels: (..., H, W, 32), events per pixel and bin.
         dlogI: (..., H, W), natural-log units.
-        summary: of the camera, (...,) or scalars; None estimates it from these very pixels.
+        summary: of the camera, (...,) or scalars; None estimates it from these pixels.
         window_s: length of the window in seconds, a number or (...,).
         intensity: as in `summarize`.
 
@@ -198,7 +198,7 @@ def encode(
 
     Raises:
         EvflowDataError: EV001, EV002, EV003, EV007, EV020 as in `summarize`; EV014 (a summary out
-            of range), EV018 (no weights).
+            of range), EV018 (not weights).
     """
     config, net = parts(params)
     voxels, dlogI, window_s, intensity = prepare(config, voxels, dlogI, window_s, intensity)
@@ -237,28 +237,29 @@ def estimate(
 ) -> Camera:
     """Camera maps from one window of events and the change of intensity over it.
 
-    The flow's answer beside the summary and the mismatch, weighed by what is known of each, so that
-    the map of a camera whose pixels are alike is no worse than its summary. Jitted; compiles once
-    per shape. One window tells a camera's thresholds to some percent and little of its pixels (a
-    mean of .027 and .031 off in the README's example, where the std of `estimate_with_std` is .025
-    and .034). Of a whole recording `estimate_camera` knows more: there the median to .006.
+    Combines the flow's estimate with the summary and the mismatch, each weighted by its precision,
+    so that the map of a camera with identical pixels is no worse than its summary. Jitted; compiles
+    once per shape. One window determines a camera's thresholds to some percent and its pixels
+    hardly (in the README's example the mean is off by .027 and .031, where the std of
+    `estimate_with_std` is .025 and .034). `estimate_camera` uses a whole recording: there the
+    median is right to .006.
 
     Args:
         params: of `load_weights`.
         voxels: (..., H, W, 32), events per pixel and bin, of `voxelize`.
         dlogI: (..., H, W), natural-log units, of `delta_log_intensity`.
         window_s: length of the window in seconds, a number or (...,).
-        intensity: mean log intensity (lin-log of DN), (..., H, W) or (...,), NaN where it is
-            unknown; None is unknown everywhere.
+        intensity: mean log intensity (lin-log of DN), (..., H, W) or (...,), NaN where unknown;
+            None: unknown everywhere.
         summary: of the camera, (...,) or scalars, pooled over more windows; None estimates it from
             this window.
 
     Returns:
-        The camera, maps (..., H, W); of the paper's network, which has no summary, the flow's own.
+        The camera, maps (..., H, W); for the paper's network, which has no summary, the flow's own.
 
     Raises:
-        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that are no counts, no
-            logarithms), EV007 (NaN), EV014 (a summary out of range), EV018 (no weights), EV020
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that cannot be counts or
+            logarithms), EV007 (NaN), EV014 (a summary out of range), EV018 (not weights), EV020
             (window_s).
 
     Example:
@@ -281,12 +282,12 @@ def estimate_with_std(
         dlogI: (..., H, W), natural-log units.
         window_s: length of the window in seconds, a number or (...,).
         intensity: as in `estimate`.
-        summary: as in `estimate`; the std is then that of a pixel in a camera so described, and
-            otherwise includes the summary's own.
+        summary: as in `estimate`; the std is then that of a pixel given this summary; otherwise it
+            includes the summary's own std.
 
     Returns:
-        The camera and its standard deviations, maps (..., H, W) in the same units; NaN of the
-        paper's network, which tells none.
+        The camera and its standard deviations, maps (..., H, W) in the same units; NaN for the
+        paper's network, which estimates none.
 
     Raises:
         EvflowDataError: EV001, EV002, EV003, EV007, EV014, EV018, EV020 as in `estimate`.
@@ -302,8 +303,8 @@ def estimate_y(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: ArrayLike = DEFAULT_WINDOW_S,
     intensity: ArrayLike | None = None, summary: Summary | None = None,
 ) -> tuple[Array, Array]:
-    """What the flow alone makes of a window, in the coordinates y, and its std: (..., H, W, 4)
-    each, NaN where the network tells none. `posterior` puts it beside the summary."""
+    """The flow's own estimate for a window, in the coordinates y, and its std: (..., H, W, 4) each,
+    NaN if the network estimates none. `posterior` combines it with the summary."""
     return _answer(params, voxels, dlogI, window_s, intensity, summary)[:2]
 
 
@@ -311,7 +312,7 @@ def _answer(
     params: Params, voxels: ArrayLike, dlogI: ArrayLike, window_s: ArrayLike,
     intensity: ArrayLike | None, summary: Summary | None,
 ) -> tuple[Array, Array, Array, Array]:
-    """`estimate_y`, and y (..., 6) of the summary and its std, 0 where it is given."""
+    """`estimate_y`, and y (..., 6) of the summary with its std, 0 if it was given."""
     config, net = parts(params)
     voxels, dlogI, window_s, intensity = prepare(config, voxels, dlogI, window_s, intensity)
     y6, y6_std = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)

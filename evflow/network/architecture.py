@@ -1,7 +1,7 @@
 """The network behind api.py: its static structure, its parts, and their joint pass over pixels.
 
 Everything per pixel is a function of (voxels, dlogI, context, y of the camera's summary) on any
-leading axes; nothing here looks across pixels (pooling.py does).
+leading axes; nothing here combines pixels (see pooling.py).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Params = dict[str, Any]
 
 
 class SpreadNet(nn.Module):
-    """Log standard deviation of y (..., 4) from what a pixel shows and the condition."""
+    """Log standard deviation of y (..., 4), from the pixel's features and the condition."""
 
     hidden: int
 
@@ -38,8 +38,8 @@ class SpreadNet(nn.Module):
 
 
 def config_of(params: Params) -> ModelConfig:
-    """The static structure behind params: its name, and the sizes of its leaves."""
-    need(params, dict, "params", "Pass what load_weights() returns.")
+    """The static structure of params, from their name and the sizes of their leaves."""
+    need(params, dict, "params", "Pass the result of load_weights().")
     if len(params) != 1 or next(iter(params)) not in MODELS:
         raise EvflowDataError(
             "EV018", f"params have the top-level keys {sorted(params)}.",
@@ -49,17 +49,17 @@ def config_of(params: Params) -> ModelConfig:
     missing = {"encoder", "flow", *(("spread",) if base.spread else ())} - set(net)
     if missing:
         raise EvflowDataError("EV018", f"params[{name!r}] has no {', '.join(sorted(missing))}.",
-                              "Pass what load_weights() returns, whole.")
+                              "Pass the whole result of load_weights().")
     try:
         return _sized(base, net)
     except (KeyError, TypeError, AttributeError, IndexError) as e:
-        raise EvflowDataError("EV018", f"params[{name!r}] are not those of the network: {e} is "
-                              "missing or no array.", "Pass what load_weights() returns, whole."
+        raise EvflowDataError("EV018", f"params[{name!r}] do not fit the network: {e} is "
+                              "missing or not an array.", "Pass the whole result of load_weights()."
                               ) from e
 
 
 def _sized(base: ModelConfig, net: Params) -> ModelConfig:
-    """The structure with the sizes of the leaves."""
+    """The structure with the sizes taken from the leaves."""
     steps = net["flow"]["level_0"]["actnorm"]["raw"].shape[0]
     hidden = net["flow"]["level_0"]["coupling"]["w_2"].shape[-1]
     return dataclasses.replace(
@@ -78,8 +78,8 @@ def _outputs(config: ModelConfig) -> int:
 def encoder_features(
     config: ModelConfig, voxels: Array, dlogI: Array, context: Array, y: Array
 ) -> Array:
-    """Encoder input: the paper's [E, dlogI], or ours with the contrast that the events carry
-    if the thresholds are the camera's, theta_on E_on and theta_off E_off."""
+    """Encoder input: the paper's [E, dlogI], or ours with the contrast that the events carry at the
+    camera's thresholds, theta_on E_on and theta_off E_off."""
     if config.code == "feature":
         return jnp.concatenate([voxels, dlogI[..., None]], -1)
     camera = squash(y[..., :4])
@@ -103,8 +103,8 @@ def encode_changes(
 
 
 def condition(config: ModelConfig, changes: Array, context: Array, y: Array) -> Array:
-    """u (..., condition): the events expected, the summary, the context. The paper's u is the
-    feature alone."""
+    """u (..., condition): the expected events, the summary, the context. The paper's u is only the
+    feature."""
     if config.code == "feature":
         return changes
     camera = squash(y[..., :4])
@@ -113,7 +113,7 @@ def condition(config: ModelConfig, changes: Array, context: Array, y: Array) -> 
 
 
 def expected_events(changes: Array, theta_on: Array, theta_off: Array, axis: int) -> Array:
-    """The changes, 2m along `axis`, in units of the camera's thresholds: events expected per
+    """The changes, 2m along `axis`, in units of the camera's thresholds: expected events per
     sub-window, in asinh."""
     up, down = jnp.split(changes, 2, axis)
     return jnp.concatenate([jnp.arcsinh(up / theta_on), jnp.arcsinh(down / theta_off)], axis)
@@ -127,12 +127,12 @@ def spread(net: Params, voxels: Array, dlogI: Array, context: Array, u: Array) -
 
 
 def centre(config: ModelConfig, y: Array) -> Array:
-    """Where y = 0 of the flow lies: at the camera's summary, so that it models the residual."""
+    """The origin of the flow's y: the camera's summary, so that the flow models the residual."""
     return y[..., :4] if config.pool else jnp.zeros_like(y[..., :4])
 
 
 def init(key: Array, config: ModelConfig, name: str = "default") -> Params:
-    """Fresh params (the flow's actnorms still want `flow.data_init`)."""
+    """New params (the flow's actnorms still need `flow.data_init`)."""
     k_summary, k_encoder, k_spread, k_flow = jax.random.split(key, 4)
     shape = (1, 1)
     voxels, dlogI = jnp.zeros((*shape, 2 * config.bins)), jnp.zeros(shape)

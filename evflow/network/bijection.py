@@ -3,7 +3,7 @@
     forward : voxels -> (y, z) at fixed code          an exact bijection (Eqs. 3-5)
     inverse : (y, z) -> voxels at fixed code
 
-A `Code` is what both hold fixed: of a video and a camera (`code_from_video`), or of the events
+A `Code` is what both hold fixed: from a video and a camera (`code_from_video`), or from the events
 (`api.encode`). Shapes: voxels (..., H, W, 32), y (..., H, W, 4), z (..., H, W, 28).
 """
 
@@ -48,7 +48,7 @@ class Code:
 
     Attributes:
         changes: (..., H, W, 2m), the changes of log intensity dL_j in the window's m = 16 equal
-            parts, as relu(+dL_j), then relu(-dL_j); of the paper's network the encoder's feature.
+            parts, as relu(+dL_j), then relu(-dL_j); for the paper's network the encoder's feature.
         summary: of the camera, (...,).
         context: (..., H, W, 3), window length and mean log intensity.
     """
@@ -73,7 +73,7 @@ def code_from_video(
     intensity: ArrayLike | None = None, sensor: SensorModel | None = None,
     optics: Optics | None = None,
 ) -> Code:
-    """Code without any events, from a video and a camera: what `generate` needs.
+    """Code from a video and a camera, without events: the input of `generate`.
 
     Args:
         params: of `load_weights`.
@@ -82,33 +82,34 @@ def code_from_video(
         camera: maps (..., H, W) or (H, W), whose summary enters the code.
         window_s: length of the window in seconds, a number or (...,).
         intensity: as in `summarize`.
-        sensor: the camera's circuit, whose `cutoff_hz` makes its pixels see the light late; None
-            is without low-pass. The light is at rest before the window.
-        optics: what frames that this camera recorded do not show (`found.optics`): light that is
-            added, and the delay of its events; None for other videos.
+        sensor: the camera's circuit, whose `cutoff_hz` makes its pixels respond late; None: no
+            low-pass. The light is constant before the window.
+        optics: how frames recorded by this camera differ from the light on its pixels
+            (`found.optics`): an offset, and the delay of its events; None for other videos.
 
     Returns:
         The code.
 
     Raises:
-        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014
-            (camera out of range), EV015 (camera of other pixels), EV018 (weights of the paper's
-            network, whose condition holds the events, or no weights), EV020 (window_s; or a
+        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (not logarithms), EV007 (NaN), EV014
+            (camera out of range), EV015 (camera of another size), EV018 (weights of the paper's
+            network, whose condition contains the events, or not weights), EV020 (window_s; or a
             sensor whose low-pass depends on an intensity that is not given).
 
     Example:
-        >>> dL = jnp.moveaxis(jnp.diff(log_frames, axis=0), 0, -1)  # of 17 frames (17, H, W)
+        >>> dL = jnp.moveaxis(jnp.diff(log_frames, axis=0), 0, -1)  # from 17 frames (17, H, W)
         >>> code = ef.code_from_video(params, dL, camera)
     """
     config, _ = parts(params)
     if config.code == "feature":
         raise EvflowDataError(
-            "EV018", "the paper's condition contains the events; a video cannot make it.",
+            "EV018", "the paper's condition contains the events; it cannot be computed from a "
+                     "video.",
             'Use load_weights("default").')
     if np.ndim(dL) < 3 or np.shape(dL)[-1] != config.changes:
         raise EvflowDataError(
             "EV002", f"dL has shape {np.shape(dL)}.", f"Expected (..., H, W, {config.changes}), "
-            "the change in each of so many equal parts of the window: add up those of finer "
+            "the change in each of that many equal parts of the window: sum those of finer "
             f"frames, dL.reshape(H, W, {config.changes}, -1).sum(-1).")
     check_finite("dL", dL)
     check_change("dL", dL)
@@ -121,8 +122,8 @@ def code_from_video(
 
 
 def seen_code(code: Code, sensor: SensorModel | None, optics: Optics | None) -> Code:
-    """The code of what pixels see of the light of a code. EV020 where that depends on intensity,
-    and none is known; pixels of unknown intensity are taken for 55 DN."""
+    """The code of the light as the pixels see it. EV020 if that depends on an intensity that is
+    unknown; if it is unknown at some pixels, 55 DN is assumed there."""
     seen_by = photoreceptor(sensor, optics)
     if seen_by.ideal:
         return code
@@ -130,8 +131,8 @@ def seen_code(code: Code, sensor: SensorModel | None, optics: Optics | None) -> 
     traced = isinstance(code.context, jax.core.Tracer)
     if not traced and not np.asarray(code.context)[..., 2].any():
         raise EvflowDataError(
-            "EV020", "a slow pixel, or one that sees other light, and no intensity.",
-            "Its low-pass is as fast as the light is bright: give code_from_video the intensity, "
+            "EV020", "a slow pixel, or one that sees additional light, but no intensity.",
+            "The speed of its low-pass depends on the light: pass intensity to code_from_video, "
             "the mean lin-log of the frames.")
     rise, fall = jnp.split(code.changes, 2, -1)
     changes, intensity = seen_changes(seen_by, rise - fall, intensity, window_s)
@@ -160,8 +161,8 @@ def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array
         (..., H, W), the log determinant of d(y, z) / d voxels.
 
     Raises:
-        EvflowDataError: EV002 (voxels of other pixels than the code's), EV003 (no real numbers),
-            EV007 (NaN), EV018 (no weights).
+        EvflowDataError: EV002 (voxels and code of different pixels), EV003 (not real numbers),
+            EV007 (NaN), EV018 (not weights).
     """
     config, net = parts(params)
     check_shape("voxels", voxels, (*code.context.shape[:-1], 2 * config.bins))
@@ -211,34 +212,36 @@ def generate(
     params: Params, key: Array, camera: Camera, code: Code, *, sensor: SensorModel | None = None,
     optics: Optics | None = None,
 ) -> Array:
-    """Events of the scene of a code as another camera would see it, z ~ N(0, 1).
+    """Events of a code's scene as another camera would record them, with z ~ N(0, 1).
 
-    The code's summary is replaced by the camera's. The camera has been running: its pixels' memory
-    is anywhere between the thresholds, whereas a simulation that starts at the window's first frame
-    sends about a tenth fewer events (a fifth where thresholds are high). Values are not clipped:
-    noise of the latents leaves small negative weights.
+    The code's summary is replaced by the camera's. The camera is assumed to have been running: its
+    pixels' memories lie anywhere between the thresholds, whereas a simulation that starts at the
+    window's first frame gives about a tenth fewer events (a fifth for high thresholds). Values are
+    not clipped: noise of the latents leaves small negative weights.
 
     Args:
         params: of `load_weights`.
         key: of jax.random, for z.
         camera: maps (..., H, W) or (H, W).
         code: of `code_from_video`, or of `encode`.
-        sensor: the circuit of this camera, whose `cutoff_hz` makes its pixels see the code's light
-            late; None where the code is of what they see (`code_from_video(sensor=...)`).
+        sensor: the circuit of this camera, whose `cutoff_hz` makes its pixels respond late to the
+            code's light; None if the code already describes what they see
+            (`code_from_video(sensor=...)`).
         optics: as in `code_from_video`.
 
     Returns:
         Voxels (..., H, W, 32).
 
     Raises:
-        EvflowDataError: EV002, EV014 (no valid camera), EV015 (camera of other pixels), EV018 (no
-            weights, or a sensor and the paper's network), EV020 (a sensor whose low-pass depends
+        EvflowDataError: EV002, EV014 (no valid camera), EV015 (camera of another size), EV018 (not
+            weights, or a sensor with the paper's network), EV020 (a sensor whose low-pass depends
             on an intensity that the code does not have).
     """
     config, _ = parts(params)
     if config.code == "feature" and not photoreceptor(sensor, optics).ideal:
         raise EvflowDataError(
-            "EV018", "the paper's condition contains the events, and no light to be seen late.",
+            "EV018", "the paper's condition contains the events, not the light that a low-pass "
+                     "could act on.",
             'Use load_weights("default").')
     code = seen_code(code, sensor, optics)
     shape = code.context.shape[:-1]
@@ -251,7 +254,7 @@ def generate(
 def log_prob(params: Params, voxels: ArrayLike, code: Code) -> Array:
     """Log density of events given a code (Eq. 3): y ~ N(summary, mismatch^2), z ~ N(0, 1).
 
-    A density only where the code came from a true video and a camera (`code_from_video`); with an
+    A density only if the code came from a true video and a camera (`code_from_video`); with an
     encoded code, which depends on the events, it is a score.
 
     Args:
@@ -264,11 +267,11 @@ def log_prob(params: Params, voxels: ArrayLike, code: Code) -> Array:
 
     Raises:
         EvflowDataError: EV002, EV003, EV007 as in `forward`; EV018 (weights of the paper's
-            network, which has no summary, or no weights).
+            network, which has no summary, or not weights).
     """
     if not config_of(params).pool:
-        raise EvflowDataError("EV018", "the weights have no summary, around which y is expected.",
-                              "Take those of the default network.")
+        raise EvflowDataError("EV018", "these weights have no summary, the mean of y's density.",
+                              "Use the default network's.")
     y, z, log_det = forward(params, voxels, code)
     y6 = architecture.over_pixels(unsquash_summary(code.summary), y.shape[:-1])
     prior = architecture.log_normal(y, y6[..., :4], architecture.base_std(y6)).sum(-1)

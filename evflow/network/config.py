@@ -1,6 +1,6 @@
 """The static structure of the network: `default`, and `paper` as printed.
 
-A configuration is hashable (a static argument of jit), and the weights' own name tells which it is.
+A configuration is hashable (a static argument of jit); the weights' name says which one they have.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from evflow.network.flow.config import FlowConfig
 class ModelConfig:
     """Static structure of the network.
 
-    pool: estimate a camera summary from all pixels and condition on it (one pixel alone
-        cannot tell its threshold: Bayes error .105 against .003 pooled).
+    pool: estimate a camera summary from all pixels and condition on it (a single pixel cannot
+        determine its threshold: Bayes error .105 against .003 pooled).
     code: "changes" builds the condition from the m signed intensity changes alone, so that a
         video is enough to generate; "feature" passes the encoder's hidden feature, which
         contains the events themselves (paper).
@@ -39,7 +39,7 @@ class ModelConfig:
 
     @property
     def spread(self) -> bool:
-        """Whether a part of the network tells how far off a pixel's parameters may be."""
+        """Whether the network estimates standard deviations of a pixel's parameters."""
         return self.code == "changes"
 
 

@@ -1,8 +1,8 @@
 """Camera parameters <-> the unbounded coordinates y in which the networks work.
 
-y = (log parameter - centre) / scale for (theta_on, theta_off, eta_on, eta_off), so thresholds
-stay positive and noise rates unbounded above (a tanh would allow negative thresholds, cap
-rates at 1 Hz and lose the bijection at its edges; it remains as the paper's option).
+y = (log parameter - centre) / scale for (theta_on, theta_off, eta_on, eta_off), so thresholds stay
+positive and noise rates unbounded above. (The paper's tanh, kept as an option, allows negative
+thresholds, caps rates at 1 Hz and is no bijection at its edges.)
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Array = jax.Array
 Output = Literal["log", "tanh"]
 
 ETA_FLOOR = 1e-3  # Hz: one event per pixel in 17 minutes; a silent pixel is mapped here
-SIGMA_OFFSET = 0.01  # lets the mismatch be 0
+SIGMA_OFFSET = 0.01  # allows a mismatch of 0
 CENTRE = np.log(np.array([0.22, 0.22, 0.12, 0.12], np.float32))
 SCALE = np.array([0.6, 0.6, 1.0, 1.0], np.float32)
 SIGMA_CENTRE, SIGMA_SCALE = np.float32(np.log(0.06)), np.float32(0.8)
@@ -27,7 +27,7 @@ TANH_EDGE = 0.999
 
 
 def per_channel(values: np.ndarray, like: Array) -> Array:
-    """Constants (C,) shaped to meet like (..., C): rank promotion stays explicit."""
+    """Constants (C,) reshaped to broadcast with like (..., C): rank promotion stays explicit."""
     return jnp.asarray(values, like.dtype).reshape((1,) * (like.ndim - 1) + (-1,))
 
 
@@ -82,8 +82,8 @@ def _natural(log_y: Array, s: Array) -> tuple[Summary, Summary]:
 
 
 def squashed_summary(y: Array, y_std: Array) -> tuple[Summary, Summary]:
-    """`squash_summary` and `summary_std`, as two programs: one would round otherwise than its
-    operations one by one."""
+    """`squash_summary` and `summary_std` as two programs: a single one would round differently from
+    the operations one by one."""
     return _natural(*_scaled(y, y_std))
 
 

@@ -1,7 +1,7 @@
-"""The network of network.py on all pixels of images whose camera is known: `estimate`'s inner part.
+"""The network on all pixels of images whose camera is known: the inner part of `estimate`.
 
-Made for speed on a CPU. Pixels are columns, weights are folded beforehand, and what is the same
-for all pixels of an image, the camera's summary and mostly the context, goes into the biases.
+Optimised for CPUs. Pixels are columns, weights are folded beforehand, and what all pixels of an
+image share (the camera's summary and usually the context) goes into the biases.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Array = jax.Array
 def estimate(
     config: ModelConfig, net: Params, voxels: Array, dlogI: Array, context: Array, y6: Array
 ) -> tuple[Array, Array]:
-    """y and its std (..., H, W, 4) of voxels (..., H, W, 32), dlogI (..., H, W), the camera's
-    y6 (..., 6), context (..., H, W, 3) or, where it is the same everywhere, (..., 1, 1, 3). The std
-    is NaN where the network has no part that tells it."""
+    """y and its std (..., H, W, 4) from voxels (..., H, W, 32), dlogI (..., H, W), the camera's y6
+    (..., 6), and context (..., H, W, 3) or, if it is the same everywhere, (..., 1, 1, 3). The std
+    is NaN if the network does not estimate it."""
     inputs, pixels = (net, voxels, dlogI, context, y6), math.prod(dlogI.shape[-2:])
     shares = chunks.executions(pixels, inputs)
     results = chunks.at_once([
@@ -41,8 +41,8 @@ def _share(
     net: Params, voxels: Array, dlogI: Array, context: Array, y6: Array, share: Any, *,
     shares: int, config: ModelConfig,
 ) -> tuple[Array, Array]:
-    """y and its std, (images, n, 4), at pixels number share * n and following of every image; the
-    last share begins early enough to have n, too."""
+    """y and its std, (images, n, 4), for n pixels of every image from number share * n on; the last
+    share starts early enough to have n, too."""
     images, pixels = math.prod(dlogI.shape[:-2]), math.prod(dlogI.shape[-2:])
     size = -(-pixels // shares)
     start = jnp.minimum(share * size, pixels - size)
@@ -72,7 +72,7 @@ def _image(
 
     rows, shared = {"voxels": voxels, "dlogI": dlogI}, {"y": y}
     (shared if same else rows)["context"] = context
-    # The way back computes a chunk again: of all pixels at once it would keep 250 kB each.
+    # The backward pass recomputes each chunk: stored for all pixels it would take 250 kB each.
     chunk = jax.checkpoint(lambda rows: _chunk(config, folded, **rows, **shared), prevent_cse=False)
     return chunks.by_platform(chunk, rows, alone=alone)
 

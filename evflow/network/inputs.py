@@ -1,7 +1,7 @@
-"""The border of the network: arrays as they come, checked and made real.
+"""Input validation of the network: arrays are checked and converted to real numbers.
 
-Wrong shapes, dtypes, values and units are `EvflowDataError`s that say what was seen; traced values
-have shapes alone, and pass. Behind it nothing is checked.
+Wrong shapes, dtypes, values and units raise `EvflowDataError`s that say what was seen; of traced
+values only the shape is checked. Inner functions check nothing.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from evflow.network.config import ModelConfig
 
 Array = jax.Array
 
-MOST_CHANGE = 7.0  # log units: more than from black to white, in lin-log or log(DN / 255 + .001)
-LONGEST_WINDOW_S = 10.0  # a hundred times the longest of the training: microseconds, more likely
+MOST_CHANGE = 7.0  # log units: above black to white, in lin-log and in log(DN / 255 + .001)
+LONGEST_WINDOW_S = 10.0  # a hundred times the longest in training: more is probably microseconds
 
 
 def real(values: ArrayLike) -> Array:
-    """As float32; float64 stays where JAX's x64 mode keeps it."""
+    """Convert to float32; float64 is kept in JAX's x64 mode."""
     values = jax.device_put(values) if isinstance(values, np.ndarray) else jnp.asarray(values)
     return values if values.dtype == jnp.float64 else values.astype(jnp.float32)
 
 
 def same_precision(values: Array, tree: Any) -> Any:
-    """The leaves of a tree in the precision of values: mixed, the coarser one would decide."""
+    """The tree's leaves in the precision of `values`, since the coarser one limits the result."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, values.dtype), tree)
 
 
 def is_real(dtype: Any) -> bool:
-    """Real numbers, bfloat16 and float8 (which NumPy calls void) among them, or bool."""
+    """Whether a dtype is real (including bfloat16, and float8, which NumPy calls void) or bool."""
     return np.dtype(dtype).kind == "b" or (
         jnp.issubdtype(dtype, jnp.number) and not jnp.issubdtype(dtype, jnp.complexfloating))
 
 
 def check_finite(name: str, values: ArrayLike) -> None:
-    """EV003 where values are no real numbers, EV007 where they are not finite."""
+    """Raise EV003 for values that are not real numbers, EV007 if they are not finite."""
     if isinstance(values, jax.core.Tracer):
         return
     given = np.asarray(plain(name, values))
@@ -56,11 +56,11 @@ def check_finite(name: str, values: ArrayLike) -> None:
 
 
 def check_shape(name: str, values: ArrayLike, expected: tuple[int, ...]) -> None:
-    """EV002 unless values have the shape of a code's pixels; then as check_finite."""
+    """Raise EV002 unless the shape matches a code's pixels; then check as `check_finite`."""
     if np.shape(values) != expected:
         raise EvflowDataError(
             "EV002", f"{name} has shape {np.shape(values)}, the code's pixels are "
-            f"{expected[:-1]}.", f"Expected {expected}: both of one window.")
+            f"{expected[:-1]}.", f"Expected {expected}: both must come from one window.")
     check_finite(name, values)
 
 
@@ -74,11 +74,11 @@ def prepare(
         raise EvflowDataError(
             "EV002", f"voxels have shape {np.shape(voxels)}.",
             f"Expected (..., H, W, {channels}): {config.bins} ON bins, then {config.bins} OFF bins,"
-            " as voxelize returns.")
+            " as returned by voxelize.")
     if np.shape(dlogI) != np.shape(voxels)[:-1]:
         raise EvflowDataError(
             "EV002", f"dlogI has shape {np.shape(dlogI)}, voxels {np.shape(voxels)}.",
-            "dlogI must be voxels' shape without the channels: (..., H, W).")
+            "dlogI must have the shape of voxels without channels: (..., H, W).")
     if 0 in np.shape(dlogI):
         raise EvflowDataError("EV001", f"voxels of shape {np.shape(voxels)} hold no pixel.")
     for name, value in (("voxels", voxels), ("dlogI", dlogI), ("window_s", window_s)):
@@ -90,7 +90,7 @@ def prepare(
         if not ((length > 0) & (length <= LONGEST_WINDOW_S)).all():
             raise EvflowDataError(
                 "EV020", f"window_s={window_s}.",
-                f"It is a length in seconds, > 0 and at most {LONGEST_WINDOW_S:g}.")
+                f"It must be a length in seconds, > 0 and at most {LONGEST_WINDOW_S:g}.")
     voxels, dlogI = real(voxels), real(dlogI)
     lead = dlogI.shape[:-2]
     window_s = _spread_over("window_s", jnp.asarray(window_s, jnp.float32), lead)
@@ -104,12 +104,12 @@ def _intensity(values: ArrayLike, shape: tuple[int, ...]) -> Array:
         given = np.asarray(values)
         if not is_real(given.dtype):
             raise EvflowDataError("EV003", f"intensity has dtype {given.dtype}.",
-                                  "Expected logarithms (lin-log of DN), or NaN where unknown.")
+                                  "Expected logarithms (lin-log of DN), NaN where unknown.")
         known = given[~np.isnan(given)]
         check_log("intensity", known)
         if known.size and known.min() < 0:
-            raise EvflowDataError("EV003", f"intensity goes down to {known.min():.3g}.",
-                                  "Black is 0 in lin-log of DN; NaN where it is unknown.")
+            raise EvflowDataError("EV003", f"the minimum of intensity is {known.min():.3g}.",
+                                  "Black is 0 in lin-log of DN; use NaN where it is unknown.")
     result = jnp.asarray(values, jnp.float32)
     if result.shape == shape[:-2]:
         result = result[..., None, None]
@@ -117,42 +117,42 @@ def _intensity(values: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def check_change(name: str, values: ArrayLike) -> None:
-    """EV003 where values, changes of log intensity, exceed that from black to white."""
+    """Raise EV003 if values, changes of log intensity, exceed the change from black to white."""
     if isinstance(values, jax.core.Tracer):
         return
     most = np.abs(np.asarray(values)).max()
     if most > MOST_CHANGE:
         raise EvflowDataError(
-            "EV003", f"{name} goes up to {most:.3g} in magnitude, but from black to white it is "
-            "5.54.", "A difference of DN? Take evflow.delta_log_intensity.")
+            "EV003", f"{name} reaches {most:.3g} in magnitude, but black to white is 5.54.",
+            "A difference of DN? Use evflow.delta_log_intensity.")
 
 
 def _check_counts(voxels: ArrayLike) -> None:
-    """EV003 for what no counts are; `generate`'s own, a fraction of an event below 0, pass."""
+    """Raise EV003 for values that are not counts; small negative ones from `generate` pass."""
     if isinstance(voxels, jax.core.Tracer):
         return
     given = np.asarray(voxels)
     if (least := given.min()) <= -1 or given.sum() < 0:
         raise EvflowDataError(
-            "EV003", f"voxels go down to {least:.3g}, but they are numbers of events.",
-            "Signed polarities in one grid, or normalised? Take evflow.voxelize.")
+            "EV003", f"the minimum of voxels is {least:.3g}, but they count events.",
+            "Signed polarities in one grid, or normalised? Use evflow.voxelize.")
 
 
 def _spread_over(name: str, values: Array, shape: tuple[int, ...]) -> Array:
-    """Broadcast to shape, or EV002."""
+    """Broadcast to shape; raises EV002."""
     try:
         return jnp.broadcast_to(values, shape)
     except ValueError:
         raise EvflowDataError(
             "EV002", f"{name} has shape {values.shape}.",
-            f"Expected one value, or {shape} as the voxels.") from None
+            f"Expected one value, or the voxels' {shape}.") from None
 
 
 def given_summary(summary: Summary, lead: tuple[int, ...]) -> Summary:
-    """A summary that the caller gives, (...,) or scalars, spread over lead. EV002, EV014."""
+    """A summary from the caller, (...,) or scalars, broadcast to lead; raises EV002, EV014."""
     if not isinstance(summary, Summary):
         raise EvflowDataError("EV003", f"summary is a {type(summary).__name__}.",
-                              "Expected a Summary, as evflow.finish returns.")
+                              "Expected a Summary, as returned by evflow.finish.")
     for name, value in vars(summary).items():
         if isinstance(value, jax.core.Tracer):
             continue
@@ -160,7 +160,7 @@ def given_summary(summary: Summary, lead: tuple[int, ...]) -> Summary:
         allowed = array > 0 if name.startswith("theta") else array >= 0
         if not (np.isfinite(array) & allowed).all():
             raise EvflowDataError("EV014", f"the summary's {name} is {array}.",
-                                  "Thresholds are > 0, noise rates and mismatches >= 0.")
+                                  "Thresholds must be > 0, noise rates and mismatches >= 0.")
     return Summary(**{name: _spread_over(f"the summary's {name}", real(value), lead)
                       for name, value in vars(summary).items()})
 
@@ -170,7 +170,7 @@ def camera_summary(camera: Camera) -> Summary:
     def median(m: Array) -> Array:
         return jnp.median(m, axis=(-2, -1))
 
-    def sigma(m: Array) -> Array:  # 1.4826 MAD: pixels at the clamp are no measure of mismatch
+    def sigma(m: Array) -> Array:  # 1.4826 MAD: robust to pixels at the clamp
         return 1.4826 * median(jnp.abs(m - median(m)[..., None, None]))
 
     return Summary(median(camera.theta_on), median(camera.theta_off), median(camera.eta_on),
@@ -178,11 +178,11 @@ def camera_summary(camera: Camera) -> Summary:
 
 
 def summary_of_pixels(camera: Camera, shape: tuple[int, ...]) -> Summary:
-    """The summary (...,) of a camera with maps (..., H, W) or (H, W) for pixels of this shape.
-    EV014, EV015."""
+    """The summary (...,) of a camera with maps (..., H, W) or (H, W), for pixels of this shape;
+    raises EV014, EV015."""
     lead = camera.validate().shape[:-2]
     if camera.shape[-2:] != shape[-2:] or lead not in ((), shape[:-2]):
         raise EvflowDataError(
-            "EV015", f"the camera is {camera.shape}, the pixels are {shape}.",
+            "EV015", f"the camera has shape {camera.shape}, the pixels {shape}.",
             "Give maps (H, W), or one camera for each of the leading axes.")
     return jax.tree.map(lambda v: jnp.broadcast_to(v, shape[:-2]), camera_summary(camera))

@@ -1,14 +1,14 @@
 """The camera summary: a set network over all pixels of any number of windows and tiles.
 
-Every pixel gives features and weights; only their *sums* are kept (`Stats`), so windows and
-tiles of one camera simply add, tiling equals the whole, and the std shrinks with the data.
-`finish` turns the sums into six medians and mismatches with their standard deviations.
+Every pixel gives features and weights; only their *sums* are kept (`Stats`), so windows and tiles
+of one camera simply add, tiling equals the whole, and the std shrinks with the data. `finish` turns
+the sums into six medians and mismatches with their standard deviations.
 
-The scale of theta comes from the event model dL = theta_on n_on - theta_off n_off + phase, of
-which the sums hold two calibrations with learned pixel weights: normal equations (least
-squares), and instrumental variables. The latter add the equation over the pixels that got
-brighter and over those that got darker: ON-OFF pairs of a path unseen between two frames and
-the counts' quantisation, which bias least squares, cancel in the sums.
+The scale of theta comes from the event model dL = theta_on n_on - theta_off n_off + phase, for
+which the sums contain two calibrations with learned pixel weights: normal equations (least
+squares), and instrumental variables. The latter add the equation over pixels that got brighter and
+over those that got darker: ON-OFF pairs caused by motion between the frames, and quantisation of
+counts, bias least squares but cancel in these sums.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from evflow.process.chunks import in_chunks
 
 Array = jax.Array
 
-RIDGE, RIDGE_THETA = 0.5, 0.22  # pseudo-observations that hold an empty calibration at .22
-DEAD_CHANGE = 0.03  # log units: smaller changes are frame noise and do not choose a side
-WINDOW_S, MIDDLE = 0.05, 4.0  # window length and log intensity about which inputs are centred
-SIGNAL_UNIT, EXPOSURE_UNIT = 1000.0, 100.0  # pixels with events, pixel seconds: scales of the std
+RIDGE, RIDGE_THETA = 0.5, 0.22  # pseudo-observations that keep an empty calibration at .22
+DEAD_CHANGE = 0.03  # log units: smaller changes are frame noise and count on neither side
+WINDOW_S, MIDDLE = 0.05, 4.0  # window length and log intensity on which inputs are centred
+SIGNAL_UNIT, EXPOSURE_UNIT = 1000.0, 100.0  # units of the std: pixels with events, pixel seconds
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Stats:
-    """Additive statistics of one camera, float32: `a + b` is of both windows or tiles. A pytree.
+    """Additive statistics of one camera, float32: `a + b` is that of both. A pytree.
 
     Attributes:
         active: (..., A) features summed over pixels with events.
@@ -63,7 +63,7 @@ class Stats:
         return _added(self, other)
 
     def __radd__(self, other: int) -> Stats:
-        """`sum(...)` begins with 0."""
+        """`sum(...)` starts with 0."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
@@ -73,7 +73,7 @@ def _added(one: Stats, other: Stats) -> Stats:
 
 
 def window_features(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
-    """(..., 3): log window length, log intensity about its middle, whether it was given."""
+    """(..., 3): log window length, centred log intensity, and whether it was given."""
     window = jnp.broadcast_to(jnp.log(window_s / WINDOW_S), shape)
     if intensity is None:
         zero = jnp.zeros(shape, window.dtype)
@@ -84,13 +84,13 @@ def window_features(window_s: Array, intensity: Array | None, shape: tuple[int, 
 
 
 def given_features(context: Array) -> tuple[Array, Array]:
-    """Window length in seconds and log intensity (...,) of `window_features`; an intensity that
-    was not given is about the middle."""
+    """Window length in seconds and log intensity (...,) from `window_features`; an intensity that
+    was not given is the centre."""
     return WINDOW_S * jnp.exp(context[..., 0]), context[..., 1] + MIDDLE
 
 
 def pixel_features(voxels: Array, dlogI: Array, context: Array) -> Array:
-    """What one pixel shows: voxels (..., 2B), dlogI (...,), context (..., 3) -> (..., F)."""
+    """Features of one pixel: voxels (..., 2B), dlogI (...,), context (..., 3) -> (..., F)."""
     on, off = jnp.split(voxels, 2, -1)
     n_on, n_off = on.sum(-1), off.sum(-1)
     scalars = [dlogI * 5.0, jnp.arcsinh(dlogI * 10.0), jnp.arcsinh(jnp.abs(dlogI) * 10.0),
@@ -115,8 +115,8 @@ class PixelNet(nn.Module):
 
 
 class FinishNet(nn.Module):
-    """Camera-wide part: pooled features -> means (6,), log std per unit of data (6,) and
-    log std that more data of the same scenes cannot lower (6,)."""
+    """Camera-wide part: pooled features -> means (6,), log std per unit of data (6,) and log std
+    that more data of the same scenes cannot reduce (6,)."""
 
     config: ModelConfig
 
@@ -133,8 +133,8 @@ def pool(
     intensity: Array | None, *, at_a_time: int | None = None, weight: Array | None = None,
 ) -> Stats:
     """Sum over pixels: voxels (..., H, W, 2B), dlogI (..., H, W) -> Stats of (...,). at_a_time:
-    pixels that go through the network together, None for all; the sums are the same. weight: how
-    often each counts, (..., H, W); None for once."""
+    pixels that go through the network together, None: all; the sums are the same. weight: how often
+    each pixel counts, (..., H, W); None: once."""
     context = window_features(jnp.asarray(window_s)[..., None, None], intensity, dlogI.shape)
     features = pixel_features(voxels, dlogI, context)
 
@@ -153,7 +153,7 @@ def pool(
     fired = (total > 0).astype(voxels.dtype)
     moments = jnp.stack(
         [n_on * n_on, n_off * n_off, n_on * n_off, n_on * dlogI, n_off * dlogI], -1)
-    # 1/(1+n): otherwise the few pixels at the clamp, with most of the events, decide alone.
+    # 1/(1+n): otherwise the few pixels at the clamp, with most of the events, dominate.
     weights = gates / (1.0 + total)[..., None]
     pixels = jnp.full(dlogI.shape[:-2], float(dlogI.shape[-1] * dlogI.shape[-2]), voxels.dtype)
     if weight is not None:
@@ -193,7 +193,7 @@ def balance(sums: Array) -> Array:
     (a, b, up), (c, d, down) = (jnp.moveaxis(row, -1, 0) for row in jnp.moveaxis(sums, -2, 0))
     a, d = a + RIDGE, d + RIDGE
     up, down = up + RIDGE * RIDGE_THETA, -down + RIDGE * RIDGE_THETA
-    # ON events of darker pixels and OFF events of brighter ones are the few: det > 0 in practice.
+    # Few ON events come from darker pixels and few OFF events from brighter ones: det > 0.
     det = jnp.maximum(a * d - b * c, 0.05 * a * d)
     return jnp.stack([(d * up + b * down) / det, (a * down + c * up) / det], -1)
 
@@ -216,8 +216,8 @@ def pooled_features(stats: Stats) -> Array:
 
 
 def finish(config: ModelConfig, params: dict, stats: Stats) -> tuple[Array, Array]:
-    """Stats -> y (..., 6) of the summary and its std in y. The variance has a part that falls
-    with the amount of data (signal pixels for theta and sigma, exposure for eta) and a rest."""
+    """Stats -> y (..., 6) of the summary and its std in y. One part of the variance falls with the
+    amount of data (signal pixels for theta and sigma, exposure for eta), the rest does not."""
     outputs: Any = FinishNet(config).apply({"params": params["finish"]}, pooled_features(stats))
     mean, per_data, rest = outputs
     signal = SIGNAL_UNIT / (stats.pixels_active + 1.0)

@@ -1,9 +1,9 @@
-"""What the flow says of a pixel, beside what is known of its camera.
+"""Combines the flow's estimate of a pixel with what is known of its camera.
 
-The flow's answer is a measurement of known width. The camera's pixels lie about its summary:
-thresholds with the mismatch sigma, in natural units as they are drawn; noise rates with 30 %, but
-for the few that are hot. The posterior is the product of both, exact for Gaussians: a camera whose
-pixels are all alike leaves nothing to say, and a map then never loses to its summary.
+The flow gives a measurement of known width. The camera's pixels are distributed around its summary:
+thresholds with the mismatch sigma, in natural units as they are drawn; noise rates with 30 %,
+except for a few hot ones. The posterior is the product of both, exact for Gaussians: if all pixels
+of a camera are alike, the flow adds nothing, so a map is never worse than its summary.
 
 Measured values v (..., 4) are theta_on, theta_off and the coordinates y of eta_on, eta_off.
 """
@@ -22,13 +22,13 @@ from evflow.network.coordinates import CENTRE, SCALE, per_channel, squash, squas
 Array = jax.Array
 
 ETA_SPREAD = 0.3  # of log eta over a camera's pixels, at most
-HOT_SHARE, HOT_SPREAD = 1e-3, 5.0  # pixels that fire by themselves, some e^5 times as often
+HOT_SHARE, HOT_SPREAD = 1e-3, 5.0  # hot pixels: their share, and spread of the log of their rates
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """What windows said of each pixel: precisions (..., 4) of v, and v times them. Sums add up."""
+    """Measurements of each pixel: precisions (..., 4) of v, and v times them. Sums add up."""
 
     precision: Array
     weighted: Array
@@ -38,7 +38,7 @@ class Evidence:
 
 
 def evidence(y: Array, y_std: Array, shown: Array | None = None) -> Evidence:
-    """Of one window: y of the flow and its std (..., 4). A threshold's width is in proportion to
+    """From one window: y of the flow and its std (..., 4). A threshold's width is proportional to
     it. shown: (...,) bool, pixels that count."""
     v = _values(y)
     width = jnp.concatenate([v[..., :2] * per_channel(SCALE[:2], v), jnp.ones_like(v[..., 2:])], -1)
@@ -49,7 +49,7 @@ def evidence(y: Array, y_std: Array, shown: Array | None = None) -> Evidence:
 
 
 @jax.jit
-@jax.checkpoint  # whose way back would keep a dozen numbers a pixel
+@jax.checkpoint  # otherwise the backward pass would store a dozen numbers per pixel
 def of_window(y: Array, y_std: Array, y6: Array, y6_std: Array) -> tuple[Camera, Camera]:
     """The posterior of one window."""
     return posterior(evidence(y, y_std), y6, y6_std)
@@ -57,8 +57,8 @@ def of_window(y: Array, y_std: Array, y6: Array, y6_std: Array) -> tuple[Camera,
 
 @jax.jit
 def posterior(found: Evidence, y6: Array, y6_std: Array) -> tuple[Camera, Camera]:
-    """Maps (...) and their std, of the camera's summary y6 (..., 6) and its own std, which all
-    pixels share. Of a pixel that says less than its camera, the std is that of the camera."""
+    """Maps (...) and their std, given the camera's summary y6 (..., 6) and its own std, which all
+    pixels share. A pixel with less information than its camera has the camera's std."""
     known, centre = squash_summary(y6), _values(y6[..., :4])
     sigma = jnp.stack([known.sigma_on, known.sigma_off], -1)
     about = jnp.concatenate([sigma, jnp.full_like(sigma, ETA_SPREAD)], -1)
@@ -71,7 +71,7 @@ def posterior(found: Evidence, y6: Array, y6_std: Array) -> tuple[Camera, Camera
     v = centre + off * jnp.concatenate([share[..., :2], eta], -1)
     theta, y_eta = v[..., :2], v[..., 2:]
     camera = Camera(theta[..., 0], theta[..., 1], *jnp.moveaxis(_rates(y_eta), -1, 0))
-    # The product's own width would take two that are wrong alike for two opinions.
+    # The product's own width would count two estimates with the same error as independent.
     width = jnp.minimum(about, jnp.where(told, found.precision, 1e-12) ** -0.5)
     slope = jnp.concatenate([jnp.ones_like(theta), _rates(y_eta)], -1)
     shared = y6_std[..., :4] * per_channel(SCALE, v) * jnp.concatenate(
@@ -87,17 +87,17 @@ def _values(y: Array) -> Array:
 
 
 def _rates(y_eta: Array) -> Array:
-    """Hz of the coordinates (..., 2) of noise rates, whose scale is 1."""
+    """Noise rates in Hz from coordinates (..., 2), whose scale is 1."""
     return jnp.exp(y_eta + per_channel(CENTRE[2:], y_eta))
 
 
 def _share(about: Array | float, precision: Array) -> Array:
-    """The weight of what was measured, where values lie about another with a deviation `about`."""
+    """The weight of a measurement, for values that scatter around another by `about`."""
     return about**2 * precision / (about**2 * precision + 1.0)
 
 
 def _hot(off: Array, precision: Array) -> Array:
-    """How likely a pixel is hot that was measured `off` its camera's noise rate."""
+    """The probability that a pixel is hot whose measured noise rate differs by `off`."""
     error = 1.0 / jnp.maximum(precision, 1e-12)
     inner, outer = ETA_SPREAD**2 + error, HOT_SPREAD**2 + error
     odds = 0.5 * (off**2 * (1.0 / inner - 1.0 / outer) - jnp.log(outer / inner))

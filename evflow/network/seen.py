@@ -1,7 +1,7 @@
-"""What a slow pixel sees of a window: the changes of light in a code, behind a photoreceptor.
+"""What a slow pixel sees in a window: a code's changes of light, filtered by a photoreceptor.
 
-The law is that of simulator/photoreceptor.py, with which `evflow simulate --camera` shows frames to
-a measured camera. The window begins at rest: the light before it is not known.
+The filter is that of simulator/photoreceptor.py, which `evflow simulate --camera` uses for a
+measured camera. The window begins at rest, since earlier light is unknown.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from evflow.simulator.photoreceptor import Photoreceptor, seen_path
 
 Array = jax.Array
 
-SUBSTEPS = 4  # of each change: the photoreceptor's rate follows the light within it
+SUBSTEPS = 4  # per change: the photoreceptor's speed follows the light within it
 
 
 def photoreceptor(sensor: SensorModel | None, optics: Optics | None) -> Photoreceptor:
-    """Of a circuit and of what frames show beside it, each ideal where it is None."""
+    """The photoreceptor for a circuit and optics, each ideal if None."""
     return Photoreceptor.of(sensor or SensorModel(), optics or Optics())
 
 
 def seen_changes(
     seen_by: Photoreceptor, changes: Array, intensity: Array, window_s: Array
 ) -> tuple[Array, Array]:
-    """Changes (..., H, W, m) of log intensity, and its mean (..., H, W), as the pixels see them.
-    intensity, window_s: of the light, of shapes that broadcast to (..., H, W)."""
+    """Changes (..., H, W, m) of log intensity and its mean (..., H, W), as the pixels see them.
+    intensity, window_s: of the light, broadcastable to (..., H, W)."""
     if seen_by.ideal:
         return changes, intensity
     law = seen_by.offset_dn, seen_by.tau_s, seen_by.delay_s, seen_by.by_light
@@ -47,11 +47,11 @@ def _seen(
     dt_s = jnp.broadcast_to(window_s / (SUBSTEPS * count), intensity.shape)
     steps = jnp.broadcast_to(dt_s, (len(each), *dt_s.shape))
     path = seen_path(lin_log_inverse(log_light), steps, offset_dn, tau_s, by_light)
-    # At the ends of the parts, `delay` later; beyond the window the light stays as it is.
+    # At the ends of the parts, `delay` later; after the window the light stays constant.
     ends = jnp.arange(0, len(path), SUBSTEPS).reshape(-1, *[1] * dt_s.ndim)
     at = jnp.clip(ends - (delay_s / dt_s)[None], 0.0, len(each))
     low = jnp.minimum(jnp.floor(at).astype(jnp.int32), len(each) - 1)
     below, above = (jnp.take_along_axis(path, low + i, 0) for i in (0, 1))
     seen = below + (at - low) * (above - below)
-    darker = jnp.log1p(jnp.maximum(offset_dn, 0.0) / 255.0)  # as simulated frames are
+    darker = jnp.log1p(jnp.maximum(offset_dn, 0.0) / 255.0)  # as for simulated frames
     return jnp.moveaxis(jnp.diff(seen, axis=0), 0, -1), 0.5 * (seen[0] + seen[-1]) - darker

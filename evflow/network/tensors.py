@@ -1,7 +1,7 @@
-"""The safetensors format, read without trust: u64 size of the header, the header, float32 data.
+"""The safetensors format, read without trusting it: u64 header size, the header, float32 data.
 
-Whatever the header claims is compared with what is there before an array is made of it; the digest
-is over names, shapes and numbers, so that a byte that is not as it was saved is seen.
+Whatever the header claims is compared with the file before an array is made; the digest covers
+names, shapes and numbers, so that any changed byte is noticed.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from evflow.errors import EvflowDataError
 from evflow.files.json_text import parse_json
 
 MOST_HEADER = 1 << 24  # bytes; ours have 25,000
-MOST_SIDE = 1 << 31  # of an array without numbers, whose other sides nothing bounds
+MOST_SIDE = 1 << 31  # of an empty array, whose other sides are otherwise unbounded
 DEEPEST = 16  # names within names
 CARD = "__metadata__"
 Arrays = dict[str, np.ndarray]
 
 
 def read_header(data: bytes) -> tuple[dict[str, Any], int]:
-    """The header, and where the data begin; ValueError where it is damaged."""
+    """The header, and the offset of the data; ValueError if it is damaged."""
     size = int.from_bytes(data[:8], "little")
     if len(data) < 8 or size > min(len(data) - 8, MOST_HEADER):
         raise ValueError(f"its header claims {size:,} of {len(data):,} bytes")
     header = parse_json(data[8 : 8 + size], object_pairs_hook=_once)
     if not isinstance(header, dict):
-        raise ValueError("its header is no object")
+        raise ValueError("its header is not an object")
     return header, 8 + size
 
 
 def parse(data: bytes) -> Arrays:
-    """The arrays by name, which show `data`. Raises ValueError (damaged), and EV018 where they are
+    """The arrays by name, as views of `data`. Raises ValueError (damaged), and EV018 if they are
     not float32, or nest badly."""
     header, start = read_header(data)
     header.pop(CARD, None)
     spans, arrays = [], Arrays()
     for name, entry in header.items():
         if not isinstance(entry, dict):
-            raise ValueError(f"{name[:80]!r} is no array")
+            raise ValueError(f"{name[:80]!r} is not an array")
         shape, (begin, end) = _shape(entry.get("shape")), _span(entry.get("data_offsets"))
         _check_kind(name, entry.get("dtype"))
         if end - begin != 4 * math.prod(shape) or end > len(data) - start:
@@ -85,7 +85,7 @@ def _shape(told: Any) -> tuple[int, ...]:
 def _span(told: Any) -> tuple[int, int]:
     if not isinstance(told, list) or len(told) != 2 or not all(type(n) is int for n in told) or (
             not 0 <= told[0] <= told[1]):
-        raise ValueError(f"a place is {str(told)[:80]}")
+        raise ValueError(f"an offset is {str(told)[:80]}")
     return told[0], told[1]
 
 
@@ -96,7 +96,7 @@ def _check_kind(name: str, kind: Any) -> None:
 
 
 def _check_names(arrays: Arrays) -> None:
-    """EV018 unless each is a path of parts, and none is a group of others."""
+    """Raise EV018 unless each name is a path of parts, and none is also a group of others."""
     groups = {str(parent) for name in arrays for parent in PurePosixPath(name).parents}
     for name in arrays:
         parts = name.split("/")

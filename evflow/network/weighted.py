@@ -1,6 +1,6 @@
-"""Statistics of pixels that count so often: those that are alike go through the network once.
+"""Weighted statistics: identical pixels go through the network once, weighted by their number.
 
-For a host that knows which they are; nothing is checked.
+For callers on the host that know which pixels are identical; nothing is checked.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Array = jax.Array
 def summarize_weighted(
     params: Params, voxels: np.ndarray, frames: np.ndarray, weight: np.ndarray, window_s: float
 ) -> Stats:
-    """Stats as of `summarize`, float32: voxels (k, 2B) of the first k pixels, the others have no
-    events; frames (n, 2), what the window's two frames show of each, in DN; weight (n,)."""
+    """Stats as from `summarize`, float32: voxels (k, 2B) of the first k pixels (the others have no
+    events); frames (n, 2), each pixel's DN in the window's two frames; weight (n,)."""
     config, net = pooling_parts(params)
     size, n = LARGE if on_cpu(params) else HUGE, len(weight)
     parts = []

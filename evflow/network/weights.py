@@ -29,12 +29,12 @@ Params = dict[str, Any]
 
 FOLDER = Path(str(resources.files("evflow") / "weights"))
 SUMS = "SHA256SUMS"  # of the released files
-DIGEST = "sha256"  # in a card: that of the arrays
-AGAIN = "Copy or make it again."
+DIGEST = "sha256"  # key in a card: hash of the arrays
+AGAIN = "Copy or create it again."
 
 
 def weights_path(name_or_path: str | os.PathLike = "default") -> Path:
-    """The file of a released name ("default") or the path itself."""
+    """The file of a released name ("default"), or the path itself."""
     need(name_or_path, str | os.PathLike, "name_or_path", "Give a released name or a path.")
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
@@ -62,9 +62,8 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
         A nested dict of float32 arrays under one key, the architecture's name.
 
     Raises:
-        EvflowDataError: EV007 (NaN), EV009 (damaged, or not what was saved), EV016 (no such file or
-            name), EV018 (tensors that are not float32, or nest badly), EV020 (neither a name nor a
-            path).
+        EvflowDataError: EV007 (NaN), EV009 (damaged or modified), EV016 (no such file or name),
+            EV018 (tensors that are not float32, or nest badly), EV020 (neither a name nor a path).
     """
     path = weights_path(name_or_path)
     data = read_whole(path)
@@ -73,7 +72,7 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
         try:
             arrays = tensors.parse(data)
         except ValueError as e:
-            raise EvflowDataError("EV009", f"it is no sound safetensors file ({e}).", AGAIN) from e
+            raise EvflowDataError("EV009", f"it is no valid safetensors file ({e}).", AGAIN) from e
         _check_whole(path, data, arrays, card)
     params: Params = {}
     for name, array in arrays.items():
@@ -81,26 +80,26 @@ def load_weights(name_or_path: str | os.PathLike = "default") -> Params:
         node = params
         for part in parents:
             node = node.setdefault(part, {})
-        node[leaf] = jax.device_put(array)  # as `jnp.asarray`, without a program for each shape
+        node[leaf] = jax.device_put(array)  # unlike `jnp.asarray`, needs no program per shape
     return params
 
 
 def _check_whole(path: Path, data: bytes, arrays: tensors.Arrays, card: dict[str, Any]) -> None:
-    """EV009 where the numbers are not those that were saved, or released; EV007 where some are not
-    finite; EV018 where there is none."""
+    """Raise EV009 if the numbers differ from those saved or released; EV007 if some are not finite;
+    EV018 if there are none."""
     if not arrays:
-        raise EvflowDataError("EV018", "it holds no array.", "Expected what save_weights writes.")
+        raise EvflowDataError("EV018", "it holds no array.", "Expected a file from save_weights.")
     if DIGEST in card and tensors.digest(arrays) != card[DIGEST]:
-        raise EvflowDataError("EV009", "its numbers are not those that were saved (their SHA-256 "
-                              "differs from that of its model card).", AGAIN)
+        raise EvflowDataError("EV009", "its numbers differ from those saved (their SHA-256 "
+                              "is not that of its model card).", AGAIN)
     if path.parent == FOLDER and hashlib.sha256(data).hexdigest() != _released().get(path.name):
         raise EvflowDataError(
-            "EV009", f"it is not the file that was released (its SHA-256 is not in {SUMS}).",
+            "EV009", f"it differs from the released file (its SHA-256 is not in {SUMS}).",
             f"Install evflow again. Replaced on purpose? Then correct {SUMS} (sha256sum).")
     for name, array in arrays.items():
         if not np.isfinite(array).all():
-            raise EvflowDataError("EV007", f"{name} is not all finite.",
-                                  "A training that diverged? Take an earlier checkpoint.")
+            raise EvflowDataError("EV007", f"{name} has NaN or infinite values.",
+                                  "A training that diverged? Use an earlier checkpoint.")
 
 
 def _released() -> dict[str, str]:
@@ -125,7 +124,7 @@ def save_weights(
 
     Raises:
         EvflowDataError: EV007 (NaN), EV013 (exists), EV019 (cannot be written), EV020 (another
-            ending, by which it could not be read again).
+            extension, with which it could not be read again).
     """
     if Path(path).suffix != ".safetensors":
         raise EvflowDataError("EV020", f"{path} does not end in .safetensors.",
@@ -134,7 +133,7 @@ def save_weights(
     arrays = {"/".join(str(k.key) for k in keys): np.asarray(leaf, np.float32)
               for keys, leaf in leaves}
     if lost := [name for name, array in arrays.items() if not np.isfinite(array).all()]:
-        raise EvflowDataError("EV007", f"{lost[0]} is not all finite.",
+        raise EvflowDataError("EV007", f"{lost[0]} has NaN or infinite values.",
                               "A training that diverged? Save an earlier state.")
     card = card | {DIGEST: tensors.digest(arrays)}
     data = save(arrays, metadata={"card": json.dumps(card, sort_keys=True)})
@@ -147,25 +146,25 @@ def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
     path = weights_path(name_or_path)
     with naming(path):
         card = _card(read_whole(path))
-    card.pop(DIGEST, None)  # of this file; a card goes on to others
+    card.pop(DIGEST, None)  # specific to this file; cards are copied to others
     return card
 
 
 def _card(data: bytes) -> dict[str, Any]:
-    """The model card as it is in the file; EV009."""
+    """The model card stored in the file; raises EV009."""
     try:
         told = tensors.read_header(data)[0].get(tensors.CARD, {})
         card = parse_json(told.get("card", "{}"))
         if not isinstance(card, dict):
-            raise TypeError(f"it is no object but a {type(card).__name__}")
+            raise TypeError(f"it is not an object but a {type(card).__name__}")
     except (ValueError, TypeError, AttributeError) as e:
         raise EvflowDataError("EV009", f"it has no readable model card ({e}).", AGAIN) from e
     return card
 
 
 def trained_steps(card: dict[str, Any]) -> dict[str, int]:
-    """Steps of training by part of a model card. Weights of one run have one count, "all"; those
-    put together from several runs have a card a part, and the released ones are such."""
+    """Training steps by part, from a model card. Weights of one run have one count, "all"; those
+    put together from several runs, such as the released ones, have a card per part."""
     if isinstance(card.get("steps"), int):
         return {"all": card["steps"]}
     return {part: inner["steps"] for part, inner in card.items()

@@ -1,9 +1,9 @@
 """Actnorm: one scale and one bias per channel, set from data before training.
 
 params: base, raw and bias (C,), stacked over steps in a level. scale = exp(base + .1 tanh(raw)):
-`base` is what data_init found and stays (a buffer: its gradient is exactly zero; keep it out of
-weight decay), `raw` is trained from 0. So log-scales cannot drift and the float32 inverse stays
-accurate.
+`base` is found by data_init and never changes (a buffer: its gradient is exactly zero; exclude it
+from weight decay), `raw` is trained from 0. So log-scales cannot drift and the float32 inverse
+stays accurate.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from evflow.network.flow.config import Array, FlowConfig, Params
 
-# How far training moves a log-scale. The float32 inverse is lost once they spread: measured round
+# How far training may move a log-scale. A large spread destroys the float32 inverse: measured round
 # trip over 64 steps 5e-4 at a standard deviation of .2, 5e2 at .5.
 LOG_SCALE_BOUND = 0.1
 

@@ -1,7 +1,7 @@
 """The front layer: h = asinh(E), element by element.
 
-Voxel counts are mostly zero with a long tail; asinh keeps zero and unit slope there and turns the
-tail into a logarithm. log|dh/dE| = -log cosh(h), in the form that neither overflows nor cancels.
+Voxel counts are mostly zero with a long tail; asinh has unit slope at zero and turns the tail into
+a logarithm. log|dh/dE| = -log cosh(h), computed in a form that neither overflows nor cancels.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the flow is made of: a frozen, hashable description, passed as a static argument.
+"""The structure of the flow: a frozen, hashable description, passed as a static argument.
 
 The flow has `levels` levels of `steps` steps. Level i works on `channels / 2**i` channels; between
 two levels the first half goes on and the second half leaves as latent z.
@@ -26,7 +26,7 @@ class FlowConfig:
     levels, steps: L and K of Eq. 8.
     hidden: width of the coupling and injector networks.
     condition: channels of the condition u.
-    injector: one affine function of u alone at the head of every level.
+    injector: an affine function of u alone at the start of every level.
     asinh: element-wise asinh before the first level, for counts with many zeros.
     """
 

@@ -1,8 +1,8 @@
 """Conditional coupling (Eq. 5): h_A stays, h_B becomes h_B + f(h_A, u).
 
 f is an MLP [h_A, u] -> hidden -> hidden -> C/2 with ReLU. Its last layer starts at zero, so a new
-flow is linear. A is the first half of the channels, B the second. The log-det is 0; the condition's
-own Jacobian is not part of it: the map is a bijection in h at fixed u.
+flow is linear. A is the first half of the channels, B the second. The log-det is 0 and does not
+include the condition's own Jacobian: the map is a bijection in h at fixed u.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def init(key: Array, channels: int, config: FlowConfig) -> Params:
     fan_in = half + config.condition
     k_h, k_u, k_2 = jax.random.split(key, 3)
     return {
-        # The first layer's weight in two parts: two products beat joining [h_A, u] at every step.
+        # The first layer's weight in two parts: two products are faster than joining [h_A, u].
         "w_h": he_normal(k_h, (steps, half, hidden), fan_in),
         "w_u": he_normal(k_u, (steps, config.condition, hidden), fan_in),
         "b_1": jnp.zeros((steps, hidden), jnp.float32),

@@ -1,13 +1,14 @@
 """The forward flow for inference: actnorm and shuffle folded into the coupling weights.
 
-Between its couplings a level only scales, offsets and reorders channels. Kept as they enter the
-level, channels g give a step's own by h[j] = scale[c] (g[c] + offset[c]) with c = channel[j]. So
-every coupling becomes g + f'(g, u) with weights as wide as the level, zero where a channel is not
-in A (inputs) or not in B (outputs), and one affine map ends the level: the same function to
-rounding, and no pass over the activations but the products.
+Between its couplings a level only scales, offsets and reorders channels. If channels g are kept as
+they enter the level, a step's own channels are h[j] = scale[c] (g[c] + offset[c]) with
+c = channel[j]. So every coupling becomes g + f'(g, u) with weights as wide as the level, zero for
+channels that are not in A (inputs) or not in B (outputs), and one affine map ends the level: the
+same function up to rounding, with no pass over the activations except the products.
 
-Columns are pixels, as in dense.py, but for the arguments and results of `forward_folded`. A step's
-input is [g, u] in one array of which only g changes, so that its first layer is one product.
+Pixels are columns, as in dense.py, except in the arguments and results of `forward_folded`. A
+step's input is [g, u] in one array, of which only g changes, so that its first layer is one
+product.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from evflow.process import chunks
 
 
 def fold(params: Params, config: FlowConfig) -> Params:
-    """Params of the same flow for `forward_folded`: fold once, use for many pixels."""
+    """Params of the same flow for `forward_folded`: fold once, then use for many pixels."""
     folded: Params = {}
     for index, order in enumerate(shuffle.orders(config)):
         level = params[f"level_{index}"]
@@ -42,8 +43,8 @@ def fold(params: Params, config: FlowConfig) -> Params:
 
 
 def settle(folded: Params, values: Array, at: int) -> Params:
-    """Folded params for pixels that share the channels at, at + 1, ... of the condition: their
-    `values` (k,) move into the biases, and u comes without them."""
+    """Folded params for pixels that share the condition's channels at, at + 1, ...: their `values`
+    (k,) move into the biases, and u is passed without them."""
     def settled(layers: Params, first: int) -> Params:
         w = layers["w_1"]
         before, same, after = jnp.split(w, [first, first + len(values)], axis=-2)
@@ -64,7 +65,7 @@ def forward_folded(
 ) -> tuple[Array, Array]:
     """`forward` without the log-det: x (..., channels), u (..., condition) -> y, z.
 
-    chunk: pixels in flight at once, 2 kB each; None chooses by the platform (chunks.py).
+    chunk: pixels processed at a time, 2 kB each; None chooses by the platform (chunks.py).
     """
     pixels = x.shape[:-1]
     rows = (x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1]))
@@ -128,7 +129,7 @@ def _fold_step(params: Params, scale: Array, offset: Array, channel: Array) -> P
 
 
 def _step(params: Params, gu: Array) -> Array:
-    """[g, u] -> [g + f'(g, u), u]: a coupling that reads A and moves B by zeros in its weights."""
+    """[g, u] -> [g + f'(g, u), u]: zeros in the weights let a coupling read A and change B only."""
     hidden = jax.nn.relu(dense(params["w_1"], params["b_1"], gu))
     hidden = jax.nn.relu(dense(params["w_2"], params["b_2"], hidden))
     out = dense(params["w_3"], params["b_3"], hidden)

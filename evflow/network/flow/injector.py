@@ -1,8 +1,8 @@
-"""Conditional injector: h exp(s(u)) + t(u), at the head of a level.
+"""Conditional injector: h exp(s(u)) + t(u), at the start of a level.
 
-With additive couplings the volume is the same at every pixel; the injector alone lets it differ
-between empty and active pixels. s = 2 tanh(.) and t come from one MLP u -> hidden -> 2C whose last
-layer starts at zero (the identity).
+Additive couplings have the same volume at every pixel; only the injector lets it differ between
+empty and active pixels. s = 2 tanh(.) and t come from one MLP u -> hidden -> 2C whose last layer
+starts at zero (the identity).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from evflow.network.flow.config import Array, FlowConfig, Params
 from evflow.network.flow.dense import dense, he_normal
 
-LOG_SCALE_BOUND = 2.0  # the voxels of empty pixels vary a hundredth as much as those of active ones
+LOG_SCALE_BOUND = 2.0  # voxels of empty pixels vary a hundredth as much as those of active ones
 
 
 def init(key: Array, channels: int, config: FlowConfig) -> Params:

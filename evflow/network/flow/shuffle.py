@@ -1,7 +1,6 @@
 """Channel shuffle: a fixed random order per step, h'[j] = h[order[j]]. Log-det 0.
 
-The orders follow from `SEED` alone. They are NumPy constants: nothing to train, to save or to
-decay.
+The orders depend on `SEED` only. They are NumPy constants: nothing to train, save or decay.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ SEED = 0  # part of the network, not of its initialisation
 
 def orders(config: FlowConfig) -> tuple[np.ndarray, ...]:
     """One int32 (steps, C) array per level; every row is a permutation of the C channels."""
-    # Trained weights are worth nothing under another order, and NumPy promises only the raw
-    # stream of a bit generator for good, not what Generator.permutation makes of it.
+    # Trained weights are useless with another order, and NumPy guarantees only the raw stream of a
+    # bit generator across versions, not the result of Generator.permutation.
     stream = np.random.PCG64(SEED)
     return tuple(
         np.argsort(stream.random_raw((config.steps, channels)), axis=1).astype(np.int32)

@@ -1,7 +1,7 @@
 """The whole flow: asinh, then levels of injector and steps, with a split between levels.
 
 f(.; u) maps x (..., channels) to y (..., width of the last level) and z (..., the rest), an exact
-bijection at fixed condition u; log-dets are per pixel and hold at fixed u. z is the halves that
+bijection at fixed condition u; log-dets are per pixel, at fixed u. z consists of the halves that
 left after each level, in order. Pixels are independent: any leading axes, flattened inside.
 
 params: {"level_0": {"injector": {...}, "actnorm": {...}, "coupling": {...}}, ...}; the leaves of
@@ -37,16 +37,16 @@ def init(key: Array, config: FlowConfig) -> Params:
 
 
 def data_init(params: Params, x: Array, u: Array, config: FlowConfig) -> Params:
-    """Set every actnorm from a batch x (..., channels), u (..., condition); the rest stays.
+    """Set every actnorm from a batch x (..., channels), u (..., condition); nothing else changes.
 
-    Each actnorm sees the batch as the steps before it left it. A channel's deviation is floored
-    at MIN_STD in units of the flow's input, not of the step's: else an all-zero channel would
-    be magnified by 1/MIN_STD at every step (20^16) and lose its inverse.
+    Each actnorm sees the batch after all earlier steps. A channel's deviation is floored at MIN_STD
+    in units of the flow's input, not of the step's: otherwise an all-zero channel would be
+    magnified by 1/MIN_STD at every step (20^16) and lose its inverse.
     """
     h, u = _columns(x), _columns(u)
     if config.asinh:
         h, _ = asinh.forward(h)
-    gain = jnp.ones_like(h[:, 0])  # (C,), of the actnorms so far
+    gain = jnp.ones_like(h[:, 0])  # (C,), of all actnorms so far
 
     def step(carry: tuple[Array, Array], xs: Any) -> tuple[tuple[Array, Array], Params]:
         (h, gain), (weights, order) = carry, xs
@@ -88,14 +88,14 @@ def inverse(
 ) -> tuple[Array, Array]:
     """y (..., 4), z (..., 28), u (..., condition) -> x (..., channels), log_det (...).
 
-    log_det is that of the inverse map: minus the forward one at x.
+    log_det is that of the inverse map: minus the forward map's at x.
     """
     pixels, h, z, u = y.shape[:-1], _columns(y), _columns(z), _columns(u)
     log_det = jnp.zeros_like(h[0])
     for index, order in reversed(list(enumerate(shuffle.orders(config)))):
         h, change = _level_inverse(params[f"level_{index}"], order, h, u, config)
         log_det += change
-        if index:  # z ends with the half that left last; it is as wide as h
+        if index:  # z ends with the half that left last, which is as wide as h
             z, left = jnp.split(z, [len(z) - len(h)])
             h = jnp.concatenate([h, left])
     if config.asinh:
@@ -133,8 +133,8 @@ def _level_inverse(
         h = shuffle.apply(coupling.inverse(weights, h, u), order)
         return actnorm.inverse(scale, bias, h), None
 
-    # exp outside the scan: beside the division XLA would make it h exp(-s), whose rounding is the
-    # same at every step. Measured round trip of a new flow: 5e-7, against 4e-5.
+    # exp outside the scan: next to the division XLA would turn it into h exp(-s), whose rounding is
+    # the same at every step. Measured round trip of a new flow: 5e-7, against 4e-5.
     s = actnorm.log_scale(params["actnorm"])
     xs = (jnp.exp(s), params["actnorm"]["bias"], shuffle.inverted(order), params["coupling"])
     h, _ = jax.lax.scan(_remat(step), h, xs, reverse=True)
