@@ -1,1 +1,1 @@
-"""From recordings to cameras: the whole pipeline, static scenes, and a camera on a bench."""
+"""From recordings to cameras: the estimation pipeline, static scenes, and cameras on a bench."""

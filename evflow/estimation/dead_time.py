@@ -1,8 +1,8 @@
 """The dead time (refractory period) of a camera, from the intervals between a pixel's events.
 
-Below the dead time there are none but noise, from it on there are many: a pixel whose light goes on
-changing fires as soon as it can. A recording in which few pixels change that fast shows no such
-edge, and then nothing is known of it but that it is shorter than what is usual there.
+Below the dead time there are no intervals except from noise, above it there are many, because a
+pixel whose light keeps changing fires as soon as it can. If few pixels change that fast there is no
+such edge, and the dead time is only known to be shorter than usual intervals.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ import numpy as np
 from evflow.files.spool import forget
 from evflow.types import Events
 
-MOST_EVENTS = 2_000_000  # that are looked at: of a longer recording, those of some of the pixels
-BLOCK = 1 << 20  # at a time: they may lie on the disk
+MOST_EVENTS = 2_000_000  # examined; of a longer recording, those of a subset of the pixels
+BLOCK = 1 << 20  # events at a time: they may be memory-mapped
 SHORTEST_US, LONGEST_US = 20.0, 50_000.0
-STEP = 1.03  # from one candidate to the next
-ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # of a candidate: where there are many, and where few
+STEP = 1.03  # ratio of successive candidates
+ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # relative ranges with many, few intervals
 ENOUGH = 200  # intervals just above
-SHARP = 8.0  # times as dense above as below: a slow pixel's densities rise by 2 over this distance
-LATTICE = 20  # different intervals within an octave: times in steps have an edge at each
-FEW_SHORTER = 0.05  # of all intervals may be shorter than a dead time: noise that does not know it
+SHARP = 8.0  # ratio of densities above and below; a slow pixel's only double over this distance
+LATTICE = 20  # distinct intervals within an octave: coarse times have an edge at each step
+FEW_SHORTER = 0.05  # maximum share of shorter intervals: from noise that ignores the dead time
 
 
 @dataclasses.dataclass(frozen=True)
 class DeadTime:
-    """seconds, std_s: of the dead time, 0 and NaN where the recording shows none."""
+    """seconds, std_s: the dead time, 0 and NaN if the recording does not show it."""
 
     seconds: float = 0.0
     std_s: float = float("nan")
@@ -38,7 +38,7 @@ class DeadTime:
 
 
 def dead_time(events: Events) -> DeadTime:
-    """The dead time of a stream's pixels, where at least ENOUGH intervals lie at its edge."""
+    """The dead time of a stream's pixels, if at least ENOUGH intervals lie at its edge."""
     intervals = np.sort(own_intervals(events))
     edges = SHORTEST_US * STEP ** np.arange(int(np.log(LONGEST_US / SHORTEST_US) / np.log(STEP)))
 
@@ -61,9 +61,9 @@ def dead_time(events: Events) -> DeadTime:
 
 
 def own_intervals(events: Events) -> np.ndarray:
-    """(N,) int64, microseconds between successive events of a pixel, whatever their polarity."""
+    """(N,) int64, microseconds between successive events of a pixel, of either polarity."""
     width, height = events.size
-    # Every k-th pixel of a shuffled order: rows and columns of a sensor may differ.
+    # Every k-th pixel in a shuffled order: rows and columns of a sensor may differ.
     share = max(1, -(-len(events) // MOST_EVENTS))
     used = np.random.default_rng(0).permutation(height * width) % share == 0
     parts = []

@@ -1,8 +1,7 @@
-"""Did the camera stay the same? The thirds of a recording beside each other.
+"""Did the camera stay the same? Compares the thirds of a recording.
 
-Of each stretch that was read, the regression of all its pixels together gives both thresholds. How
-they scatter within a third says how well the third knows them; what a path lacks of contrast, by
-the speed of what moves, scatters likewise.
+The pooled regression of every stretch gives both thresholds. Their scatter within a third is the
+third's error; it includes contrast that the motion estimate misses at high speeds.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ Array = np.ndarray
 
 LEAST_PARTS = 3  # stretches in each third
 LEAST_EVENTS = 500.0  # of a stretch, in the regression
-APART = 3.5  # standard deviations of a difference: of six, one in a thousand steady recordings
-LEAST_APART = 0.04  # of a threshold: smaller changes are the path's, where motion changes
+APART = 3.5  # standard deviations of a difference: one steady recording in a thousand exceeds it
+LEAST_APART = 0.04  # of a threshold: smaller differences come from changing motion
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Part:
-    """middle_us: of a stretch; theta: (2,) of its regression, NaN where it tells too little."""
+    """middle_us: of a stretch; theta: (2,) from its regression, NaN if undetermined."""
 
     middle_us: int
     theta: Array
@@ -38,10 +37,10 @@ class Third:
     """A third of the time that was read.
 
     Attributes:
-        begin_us: where it begins, on the recording's clock.
-        end_us: where it ends.
-        stretches: how many stretches tell it.
-        theta_on: ON threshold by the regression of all pixels together, natural-log units.
+        begin_us: start, on the recording's clock.
+        end_us: end.
+        stretches: number of stretches used.
+        theta_on: ON threshold from the pooled regression, natural-log units.
         theta_off: OFF threshold likewise.
         std_on: standard deviation of theta_on.
         std_off: standard deviation of theta_off.
@@ -61,7 +60,7 @@ class Third:
 
 
 def part(span_us: tuple[int, int], evidence: PixelEvidence) -> Part:
-    """What a stretch alone says, from its evidence."""
+    """The thresholds from a single stretch's evidence."""
     aa, ab, bb, ay, by, yy, events = evidence.equations.sum((1, 2))
     middle, scale = sum(span_us) // 2, np.array([[aa, ab], [ab, bb]])
     if events < LEAST_EVENTS or np.linalg.det(scale) <= 1e-6 * aa * bb or yy <= 0:
@@ -73,8 +72,8 @@ def part(span_us: tuple[int, int], evidence: PixelEvidence) -> Part:
 
 
 def thirds(parts: Sequence[Part]) -> tuple[Third, ...]:
-    """The thirds of the time between the first and the last stretch; none where one of them has
-    too few stretches."""
+    """The thirds of the time between the first and the last stretch; empty if one of them has too
+    few stretches."""
     parts = sorted((p for p in parts if np.isfinite(p.theta).all() and (p.theta > 0).all()),
                    key=lambda p: p.middle_us)
     if len(parts) < 3 * LEAST_PARTS:
@@ -96,8 +95,9 @@ def thirds(parts: Sequence[Part]) -> tuple[Third, ...]:
 
 
 def changed(found: Sequence[Third]) -> list[str]:
-    """"on", "off": the thresholds that differ between two of the thirds by more than their errors
-    allow."""
+    """"on", "off": thresholds that differ between two of the thirds by more than their errors
+    allow.
+    """
     names = []
     for name in ("on", "off"):
         log_theta = np.log([getattr(t, f"theta_{name}") for t in found])
@@ -111,13 +111,13 @@ def changed(found: Sequence[Third]) -> list[str]:
 
 
 def notes(found: Sequence[Third]) -> list[Note]:
-    """A note on each threshold that did not stay the same."""
+    """A note on each threshold that changed."""
     result = []
     for name in changed(found):
         values = ", ".join(f"{getattr(t, f'theta_{name}'):.3f} ± {getattr(t, f'std_{name}'):.3f}"
                            for t in found)
         result.append(Note(
-            f"theta_{name}.drift", f"θ {name.upper()} is not the same in the three thirds of the "
-            f"recording ({values}): biases that were changed, temperature, or another light? The "
-            "estimate is a mean over them; --start and --stop take a part."))
+            f"theta_{name}.drift", f"θ {name.upper()} differs between the three thirds of the "
+            f"recording ({values}): were biases, temperature or light changed? The estimate is a "
+            "mean over them; --start and --stop select a part."))
     return result

@@ -1,4 +1,4 @@
-"""A camera measured piece by piece, as beside a running one."""
+"""A camera measured piece by piece, while it is recording."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from evflow.types import Recording
 class CameraEstimator:
     """Measure a camera while it records: add pieces of a recording, ask for the estimate so far.
 
-    Of what was added sums are kept, and a number of pieces that does not grow: memory is bounded
-    by the size of the sensor. The first pieces also tell what the pixels see the frames by. Given
-    one recording whole, the estimate is that of `estimate_camera(recording, effort="full")`.
+    Only sums and a bounded number of pieces are kept: memory is bounded by the size of the sensor.
+    The photoreceptor and the frames' offset are measured from the first pieces. If one recording is
+    added whole, the estimate equals `estimate_camera(recording, effort="full")`.
 
     Args:
         params: of `load_weights`; None loads the released ones.
@@ -32,7 +32,7 @@ class CameraEstimator:
         min_window_us: as in `estimate_camera`.
 
     Raises:
-        EvflowDataError: EV020 (an option that is not known).
+        EvflowDataError: EV020 (an unknown option).
 
     Example:
         >>> estimator = ef.CameraEstimator()
@@ -41,9 +41,9 @@ class CameraEstimator:
         >>> estimator.estimate().save("camera.npz")
     """
 
-    FIRST = 8  # stretches that are waited for before anything is measured
+    FIRST = 8  # stretches to collect before anything is measured
     KEPT = 32  # stretches whose quiet time is counted
-    NOTES = 20  # on pieces, that are kept
+    NOTES = 20  # notes on pieces that are kept
 
     def __init__(
         self, params: api.Params | None = None, *, refine: Literal["auto", "off"] = "auto",
@@ -62,16 +62,16 @@ class CameraEstimator:
         """Read one more piece of the recording.
 
         Args:
-            piece: events and the frames that they lie between, at least two; of the same camera.
-                Its last frame is the next piece's first.
+            piece: events and at least two frames around them, from the same camera. Its last frame
+                is the next piece's first.
 
         Returns:
-            How many windows between frames it had that could be used; 0 of a piece in which
-            nothing happens, which is left out.
+            How many usable windows between frames it had; 0 for a piece in which nothing happens,
+            which is left out.
 
         Raises:
             EvflowDataError: EV011 (fewer than two frames), EV012 (frames and events do not
-                overlap), EV015 (another size), EV020 (no `Recording`). What was added before stays.
+                overlap), EV015 (another size), EV020 (not a `Recording`). Earlier pieces are kept.
         """
         if isinstance(piece, Recording) and self._size not in (None, piece.events.size):
             raise EvflowDataError("EV015", f"a piece of {piece.events.size} pixels after "
@@ -94,26 +94,26 @@ class CameraEstimator:
         return len(plan.pairs)
 
     def estimate(self) -> CameraEstimate:
-        """The camera, of all that was added.
+        """Estimate the camera from everything that was added.
 
         Returns:
-            As of `estimate_camera`; more pieces can be added afterwards.
+            As from `estimate_camera`; more pieces can be added afterwards.
 
         Raises:
-            EvflowDataError: EV017 (no window that could be used was added yet).
+            EvflowDataError: EV017 (no usable window was added yet).
         """
         if self._state is None and self._waiting:
             self._begin()
         if self._state is None:
             raise EvflowDataError(
-                "EV017", "nothing was added that could be used"
+                "EV017", "no usable window was added"
                 + "".join(f" ({note})" for note in self._notes[:3]) + ".",
                 "Add pieces with frames, in which something moves.")
         extent = Extent(self._seconds, self._seconds, self._stretches, self._stretches)
         return estimate(self._state, extent=extent, before=self._notes)
 
     def _begin(self) -> None:
-        """Measure what waited."""
+        """Measure the stretches collected so far."""
         waited, self._waiting = self._waiting, ()
         state = State(self._params, looked_through(waited, measured=self._pixel == "measured"))
         most = most_simulated(waited[0].recording.events.size)
@@ -124,8 +124,8 @@ class CameraEstimator:
         self._apart = max(1, len(waited) // most)
 
     def _next(self, state: State, stretch: Stretch) -> State:
-        """The state with a later stretch: of those that are simulated each second one makes room
-        where there are too many, so that they stay spread over the time."""
+        """The state with a further stretch; every second simulated stretch is dropped when there
+        are too many, so that they stay spread over the time."""
         most = most_simulated(stretch.recording.events.size)
         length = max((len(c.dt_s) for c in state.chunks), default=0)
         wanted = len(stretch.run) >= length > 0 and len(state.parts) % self._apart == 0

@@ -14,12 +14,12 @@ class Extent:
 
     Attributes:
         read_s: seconds of the recording that were read.
-        seconds: seconds of it that could be.
-        stretches: how many stretches of some frames were read; 0 where nothing was chosen.
-        of: how many there are.
-        gain: share by which the pixels' errors would shrink were twice as much read; NaN where
-            that was not looked at.
-        ended: whether reading was ended from outside.
+        seconds: seconds that could be read.
+        stretches: number of stretches of some frames that were read; 0 if none were selected.
+        of: number of stretches in all.
+        gain: relative reduction of the pixels' errors if twice as much were read; NaN if not
+            evaluated.
+        ended: whether reading was stopped from outside.
     """
 
     read_s: float = 0.0
@@ -35,18 +35,18 @@ class Extent:
         return self.stretches >= self.of
 
     def notes(self) -> list[Note]:
-        """What to know of it: nothing where everything was read."""
+        """Notes about it; none if everything was read."""
         if self.whole:
             return []
         told = (f"{self.read_s:.1f} of {self.seconds:.1f} s were read, in {self.stretches} of "
                 f"{self.of} stretches")
         if self.ended:
-            return [Note("reading.ended", f"{told}: reading was ended. The estimate is that of "
-                         "what was read; its errors say how well that tells it.")]
+            return [Note("reading.ended", f"{told}: reading was stopped. The estimate uses what "
+                         "was read; its errors say how well that determines the camera.")]
         more = (f"; with twice as much the pixels' errors would be {self.gain:.0%} smaller"
                 if self.gain == self.gain else "")
-        return [Note("reading.part", f"{told}, those in which most happens{more}. "
-                     "All is read with --effort full (effort='full').")]
+        return [Note("reading.part", f"{told}, those with most activity{more}. "
+                     "To read everything: --effort full (effort='full').")]
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready values."""

@@ -1,8 +1,8 @@
-"""A recording divided in two, to try what its first part tells on the second.
+"""A recording divided in two, to test what its first part predicts on the second.
 
-The stretches of the longest time without a gap are divided where two of them meet, near the
-middle. What was read of the first part is a `State` of its own: sums over stretches, so that
-nothing is read again.
+The stretches of the longest time without a gap are divided where two of them meet, near the middle.
+What was read of the first part is a `State` of its own (sums over stretches), so nothing is read
+again.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from evflow.simulator.photoreceptor import IDEAL
 
 @dataclasses.dataclass(frozen=True)
 class Division:
-    """first: numbers of the stretches of the first part; rest: (first, last) frame of the second,
-    which begins where the first part ends."""
+    """first: numbers of the stretches of the first part; rest: (first, last) frame of the second
+    part, which begins where the first one ends."""
 
     first: range
     rest: tuple[int, int]
@@ -30,22 +30,23 @@ class Division:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class First:
-    """What an estimate has made of a recording's first part. state: of what was read of it; told:
-    the stretches that the photoreceptor of the state's eyes was looked for in; rest: (first, last)
-    frame of what comes after it."""
+    """What an estimate computed from a recording's first part. state: of what was read of it; told:
+    the stretches in which its photoreceptor was looked for; rest: (first, last) frame of the
+    rest."""
 
     state: State
     told: tuple[Stretch, ...]
     rest: tuple[int, int]
 
     def estimate(self) -> CameraEstimate:
-        """The camera as the first part alone tells it."""
+        """The camera, estimated from the first part alone."""
         return estimate(_on_its_own(self))
 
 
 def divided(stretches: Sequence[Stretch]) -> Division | None:
-    """Where a recording's stretches, in time order, are divided; None where no two meet, or there
-    is no path."""
+    """Where to divide a recording's stretches, in time order; None if no two meet, or without a
+    path.
+    """
     groups: list[range] = []
     for i, stretch in enumerate(stretches):
         if not stretch.run:
@@ -63,7 +64,7 @@ def divided(stretches: Sequence[Stretch]) -> Division | None:
 
 
 def _on_its_own(first: First) -> State:
-    """The state with the photoreceptor and the dead time that the first part tells by itself."""
+    """The state with photoreceptor and dead time as measured on the first part itself."""
     state, eyes = first.state, first.state.eyes
     runs, told = ([(s.recording, s.run) for s in part] for part in (state.read, first.told))
     found = eyes.found

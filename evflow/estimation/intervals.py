@@ -1,8 +1,8 @@
 """How long pixels wait for an event while nothing happens near them: life tables.
 
-Per time since a pixel's last event, for how many seconds pixels waited that long, and how many ON
-and OFF events ended it. Noise of a Poisson process ends all waits alike, leak those of one length.
-Tables add.
+For each time since a pixel's last event: how many seconds pixels waited that long, and how many ON
+and OFF events ended the wait. Poisson noise ends waits at a constant rate, leak ends those of one
+length. Tables add.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from evflow.types import Events
 
 Array = np.ndarray
 
-STEP = 1.12  # from one edge to the next
-EDGES = np.concatenate([[0.0], 1e-3 * STEP ** np.arange(123)])  # s: to a quarter of an hour
-CENSORED, ON, OFF = 0, 1, 2  # how a wait ends
+STEP = 1.12  # ratio of successive edges
+EDGES = np.concatenate([[0.0], 1e-3 * STEP ** np.arange(123)])  # s: up to a quarter of an hour
+CENSORED, ON, OFF = 0, 1, 2  # how a wait ended
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Waits:
-    """own: (3, K) seconds waited, ON and OFF events that ended it, by the time since the pixel's
-    last event, between EDGES (K + 1,); first: the same of pixels that have not sent any, by the
-    time since they are watched."""
+    """own: (3, K) seconds waited, and ON and OFF events that ended the wait, by the time since the
+    pixel's last event, between EDGES (K + 1,); first: the same for pixels without any event so far,
+    by the time since they are observed."""
 
     own: Array
     first: Array
@@ -38,7 +38,7 @@ class Waits:
 
 
 def life_table(seconds: Array, ended: Array) -> Array:
-    """(3, K) of waits (N,): how long each was, and how it ended."""
+    """(3, K) from waits (N,): how long each was, and how it ended."""
     k = np.clip(np.searchsorted(EDGES, seconds, side="right") - 1, 0, len(EDGES) - 2)
     width, bins = np.diff(EDGES), len(EDGES) - 1
     beyond = np.bincount(k, minlength=bins)[::-1].cumsum()[::-1]
@@ -48,8 +48,8 @@ def life_table(seconds: Array, ended: Array) -> Array:
 
 
 def waits_at_rest(events: Events, hot: Array, span_us: tuple[int, int] | None = None) -> Waits:
-    """The waits of all pixels (H, W) that are not hot, of a scene at rest. span_us: for how long
-    they were watched, if that is more than from the first event to the last."""
+    """The waits of all pixels (H, W) that are not hot, in a static scene. span_us: how long they
+    were observed, if more than from the first event to the last."""
     begin, end = span_us or (int(events.t[0]), int(events.t[-1]))
     width, _ = events.size
     pixel = events.y.astype(np.int64) * width + events.x
@@ -69,16 +69,16 @@ def waits_at_rest(events: Events, hot: Array, span_us: tuple[int, int] | None = 
 
 
 class QuietWaits:
-    """The waits of pixels in quiet windows, one window after the other: a wait counts from a
-    pixel's own event on, as long as nothing happens near it."""
+    """The waits of pixels in successive quiet windows: a wait starts at a pixel's own event and
+    lasts as long as nothing happens near it."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        self._last = np.full(shape[0] * shape[1], np.nan)  # s, of the event that a wait began with
+        self._last = np.full(shape[0] * shape[1], np.nan)  # s, of the event that started the wait
         self._end_us = -1
         self._own = np.zeros((3, len(EDGES) - 1))
 
     def add(self, events: Events, span_us: tuple[int, int], quiet: Array) -> None:
-        """The events of a window, which begins at span_us[0], and where (H, W) it is quiet."""
+        """The events of a window that begins at span_us[0], and where (H, W) it is quiet."""
         if span_us[0] != self._end_us:
             self._cut(np.ones(len(self._last), bool), self._end_us)
         self._end_us = span_us[1]

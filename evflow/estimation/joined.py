@@ -1,4 +1,4 @@
-"""One camera of two estimates: thresholds of a moving scene or of steps, noise of one at rest."""
+"""Joins two estimates: thresholds from a moving scene or steps, noise from a static scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
     """The estimate with the thresholds, circuit and optics of the camera.npz at `path`.
 
     Raises EV015 (another size), EV020 (no standard deviations, or thresholds that were not
-    measured there either), and what reading a camera raises.
+    measured there), and what reading a camera raises.
     """
     camera, std = Camera.load_with_std(path)
     undetermined = read_undetermined(path)
@@ -49,14 +49,14 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
     values = {name: nearest[name] for name in (*THRESHOLDS, *sigmas)}
     value_errors = {name: float(np.median(np.asarray(errors[name])[used])) for name in THRESHOLDS}
     value_errors |= {name: values[name] / np.sqrt(2.0 * used.sum()) for name in sigmas}
-    if known := read_summary(path):  # what it says of itself, rather than what maps tell of it
+    if known := read_summary(path):  # the file's own summary, not one computed from its maps
         values, value_errors = ({name: of[name] for name in (*THRESHOLDS, *sigmas)}
                                 for of in known)
 
     def scalars(numbers: dict[str, float]) -> dict[str, jnp.ndarray]:
         return {name: jnp.float32(number) for name, number in numbers.items()}
 
-    said = Note("theta.joined", f"the thresholds are those of {path}.")
+    said = Note("theta.joined", f"the thresholds come from {path}.")
     return dataclasses.replace(
         found, camera=dataclasses.replace(found.camera, **maps),
         std=dataclasses.replace(found.std, **errors),

@@ -1,13 +1,13 @@
-"""Leak told from other noise: ON events that come at a pixel's own regular intervals.
+"""Separates leak from other noise: ON events at a pixel's own regular intervals.
 
-A memory that leaks reaches the ON threshold 1 / leak_hz after the pixel's last event, in every
-light; all other noise ends a wait at any time. So the rates of a life table (intervals.py) are
+A leaking memory reaches the ON threshold 1 / leak_hz after the pixel's last event, at any light;
+all other noise ends a wait at any time. So the rates of a life table (intervals.py) are
 
     OFF(t) = m(t),    ON(t) = ratio m(t) + h(t),    t since the pixel's last event,
 
-m whatever the pixels make it (uneven pixels: high at first), h the hazard of a log-normal around
-1 / leak_hz, as pixels differ a little. Of pixels that have not fired since they are watched, the
-last event was at any time before, or, in a simulation, at the beginning.
+where m is arbitrary (uneven pixels: high at first) and h is the hazard of a log-normal around
+1 / leak_hz, since pixels differ a little. For pixels that have not fired since observation started,
+the last event was at an unknown earlier time, or, in a simulation, at the start.
 """
 
 from __future__ import annotations
@@ -23,19 +23,21 @@ Array = np.ndarray
 
 PERIODS = np.geomspace(0.02, 60.0, 131)  # s, 1 / leak_hz: steps of a sixteenth
 SPREADS = (0.04, 0.08, 0.14, 0.23, 0.32)  # std of the log of the period: v2e's pixels have .23
-RATIOS = (0.15, 7.0)  # of ON over OFF noise but for leak, at most
-RATIO_STEPS = 6  # of expectation and maximisation
-RATIO_SPREAD = 0.5  # std of its log before any data
-ODDS = 8.0  # log odds that it takes to speak of leak
-LEAST_EVENTS = 200.0  # of leak, to tell its rate
-MOST_HAZARD = 50.0  # of a period: what is left of a wait after it
-FLOOR = 0.05  # relative error: periods of a grid, pixels that differ otherwise
+RATIOS = (0.15, 7.0)  # bounds on ON over OFF noise without leak
+RATIO_STEPS = 6  # EM iterations
+RATIO_SPREAD = 0.5  # prior std of its log
+ODDS = 8.0  # log odds required to report leak
+LEAST_EVENTS = 200.0  # leak events required to report its rate
+MOST_HAZARD = 50.0  # per period: bounds the hazard in the tail
+FLOOR = 0.05  # relative error: grid of periods, and other differences between pixels
 
 
 @dataclasses.dataclass(frozen=True)
 class Leak:
-    """hz, std_hz: of a pixel that sends nothing else, 0 and NaN where it is not told; rate_hz:
-    events per second that were seen, fewer, as others reset the memory; events: how many."""
+    """hz, std_hz: for a pixel without other events, 0 and NaN if undetermined; rate_hz: leak events
+    per second that were seen, which are fewer because others reset the memory; events: their
+    number.
+    """
 
     hz: float = 0.0
     std_hz: float = float("nan")
@@ -44,13 +46,13 @@ class Leak:
 
 
 def measured_leak(waits: Waits) -> Leak:
-    """The leak that pixels show while they are left alone."""
+    """The leak that pixels show while nothing happens near them."""
     tables = np.concatenate([waits.own, waits.first], 1)
     used = tables[0] > 0
     seconds, on, off = tables[:, used]
     if on.sum() < LEAST_EVENTS:
         return Leak()
-    from scipy import special  # of which short recordings have no need
+    from scipy import special  # short recordings do not need it
 
     others = float(2.0 * (off.sum() + 0.5) / seconds.sum())
     grid = [(period, spread, fresh) for fresh in (False, True) for spread in SPREADS
@@ -72,8 +74,8 @@ def measured_leak(waits: Waits) -> Leak:
 
 
 def _hazards(period: float, spread: float, fresh: bool, others: float) -> Array:
-    """(2 K,) leak events per second that is waited, between EDGES: since the last event, and since
-    pixels are watched that have sent none."""
+    """(2 K,) leak events per second of waiting, between EDGES: since the last event, and for pixels
+    without an event since they are observed."""
     from scipy import special
 
     z = np.log(np.maximum(EDGES, 1e-9) / period) / spread
@@ -85,14 +87,14 @@ def _hazards(period: float, spread: float, fresh: bool, others: float) -> Array:
     periods = (period * np.exp(spread * nodes))[:, None]
     left = np.maximum(periods - middle, periods / MOST_HAZARD)
     hazard = others / np.expm1(np.clip(others * left, 1e-9, 50.0))
-    # Of the slower pixels more are still waiting.
+    # More of the slower pixels are still waiting.
     waiting = weights[:, None] * np.maximum(1.0 - middle / periods, 1e-9)
     return np.concatenate([own, (waiting * hazard).sum(0) / waiting.sum(0)])
 
 
 @functools.cache
 def _nodes() -> tuple[Array, Array]:
-    """Normal numbers that stand for all, and their weights."""
+    """Quadrature nodes of a standard normal, and their weights."""
     from scipy import special
 
     nodes, weights = special.roots_hermite(5)
@@ -100,8 +102,8 @@ def _nodes() -> tuple[Array, Array]:
 
 
 def _likelihood(leaked: Array, on: Array, off: Array) -> tuple[Array, Array]:
-    """(G,) log probability of the events with so much leak (G, K), at the most probable m of each
-    time and ratio; and (2, G, K) ON and OFF events that are then expected."""
+    """(G,) log probability of the events for this much leak (G, K), at the most probable m at each
+    time and ratio; and (2, G, K) the expected ON and OFF events."""
     left = np.maximum(on.sum() - leaked.sum(1), 0.0)
     for _ in range(RATIO_STEPS):
         ratio = np.clip(left / (off.sum() + 0.5), *RATIOS)[:, None]
@@ -115,8 +117,8 @@ def _likelihood(leaked: Array, on: Array, off: Array) -> tuple[Array, Array]:
 
 
 def _strangeness(expected: Array, on: Array, off: Array) -> float:
-    """How many times more the events scatter about what is expected (2, K) than counts do; at
-    least 1."""
+    """Overdispersion: how much more the events scatter around the expected ones (2, K) than Poisson
+    counts; at least 1."""
     many = expected.min(0) > 5.0
     if not many.any():
         return 1.0

@@ -21,13 +21,13 @@ from evflow.types import Window
 
 Array = jax.Array
 
-SLOW_ERROR = 0.15  # of the network's thresholds, relative, where pixels are not ideal
+SLOW_ERROR = 0.15  # relative error of the network's thresholds if pixels are not ideal
 
 
 def by_flow(
     params: api.Params, windows: Iterable[Window], summary: Summary, summary_std: Summary
 ) -> tuple[Camera, Camera]:
-    """The windows' measurements by the flow together, beside the summary and the mismatch; the
+    """Combines the windows' measurements by the flow with the summary and the mismatch; the
     summary's own error, which all pixels share, is added to the std."""
     found: Evidence | None = None
     for window in windows:
@@ -44,8 +44,8 @@ def by_flow(
 def by_regression(
     evidence: PixelEvidence, summary: Summary, summary_std: Summary
 ) -> tuple[Camera, Camera]:
-    """Each pixel's thresholds from its regression on the path, beside the summary's noise rates;
-    the summary's own error, which all pixels share, is added to the std."""
+    """Each pixel's thresholds from its regression on the path, combined with the summary, and the
+    summary's noise rates; the summary's own error, which all pixels share, is added to the std."""
     theta, error = pixel_posterior(evidence, summary)
     shared = (float(summary_std.theta_on), float(summary_std.theta_off))
     on, off = (np.sqrt(e**2 + np.float32(s**2)) for e, s in zip(error, shared, strict=True))
@@ -63,8 +63,8 @@ def with_rates(
     camera: Camera, std: Camera, quiet: np.ndarray, hot: np.ndarray, summary: Summary,
     summary_std: Summary,
 ) -> tuple[Camera, Camera]:
-    """The maps with each pixel's noise rates from its quiet time: a window holds too little noise
-    of a pixel for the network to say more than the camera's."""
+    """The maps with each pixel's noise rates from its quiet time: a window contains too little
+    noise of a pixel for the network to improve on the camera's rate."""
     rates, errors = {}, {}
     law = threshold_law(quiet, np.stack([camera.theta_on, camera.theta_off]), hot)
     for name, (events, seconds), relative in zip(("eta_on", "eta_off"), quiet, law, strict=True):
@@ -86,8 +86,8 @@ def refined(
 
 
 def regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Summary]:
-    """The summary with the mean of its own and the pooled regression's thresholds, weighted by what
-    is known of each: the network knows few slow pixels, and a poor path says little."""
+    """The summary with its thresholds averaged with those of the pooled regression, weighted by
+    precision: the network knows few slow pixels, and a poor path determines little."""
     theta, error = found.thresholds()
     values, errors = {}, {}
     for name, other in zip(("theta_on", "theta_off"), theta, strict=True):
@@ -100,7 +100,7 @@ def regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Su
 
 
 def widened(summary: Summary, std: Summary, found: Found) -> Summary:
-    """The std with what not knowing the photoreceptor leaves open of the thresholds."""
+    """The std plus the uncertainty of the thresholds that the photoreceptor's leaves."""
     on, off = found.theta_error
     return dataclasses.replace(
         std, theta_on=jnp.hypot(std.theta_on, jnp.float32(on) * summary.theta_on),

@@ -1,4 +1,4 @@
-"""Polarities that tell nothing: what is said of their thresholds, and of the other's."""
+"""Fallback when one polarity has too few events to determine its threshold."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from evflow.network.pooling import Stats
 from evflow.training.config import PRESETS
 
 POLARITIES = ("on", "off")
-BEYOND_NOISE = 3.0  # standard deviations by which fewer events must exceed the noise to tell it
-UNREFINED = (0.5, 1.0)  # relative errors of theta, eta where nothing but the network tells them
+BEYOND_NOISE = 3.0  # standard deviations by which events must exceed the noise
+UNREFINED = (0.5, 1.0)  # relative errors of theta, eta from the network alone
 
 
 def untold(stats: Stats, summary: Summary) -> tuple[str, ...]:
-    """The polarities, of "on" and "off", whose events are not more than noise sends."""
+    """The polarities, "on" and "off", with no more events than noise explains."""
     found = []
     for name in POLARITIES:
         events = float(getattr(stats, f"events_{name}"))
@@ -33,9 +33,9 @@ def untold(stats: Stats, summary: Summary) -> tuple[str, ...]:
 def without(
     names: tuple[str, ...], chunks: list[Chunk], summary: Summary, std: Summary
 ) -> tuple[Summary, Summary]:
-    """The summary and its std with the prior's thresholds where nothing tells them. The other
-    polarity is what the chunks tell of it alone, unless the summary itself foresees that nothing
-    is told."""
+    """The summary and its std with the prior's thresholds for undetermined polarities. Re-estimates
+    the other polarity by itself, unless a high threshold in the summary already explains the
+    missing events."""
     known = {f"theta_{n}": _theta_prior() for n in names}
     for told, name in enumerate(POLARITIES):
         if name in names or (chunks and foreseen(chunks, summary, std, told)):

@@ -1,12 +1,12 @@
 """Whole recordings: stretches -> a state -> the camera.
 
-The windows are pooled: their `Stats` add up to the network's summary. What is between the frames
-is looked at stretch by stretch (refine/): some are simulated, to refine the summary, and the
+The windows are pooled: their `Stats` add up to the network's summary. The motion between frames is
+followed stretch by stretch (refine/): some stretches are simulated to refine the summary, and a
 regression on all of them gives each pixel's thresholds. The flow is not run. Only without a path
-between the frames (refine="off", or frames too small for optical flow) the flow estimates every
-pixel of every window, and the windows are fused by their precision. Noise rates are those of the
-quiet time, either way. A pixel that says nothing keeps the camera's summary, with a wide std.
-Of a long recording a part is read (reading.py).
+between the frames (refine="off", or frames too small for optical flow) does the flow estimate every
+pixel of every window, and the windows are fused by their precision. Noise rates come from the quiet
+time in either case. A pixel without information gets the camera's summary, with a wide std. Of a
+long recording only a part is read (reading.py).
 """
 
 from __future__ import annotations
@@ -51,31 +51,31 @@ def estimate_camera(
 ) -> CameraEstimate:
     """Measure a camera, pixel by pixel, from a recording with frames.
 
-    Of a scene that stands still, or without frames, the noise alone is measured. What usually goes
-    wrong with a recording is not looked for here: `check(recording).raise_if_failed()` before.
+    For a static scene, or without frames, only the noise is measured. Common faults of recordings
+    are not looked for: call `check(recording).raise_if_failed()` first.
 
     Args:
         recording_or_path: events and frames on one clock, or the path of a file that holds them.
-        params: of `load_weights`; None loads the released ones. Of the paper's network, which sees
-            pixels alone, the maps are the mean of its windows', which are shorter (25 ms at least),
-            and standard deviations NaN.
+        params: of `load_weights`; None loads the released ones. For the paper's network, which sees
+            pixels separately, the maps are the mean over windows, which are shorter (25 ms at
+            least), and standard deviations are NaN.
         refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .011).
-        pixel: "measured" looks for the photoreceptor and for what frames do not show; "ideal" takes
-            pixels and frames at their word.
-        effort: how much is read. "normal": of a long recording stretches that are spread over it,
-            until the errors stop shrinking or as many are read as take a minute for a DAVIS346;
-            "quick": a third of that; "full": everything. `.extent` of the result says how much it
-            was, and what more would bring. A short recording is read whole.
-        min_window_us: windows run from frame to frame until at least this long, microseconds.
+        pixel: "measured" measures the photoreceptor and the frames' offset; "ideal" assumes ideal
+            pixels and frames.
+        effort: how much is read. "normal": of a long recording, stretches spread over it, until the
+            errors stop shrinking or a minute's work is done (DAVIS346); "quick": a third of that;
+            "full": everything. `.extent` of the result says how much was read, and what more would
+            bring. A short recording is read whole.
+        min_window_us: minimum length of a window in microseconds; windows run from frame to frame.
         progress: progress(done, total) is called after every window and stretch.
         until: until(summary, std) is called after every stretch with the camera's summary so far
-            and its standard deviation, before refinement; where it returns True, no more is read.
+            and its standard deviation, before refinement; if it returns True, reading stops.
 
     Returns:
         The maps, their standard deviations, the camera's summary, and what to know about them.
 
     Raises:
-        EvflowDataError: EV001 (no events), EV011 (no frames, and no scene at rest), EV012 (no
+        EvflowDataError: EV001 (no events), EV011 (no frames, and the scene moves), EV012 (no
             overlap in time), EV017 (too little), EV018 (weights), EV020; also `read_recording`'s.
 
     Example:
@@ -87,8 +87,8 @@ def estimate_camera(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Measured:
-    """found: the camera. first: what was made of the recording's first part, to be tried on the
-    rest; None where nothing was read of it, or the recording is too short to be divided."""
+    """found: the camera. first: what was computed from the recording's first part, to be tested on
+    the rest; None if nothing was read of it, or the recording is too short to divide."""
 
     found: CameraEstimate
     first: First | None = None
@@ -100,7 +100,7 @@ def measure(
     effort: Effort = "normal", min_window_us: int = 40_000, progress: Progress | None = None,
     until: Until | None = None, stage: Stage = lambda _: None,
 ) -> Measured:
-    """`estimate_camera`, with what a report takes up. stage(name) is called when one begins."""
+    """`estimate_camera`, with what a report needs. stage(name) is called when one begins."""
     check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")),
                   effort=(effort, EFFORTS))
     recording = recording_or_path
@@ -155,7 +155,7 @@ def _unpooled(
 
 
 def read_whole(recording: Recording, params: api.Params) -> State:
-    """All of a recording with frames that can be used. Raises EV017 where there is none."""
+    """All usable windows of a recording with frames. Raises EV017 if there are none."""
     plan = plan_windows(recording)
     iter_windows(recording, plan=plan)
     stretches = cut(recording, plan)
@@ -167,15 +167,15 @@ def read_whole(recording: Recording, params: api.Params) -> State:
 
 
 def check_options(**options: tuple[str, Sequence[str]]) -> None:
-    """EV020 for a value that is none of those known."""
+    """Raise EV020 for a value that is not one of the known ones."""
     for name, (value, known) in options.items():
         if value not in known:
             raise EvflowDataError("EV020", f"{name}={value!r}.", f"Choose from {tuple(known)}.")
 
 
 class Steps:
-    """Counts what is done for `progress`: windows and stretches that are read, and windows that
-    are read again; where reading ends early, the rest at once."""
+    """Counts finished work for `progress`: windows and stretches that are read, and windows that
+    are read again; if reading stops early, the rest is counted at once."""
 
     def __init__(self, stretches: Sequence[Stretch], progress: Progress | None) -> None:
         windows = sum(len(s.windows) for s in stretches)
@@ -197,8 +197,8 @@ def _read(
     state: State, stretches: Sequence[Stretch], order: Order, effort: Effort,
     until: Until | None, steps: Steps, first: range,
 ) -> tuple[State, State, Extent]:
-    """The state with the stretches of the order, that with those of them in the first part, and
-    how much they are."""
+    """The state after the ordered stretches, the state after those of the first part, and how much
+    was read."""
     partial, early = len(order.numbers) < len(stretches), state
     history: list[tuple[int, float]] = []
     read: list[int] = []

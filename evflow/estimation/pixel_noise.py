@@ -1,10 +1,11 @@
-"""Each pixel's noise rate, beside the camera's: what the pixel sends while nothing happens near it.
+"""Each pixel's noise rate relative to the camera's: what the pixel sends while nothing happens near
+it.
 
-Over pixels the rates are gamma-distributed around the camera's, counts are Poisson: given the
-spread, the posterior of a pixel's rate is a gamma distribution again. The spread itself is what
-makes the counts of all pixels likely (a negative binomial), so that pixels differ by as much as
-the recording shows them to, and a short one leaves all of them at the camera's rate. Where it
-makes the counts likelier, rates go as one over the pixel's threshold, as v2e's shot noise does.
+Rates are gamma-distributed around the camera's over pixels, and counts are Poisson: given the
+spread, the posterior of a pixel's rate is again a gamma distribution. The spread itself is inferred
+from the counts of all pixels (a negative binomial), so pixels differ by as much as the recording
+supports, and a short one leaves all of them at the camera's rate. If it makes the counts likelier,
+rates are taken as inversely proportional to the pixel's threshold, as for v2e's shot noise.
 """
 
 from __future__ import annotations
@@ -14,27 +15,27 @@ import numpy as np
 
 Array = np.ndarray
 
-SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate over its mean
-SPREAD, SPREAD_ERROR = 0.05, 0.6  # expected before any data, and the std of its log
-NEGLIGIBLE = 1e-4  # probability of a spread that is left out
+SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate, relative to its mean
+SPREAD, SPREAD_ERROR = 0.05, 0.6  # prior median of the spread, and std of its log
+NEGLIGIBLE = 1e-4  # probability below which a spread is left out
 LEAST_THETA = 0.01  # log units: thresholds are clamped there
-LAW_ODDS = 5.0  # log odds that it takes to let rates follow the thresholds
-LAW_EVENTS = 100  # and events: a pixel's few also lower the threshold that is found for it
-SIGNAL = 0.5  # of the events of quiet pixels may be what is left of the signal
-PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it alone
+LAW_ODDS = 5.0  # log odds required to let rates follow the thresholds
+LAW_EVENTS = 100  # and events: few events of a pixel also lower its estimated threshold
+SIGNAL = 0.5  # maximum share of residual signal among the events of quiet pixels
+PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it only
 
-AROUND = 9  # pixels: side of the neighbourhood in which events are company
-CHANCE = 4.0  # standard deviations of the noise around a pixel, that it may have
-STILL = 0.05  # log units: of 3x3 pixels from frame to frame; less than any threshold of use
-DRIFT = 0.1  # log units per second, of 5x5 pixels: slower than a frame's noise, yet it sends events
+AROUND = 9  # pixels: side of the neighbourhood in which other events are counted
+CHANCE = 4.0  # standard deviations of noise allowed around a pixel
+STILL = 0.05  # log units: 3x3 pixels from frame to frame; less than any useful threshold
+DRIFT = 0.1  # log units per second, 5x5 pixels: below the frames' noise, but enough for events
 
 
 def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
-    """Rates (2, H, W), ON and OFF, relative to the camera's: 1, or as one over the thresholds
-    theta (2, H, W) where quiet (2, 2, H, W) of `quiet_time` makes that the likelier. Signal that
-    is left near what moves follows the thresholds too: noise that does not, and a share of SIGNAL,
-    must be the less likely as well, by LAW_EVENTS or more; and pixels of thresholds that no still
-    place reaches must say so too."""
+    """Rates (2, H, W), ON and OFF, relative to the camera's: 1, or inversely proportional to the
+    thresholds theta (2, H, W) if quiet (2, 2, H, W) from `quiet_time` makes that likelier. Residual
+    signal near moving objects follows the thresholds too: so noise that does not, mixed with a
+    share SIGNAL of it, must also be less likely, with at least LAW_EVENTS events; and pixels whose
+    threshold exceeds what calm places reach must agree."""
     watched = quiet[:, 1] * ~hot
     if (quiet[:, 0] * ~hot).sum() < LAW_EVENTS:
         return np.ones(theta.shape)
@@ -52,7 +53,7 @@ def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
 
 
 def _likelihood(events: Array, expected: Array, hot: Array) -> float:
-    """Log of the probability of events (H, W) that are expected in this proportion."""
+    """Log probability of events (H, W), given expected ones up to a common factor."""
     used = ~hot & (expected > 0)
     n, expected = events[used].astype(np.float64), expected[used].astype(np.float64)
     if not n.sum():
@@ -67,10 +68,10 @@ def pixel_rates(
 ) -> tuple[Array, Array]:
     """Noise rates (H, W) in Hz and their std, around the camera's, which is rate_hz.
 
-    events (H, W): sent in the seconds (H, W) for which the pixel was watched, 0 for never. Pixels
-    are compared with each other, so that what few events are not noise cancel. hot (H, W) bool:
-    pixels unlike the others, whose rates follow from their own events alone. relative (H, W):
-    rates expected before, of `threshold_law`.
+    events (H, W): sent in the seconds (H, W) for which the pixel was observed, 0 for never. Pixels
+    are compared with each other, so residual signal, common to all pixels, cancels. hot (H, W)
+    bool: pixels unlike the others, whose rates follow from their own events alone. relative (H, W):
+    rates expected a priori, from `threshold_law`.
     """
     n, seconds = events.astype(np.float64), np.asarray(seconds, np.float64)
     law, seconds = np.broadcast_to(relative, n.shape), seconds * relative
@@ -89,7 +90,7 @@ def pixel_rates(
 
 
 def _shapes(n: Array, expected: Array) -> tuple[Array, Array]:
-    """Shapes of the gamma distribution, and how probable the counts (N,) make each."""
+    """Shapes of the gamma distribution, and their probabilities given the counts (N,)."""
     shapes, log_p = SPREADS**-2.0, _log_shapes(n, expected)
     weights = np.exp(log_p - log_p.max())
     weights /= weights.sum()
@@ -98,7 +99,7 @@ def _shapes(n: Array, expected: Array) -> tuple[Array, Array]:
 
 
 def _log_shapes(n: Array, expected: Array) -> Array:
-    """Log probability of the counts (N,) and of each spread, but for what all share."""
+    """Log probability of the counts (N,) for each spread, up to a constant."""
     shapes = SPREADS**-2.0
     above = np.bincount(n.astype(np.int64), minlength=1)[::-1].cumsum()[::-1][1:]
     k = np.arange(len(above))  # `above`: how many pixels sent more than k
@@ -112,12 +113,12 @@ def quiet_time(
     counts: Array, dlog: Array, seen: Array, hot: Array, seconds: float, rates: Array
 ) -> Array:
     """(2, 2, H, W) float32, ON and OFF: events of pixels around which nothing happens in a window
-    between two frames, and the seconds for which they were watched.
+    between two frames, and the seconds for which they were observed.
 
     counts (2, H, W): ON and OFF events; dlog (H, W): change of log intensity; seen (H, W) bool:
-    where the frames show what the pixel saw; rates (2,): the camera's noise in Hz, whose events
-    are no company, nor are those of hot (H, W) pixels. A pixel's own events do not enter the
-    choice, so that what it sends is a fair sample.
+    where the frames show what the pixel saw; rates (2,): the camera's noise in Hz, which does not
+    count as activity, nor do events of hot (H, W) pixels. A pixel's own events do not affect
+    whether it is selected, so that its noise is sampled without bias.
     """
     still = _still(dlog, seen, seconds)
     found = []
@@ -131,15 +132,16 @@ def quiet_time(
 def calm(
     counts: Array, dlog: Array, seen: Array, hot: Array, seconds: float, rates: Array
 ) -> Array:
-    """(H, W) bool: pixels around which no more happens in a window than noise may send. Arguments
-    as of `quiet_time`, which takes those with less than usual: of many windows in a row none is."""
+    """(H, W) bool: pixels around which no more happens in a window than noise explains. Arguments
+    as for `quiet_time`, which takes those with less than usual: of many successive windows none
+    is."""
     expected = float(np.sum(rates)) * seconds * AROUND**2
     near = _company(counts.sum(0), hot)
     return _still(dlog, seen, seconds) & ~hot & (near < expected + CHANCE * np.sqrt(expected) + 1.5)
 
 
 def _still(dlog: Array, seen: Array, seconds: float) -> Array:
-    """(H, W) bool: where the frames show no change."""
+    """(H, W) bool: where the frames do not change."""
     change = np.ascontiguousarray(np.abs(dlog), np.float32)
     still = seen & (cv2.dilate(change, np.ones((3, 3), np.uint8)) < STILL)
     drift = np.abs(cv2.blur(np.ascontiguousarray(dlog, np.float32), (5, 5)))
@@ -147,7 +149,7 @@ def _still(dlog: Array, seen: Array, seconds: float) -> Array:
 
 
 def _company(own: Array, hot: Array) -> Array:
-    """Events (H, W) around each pixel, its own and those of hot ones left out."""
+    """Events (H, W) around each pixel, without its own and those of hot ones."""
     others = np.where(hot, 0, own).astype(np.float32)
     return cv2.boxFilter(others, -1, (AROUND, AROUND), normalize=False,
                          borderType=cv2.BORDER_CONSTANT) - others

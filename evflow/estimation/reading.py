@@ -1,8 +1,8 @@
 """Which stretches of a recording are read, in which order, and when that is enough.
 
-A camera does not change, so a part of a long recording tells it: stretches spread over the time,
-of each part that in which most happens where little is known yet, until the errors stop shrinking
-or a budget is spent. What fits into the budget is read whole, in order.
+A camera does not change, so part of a long recording determines it: stretches spread over the time,
+chosen in each part where most happens at little-known pixels, until the errors stop shrinking or a
+budget is spent. What fits into the budget is read whole, in order.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ Effort = Literal["quick", "normal", "full"]
 EFFORTS = ("quick", "normal", "full")
 
 UNIT = INTERVALS * PART[0] * PART[1]  # pixels of a stretch of a DAVIS346
-LONG_S, MOST_LONGER = 30.0, 2.0  # of longer recordings more is read, by the root of their length
-MOST_LARGER = 2.0  # of larger sensors too: their pixels are known from fewer events
-CELL, SAMPLE = 16, 16  # pixels; every 16th event is counted to choose
-SATURATED = 4.0  # events of a pixel, beyond which more say little
-BATCH = 4  # stretches between two looks at the errors
-SIMULATED = 5  # stretches, of many: what they leave of the camera's error is the model's own
+LONG_S, MOST_LONGER = 30.0, 2.0  # longer recordings: budget grows as the root of their length
+MOST_LARGER = 2.0  # also for larger sensors: fewer events per pixel are enough
+CELL, SAMPLE = 16, 16  # pixels; stride of the events counted for the choice
+SATURATED = 4.0  # events per pixel beyond which more add little
+BATCH = 4  # stretches between two evaluations of the errors
+SIMULATED = 5  # stretches, of many: beyond this the model's own error dominates
 
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """most: how many stretches of a DAVIS346 are read; enough: share by which the errors would
-    shrink with twice as much, below which no more is read."""
+    """most: number of stretches of a DAVIS346 to read; enough: stop when reading twice as much
+    would reduce the errors by less than this share."""
 
     most: int
     enough: float
@@ -43,8 +43,8 @@ BUDGETS = {"quick": Budget(6, 0.1), "normal": Budget(18, 0.03)}
 
 @dataclasses.dataclass(frozen=True)
 class Order:
-    """numbers: of the stretches that are read, in this order; simulated: those of them that the
-    refinement simulates; every: which of a stretch's windows are pooled."""
+    """numbers: of the stretches to read, in this order; simulated: those that the refinement
+    simulates; every: which of a stretch's windows are pooled."""
 
     numbers: tuple[int, ...]
     simulated: frozenset[int]
@@ -52,7 +52,7 @@ class Order:
 
 
 def ordered(stretches: Sequence[Stretch], effort: Effort) -> Order:
-    """What is read of a recording's stretches, which are in time order."""
+    """What to read of a recording's stretches, which are in time order."""
     recording = stretches[0].recording
     most = most_simulated(recording.events.size)
     lengths = [max(len(s.run), len(s.windows)) for s in stretches]
@@ -67,7 +67,7 @@ def ordered(stretches: Sequence[Stretch], effort: Effort) -> Order:
 
 
 def _affordable(stretches: Sequence[Stretch], lengths: list[int], effort: Effort) -> int:
-    """How many stretches the budget is for."""
+    """How many stretches the budget allows."""
     recording = stretches[0].recording
     width, height = recording.events.size
     begin, end = stretches[0].span_us[0], stretches[-1].span_us[1]
@@ -78,8 +78,8 @@ def _affordable(stretches: Sequence[Stretch], lengths: list[int], effort: Effort
 
 
 def _chosen(stretches: Sequence[Stretch], number: int) -> list[int]:
-    """Numbers of stretches: one of each of as many equal parts, in an order of which any beginning
-    is spread over the whole."""
+    """Numbers of stretches: one from each of `number` equal parts, ordered so that any prefix is
+    spread over the whole."""
     edges = np.linspace(0, len(stretches), number + 1).astype(int)
     longest = max(len(s.run) for s in stretches)
     known: Array | float = 0.0
@@ -94,12 +94,12 @@ def _chosen(stretches: Sequence[Stretch], number: int) -> list[int]:
 
 
 def _value(counts: Array) -> Array:
-    """What so many events of a pixel are worth."""
+    """The value of so many events of a pixel."""
     return np.log1p(counts / SATURATED)
 
 
 def _cells(stretch: Stretch) -> Array:
-    """Events per pixel of a stretch, in cells of pixels, by a sample."""
+    """Events per pixel of a stretch, in cells of pixels, estimated from a sample."""
     events = stretch.recording.events
     width, height = events.size
     part = events.slice(*stretch.span_us)
@@ -110,7 +110,7 @@ def _cells(stretch: Stretch) -> Array:
 
 
 def _spreading(number: int) -> list[int]:
-    """0 ... number - 1, so that any beginning of it is spread (van der Corput)."""
+    """0 ... number - 1 in an order whose prefixes are evenly spread (van der Corput)."""
     def mirrored(i: int) -> float:
         place, scale = 0.0, 0.5
         while i:
@@ -122,8 +122,8 @@ def _spreading(number: int) -> list[int]:
 
 
 def gain(history: Sequence[tuple[int, float]]) -> float:
-    """Share by which errors would shrink with twice as much. history: (stretches, variance) so
-    far; a variance is a / stretches + b. NaN of fewer than two."""
+    """Relative reduction of the errors with twice as much data. history: (stretches, variance) so
+    far; the variance is modelled as a / stretches + b. NaN for fewer than two."""
     if len(history) < 2:
         return float("nan")
     n, now = history[-1]

@@ -1,4 +1,4 @@
-"""What to know about an estimate: notes on its pixels, its thresholds and what its pixels see."""
+"""Notes on an estimate: on its pixels, its thresholds, and what its pixels see."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def camera_notes(
 ) -> list[Note]:
     found = []
     for name, mask, what in (
-        ("hot", hot, "they fire while nothing moves, and were left out of the refinement."),
+        ("hot", hot, "they fire while nothing moves and were left out of the refinement."),
         ("dead", dead, "they never fire while all around them do; the maps show the camera's "
          "summary there."),
     ):
@@ -35,9 +35,9 @@ def camera_notes(
         theta = float(getattr(summary, f"theta_{name}"))
         if name in unknown:
             found.append(Note(
-                f"theta_{name}.undetermined", f"only {int(events)} {name.upper()} events, as noise "
-                f"sends: theta_{name} is undetermined, its value is the prior's, and the other "
-                "threshold was measured alone, less precisely."))
+                f"theta_{name}.undetermined", f"only {int(events)} {name.upper()} events, no more "
+                f"than noise: theta_{name} is undetermined and has the prior's value; the other "
+                "threshold was measured by itself, less precisely."))
         elif float(events) < FEW_EVENTS:
             found.append(Note(
                 f"theta_{name}.uncertain",
@@ -45,8 +45,8 @@ def camera_notes(
         elif not low <= theta <= high:
             found.append(Note(
                 f"theta_{name}.extrapolated", f"theta_{name} = {theta:.3f} lies outside the "
-                f"{low}-{high} that the network was trained on: an extrapolation. Frames with a "
-                "gamma or an offset stretch the scale."))
+                f"network's training range {low}-{high}: an extrapolation. A gamma or an offset of "
+                "the frames has this effect."))
     active = float((n_events >= VALID_EVENTS).mean())
     if active < ACTIVE_SHARE:
         found.append(Note(
@@ -58,23 +58,23 @@ def camera_notes(
 def receptor_notes(found: Found | None) -> list[Note]:
     if found is None:
         return []
-    notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be seen: it is "
-                  f"above {found.least_cutoff_hz:.0f} Hz at 255 DN.")]
+    notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be measured: it "
+                  f"is above {found.least_cutoff_hz:.0f} Hz at 255 DN.")]
     if found.sensor[0].cutoff_hz:
-        notes = [Note("pixels.slow", "the thresholds are those of the light behind the "
+        notes = [Note("pixels.slow", "the thresholds refer to light filtered by the "
                       "photoreceptor's low-pass"
-                      + ("" if found.seen.by_light else ", as fast in the dark as in light")
-                      + "; without it they come out otherwise where things move fast.")]
+                      + ("" if found.seen.by_light else ", equally fast in dark and bright light")
+                      + "; ignoring it would change them where things move fast.")]
     optics = found.optics
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
         notes.append(Note(
             "frames.light", f"pixels see {abs(optics.offset_dn):.0f} DN {more} light than the "
-            "frames show (dark current, black level): thresholds are those of that light. A gamma "
-            "of the frames cannot be told from one recording."))
+            "frames show (dark current, black level): the thresholds refer to that light. A gamma "
+            "of the frames cannot be recognised in a single recording."))
     return notes
 
 
 def noise_notes(shot: Shot) -> list[Note]:
     return [Note("noise.even", "the noise does not fall with light as v2e's shot noise does: "
-                 "simulations have as much of it everywhere.")] if shot.even else []
+                 "simulations have the same noise at any light.")] if shot.even else []

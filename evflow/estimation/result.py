@@ -1,4 +1,4 @@
-"""What an estimate gives: maps with their errors, the camera's summary, and what to know."""
+"""The result of an estimate: maps with errors, the camera's summary, and notes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.refine.receptor_search import Found
 from evflow.notes import Note, as_dicts
 
-THRESHOLDS = ("theta_on", "theta_off")  # of whose measurement `undetermined` speaks
+THRESHOLDS = ("theta_on", "theta_off")  # possible entries of `undetermined`
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -28,7 +28,7 @@ class CameraEstimate:
 
     Attributes:
         camera: maps (H, W), theta in natural-log units, eta in Hz.
-        std: their standard deviations, in the same units; NaN of weights that tell none.
+        std: their standard deviations, in the same units; NaN for weights that estimate none.
         summary: the camera's medians, noise rates and mismatch, scalars.
         summary_std: their standard deviations.
         valid: (H, W) bool, pixels that are not hot and have at least 3 events in the windows used,
@@ -36,22 +36,22 @@ class CameraEstimate:
         n_events: (H, W) uint32, events in the windows used.
         hot: (H, W) bool, pixels that fire while nothing moves.
         dead: (H, W) bool, pixels that never fire while those around them do.
-        windows: how many windows were used; 0 of a static scene.
+        windows: number of windows used; 0 for a static scene.
         notes: what to know before trusting it.
-        undetermined: those of `THRESHOLDS` that the recording does not tell: their values, and
-            widths, are the prior's.
-        sensor: the pixel circuit as far as it was measured: cutoff_hz, 0 where the photoreceptor
-            is too fast to be seen, and cutoff_by_light; refractory_s, 0 where too few pixels
-            change that fast; leak_hz and shot_hz, both parts of the camera's eta, 0 where fewer
-            than 200 such events tell.
+        undetermined: those of `THRESHOLDS` that the recording does not determine: their values and
+            widths are the prior's.
+        sensor: the pixel circuit as far as it was measured: cutoff_hz, 0 if the photoreceptor is
+            too fast to be measured, and cutoff_by_light; refractory_s, 0 if too few pixels change
+            that fast; leak_hz and shot_hz, both part of the camera's eta, 0 if there are fewer
+            than 200 such events.
         sensor_std: its standard deviations by field, NaN where nothing was measured.
-        optics: what the frames show beside what the pixels saw.
+        optics: how the frames relate to the light on the pixels: offset and delay.
         receptor: how both were found: the search for the photoreceptor and what it explains; None
-            where nothing was looked for.
+            if nothing was searched for.
         extent: how much of the recording was read, and what more would bring.
-        thirds: thresholds of the three thirds of the recording, where it is long enough to tell:
-            whether the camera stayed the same.
-        bench: of a bench, its levels of light: noise and speed at each; None of other recordings.
+        thirds: thresholds of the three thirds of the recording, if it is long enough: whether the
+            camera stayed the same.
+        bench: for a bench, its light levels: noise and speed at each; None for other recordings.
     """
 
     camera: Camera
@@ -82,8 +82,8 @@ class CameraEstimate:
         return f"CameraEstimate({width}x{height}{values}, {len(self.notes)} notes)"
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
-        """Write camera.npz: theta_on ..., theta_on_std ... (where told), valid, n_events, hot,
-        dead, and the scalars of `camera.optics`: summary, circuit, frames.
+        """Write camera.npz: theta_on ..., theta_on_std ... (if known), valid, n_events, hot, dead,
+        and the scalars of `camera.optics`: summary, circuit, frames.
 
         Args:
             path: of the file; `Camera.load` reads it.

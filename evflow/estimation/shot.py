@@ -1,7 +1,8 @@
-"""Shot noise against light: how much of it a pixel would send in the dark.
+"""Shot noise against light: how much of it a pixel would have in the dark.
 
-v2e's goes as 1 - .75 I01, from a tenth less than in the dark to a quarter (R/2 of each polarity,
-`shot_hz` R). Events of quiet pixels, by the light that they see, tell whether a camera's does.
+v2e's is proportional to 1 - .75 I01, from a tenth below the dark value to a quarter of it (R/2 for
+each polarity, `shot_hz` R). Events of quiet pixels, by the light they see, show whether a camera's
+is.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from evflow.light.log_maps import noise_factor, normalised_intensity
 
 Array = np.ndarray
 
-LIGHTS = 8  # steps of I01
+LIGHTS = 8  # bins of I01
 LEAST_EVENTS = 200.0
-ODDS = 3.0  # log odds that it takes to say whether noise follows light
-UNSURE = 0.25  # relative error of shot_hz where neither is said
+ODDS = 3.0  # log odds required to decide whether noise depends on light
+UNSURE = 0.25  # relative error of shot_hz if undecided
 
 
 @dataclasses.dataclass(frozen=True)
 class Shot:
-    """hz, std_hz: v2e's rate in the dark, both polarities; 0 and NaN where it is not told. even:
-    enough events say that the noise does not fall with light as v2e's does; falls: that it does."""
+    """hz, std_hz: v2e's rate in the dark, both polarities; 0 and NaN if undetermined. even: enough
+    events show that the noise does not fall with light as v2e's does; falls: that it does."""
 
     hz: float = 0.0
     std_hz: float = float("nan")
@@ -35,8 +36,8 @@ class Shot:
 
 
 def by_light(quiet: Array, dn: Array, hot: Array) -> Array:
-    """(2, 3, LIGHTS), ON and OFF: events, seconds and seconds times `noise_factor` of pixels, by
-    the light dn (H, W) that they see; quiet (2, 2, H, W): their events and seconds."""
+    """(2, 3, LIGHTS), ON and OFF: events, seconds, and seconds times `noise_factor` of pixels, by
+    the light dn (H, W) they see; quiet (2, 2, H, W): their events and seconds."""
     i01 = normalised_intensity(np.clip(dn, 0.0, 255.0)[~hot].astype(np.float64))
     step = np.minimum((i01 * LIGHTS).astype(np.int64), LIGHTS - 1)
     factor = noise_factor(i01)
@@ -45,7 +46,7 @@ def by_light(quiet: Array, dn: Array, hot: Array) -> Array:
 
 
 def scatter(quiet: Array, hot: Array) -> float:
-    """How much more than counts the events (2, 2, H, W) of quiet pixels scatter; at least 1."""
+    """Overdispersion of the events (2, 2, H, W) of quiet pixels; at least 1."""
     events, seconds = quiet[:, 0][:, ~hot], quiet[:, 1][:, ~hot]
     rate = events.sum(1) / np.maximum(seconds.sum(1), 1e-9)
     expected = rate[:, None] * seconds
@@ -55,16 +56,16 @@ def scatter(quiet: Array, hot: Array) -> float:
 def measured_noise(
     sensor: SensorModel, std: Mapping[str, float], leak: Leak, shot: Shot
 ) -> tuple[SensorModel, dict[str, float]]:
-    """A circuit with what was measured of its noise, all of which is the camera's eta, and the
+    """A circuit with the measured parts of its noise, which add up to the camera's eta, and the
     standard deviations."""
     return (dataclasses.replace(sensor, leak_hz=leak.hz, shot_hz=shot.hz, eta_is_all=True),
             {**std, "leak_hz": leak.std_hz, "shot_hz": shot.std_hz})
 
 
 def measured_shot(light: Array, leak_hz: float, scattered: float, error: float = 0.0) -> Shot:
-    """v2e's shot noise, from events by light (2, 3, LIGHTS). leak_hz: ON events of another kind,
-    in any light; scattered: of `scatter`; error: relative, of the events, as where signal may be
-    among them."""
+    """v2e's shot noise, from events by light (2, 3, LIGHTS). leak_hz: ON events from leak, at any
+    light; scattered: from `scatter`; error: relative, of the events, e.g. for residual signal among
+    them."""
     events, seconds, falling = np.moveaxis(light, 1, 0)
     leaked = np.stack([leak_hz * seconds[0], np.zeros(LIGHTS)])
     noise = np.maximum(events.sum(1) - leaked.sum(1), 0.0)
@@ -74,7 +75,7 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     for side, (n, other, sent, shapes) in enumerate(zip(
             events, leaked, noise, zip(falling, seconds, strict=True), strict=True)):
         if side == 0 and not leak_hz:
-            continue  # there may be leak among ON noise, which is as much in any light
+            continue  # ON noise may contain leak, which does not depend on light
         likely = []
         for shape in shapes:
             expected = np.maximum(sent * shape / shape.sum() + other, 1e-12)
@@ -83,7 +84,7 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     if odds < -ODDS:
         return Shot(even=True)
     halves = noise / np.maximum(falling.sum(1), 1e-9)
-    excess = 0.0 if leak_hz else max(float(halves[0] - halves[1]), 0.0)  # of ON: leak, or not
+    excess = 0.0 if leak_hz else max(float(halves[0] - halves[1]), 0.0)  # of ON: maybe leak
     hz = float(halves.sum()) - excess
     relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2
                        + (0.5 * excess / max(hz, 1e-9)) ** 2)
@@ -93,10 +94,10 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
 def at_mean_light(
     eta: Array, std: Array, light: Array, leak_hz: float, factor: float, error: float
 ) -> tuple[Array, Array]:
-    """Noise rates (2,) in Hz of a camera whose shot noise falls with light, and their std: events
-    of quiet places, which may be darker or brighter than others, at the light of all.
+    """Noise rates (2,) in Hz of a camera whose shot noise falls with light, and their std: corrects
+    for quiet places being darker or brighter than the rest.
 
-    eta, std (2,): rates that were found without; light (2, 3, LIGHTS), leak_hz, error: as in
+    eta, std (2,): rates before correction; light (2, 3, LIGHTS), leak_hz, error: as in
     `measured_shot`; factor: mean of `noise_factor` over pixels and time."""
     events, seconds, falling = np.maximum(light.sum(-1), 1e-9).T
     leaked = leak_hz * np.array([1.0, 0.0])

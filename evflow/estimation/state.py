@@ -1,9 +1,9 @@
-"""What has been read of a camera so far, as a value, and the two things to do with it: `add` a
-stretch, and `estimate` the camera.
+"""What has been read of a camera so far, as a value, and the two operations on it: `add` a stretch,
+and `estimate` the camera.
 
 Everything in a `State` is a sum over what was read, or bounded by the size of the sensor: maps of
-evidence, and the few stretches that are simulated. Only references to what was read grow, to
-count the quiet time at the end; `thinned` bounds these.
+evidence, and the few stretches that are simulated. Only references to what was read grow, for
+counting the quiet time at the end; `thinned` bounds these.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ Array = np.ndarray
 Advance = Callable[[], None]
 Stage = Callable[[str], None]
 
-MOST_EVENTS = 16_000_000  # in which the dead time is looked for, the first
-SIGNAL_ERROR = 0.1  # relative, of noise rates where something moves: what is left of the signal
+MOST_EVENTS = 16_000_000  # used to look for the dead time, from the start
+SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual signal
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Eyes:
-    """What the pixels see the frames by, how noisy these are, DN, and how long pixels rest: found
+    """How the pixels see what the frames show, the frames' noise in DN, and the dead time: measured
     before anything else is read, as all evidence depends on it. films: of stretches to be read."""
 
     seen_by: Photoreceptor = IDEAL
@@ -71,9 +71,8 @@ class Eyes:
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
     """params: of the network. stats, n_events, n_shown (H, W), evidence, quiet (4, H, W): sums over
-    all that was read; chunks: the stretches that are simulated; read: the stretches whose quiet
-    time is counted at the end; windows, seconds: how many were read; parts: of each stretch, what
-    drift.py compares."""
+    all that was read; chunks: stretches to simulate; read: stretches whose quiet time is counted at
+    the end; windows, seconds: amounts read; parts: of each stretch, what drift.py compares."""
 
     params: api.Params
     eyes: Eyes
@@ -89,7 +88,7 @@ class State:
     parts: tuple[drift.Part, ...] = ()
 
     def __add__(self, more: State) -> State:
-        """This and what was read after it, by the same eyes."""
+        """The sum of this and of what was read after it, with the same eyes."""
         def total(one: Any, other: Any) -> Any:
             return other if one is None else one if other is None else one + other
 
@@ -99,7 +98,7 @@ class State:
 
 
 def looked_through(stretches: Sequence[Stretch], *, measured: bool) -> Eyes:
-    """The eyes of a camera, from some of its stretches. measured: False takes pixels for ideal."""
+    """The eyes of a camera, from some of its stretches. measured: False assumes ideal pixels."""
     dead = dead_time(first_events(max((s.recording.events for s in stretches), key=len)))
     runs = [(s.recording, s.run) for s in stretches if s.run]
     if not runs:
@@ -112,7 +111,7 @@ def looked_through(stretches: Sequence[Stretch], *, measured: bool) -> Eyes:
 
 
 def first_events(events: Events) -> Events:
-    """The first MOST_EVENTS of them."""
+    """The first MOST_EVENTS events."""
     if len(events) <= MOST_EVENTS:
         return events
     return events.slice(int(events.t[0]), int(events.t[MOST_EVENTS]))
@@ -122,7 +121,7 @@ def add(
     state: State, stretch: Stretch, *, simulate: bool, every: int = 1,
     advance: Advance = lambda: None,
 ) -> State:
-    """The state with one more stretch; `look` says of what."""
+    """The state with one more stretch; arguments as for `look`."""
     return state + look(state, stretch, simulate=simulate, every=every, advance=advance)
 
 
@@ -130,9 +129,9 @@ def look(
     state: State, stretch: Stretch, *, simulate: bool, every: int = 1,
     advance: Advance = lambda: None,
 ) -> State:
-    """What a stretch alone says, seen by a state's eyes. simulate: whether it is one of those that
-    the refinement simulates; every: which of its windows are pooled, each one, or each second;
-    advance() is called after every window, and after the stretch."""
+    """The evidence of a single stretch, with a state's eyes. simulate: whether the refinement
+    simulates it; every: which of its windows are pooled (each, or every second); advance() is
+    called after every window, and after the stretch."""
     give_back()
     stats, n_events, n_shown = None, np.zeros(()), np.zeros(())
     for number, window in enumerate(_windows([stretch])):
@@ -157,7 +156,7 @@ def look(
 
 
 def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
-    """The state with what the path between a stretch's frames tells, and no windows."""
+    """The state with the evidence from the path between a stretch's frames, without windows."""
     place, seen_by = (stretch.recording, stretch.run), state.eyes.seen_by
     chunk = make_chunk(*place, STEPS, seen_by, state.eyes.noise_dn, first=stretch.first,
                        film=state.eyes.films.pop(of_place(*place), None))
@@ -170,7 +169,7 @@ def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
 
 
 def glance(state: State) -> tuple[Summary, Summary]:
-    """The camera's summary so far and its std, before any refinement: of no cost."""
+    """The camera's summary so far and its std, before any refinement; takes no time."""
     assert state.stats is not None
     summary, std = api.finish(state.params, state.stats)
     found = state.eyes.found
@@ -182,7 +181,7 @@ def glance(state: State) -> tuple[Summary, Summary]:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Refined:
     """hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera, before
-    refine/doubt.py; signs: what that goes by, None where nothing was looked for on the path."""
+    refine/doubt.py; signs: the input of that, None if nothing was searched for on the path."""
 
     hot: Array
     chunks: tuple[Chunk, ...]
@@ -192,7 +191,7 @@ class Refined:
 
 
 def refine(state: State) -> Refined:
-    """The camera's summary by simulation and regression, where there is a path between frames."""
+    """The camera's summary by simulation and regression, if there is a path between frames."""
     summary, std = glance(state)
     hot = np.zeros(np.shape(state.n_events), bool)
     if state.evidence is None or state.quiet is None:
@@ -215,9 +214,9 @@ def estimate(
     state: State, *, extent: Extent | None = None, before: Sequence[Note] = (),
     after: Sequence[Note] = (), advance: Advance = lambda: None, stage: Stage = lambda _: None,
 ) -> CameraEstimate:
-    """The camera, of all that was read. extent: how much that is; before, after: notes on how it
-    was read, beside its own; advance() is called after every window that is read again, stage()
-    with the name of what begins."""
+    """The camera, from all that was read. extent: how much that is; before, after: notes on
+    reading, placed around its own; advance() is called after every window that is read again,
+    stage() with the name of each stage."""
     assert state.stats is not None
     need_shown(state.n_events, state.n_shown)
     stage("refining")
@@ -297,8 +296,8 @@ def _told(windows: Iterator[Window], advance: Advance) -> Iterator[Window]:
 
 
 def thinned(state: State, chunks: int, read: int) -> State:
-    """The state with each second of its simulated stretches where there are as many as `chunks`,
-    and likewise of those whose quiet time is counted, `read`."""
+    """The state with every second simulated stretch dropped if there are `chunks` of them, and
+    likewise for the stretches whose quiet time is counted, `read`."""
     return dataclasses.replace(
         state, chunks=state.chunks[::2] if 1 < chunks <= len(state.chunks) else state.chunks,
         read=state.read[::2] if len(state.read) >= read else state.read)

@@ -1,6 +1,6 @@
 """A camera's noise from a static scene: rates per pixel, thresholds unknown.
 
-Whether it is static the events themselves tell (recordings/stillness.py).
+Whether the scene is static is decided from the events (recordings/stillness.py).
 """
 
 from __future__ import annotations
@@ -32,11 +32,10 @@ def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraE
     """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
 
     A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
-    over pixels that are not hot. Thresholds are those of the prior that the
-    network was trained on, with its width; `valid` is False everywhere. lux: the illuminance, for
-    `.bench`, which `noise_over_light` joins. Of its kinds, leak is told by its intervals, shot
-    noise where frames show the light.
-    Raises EV011 (with frames: EV017) where the scene moves, or is too short to tell.
+    over pixels that are not hot. Thresholds are those of the network's training prior, with its
+    width; `valid` is False everywhere. lux: the illuminance, for `.bench`, which `noise_over_light`
+    joins. Leak is identified by its intervals, shot noise if frames show the light. Raises EV011
+    (EV017 with frames) if the scene moves, or the recording is too short to decide.
     """
     events = recording.events
     counts = events.count_map()
@@ -70,7 +69,7 @@ def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraE
 
 
 def _kinds(recording: Recording, counts: np.ndarray, hot: np.ndarray) -> tuple[Leak, Shot]:
-    """Leak, and, where frames show the light, shot noise."""
+    """Leak and, if frames show the light, shot noise."""
     events, begin = recording.events, int(recording.events.t[0])
     if recording.has_frames:
         begin = min(begin, int(recording.frame_times[0]))
@@ -84,19 +83,19 @@ def _kinds(recording: Recording, counts: np.ndarray, hot: np.ndarray) -> tuple[L
 
 
 def noise_over_light(found: Sequence[CameraEstimate]) -> CameraEstimate:
-    """The first of several estimates of one camera's noise, each with its lux, whose `.bench` has
-    the levels of all; EV015 where they are of different sizes."""
+    """The first of several estimates of one camera's noise, each with its lux; `.bench` has the
+    levels of all. EV015 if their sizes differ."""
     sizes = {f.camera.shape for f in found}
     if len(sizes) > 1:
         raise EvflowDataError("EV015", f"recordings of cameras of different sizes: {sizes}.",
-                              "Noise against illuminance is that of one camera.")
+                              "Noise against illuminance needs recordings of one camera.")
     levels = [level for f in found if f.bench for level in f.bench.levels]
     return dataclasses.replace(
         found[0], bench=Bench("lux", tuple(sorted(levels, key=lambda v: v.light))))
 
 
 def uniform(bounds: tuple[float, float]) -> tuple[float, float]:
-    """Mean and standard deviation of a prior between bounds: of what nothing was measured."""
+    """Mean and standard deviation of a uniform prior, for what was not measured."""
     return 0.5 * sum(bounds), (bounds[1] - bounds[0]) / float(np.sqrt(12.0))
 
 
@@ -105,18 +104,18 @@ def _require_static(recording: Recording, hot: np.ndarray) -> None:
     if reason:
         raise EvflowDataError(
             "EV017" if recording.has_frames else "EV011",
-            f"events alone tell the noise of a scene at rest only, and {reason}",
+            f"without using frames only the noise of a static scene can be measured, and {reason}",
             ("It has frames: measure its thresholds too (--protocol motion). " if
-             recording.has_frames else "Thresholds are measured against intensity: give frames, "
+             recording.has_frames else "Thresholds are measured against intensity: provide frames, "
              "--frames DIR --timestamps FILE. ") +
-            "The noise alone needs some seconds of a static scene.")
+            "To measure only noise, record some seconds of a static scene.")
 
 
 def _rates(
     counts: np.ndarray, hot: np.ndarray, seconds: float
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Rates (H, W) of one polarity in Hz and their std, the mean of the others than hot pixels
-    and its std."""
+    """Rates (H, W) of one polarity in Hz and their std; and the mean over pixels that are not hot
+    with its std."""
     normal = counts[~hot].astype(np.float64)
     mean, variance, least = float(normal.mean()), float(normal.var()), 1.0 / normal.size
     rate, error = pixel_rates(
@@ -128,11 +127,11 @@ def _rates(
 def _notes(hot: np.ndarray, total: np.ndarray, frames: bool) -> tuple[Note, ...]:
     code, why = (("scene.static", "nothing moves in frames and events") if frames else
                  ("frames.none", "no frames"))
-    found = [Note(code, f"{why}: theta_on and theta_off are undetermined, their values are the "
-                  "prior's; the noise rates are those of a static scene.")]
+    found = [Note(code, f"{why}: theta_on and theta_off are undetermined and have the "
+                  "prior's values; the noise rates are those of a static scene.")]
     if hot.any():
         share = float(total[hot].sum()) / float(total.sum())
         y, x = np.unravel_index(int(np.argmax(np.where(hot, total, 0))), total.shape)
         found.append(Note("pixels.hot", f"{hot.sum()} hot pixels send {share:.0%} of the events, "
-                          f"most of them x={x}, y={y}: left out of the summary."))
+                          f"most of them x={x}, y={y}; they are left out of the summary."))
     return tuple(found)

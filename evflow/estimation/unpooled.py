@@ -1,8 +1,8 @@
-"""A camera by weights that see every pixel alone, as the paper's network does: the flow's map of
-each window, and the mean of all.
+"""A camera from weights that see every pixel separately, like the paper's network: the mean of the
+flow's maps over all windows.
 
-There is no set network to pool the windows, nothing to begin a refinement from, and no part that
-tells errors: standard deviations are NaN, and the summary is read off the maps.
+There is no set network to pool windows, no starting point for a refinement, and no estimate of
+errors: standard deviations are NaN, and the summary is computed from the maps.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from evflow.types import Recording, Window
 
 Array = np.ndarray
 
-WINDOW_US = 25_000  # at least: the paper's network was trained on windows of 32 ms, and no others
+WINDOW_US = 25_000  # minimum: the paper's network was trained only on windows of 32 ms
 
 
 def window_map(params: api.Params, window: Window) -> tuple[Array, Array]:
-    """What the flow says of one window, (4, H, W) by PARAMETERS, and where its frames show the
-    light, (H, W) bool."""
+    """The flow's maps for one window, (4, H, W) by PARAMETERS, and where its frames show the light,
+    (H, W) bool."""
     voxels, dlogI, given = window_inputs(window)
     y, _ = api.estimate_y(params, voxels, dlogI, summary=None, **given)
     camera = squash(y, config_of(params).output)
@@ -43,8 +43,8 @@ def estimate_unpooled(
     recording: Recording, windows: Iterator[Window], params: api.Params, *,
     before: tuple[Note, ...] = (), advance: Callable[[], None] = lambda: None,
 ) -> CameraEstimate:
-    """The mean of the windows' maps; `before` are notes on how the recording was read. Raises
-    EV017 where no event happens in what the frames show."""
+    """The mean of the windows' maps; `before` are notes on reading. Raises EV017 if no event
+    happens where the frames show light."""
     shape = recording.events.size[::-1]
     total, times = np.zeros((4, *shape)), np.zeros(shape)
     n_events, n_shown, count = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32), 0
@@ -67,8 +67,8 @@ def estimate_unpooled(
 
 
 def _within(total: Array, times: Array) -> tuple[Array, float]:
-    """Mean maps (4, H, W) of their sums, as a camera can have them, the median of the others where
-    nothing was shown; and the share of values that no camera has."""
+    """Mean maps (4, H, W) from their sums, raised to possible values, with the median of the others
+    where nothing was shown; and the share of impossible values."""
     known = times > 0
     maps = total / np.maximum(times, 1)
     middle = np.median(maps[:, known], 1)[:, None, None]
@@ -78,18 +78,18 @@ def _within(total: Array, times: Array) -> tuple[Array, float]:
 
 
 def _summary(maps: Array, used: Array) -> Summary:
-    """Medians of thresholds, means of rates, and how thresholds differ from pixel to pixel."""
+    """Medians of thresholds, means of rates, and the spread of thresholds over pixels."""
     theta, eta = maps[:2, used], maps[2:, used]
     values = (*np.median(theta, 1), *eta.mean(1), *theta.std(1))
     return Summary(*(jnp.float32(v) for v in values))
 
 
 def _notes(below: float) -> list[Note]:
-    notes = [Note("std.none", "these weights see every pixel alone and tell no error: standard "
-                  "deviations are NaN, the summary is the median of the maps, and nothing was "
-                  "refined. The weights \"default\" tell more.")]
+    notes = [Note("std.none", "these weights see every pixel separately and estimate no errors: "
+                  "standard deviations are NaN, the summary is the median of the maps, and nothing "
+                  "was refined. The weights \"default\" estimate more.")]
     if below:
-        notes.append(Note("maps.raised", f"{below:.1%} of the maps' values were below what a "
-                          f"camera has (θ {THETA_MIN}, η 0) and were raised to it."))
+        notes.append(Note("maps.raised", f"{below:.1%} of the maps' values were impossible (below "
+                          f"θ {THETA_MIN}, η 0) and were raised to that."))
     return notes
 

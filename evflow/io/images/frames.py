@@ -64,7 +64,6 @@ class FrameHints:
         may be a single picture.
     clip: treat values above full_scale as white and negative ones as black, for radiance, which has
         no upper limit, instead of refusing them.
-        radiance, which has no upper end, instead of refusing it.
     """
 
     fps: float | None = None
