@@ -95,7 +95,7 @@ def test_names_and_cards_by_which_weights_can_be_read_again(tmp_path: Path) -> N
     path = tmp_path / "a.safetensors"
     for card in ("[1]", "3", "null"):
         path.write_bytes(save({"a": np.zeros(3, np.float32)}, metadata={"card": card}))
-        with pytest.raises(EvflowDataError, match=r"EV009.*no object"):
+        with pytest.raises(EvflowDataError, match=r"EV009.*not an object"):
             model_card(path)
 
 
