@@ -78,6 +78,7 @@ def main(argv: list[str] | None = None) -> int:
                 "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
             if isinstance(command, Compiling) and command.compile_cache:
                 remember()
+            early.settle()
             command.run()
             sys.stdout.flush()
     except EvflowDataError as e:

@@ -112,7 +112,9 @@ class Estimate(Compiling, Reading):
     """Print the summary as JSON."""
 
     def run(self) -> None:
+        from evflow.estimation import pipeline  # noqa: F401 - loaded before the modules settle
         from evflow.files.folders import staged
+        from evflow.process import early
         from evflow.process.memory import keep
         from evflow.report import plots
         from evflow.report.text import describe
@@ -135,6 +137,7 @@ class Estimate(Compiling, Reading):
             if self.protocol != protocol:
                 refuse(self, (name,), f"only useful with --protocol {protocol}")
         need_packages(self.recording, *self.more, pictures=self.plots or self.report)
+        early.settle()
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording, checked, doubts = self._recorded(self.recording)
             if recording.frames.size <= SHORT:

@@ -166,34 +166,42 @@ def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:
 
 def _company(sides: dict[str, Events]) -> dict[str, Any]:
     """What the events of a pixel have to do with those before and around it."""
-    found = {name: _own_intervals(events) for name, events in sides.items()}
+    keys = {name: _by_pixel(events) for name, events in sides.items()}
+    found = {name: _own_intervals(events, keys[name]) for name, events in sides.items()}
     intervals = _times_alike({name: own for name, (own, _) in found.items()})
     same = {name: share for name, (_, share) in found.items()}
     del found  # as large as the events
-    around = {name: _neighbour_delays(events) for name, events in sides.items()}
+    around = {name: _neighbour_delays(events, keys[name]) for name, events in sides.items()}
     alone = {name: float((d > ALONE_US).mean()) if d.size else None for name, d in around.items()}
     near = {name: d[np.isfinite(d)] for name, d in around.items()}
     return {"intervals": intervals, "neighbours": {**_times_alike(near), "alone": alone},
             "same_polarity": same}
 
 
-def _own_intervals(events: Events) -> tuple[np.ndarray, float | None]:
-    """(M,) us between successive events of a pixel; the share of them of one polarity."""
-    order = np.argsort(_pixels(events), kind="stable")
-    pixel, t, p = _pixels(events)[order], events.t[order], events.p[order]
+def _by_pixel(events: Events) -> np.ndarray:
+    """(N,) pixel * N + number of the events, by pixel and then by time: sorted in a fifth of the
+    time that an order takes."""
+    keys = _pixels(events) * len(events)
+    keys += np.arange(len(events))
+    keys.sort()
+    return keys
+
+
+def _own_intervals(events: Events, keys: np.ndarray) -> tuple[np.ndarray, float | None]:
+    """(M,) us between successive events of a pixel; the share of them of one polarity. keys: of
+    `_by_pixel`."""
+    pixel, order = np.divmod(keys, max(len(events), 1))
+    t, p = events.t[order], events.p[order]
     same = pixel[1:] == pixel[:-1]
     repeats = (p[1:] == p[:-1])[same]
     return np.diff(t)[same].astype(np.float64), float(repeats.mean()) if repeats.size else None
 
 
-def _neighbour_delays(events: Events) -> np.ndarray:
+def _neighbour_delays(events: Events, keys: np.ndarray) -> np.ndarray:
     """(M,) us from the latest event of the eight pixels around to an event, inf without one;
-    M <= ASKED_EVENTS events, evenly taken."""
+    M <= ASKED_EVENTS events, evenly taken. keys: of `_by_pixel`."""
     n = len(events)
     width, height = events.size
-    keys = _pixels(events) * n
-    keys += np.arange(n)
-    keys.sort()  # by pixel, then by time
     asked = np.linspace(0, n - 1, min(n, ASKED_EVENTS)).astype(np.int64)
     asked = asked[np.argsort(_pixels(events)[asked], kind="stable")]  # found in order: in the cache
     x, y = events.x[asked].astype(np.int64), events.y[asked].astype(np.int64)

@@ -10,7 +10,7 @@ import gc
 import os
 import sys
 
-GARBAGE = 20_000  # new objects before Python searches for garbage
+GARBAGE = 50_000  # new objects before Python searches for garbage
 
 
 def is_command() -> bool:
@@ -24,10 +24,17 @@ def save_time() -> None:
     """Reduce overhead. NumPy's linear-algebra threads spin while they wait for each other, longer
     than products of a few numbers take (the environment's own setting is respected); and Python
     searches all objects for garbage after every 700 new ones, hundreds of times while modules load
-    and programs are traced."""
+    and programs are traced; until `settle`, not at all."""
     if "OMP_NUM_THREADS" not in os.environ:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
+    gc.disable()
+
+
+def settle() -> None:
+    """Search for garbage from here on, but not among what exists, which is modules above all."""
+    gc.freeze()
+    gc.enable()
 
 
 def end_on_interrupt() -> None:
