@@ -23,9 +23,7 @@ from .network.api import Stats as Stats
 from .network.api import encode as encode
 from .network.api import estimate as estimate
 from .network.api import estimate_with_std as estimate_with_std
-from .network.api import finish as finish
 from .network.api import squash as squash
-from .network.api import summarize as summarize
 from .network.api import unsquash as unsquash
 from .network.bijection import Code as Code
 from .network.bijection import code_from_video as code_from_video
@@ -33,6 +31,8 @@ from .network.bijection import forward as forward
 from .network.bijection import generate as generate
 from .network.bijection import inverse as inverse
 from .network.bijection import log_prob as log_prob
+from .network.summary import finish as finish
+from .network.summary import summarize as summarize
 from .network.weights import load_weights as load_weights
 from .network.weights import save_weights as save_weights
 from .recordings.adjust import linearised as linearised

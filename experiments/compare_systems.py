@@ -24,34 +24,25 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import time
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
-from evflow import Recording, estimate_camera, load_weights, read_recording
-from evflow.baselines import SYSTEMS, Fitted, Lgan, Match, System
-from evflow.baselines.base import intervals, usable
-from evflow.camera import Camera
+from evflow import Recording, load_weights, read_recording
+from evflow.baselines import SYSTEMS, Lgan, System
+from evflow.baselines.base import usable
 from evflow.errors import EvflowDataError
 from evflow.report import plots
-from experiments.shared import alone
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
+from experiments.shared.compared import POLARITIES, averages, picture, table
+from experiments.shared.fits import all_fits, score
 from experiments.shared.many import Setup, scores
 from experiments.shared.protocols import ENOUGH, protocols
+from experiments.shared.second_half import CHANGED, carried, changes, halves
 
-OURS, CONSTANT, KNOWN = "ours", "constant .3", "match, true video"
-POLARITIES = ("on", "off")
-METRICS = ("mae_sequence", "mae_pixel", "median")
-# Table III, synthetic data, ON and OFF.
-PAPER = {"ecc": (0.043, 0.128), "s2r": (0.049, 0.131), "jaer": (0.025, 0.055),
-         "lgan": (0.117, 0.128), OURS: (0.023, 0.022)}
 REAL = ("newton_cradle_davis346.aedat4", "ijrr_slider_depth")
-CHANGED = 0.1  # log units: pixels that change by less between two frames say little
-SMOOTH = 1.0  # pixels: frames and counts are blurred alike, against noise and misregistration
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,94 +77,9 @@ def systems_of(options: Options) -> dict[str, System]:
     return SYSTEMS | {"lgan": Lgan(iterations=20)}
 
 
-def all_fits(params: Any, recording: Recording, systems: dict[str, System]) -> dict[str, Fitted]:
-    """Every system and ours on one recording."""
-    return {name: s.fit(recording) for name, s in systems.items()} | ours(params, recording)
-
-
-def ours(params: Any, recording: Recording) -> dict[str, Fitted]:
-    """`estimate_camera` as one of the systems, whose thresholds are those of the summary, after
-    what is in it by itself."""
-    start = time.perf_counter()
-    span = min(40_000, int(recording.frame_times[-1] - recording.frame_times[0]))
-    found = estimate_camera(recording, params, min_window_us=span)
-    seconds = time.perf_counter() - start
-    theta = np.array([float(found.summary.theta_on), float(found.summary.theta_off)])
-    return alone.fitted(params, recording, found, span) | {
-        OURS: Fitted(found.camera, np.stack([found.valid] * 2), theta, seconds)}
-
-
-def flat(recording: Recording, theta: float) -> Fitted:
-    """A constant, as one of the systems."""
-    width, height = recording.events.size
-    return Fitted(Camera.constant((height, width), theta, theta),
-                  np.zeros((2, height, width), bool), np.full(2, theta), 0.0)
-
-
 def lively(_params: Any, hidden: Hidden, _protocol: Protocol) -> Hidden | None:
     """A recording with enough events of both polarities."""
     return hidden if (hidden.signal_events() >= ENOUGH).all() else None
-
-
-def score(params: Any, hidden: Hidden, systems: dict[str, System]) -> dict[str, Any]:
-    """Errors of every system on one recording."""
-    recording = hidden.recording
-    fits = all_fits(params, recording, systems)
-    fits[CONSTANT] = flat(recording, 0.3)
-    dense = Recording(recording.events, hidden.video.astype(np.float32),
-                      1000 * np.arange(len(hidden.video)))
-    fits[KNOWN] = Match("given", start="fresh").fit(dense)
-    result: dict[str, Any] = {"signal": hidden.signal_events().tolist()}
-    for name, fit in fits.items():
-        row: dict[str, Any] = {"seconds": fit.seconds, "told": bool(fit.found.all())}
-        for i, polarity in enumerate(POLARITIES):
-            seen = np.asarray(getattr(fit.camera, f"theta_{polarity}"))
-            pixels = np.asarray(getattr(hidden.camera, f"theta_{polarity}"))
-            true = float(getattr(hidden.nominal, f"theta_{polarity}"))
-            row |= {f"mae_sequence/{polarity}": float(np.abs(seen - true).mean()),
-                    f"mae_pixel/{polarity}": float(np.abs(seen - pixels).mean()),
-                    f"median/{polarity}": float(abs(fit.theta[i] - true)),
-                    f"signed/{polarity}": float(fit.theta[i] - true)}
-        result[name] = row
-    return result
-
-
-def averages(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means per system over its recordings, with the standard error of |median - θ|."""
-    result: dict[str, Any] = {}
-    for name in (n for n in found[0] if n != "signal"):
-        mine = [r[name] for r in found if name in r]
-        one = {k: float(np.mean([r[k] for r in mine])) for k in mine[0] if "/" in k}
-        one |= {f"error/{p}": float(np.std([r[f"median/{p}"] for r in mine])
-                                    / np.sqrt(len(mine))) for p in POLARITIES}
-        # A median: the first recording compiles.
-        one["seconds"] = float(np.median([r["seconds"] for r in mine]))
-        one["told"] = float(np.mean([r["told"] for r in mine]))
-        result[name] = one | {"recordings": len(mine)}
-    return result
-
-
-def halves(recording: Recording) -> tuple[Recording, Recording]:
-    """The usable part of a recording before and from its middle frame on: they share that frame
-    and no event."""
-    found, events = usable(recording), recording.events
-    cuts = [found[0], found[(len(found) + 1) // 2], found[-1] + 1]
-    times = recording.frame_times
-    first, second = (
-        Recording(events.slice(int(times[a]), int(times[b])), recording.frames[a:b + 1],
-                  times[a:b + 1]) for a, b in itertools.pairwise(cuts))
-    return first, second
-
-
-def changes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """ON and OFF events (N, 2, H, W) and log changes (N, H, W) between usable frames, blurred."""
-    parts = [(p.counts, p.after - p.before) for p in intervals(recording)]
-    n, d = (np.stack(x) for x in zip(*parts, strict=True))
-    return np.stack([[blurred(c) for c in pair] for pair in n]), np.stack([blurred(x) for x in d])
-
-
-def blurred(image: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(np.ascontiguousarray(image, np.float32), (0, 0), SMOOTH)
 
 
 def held_out(
@@ -201,57 +107,6 @@ def held_out(
         result[name] = {"theta": fit.theta.tolist(), "left": left(*maps),
                         "seconds": fit.seconds, "notes": list(fit.notes)}
     return result
-
-
-def carried(n: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
-    """What the events carry (N, H, W) at thresholds (H, W)."""
-    return n[:, 0] * on[None] - n[:, 1] * off[None]
-
-
-def table(result: dict[str, Any]) -> str:
-    """Markdown: a table of the simulated recordings, one of each real recording."""
-    lines = ["| recordings | system | \\|median - θ\\| ON | OFF | mae_sequence ON | OFF | "
-             "mae_pixel ON | OFF | bias ON | OFF | told | s | paper ON | OFF |",
-             "|" + "---|" * 14]
-    for protocol, systems in result["simulated"].items():
-        for name, r in systems.items():
-            paper = PAPER.get(name)
-            cells = [f"{r[f'median/{p}']:.3f} ± {r[f'error/{p}']:.3f}" for p in POLARITIES]
-            cells += [f"{r[f'{m}/{p}']:.3f}" for m in METRICS[:2] for p in POLARITIES]
-            cells += [f"{r[f'signed/{p}']:+.3f}" for p in POLARITIES]
-            cells += [f"{r['told']:.0%}", f"{r['seconds']:.2f}"]
-            cells += [f"{x:.3f}" for x in paper] if paper else ["", ""]
-            lines.append(f"| {protocol} ({r['recordings']}) | {name} | {' | '.join(cells)} |")
-    for recording, systems in result["real"].items():
-        lines += ["", f"| {recording} | θ ON | θ OFF | change left over | s |", "|" + "---|" * 5]
-        lines += [f"| {name} | {r['theta'][0]:.3f} | {r['theta'][1]:.3f} | {r['left']:.1%} | "
-                  f"{r['seconds']:.2f} |" for name, r in systems.items()]
-    return "\n".join(lines)
-
-
-def picture(result: dict[str, Any], path: Path) -> None:
-    """|median - θ| of every system, one panel per protocol; crosses are the paper's figures,
-    which are of mae_sequence."""
-    panels = result["simulated"]
-    figure = plots.new_figure(5.5 * len(panels), 5.5)
-    axes = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
-    for axis, (protocol, systems) in zip(axes, panels.items(), strict=True):
-        names = list(systems)[::-1]
-        for i, (p, colour) in enumerate(zip(POLARITIES, (plots.ON_COLOUR, plots.OFF_COLOUR),
-                                            strict=True)):
-            y = np.arange(len(names)) + 0.2 * (0.5 - i)
-            axis.errorbar([systems[n][f"median/{p}"] for n in names], y,
-                          xerr=[systems[n][f"error/{p}"] for n in names], fmt="o", color=colour,
-                          label=f"θ {p.upper()}")
-            known = [(PAPER[n][i], at) for n, at in zip(names, y, strict=True) if n in PAPER]
-            axis.plot(*zip(*known, strict=True), "x", color=colour)
-        axis.set_yticks(np.arange(len(names)), names)
-        axis.set_xscale("log")
-        axis.set_xlabel("|median − θ|  (x: paper, mae_sequence)")
-        axis.set_title(f"mismatch {protocol}")
-        axis.grid(alpha=0.3)
-    axes[0].legend()
-    plots.save_figure(figure, path)
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -24,27 +24,23 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 
 from evflow.commands.options import check_finite, parse_size
-from evflow.downstream import EVFlowNet, prepared, reconstruct
+from evflow.downstream import EVFlowNet, reconstruct
 from evflow.downstream.released import Trained, load_network
-from evflow.downstream.simulated import SequenceConfig
 from evflow.errors import EvflowDataError
 from evflow.metrics import (
     PROTOCOLS,
-    FwlConvention,
     ImageProtocol,
-    fwl,
     load_lpips,
-    score_flow,
     score_images,
 )
 from evflow.report import plots
 from evflow.training.config import as_dict
-from experiments.shared import held_out, targets
+from experiments.shared import held_out
 from experiments.shared.common import at_least, begin, run_script, write_result, write_text
+from experiments.shared.network_outputs import Synthetic, real_flow
 from experiments.shared.network_scores import picture, report
 from experiments.shared.recorded import (
     Part,
@@ -59,7 +55,6 @@ from experiments.shared.recorded import (
 
 REAL = ("newton_cradle_davis346.aedat4", "ijrr_slider_depth")
 ROTATIONS = ("ijrr_boxes_rotation", "ijrr_dynamic_rotation")
-SKIPPED, WINDOWS = 6, 20  # of synthetic clips
 LEAST_SIDE, LEAST_MS = 32, 1  # in fewer pixels the high thresholds of a target see no event
 
 
@@ -174,67 +169,6 @@ def real_video(
     return linear, pairs
 
 
-def real_flow(trained: Trained, found: list[Part], slices: dict[str, Rotation]) -> dict[str, Any]:
-    """FWL of recordings window by window, and of rotations beside the gyroscope's flow."""
-    rows: dict[str, Any] = {}
-    for part in found:
-        flows = reconstruct(trained.network, trained.params, part.events, part.edges_us[1:],
-                            **trained.how)
-        rows[part.name] = score_flow(
-            part.events, part.edges_us[part.warmup:], flows[part.warmup:])
-    how = FwlConvention(reference="first")
-    for name, one in slices.items():
-        tensor = jnp.asarray(
-            prepared(one.events, trained.network.bins, trained.split))[None, None]
-        flow = np.asarray(held_out.outputs(
-            trained.network, trained.params, tensor, trained.normalised)[0, 0])
-        x, y, t, p, ones = map(jnp.asarray, (*one.xy.T, one.t, one.p, np.ones(len(one.t))))
-        made, ideal = (fwl(x, y, t, p, ones, jnp.asarray(f), how) for f in (flow, one.flow))
-        rows[name] = {"fwl": float(made), "convention": how.as_dict(), "fwl_truth": float(ideal),
-                      "events_per_window": float(len(one.t))}
-    return rows
-
-
-class Synthetic:
-    """Clips of the target cameras, made once."""
-
-    def __init__(self, options: Options) -> None:
-        bank = targets.held_out_bank(48, photos=False)
-        shape = (options.side, options.side)
-        seen = [targets.target(camera, circuit, shape)
-                for camera in targets.CAMERAS for circuit in targets.CIRCUITS]
-        self.clips = {t.name: held_out.gather(targets.clips(
-            t, bank, SequenceConfig(scene=targets.SCENES), options.scenes, WINDOWS))
-            for t in seen}
-
-    def scores(self, trained: Trained, lpips: Any) -> dict[str, dict[str, float | None]]:
-        """Means over clips, of every camera."""
-        rows = {}
-        for name, clips in self.clips.items():
-            made = _outputs(trained, clips)
-            found = (held_out.flow_scores(made, clips, SKIPPED)
-                     if isinstance(trained.network, EVFlowNet)
-                     else held_out.video_scores(made, clips, SKIPPED, lpips))
-            rows[name] = {k: _mean(v) for k, v in found.items()}
-        return rows
-
-
-def _outputs(trained: Trained, clips: held_out.Clips) -> Any:
-    """What a network makes of clips, time first; those that take other event tensors than the
-    clips', one clip after the other."""
-    network, params = trained.network, trained.params
-    if network.bins == clips.tensors.shape[-1] and not trained.split:
-        return held_out.outputs(network, params, clips.tensors, trained.normalised)
-    return np.stack([reconstruct(network, params, events, edges[1:], **trained.how)
-                     for events, edges in zip(clips.events, clips.edges_us, strict=True)], 1)
-
-
-def _mean(scores: np.ndarray) -> float | None:
-    """Of the clips that have a score; None where none has."""
-    known = scores[np.isfinite(scores)]
-    return float(known.mean()) if known.size else None
-
-
 def main(options: Options) -> dict[str, Any]:
     """Score every network on everything that it can see; returns what is written."""
     begin(options, "evaluate_network")
@@ -250,7 +184,7 @@ def main(options: Options) -> dict[str, Any]:
         print(f"without LPIPS: {error}")
         lpips = None
     found, slices = parts(options), {} if options.data else rotations()
-    synthetic = None if options.data else Synthetic(options)
+    synthetic = None if options.data else Synthetic(options.side, options.scenes)
     result: dict[str, Any] = {}
     shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for name, trained in networks.items():

@@ -24,33 +24,24 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from evflow import Recording, estimate_camera, load_weights, read_recording
+from evflow import load_weights, read_recording
 from evflow.baselines import SYSTEMS
 from evflow.baselines.base import usable
-from evflow.baselines.integration import Integration
-from evflow.camera import Camera, CameraPrior, Summary
+from evflow.camera import CameraPrior
 from evflow.errors import EvflowDataError
 from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
-from experiments.shared import alone
 from experiments.shared.cameras import Protocol, hidden_recording
 from experiments.shared.change_systems import cut
 from experiments.shared.common import begin, conclude, run_script
-from experiments.shared.images import SCORES, mean_ci, score
+from experiments.shared.images import SCORES, mean_ci
+from experiments.shared.integrated import Case, halves, image, scored, spans, thresholds
+from experiments.shared.integrated_pages import picture, table
 from experiments.shared.recordings import held_recordings
 
-HORIZONS = {"1 frame": 1, "5 frames": 5, "10 frames": 10, "1e5 events": 100_000,
-            "5e5 events": 500_000}  # frames, or events from 1000 on
 SIZES = {"DAVIS240": (180, 240), "DAVIS346": (260, 346), "VGA": (480, 640)}
 SCENE = SceneConfig(speed_px_s=(60.0, 300.0), static_fraction=0.0, contrast=(0.6, 1.0))
-PAPER = {  # Table X: RMSE, PSNR, SSIM
-    "DAVIS240": {"ecc": (37.56, 16.82, .41), "s2r": (32.37, 18.10, .45),
-                 "jaer": (35.10, 17.39, .42), "lgan": (32.30, 18.15, .42),
-                 "ours, maps": (32.24, 18.17, .42)},
-    "DAVIS346": {"ecc": (54.81, 13.75, .33), "s2r": (50.55, 14.45, .35),
-                 "jaer": (57.72, 13.42, .34), "lgan": (45.73, 15.29, .36),
-                 "ours, maps": (39.76, 16.37, .37)}}
 # In the picture, beside the systems that were asked for
 SHOWN = ("no events", "default .2", "ecc", "ecc median", "ours, maps")
 
@@ -84,17 +75,6 @@ QUICK = ("ecc", "ecc offset 40", "ecc median", "jaer normalised", "s2r")
 EACH = tuple(name for name, system in SYSTEMS.items() if math.isinf(system.most_recordings))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Case:
-    """A recording and, where it was simulated, its true camera. camera: its row of Table X."""
-
-    name: str
-    camera: str
-    recording: Recording
-    truth: Camera | None = None
-    nominal: Summary | None = None
-
-
 def cases(options: Options) -> Iterator[Case]:
     """Real recordings, then simulated ones of cameras of each size (debug: one, and a small
     one)."""
@@ -115,121 +95,6 @@ def cases(options: Options) -> Iterator[Case]:
             hidden = hidden_recording(key, bank, protocol)
             yield Case(f"simulated {shape[1]}x{shape[0]}", kind, hidden.recording,
                        hidden.camera, hidden.nominal)
-
-
-def halves(recording: Recording) -> tuple[Recording, Recording]:
-    """The recording up to the middle of its usable frames, and from it on."""
-    times, events, good = recording.frame_times, recording.events, usable(recording)
-    middle = good[len(good) // 2]
-    cuts = (min(times[0], events.t[0]), times[middle], max(times[-1], events.t[-1]))
-    first, second = (events.slice(int(a) + late, int(b) + 1)
-                     for a, b, late in ((cuts[0], cuts[1], 0), (cuts[1], cuts[2], 1)))
-    return (Recording(first, recording.frames[:middle + 1], times[:middle + 1]),
-            Recording(second, recording.frames[middle:], times[middle:]))
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Thresholds:
-    """A camera to integrate with (None: no events at all), its log map's offset, and for how many
-    seconds it was sought."""
-
-    camera: Camera | None
-    offset_dn: float = 0.0
-    seconds: float = 0.0
-
-
-def thresholds(
-    case: Case, part: Recording, params: Any, systems: tuple[str, ...]
-) -> dict[str, Thresholds]:
-    """By name; measured on a part of the recording, or all of it."""
-    shape = part.frames.shape[1:]
-    found = {"no events": Thresholds(None), "default .2": Thresholds(Camera.constant(shape))}
-    for name in systems:
-        fitted = SYSTEMS[name].fit(part)
-        found[name] = Thresholds(fitted.camera, getattr(SYSTEMS[name], "offset_dn", 0.0),
-                                 fitted.seconds)
-    ours = estimate_camera(part, params)
-    found |= {name: Thresholds(fitted.camera)
-              for name, fitted in alone.fitted(params, part, ours).items() if name != alone.SUMMARY}
-    found["ours, summary"] = Thresholds(constant(shape, ours.summary))
-    found["ours, maps"] = Thresholds(ours.camera)
-    if case.truth is not None and case.nominal is not None:
-        found["true, nominal"] = Thresholds(constant(shape, case.nominal))
-        found["true, maps"] = Thresholds(case.truth)
-    return found
-
-
-def constant(shape: tuple[int, ...], summary: Summary) -> Camera:
-    return Camera.constant(shape, float(summary.theta_on), float(summary.theta_off))
-
-
-def spans(recording: Recording, horizon: int, most: int) -> list[tuple[int, int]]:
-    """(first, last) frames of the images of a horizon: through usable intervals only."""
-    good = set(usable(recording))
-    at = np.searchsorted(recording.events.t, recording.frame_times, side="right")
-    found = []
-    for first in sorted(good):
-        last = (first + horizon if horizon < 1000
-                else int(np.searchsorted(at, at[first] + horizon)))
-        if last < len(at) and all(i in good for i in range(first, last)):
-            found.append((first, last))
-    step = np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int)
-    return [found[i] for i in step]
-
-
-def image(recording: Recording, span: tuple[int, int], by: Thresholds) -> np.ndarray:
-    """The frame at the end of a span (H, W) as predicted from the one at its begin."""
-    frame = recording.frame_dn(span[0])
-    if by.camera is None:
-        return frame
-    t0, t1 = (int(recording.frame_times[i]) for i in span)
-    events = recording.events.slice(t0 + 1, t1 + 1)
-    return Integration(by.offset_dn).reconstruct(
-        events, frame[None], np.array([t0]), by.camera, np.array([t1]))[0]
-
-
-def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
-    """Markdown, a block per horizon; the paper's row beside systems that it has."""
-    lines = []
-    for group, horizons in rows.items():
-        kind = group.split(", ")[-1]
-        for horizon, systems in horizons.items():
-            lines += [f"\n**{group}, {horizon}**\n",
-                      "| thresholds | RMSE | PSNR [dB] | SSIM | SSIM global | seconds | "
-                      "paper: RMSE, PSNR, SSIM |", "|" + "---|" * 7]
-            for name, row in systems.items():
-                values = [f"{row[s][0]:.3f}" + (f" ± {row[s][1]:.3f}" if row[s][1] else "")
-                          for s in SCORES]
-                paper = ", ".join(map(str, PAPER.get(kind, {}).get(name, ())))
-                lines.append(f"| {name} | {' | '.join(values)} | {row['seconds']:.1f} | {paper} |")
-    return "\n".join(lines)
-
-
-def picture(out: Path, shown: list[tuple[str, np.ndarray, dict[str, np.ndarray]]]) -> None:
-    """Frames beside what the systems predict of them, with the RMSE of each."""
-    columns = 1 + len(shown[0][2])
-    figure = plots.new_figure(3.0 * columns, 2.6 * len(shown))
-    axes = figure.subplots(len(shown), columns, squeeze=False)
-    for row, (name, frame, images) in zip(axes, shown, strict=True):
-        for axis, (title, seen) in zip(row, {name: frame, **images}.items(), strict=True):
-            rmse = np.sqrt(np.mean((seen - frame) ** 2))
-            axis.imshow(seen, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-            axis.set_title(title if title == name else f"{title}: {rmse:.1f}", fontsize=9)
-            axis.set_axis_off()
-    plots.save_figure(figure, out)
-
-
-def scored(case: Case, by: dict[str, Thresholds], most: int) -> dict[str, dict[str, list[float]]]:
-    """Mean scores of each system at each horizon that the recording is long enough for."""
-    rows: dict[str, dict[str, list[float]]] = {}
-    for horizon, amount in HORIZONS.items():
-        chosen = spans(case.recording, amount, most)
-        for name, one in by.items() if chosen else ():
-            images = np.stack([image(case.recording, span, one) for span in chosen])
-            frames = np.stack([case.recording.frame_dn(span[1]) for span in chosen])
-            means = score(images, frames).mean(0).tolist()
-            rows.setdefault(horizon, {})[name] = [*means, len(chosen)]
-    return rows
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -28,16 +28,11 @@ _clips.png.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
-from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet
-from evflow.downstream.simulated import SequenceConfig
-from evflow.downstream.train import LearningConfig
 from evflow.errors import EvflowDataError
 from evflow.network.weights import weights_path
 from evflow.process.provenance import provenance
@@ -45,47 +40,10 @@ from evflow.report import plots
 from evflow.training.config import as_dict
 from experiments.shared import gains, held_out
 from experiments.shared.common import at_least, run_script, write_result, write_text
-from experiments.shared.conditions import E2V, RAW, Condition, Files, digest
-from experiments.shared.targets import CAMERAS, SCENES
-from experiments.shared.trainings import SIMULATED, Setting, Trainings
-
-Task = Literal["video", "flow"]
-Preset = Literal["debug", "small", "full"]
-# One motion, of pixels rather than parts of one in a window, and contrasts that cross thresholds:
-# of scenes as those of images, few steps of a small network learned no flow.
-MOVING = dataclasses.replace(
-    SCENES, contrast=(0.5, 1.0), foregrounds=0, speed_px_s=(50.0, 250.0))
-COMPARED = ("s2r", "jaer", "ecc median", "match", "lgan")
-ALONE: dict[Task, str] = {"video": E2V, "flow": RAW}  # what the paper has beside them
-
-
-def preset_of(task: Task, preset: Preset) -> Setting:
-    data = SequenceConfig(scene=SCENES)
-    if preset == "debug":
-        data = dataclasses.replace(data, sequences=2, windows=4, steps_per_window=2, crop=16)
-        learning = LearningConfig(data, steps=6, warmup=2, skip=1)
-        network = E2VID(base=4, encoders=1, blocks=0) if task == "video" else EVFlowNet(base=4)
-        return Setting(network, learning, seeds=2, shape=(32, 32), textures=8, drawn=8,
-                       seconds=0.5, scenes=2, windows=8, skipped=3)
-    if preset == "small":  # 25 trainings of 220 steps of .45 s take 45 minutes on two cores
-        if task == "video":
-            return Setting(E2VID_SMALL, LearningConfig(data, steps=220))
-        # Two windows hold hardly a pause, 20 of a clip many: no scene stops. 25 trainings of
-        # 3000 steps of .05 s take an hour of one core; 800 steps learned little flow.
-        data = dataclasses.replace(data, scene=MOVING, sequences=12, windows=2, crop=40,
-                                   pause=0.0, noise=0.0)
-        return Setting(EVFlowNet(base=16, encoders=3), LearningConfig(
-            data, steps=3000, warmup=20, rate=2e-3, skip=0, elsewhere=0.0, normalised=True))
-    large = dataclasses.replace(data, sequences=4, windows=40, crop=128)
-    setting = Setting(
-        E2VID_PLUS, LearningConfig(large, steps=5000, warmup=200, rate=3e-4),
-        (*SIMULATED, ALONE[task], *COMPARED), tuple(CAMERAS),
-        shape=(180, 240), textures=512, drawn=64, windows=40, skipped=10, perceptual=True)
-    if task == "video":
-        return setting
-    large = dataclasses.replace(large, windows=4, sequences=16, noise=0.0, hot_pixels=0.0)
-    return dataclasses.replace(setting, network=EVFlowNet(), learning=LearningConfig(
-        large, steps=5000, warmup=200, rate=2e-4))
+from experiments.shared.conditions import Files, digest
+from experiments.shared.same_runs import nothing_lost, same_setting
+from experiments.shared.see_better_settings import Preset, Task, preset_of
+from experiments.shared.trainings import Setting, Trainings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,43 +92,6 @@ def chosen(options: Options) -> Setting:
                              "circuits": options.circuits, "seeds": options.seeds}
     return dataclasses.replace(
         setting, learning=learning, **{k: v for k, v in given.items() if v})
-
-
-def same_setting(out: Path, shared: dict[str, Any], setting: Setting) -> None:
-    """Write down what the runs in `out` share; EV013 where they were made by another setting."""
-    # What may grow from one command to the next: everything is trained and scored by itself.
-    free = ("names", "cameras", "circuits", "seeds")
-    wanted = shared | {k: v for k, v in as_dict(setting).items() if k not in free}
-    wanted = json.loads(json.dumps(wanted))
-    path = out / "setting.json"
-    if path.is_file():
-        before = json.loads(path.read_text())["config"]
-        if before != wanted:
-            differ = [k for k in wanted if before.get(k) != wanted[k]]
-            raise EvflowDataError("EV013", f"{out} holds runs of another setting ({differ}).",
-                                  "Choose another --out.")
-        return
-    write_result(path, {}, wanted)
-
-
-def nothing_lost(out: Path, conditions: Iterable[Condition], seeds: int) -> None:
-    """EV013 where the tables in `out` have targets, conditions or seeds that these leave out."""
-    path = out / "see_better.json"
-    if not path.is_file():
-        return
-    made = {(t.name, c.label) for c in conditions for t in c.targets}
-    targets, lost = {target for target, _ in made}, set()
-    for target, rows in json.loads(path.read_text())["result"]["targets"].items():
-        if target not in targets:
-            lost.add(target)
-            continue
-        lost |= {label for label in rows if (target, label) not in made}
-        lost |= {f"seed {seed}" for measures in rows.values() for entry in measures.values()
-                 for seed in entry["seeds"] if seed >= seeds}
-    if lost:
-        raise EvflowDataError(
-            "EV013", f"{path} has {', '.join(sorted(lost))}, which this command leaves out.",
-            "Give all --names, --targets and other conditions that it has, or another --out.")
 
 
 def files(given: tuple[str, ...]) -> dict[str, Path]:

@@ -12,28 +12,22 @@ and stops; the same command goes on, bit for bit.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
 from evflow import read_recording
 from evflow.camera import Camera
 from evflow.downstream.evflownet import EVFlowNet
-from evflow.downstream.network import Network, Params, run
+from evflow.downstream.network import Network, Params
 from evflow.downstream.presets import training
 from evflow.downstream.recorded import recorded_bank, sample_recorded
 from evflow.downstream.released import load_network, save_network
-from evflow.downstream.simulated import Sequences, has_events, sample_sequences
+from evflow.downstream.simulated import sample_sequences
 from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
-from evflow.metrics.flow import aee
-from evflow.metrics.image_scores import frame_scores
 from evflow.metrics.perceptual import load_lpips
 from evflow.network.weights import weights_path
 from evflow.process.provenance import provenance
@@ -43,11 +37,8 @@ from evflow.training.loop import train
 from evflow.training.options import RunOptions
 from experiments.shared.common import at_least, run_script, write_result
 from experiments.shared.conditions import digest
-from experiments.shared.held_out import ENDPOINTS, PROTOCOL, scored_by
-
-Array = jax.Array
-
-HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
+from experiments.shared.held_out import ENDPOINTS, scored_by
+from experiments.shared.network_figures import measure, table
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -171,69 +162,6 @@ def configuration(options: Options) -> Run:
     start = None if options.start is None else digest(
         path if (path := Path(options.start)).is_file() else weights_path(path))
     return Run(network, learning, lpips, camera, recordings, start)
-
-
-def measure(
-    network: Network, params: Params, learning: LearningConfig, camera: Camera | None, batches: int
-) -> dict[str, float]:
-    """Mean figures of held-out sequences of the same kind: other textures (no photographs), other
-    scenes and cameras. Of images after the first half of the windows, beside those of even grey;
-    of flow where more than one event is left after ON and OFF cancel, beside those of none and of
-    each window's median."""
-    k_bank, k_data = jax.random.split(jax.random.key(HELD_OUT))
-    bank = make_bank(k_bank, 48, photos=False)
-    weights = None
-    # The figure is left out where its weights are not installed, or the images too small for it.
-    with contextlib.suppress(EvflowDataError):
-        weights = load_lpips() if learning.data.crop >= 32 else None
-    score = _flow_figures if isinstance(network, EVFlowNet) else _image_figures
-    sample = jax.jit(functools.partial(sample_sequences, config=learning.data))
-    rows = []
-    for i in range(batches):
-        sequences = sample(jax.random.fold_in(k_data, i), bank, camera=camera)
-        rows.append(jax.device_get(score(network, params, sequences, learning.normalised, weights)))
-    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
-
-
-@functools.partial(jax.jit, static_argnames=("network", "normalised"))
-def _image_figures(
-    network: Network, params: Params, sequences: Sequences, normalised: bool, weights: Params | None
-) -> dict[str, Array]:
-    tensors = sequences.given(normalised)
-    images, _ = run(network, params, tensors)
-    late = len(images) // 2
-    images, frames = images[late:], sequences.frames[late:]
-    seen, grey = (frame_scores(a, frames, PROTOCOL, weights)
-                  for a in (images, jnp.full_like(frames, 0.5)))
-    return {name: jnp.mean(seen[name]) for name in seen} | {
-        f"grey_{name}": jnp.mean(grey[name]) for name in seen}
-
-
-@functools.partial(jax.jit, static_argnames=("network", "normalised"))
-def _flow_figures(
-    network: Network, params: Params, sequences: Sequences, normalised: bool, _: Any
-) -> dict[str, Array]:
-    tensors = sequences.given(normalised)
-    flow, _ = network.apply(params, tensors)
-    events, truth = has_events(sequences.tensors), sequences.flow
-    # What no constant flow does better than, but for the median of vectors.
-    median = jnp.nanmedian(
-        jnp.where(events[..., None, :, :], truth, jnp.nan), (-2, -1), keepdims=True)
-    guesses = {"": flow, "none_": jnp.zeros_like(flow),
-               "constant_": jnp.broadcast_to(median, flow.shape)}
-    rows: dict[str, Array] = {}
-    for name, guess in guesses.items():
-        error, beyond = aee(guess, truth, events)
-        rows |= {f"{name}aee": jnp.nanmean(error), f"{name}outlier_percent": jnp.nanmean(beyond)}
-    return rows
-
-
-def table(result: dict[str, Any]) -> str:
-    """Markdown, one row."""
-    names = [name for name, value in result.items() if isinstance(value, int | float)]
-    cells = (f"{result[name]:.4g}" for name in names)
-    return "\n".join((f"| {' | '.join(names)} |", "|" + "---|" * len(names),
-                      f"| {' | '.join(cells)} |"))
 
 
 if __name__ == "__main__":

@@ -159,8 +159,7 @@ class Estimate(Compiling, Reading):
             write_json(out / "camera.json", facts)
         said = [f"verdict: {tested['grade']}", *tested["verdict"], *(
             [tested["nearest"]] if self.simulators else [])] if tested else []
-        print(json.dumps(facts, indent=2) if self.json else
-              "\n".join([words, *said]))
+        print(json.dumps(facts, indent=2) if self.json else "\n".join([words, *said]))
         print(f"written to {self.out}/", file=sys.stderr)
 
     def _check_light(self) -> None:
@@ -233,6 +232,7 @@ class Estimate(Compiling, Reading):
         from evflow.estimation.pipeline import measure
         from evflow.network.weights import load_weights, model_card, trained_steps, weights_hash
         from evflow.process.terminal import Stages, bar
+        from evflow.report.text import thresholds
 
         params = load_weights(self.weights)
         began = time.monotonic()
@@ -240,7 +240,7 @@ class Estimate(Compiling, Reading):
             stages = Stages(progress)
 
             def enough(summary: Summary, std: Summary) -> bool:
-                stages.know(so_far(summary, std))
+                stages.know(thresholds(summary, std))
                 late = self.budget_s is not None and time.monotonic() - began >= self.budget_s
                 return late or bool(asked)
 
@@ -300,9 +300,3 @@ class Estimate(Compiling, Reading):
                 source=self.recording, command=command,
                 min_window_us=round(self.window_ms * 1000), first=first, checked=checked,
                 progress=stages.count, stage=stages.stage, simulators=self.simulators)
-
-
-def so_far(summary: Summary, std: Summary) -> str:
-    """The thresholds so far, while the recording is read."""
-    return ", ".join(f"θ {side.upper()} {float(getattr(summary, f'theta_{side}')):.3f} ± "
-                     f"{float(getattr(std, f'theta_{side}')):.3f}" for side in ("on", "off"))

@@ -1,9 +1,8 @@
 """What has been read of a camera so far, as a value, and the two operations on it: `add` a stretch,
 and `estimate` the camera.
 
-Everything in a `State` is a sum over what was read, or bounded by the size of the sensor: maps of
-evidence, and the few stretches that are simulated. Only references to what was read grow, for
-counting the quiet time at the end; `thinned` bounds these.
+A `State` consists of sums over what was read (maps of evidence) and the few stretches that are
+simulated. Only its references to what was read grow; `thinned` bounds them.
 """
 
 from __future__ import annotations
@@ -51,7 +50,6 @@ from evflow.types import Events, Window, release
 Array = np.ndarray
 Advance = Callable[[], None]
 Stage = Callable[[str], None]
-
 MOST_EVENTS = 16_000_000  # used to look for the dead time, from the start
 SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual signal
 
@@ -224,6 +222,7 @@ def estimate(
     n_events = state.n_events.astype(np.uint32)
     refined = refine(state)
     hot, summary, std = refined.hot, refined.summary, refined.std
+    dead = dead_pixels(n_events)
     doubt = next(iter(state.params.values())).get("doubt")
     if unknown := untold(stats, summary):
         summary, std = without(unknown, list(refined.chunks), summary, std)
@@ -243,9 +242,7 @@ def estimate(
         again = _told(_windows(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
     camera, error = maps.with_rates(camera, error, sent, hot, summary, std)
-    dead = dead_pixels(n_events)
-    extent = extent or EVERYTHING
-    thirds = drift.thirds(state.parts)
+    extent, thirds = extent or EVERYTHING, drift.thirds(state.parts)
     return CameraEstimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,

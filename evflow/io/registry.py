@@ -1,9 +1,8 @@
 """Reading and writing recordings: the registry of formats.
 
 A format is a module with a NAME, its EXTENSIONS, `sniff` and `read`, and an `EventWriter` if it can
-be written; to add one, create its file and list it in `FORMATS` and in `WRITERS`. A file is
-recognised by its content; its extension matters only if several formats claim it. Whatever is wrong
-with a file is reported as an `EvflowDataError`.
+be written; to add one, list its module in `FORMATS` and in `WRITERS`. A file is recognised by its
+content, and by its extension if several formats claim it. Errors are `EvflowDataError`s.
 """
 
 from __future__ import annotations
@@ -271,8 +270,7 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
 
 
 def _doubted(recording: Recording, format: str, told: Hints, written: Written) -> Recording:
-    """The recording, with a note if another unit of its times is more likely or if they are coarse;
-    EV023 if the user must decide."""
+    """The recording, with a note if its times are doubtful; EV023 if the user must decide."""
     said = coarse(recording.events.t, written)
     found = doubt(recording.events, recording.frame_times, format, written.unit) if (
         told.time_unit == "auto") else None

@@ -23,9 +23,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
-from evflow.checks import need
 from evflow.errors import EvflowDataError
-from evflow.network import architecture, coordinates, inference, pooling
+from evflow.network import architecture, coordinates, inference
 from evflow.network.architecture import Params, config_of
 from evflow.network.bijection import (
     DEFAULT_WINDOW_S,
@@ -39,23 +38,11 @@ from evflow.network.bijection import (
     pixel_context,
 )
 from evflow.network.config import ModelConfig
-from evflow.network.coordinates import (
-    Output,
-    camera_std,
-    squash_summary,
-    squashed_summary,
-    unsquash_summary,
-)
-from evflow.network.inputs import (
-    check_finite,
-    given_summary,
-    prepare,
-    real,
-    same_precision,
-)
+from evflow.network.coordinates import Output, camera_std, squash_summary, unsquash_summary
+from evflow.network.inputs import check_finite, given_summary, prepare, real, same_precision
 from evflow.network.pooling import Stats
 from evflow.network.posterior import of_window
-from evflow.process.chunks import LARGE, on_cpu
+from evflow.network.summary import finish, pooled_y, summarize
 
 __all__ = [
     "Code", "Params", "Stats", "code_from_video", "encode", "estimate", "estimate_with_std",
@@ -100,83 +87,6 @@ def unsquash(camera: Camera, output: Output = "log") -> Array:
     """
     camera.check_values()
     return coordinates.unsquash(camera, output)
-
-
-def summarize(
-    params: Params, voxels: ArrayLike, dlogI: ArrayLike, *, window_s: ArrayLike = DEFAULT_WINDOW_S,
-    intensity: ArrayLike | None = None,
-) -> Stats:
-    """Additive statistics of all pixels: the pooled evidence for the camera's summary.
-
-    Statistics of windows and tiles of one camera are added: `sum(summarize(...) for ...)`.
-
-    Args:
-        params: of `load_weights`.
-        voxels: (..., H, W, 32), events per pixel and bin, of `voxelize`.
-        dlogI: (..., H, W), natural-log units, of `delta_log_intensity`.
-        window_s: length of the window in seconds, a number or (...,).
-        intensity: mean log intensity (lin-log of DN), (..., H, W) or (...,), NaN where unknown;
-            None: unknown everywhere.
-
-    Returns:
-        Statistics (...,), pooled over (H, W) only.
-
-    Raises:
-        EvflowDataError: EV001 (no pixel), EV002 (shape), EV003 (values that cannot be counts or
-            logarithms), EV007 (NaN), EV018 (weights of the paper's network, which does not pool, or
-            not weights), EV020 (window_s).
-
-    Example:
-        >>> stats = sum(ef.summarize(params, v, d) for v, d in windows)
-        >>> summary, std = ef.finish(params, stats)
-    """
-    config, net = pooling_parts(params)
-    inputs = prepare(config, voxels, dlogI, window_s, intensity)
-    at_a_time = LARGE if on_cpu(inputs) else None  # activations of all would be new memory
-    return _pool(net["summary"], *inputs, config=config, at_a_time=at_a_time)
-
-
-def pooling_parts(params: Params) -> tuple[ModelConfig, Params]:
-    """`parts` of a network that has a summary; EV018 for others."""
-    config, net = parts(params)
-    if not config.pool or "summary" not in net:
-        raise EvflowDataError(
-            "EV018", "these weights estimate every pixel separately and have no summary.",
-            'Use load_weights("default").')
-    return config, net
-
-
-@partial(jax.jit, static_argnames=("config", "at_a_time"))
-def _pool(
-    net: Params, voxels: Array, dlogI: Array, window_s: Array, intensity: Array | None, *,
-    config: ModelConfig, at_a_time: int | None,
-) -> Stats:
-    return pooling.pool(config, net, voxels, dlogI, window_s, intensity, at_a_time=at_a_time)
-
-
-def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
-    """The camera's summary from pooled statistics.
-
-    Args:
-        params: of `load_weights`.
-        stats: of `summarize`, one or a sum.
-
-    Returns:
-        The summary and its standard deviation, (...,) each, in natural units (natural log, Hz);
-        the std shrinks with the amount of data.
-
-    Raises:
-        EvflowDataError: EV018 (weights of the paper's network, which has no summary, or not
-            weights), EV020 (not statistics).
-    """
-    config, net = pooling_parts(params)
-    need(stats, Stats, "stats", "Pass the result of summarize, or a sum of results.")
-    return squashed_summary(*_finish(net["summary"], stats, config=config))
-
-
-@partial(jax.jit, static_argnames="config")
-def _finish(net: Params, stats: Stats, *, config: ModelConfig) -> tuple[Array, Array]:
-    return pooling.finish(config, net, stats)
 
 
 def encode(
@@ -228,7 +138,7 @@ def _known_summary(
     if not config.pool:
         return jnp.zeros((*lead, 6)), jnp.zeros((*lead, 6))
     stats = summarize(params, voxels, dlogI, window_s=window_s, intensity=intensity)
-    return _finish(parts(params)[1]["summary"], stats, config=config)
+    return pooled_y(parts(params)[1]["summary"], stats, config=config)
 
 
 def estimate(

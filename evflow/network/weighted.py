@@ -14,10 +14,10 @@ import numpy as np
 
 from evflow.light.log_maps import mean_and_change
 from evflow.network import pooling
-from evflow.network.api import pooling_parts
 from evflow.network.architecture import Params
 from evflow.network.config import ModelConfig
 from evflow.network.pooling import Stats
+from evflow.network.summary import pooling_parts
 from evflow.process.chunks import HUGE, LARGE, on_cpu
 
 Array = jax.Array

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from evflow.camera import Summary
 from evflow.estimation.bench.levels import Bench
 from evflow.estimation.result import CameraEstimate
 from evflow.report.page import number, plural, spread
@@ -13,6 +14,12 @@ LABELS = {
     "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON (Hz/pixel)",
     "eta_off": "noise OFF (Hz/pixel)", "sigma_on": "mismatch ON", "sigma_off": "mismatch OFF",
 }
+
+
+def thresholds(summary: Summary, std: Summary) -> str:
+    """The thresholds on one line, while a recording is read."""
+    return ", ".join(f"θ {side.upper()} {float(getattr(summary, f'theta_{side}')):.3f} ± "
+                     f"{float(getattr(std, f'theta_{side}')):.3f}" for side in ("on", "off"))
 
 
 def describe(found: CameraEstimate) -> str:

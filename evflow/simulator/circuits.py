@@ -1,9 +1,8 @@
 """Pixel circuits on the host: frames in, block by block; events out.
 
-`Still` and `Drifting` (v2e, ESIM, the paper) and `Brownian` (DVS-Voltmeter) keep the pixels'
-state from block to block. `run` sends blocks to the device and yields what will fetch their events;
-by then the next block is under way: packing the events of the one before keeps a second core busy.
-Voxels are made of `steps`, which `Still` and `Drifting` have.
+`Still` and `Drifting` (v2e, ESIM, the paper) and `Brownian` (DVS-Voltmeter) keep the pixels' state
+between blocks. `run` dispatches blocks and yields functions that fetch their events, while the next
+block runs. Voxels are made from `steps`, which `Still` and `Drifting` have.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ SALTED = 64 * BLOCK  # intervals whose salts are drawn at a time
 
 class Circuit(Protocol):
     def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
-        """For each block, what fetches its events. video: up to BLOCK flat frames, and the
-        (T + 1,) times of these and of the frame before."""
+        """For each block, a function that fetches its events. video: up to BLOCK flat frames, and
+        (T + 1,) times: theirs and the previous frame's."""
 
 
 def circuit(
@@ -250,9 +249,7 @@ class Still(_Thresholds):
             pieces.append((some, seen.frames, sent))
         return pieces, block, np.diff(edges)
 
-    def _signal(
-        self, keys: Keys, pieces: list[Piece], dt_us: np.ndarray
-    ) -> Iterator[np.ndarray]:
+    def _signal(self, keys: Keys, pieces: list[Piece], dt_us: np.ndarray) -> Iterator[np.ndarray]:
         exact = self.lapse.signal(keys, self.here.camera, pieces, dt_us)
         return super()._signal(keys, pieces, dt_us) if exact is None else exact
 

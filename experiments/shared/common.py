@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
+import numpy as np
 import tyro
 
 from evflow.errors import EvflowDataError
@@ -49,6 +50,13 @@ def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> 
     record = {"result": result, "config": config, "weights_sha256": hashes(config),
               "took": took(), **provenance()}
     atomic_text(path, json.dumps(record, indent=2, default=str) + "\n", overwrite=True)
+
+
+def plain(value: Any) -> Any:
+    """A result with lists in place of arrays."""
+    if isinstance(value, dict):
+        return {name: plain(one) for name, one in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def took() -> dict[str, float]:

@@ -13,8 +13,10 @@ from evflow import Recording
 from evflow.baselines import SYSTEMS
 from evflow.types import Events
 from experiments import compare_systems
-from experiments.compare_systems import CONSTANT, KNOWN, OURS, Options, halves
+from experiments.compare_systems import Options
 from experiments.shared import alone
+from experiments.shared.compared import CONSTANT, KNOWN, OURS
+from experiments.shared.second_half import halves
 
 
 def test_halves_share_a_frame_and_no_event() -> None:

@@ -23,7 +23,7 @@ from evflow.metrics import FwlConvention, fwl
 from evflow.types import Events
 from experiments import evaluate_network
 from experiments.evaluate_network import Options
-from experiments.shared import recorded
+from experiments.shared import network_outputs, recorded, targets
 
 SIZE = (32, 24)
 
@@ -204,19 +204,19 @@ def test_without_data_synthetic_cameras_are_seen(
     trained = load_network(saved(tmp_path, EVFlowNet(base=2)))
     assert evaluate_network.parts(Options()) == []
     assert evaluate_network.rotations() == {}
-    monkeypatch.setattr(evaluate_network.targets, "CAMERAS", {"low": (0.12, 0.16, 4.0, 2.5, 0.03)})
-    monkeypatch.setattr(evaluate_network.targets, "CIRCUITS", {
-        "esim": evaluate_network.targets.CIRCUITS["esim"]})
-    rows = evaluate_network.Synthetic(Options(scenes=1, side=32)).scores(trained, None)
+    monkeypatch.setattr(targets, "CAMERAS", {"low": (0.12, 0.16, 4.0, 2.5, 0.03)})
+    monkeypatch.setattr(targets, "CIRCUITS", {
+        "esim": targets.CIRCUITS["esim"]})
+    rows = network_outputs.Synthetic(side=32, scenes=1).scores(trained, None)
     assert set(rows) == {"low esim"}
     assert rows["low esim"]["aee"] > 0
     split = dataclasses.replace(trained, network=EVFlowNet(bins=10, base=2), split=True)
     params = split.network.init(jax.random.key(0), (32, 32))
-    other = evaluate_network.Synthetic(Options(scenes=1, side=32)).scores(
+    other = network_outputs.Synthetic(side=32, scenes=1).scores(
         dataclasses.replace(split, params=params), None)
     assert other["low esim"]["aee"] > 0
-    clips = evaluate_network.Synthetic(Options(scenes=1, side=32)).clips["low esim"]
-    whole = evaluate_network._outputs(trained, clips)
+    clips = network_outputs.Synthetic(side=32, scenes=1).clips["low esim"]
+    whole = network_outputs._outputs(trained, clips)
     one_by_one = np.stack([reconstruct(trained.network, trained.params, events, edges[1:])
                            for events, edges in zip(clips.events, clips.edges_us, strict=True)], 1)
     np.testing.assert_allclose(whole, one_by_one, atol=1e-4)
@@ -229,7 +229,7 @@ def test_flow_of_a_rotation_is_scored_beside_the_gyroscope(
     one = recorded.read_rotation(data_file(f"data/recordings/ijrr_{name}_rotation"))
     assert len(one.events) > 0.9 * len(one.t)
     trained = load_network(saved(tmp_path, EVFlowNet(base=2)))
-    row = evaluate_network.real_flow(trained, [], {name: one})[name]
+    row = network_outputs.real_flow(trained, [], {name: one})[name]
     assert row["fwl_truth"] == pytest.approx(reference, abs=0.01)
     assert row["fwl"] < row["fwl_truth"]
 
@@ -240,7 +240,7 @@ def test_flow_of_a_rotation_is_made_of_the_tensors_that_the_network_learned_from
     one = recorded.read_rotation(data_file("data/recordings/ijrr_dynamic_rotation"))
     trained = load_network("evflownet-small")
     assert trained.normalised
-    found = evaluate_network.real_flow(trained, [], {"dynamic": one})["dynamic"]["fwl"]
+    found = network_outputs.real_flow(trained, [], {"dynamic": one})["dynamic"]["fwl"]
     assert found == pytest.approx(1.83, abs=0.01)  # as the model card says
     tensor = jnp.asarray(event_tensor(one.events))[None]
     columns = (*one.xy.T, one.t, one.p, np.ones(len(one.t), np.float32))

@@ -11,6 +11,7 @@ import pytest
 from evflow.camera import Camera
 from evflow.types import Events, Recording
 from experiments import changes, integrate
+from experiments.shared import integrated, integrated_pages
 from experiments.shared.change_systems import cut
 from experiments.shared.images import mean_ci, score
 
@@ -51,10 +52,10 @@ def test_scores_are_those_of_bytes() -> None:
 
 def test_images_of_the_right_thresholds_are_the_frames() -> None:
     recording = sweep()
-    right, wrong = (integrate.Thresholds(Camera.constant(SHAPE, t, t)) for t in (0.05, 0.07))
-    held = integrate.Thresholds(None)
-    case = integrate.Case("ramp", "", recording)
-    rows = integrate.scored(case, {"right": right, "wrong": wrong, "none": held}, 24)
+    right, wrong = (integrated.Thresholds(Camera.constant(SHAPE, t, t)) for t in (0.05, 0.07))
+    held = integrated.Thresholds(None)
+    case = integrated.Case("ramp", "", recording)
+    rows = integrated.scored(case, {"right": right, "wrong": wrong, "none": held}, 24)
     assert {"1 frame", "5 frames"} <= set(rows)
     for row in rows.values():
         assert row["right"][0] < 0.5
@@ -67,15 +68,15 @@ def test_spans_end_at_the_first_frame_after_so_many_events() -> None:
     recording = sweep()
     per_frame = len(recording.events) // 8
     assert per_frame > 1000
-    assert integrate.spans(recording, 2 * per_frame, 99)[0] == (0, 2)
-    assert integrate.spans(recording, 2 * per_frame + 1, 99)[0] == (0, 3)
-    assert integrate.spans(recording, 9 * per_frame, 99) == []
-    assert integrate.spans(recording, 1, 3) == [(0, 1), (4, 5), (7, 8)]
+    assert integrated.spans(recording, 2 * per_frame, 99)[0] == (0, 2)
+    assert integrated.spans(recording, 2 * per_frame + 1, 99)[0] == (0, 3)
+    assert integrated.spans(recording, 9 * per_frame, 99) == []
+    assert integrated.spans(recording, 1, 3) == [(0, 1), (4, 5), (7, 8)]
 
 
 def test_halves_share_the_middle_frame_and_lose_no_event() -> None:
     recording = sweep()
-    first, second = integrate.halves(recording)
+    first, second = integrated.halves(recording)
     assert first.frame_times[-1] == second.frame_times[0]
     assert len(first.events) + len(second.events) == len(recording.events)
     part = cut(recording, (0.02, 0.1))
@@ -117,5 +118,6 @@ def test_changes_are_told_by_every_system(
 
 def test_a_picture_shows_the_systems_that_there_are(tmp_path: Path) -> None:
     frame = np.full(SHAPE, 90.0, np.float32)
-    integrate.picture(tmp_path / "one.png", [("ramp", frame, {"lgan": frame, "ours": frame})])
+    shown = [("ramp", frame, {"lgan": frame, "ours": frame})]
+    integrated_pages.picture(tmp_path / "one.png", shown)
     assert cv2.imread(str(tmp_path / "one.png")) is not None

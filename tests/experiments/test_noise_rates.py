@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from experiments import noise_rates
-from experiments.noise_rates import BENCH, DN, MODELS, SCENES, SYSTEMS, THETA, Options
-from experiments.shared import measured_noise
+from experiments.noise_rates import Options
+from experiments.shared import measured_noise, noise_scenes, noise_systems
+from experiments.shared.common import plain
+from experiments.shared.noise_scenes import MODELS, SCENES
+from experiments.shared.noise_systems import BENCH, DN, SYSTEMS, THETA
 
 KEY = jax.random.key(5)
 
@@ -23,14 +26,14 @@ KEY = jax.random.key(5)
 def test_truth_counts_and_ours_agree_at_rest(sensor: str, row: int) -> None:
     """10 s of 4096 pixels, at least 1700 events per rate: counting error, 4 std; where the truth
     is none, none."""
-    recording, truth = noise_rates.record(KEY, sensor, "flat", THETA[row], float(DN[7]), 64)
-    events = truth * 64 * 64 * noise_rates.FLAT_S
-    seen = noise_rates.counting(recording)
+    recording, truth = noise_scenes.record(KEY, sensor, "flat", THETA[row], float(DN[7]), 64)
+    events = truth * 64 * 64 * noise_scenes.FLAT_S
+    seen = noise_scenes.counting(recording)
     assert np.abs(seen - truth)[events < 1].max(initial=0.0) == 0.0
     assert (events >= 1).sum() == (1 if sensor == "dvs346" else 2)
     some = events >= 1
     assert (np.abs(seen - truth)[some] < 4.0 * truth[some] / np.sqrt(events[some])).all()
-    found = noise_rates.ours(None, recording)
+    found = measured_noise.ours(None, recording)
     assert (np.abs(found["ours"] - truth) <= 4.0 * found["std"]).all()
 
 
@@ -38,18 +41,18 @@ def test_rest_with_a_texture_has_the_noise_of_its_light() -> None:
     """Truth of a textured scene: the mean over its pixels of their own laws, and what comes."""
     counts = np.zeros((2, 2))
     for k in range(3):
-        recording, truth = noise_rates.record(
+        recording, truth = noise_scenes.record(
             jax.random.fold_in(KEY, k), "eq12", "still", THETA[0], 100.0, 64)
         assert recording.frames.std(0).max() < 1.0 < recording.frames.std((1, 2)).min()
         seconds = 1e-6 * recording.events.duration_us
         counts += np.stack([recording.events.count_map().sum((1, 2)), truth * 64**2 * seconds])
     assert (np.abs(counts[0] - counts[1]) < 4 * np.sqrt(counts[1])).all()
-    np.testing.assert_allclose(truth, noise_rates.law("eq12", THETA[0], 100.0), rtol=1e-3)
+    np.testing.assert_allclose(truth, noise_scenes.law("eq12", THETA[0], 100.0), rtol=1e-3)
 
 
 def test_a_moving_disc_leaves_quiet_parts() -> None:
     """Its path fires far more than noise, the half of the sensor beside it no more."""
-    recording, truth = noise_rates.record(KEY, "eq12", "moving", THETA[0], 100.0, 64)
+    recording, truth = noise_scenes.record(KEY, "eq12", "moving", THETA[0], 100.0, 64)
     moved = np.ptp(recording.frames.astype(float), axis=0) > 25
     counts = recording.events.count_map().sum(0)
     still = cv2.dilate(moved.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
@@ -57,22 +60,22 @@ def test_a_moving_disc_leaves_quiet_parts() -> None:
     expected = truth.sum() * 1e-6 * recording.events.duration_us
     assert counts[still].mean() == pytest.approx(expected, abs=4 * np.sqrt(expected / still.sum()))
     assert counts[moved].mean() > 5 * expected
-    assert (noise_rates.counting(recording) > 1.5 * truth).all()
+    assert (noise_scenes.counting(recording) > 1.5 * truth).all()
 
 
 def test_closed_forms_at_the_bench_and_elsewhere() -> None:
     """v2e's constant is right at the bench in sum, falls with light as Eq. 12 does, and as
     1 / threshold; the voltmeter's is its sensor's law."""
-    bench = noise_rates.law("eq12", THETA[BENCH[0]], DN[BENCH[1]])
-    there = noise_rates.closed_forms(THETA[BENCH[0]], float(DN[BENCH[1]]), bench)
+    bench = noise_scenes.law("eq12", THETA[BENCH[0]], DN[BENCH[1]])
+    there = noise_systems.closed_forms(THETA[BENCH[0]], float(DN[BENCH[1]]), bench)
     assert there["v2e"].sum() == pytest.approx(bench.sum(), rel=1e-5)
     np.testing.assert_array_equal(there["constant"], bench)
-    bright = noise_rates.closed_forms(THETA[BENCH[0]], float(DN[7]), bench)
-    light = noise_rates.law("eq12", THETA[BENCH[0]], DN[7]) / bench
+    bright = noise_systems.closed_forms(THETA[BENCH[0]], float(DN[7]), bench)
+    light = noise_scenes.law("eq12", THETA[BENCH[0]], DN[7]) / bench
     np.testing.assert_allclose(bright["v2e"] / there["v2e"], light, rtol=1e-5)
-    other = noise_rates.closed_forms(2 * THETA[BENCH[0]], float(DN[BENCH[1]]), bench)
+    other = noise_systems.closed_forms(2 * THETA[BENCH[0]], float(DN[BENCH[1]]), bench)
     np.testing.assert_allclose(other["v2e"], there["v2e"] / 2, rtol=1e-5)
-    np.testing.assert_allclose(there["evolt, θ"], noise_rates.law(
+    np.testing.assert_allclose(there["evolt, θ"], noise_scenes.law(
         "dvs346", THETA[BENCH[0]], DN[BENCH[1]]), rtol=1e-5)
 
 
@@ -81,12 +84,12 @@ def test_scores_leave_out_what_is_not_told() -> None:
     seen = np.full(truth.shape, 0.1)
     seen[..., 1] = 0.3
     seen[0, 0], seen[2] = np.nan, 0.7
-    row = noise_rates.scored({"truth": truth, "a": seen, "b": truth * np.nan}, "a")
+    row = noise_systems.scored({"truth": truth, "a": seen, "b": truth * np.nan}, "a")
     assert row["told"] == pytest.approx(5 / 6)
     assert row["ON"][0] == pytest.approx(0.3)  # .1, .1, .7
     assert row["OFF"][0] == pytest.approx((0.3 + 0.3 + 0.7) / 3)
     assert row["ON"][1] == pytest.approx(4.3027 * np.sqrt(0.12) / np.sqrt(3), rel=1e-3)
-    assert noise_rates.scored({"truth": truth, "b": truth * np.nan}, "b")["told"] == 0.0
+    assert noise_systems.scored({"truth": truth, "b": truth * np.nan}, "b")["told"] == 0.0
 
 
 def small(monkeypatch: pytest.MonkeyPatch, scenes: tuple[str, ...]) -> None:
@@ -106,7 +109,7 @@ def test_table_has_all_cells_and_follows_from_the_seed(
     saved = json.loads((tmp_path / "noise_rates.json").read_text())
     assert saved["config"]["seed"] == options.seed
     assert set(saved["result"]["simulated"]) == set(MODELS)
-    again = noise_rates.plain(noise_rates.table_of(None, "dvs346", "flat", options))
+    again = plain(noise_rates.table_of(None, "dvs346", "flat", options))
     assert json.loads(json.dumps(again)) == saved["result"]["simulated"]["dvs346"]["flat"]
     text = (tmp_path / "noise_rates.md").read_text()
     for sensor, scenes in saved["result"]["simulated"].items():

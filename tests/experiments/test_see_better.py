@@ -23,9 +23,10 @@ from evflow.scenes import make_bank
 from evflow.types import Events
 from experiments import see_better
 from experiments.see_better import Options, files
-from experiments.shared import eventgan_sequences, gains, held_out, targets
+from experiments.shared import eventgan_sequences, gains, held_out, same_runs, targets
 from experiments.shared.common import slug
 from experiments.shared.conditions import Files, Workshop, conditions, network_maps, told
+from experiments.shared.see_better_settings import preset_of
 from experiments.shared.trainings import SIMULATED, Trainings
 
 SHAPE = (24, 32)
@@ -246,16 +247,16 @@ def test_a_table_is_never_replaced_by_a_narrower_one(tmp_path: Path) -> None:
     both = [target(), target("low")]
     full, fewer = (conditions(workshop(tmp_path), both, names)
                    for names in (("default", "wide", "oracle"), ("wide",)))
-    see_better.nothing_lost(tmp_path, fewer, 1)  # there is none
+    same_runs.nothing_lost(tmp_path, fewer, 1)  # there is none
     rows = {name: {"ssim": scores([0.1, 0.2])} for name in ("default", "wide", "oracle")}
     found = {t.name: gains.compared(rows) for t in both}
     path.write_text(json.dumps({"result": {"targets": found}}))
-    see_better.nothing_lost(tmp_path, full, 2)
+    same_runs.nothing_lost(tmp_path, full, 2)
     alone = conditions(workshop(tmp_path), both[:1], ("default", "wide", "oracle"))
     for given, seeds, lost in ((fewer, 3, "default, oracle,"), (full, 1, "seed 1,"),
                                (alone, 2, "low noisy,")):
         with pytest.raises(EvflowDataError, match=f"EV013.* has {lost} which"):
-            see_better.nothing_lost(tmp_path, given, seeds)
+            same_runs.nothing_lost(tmp_path, given, seeds)
 
 
 def test_numbers_that_leave_nothing_to_do_are_refused() -> None:
@@ -316,7 +317,7 @@ def test_runs_are_kept_and_gone_on_with(
 
 @pytest.mark.slow
 def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> None:
-    setting = see_better.preset_of("flow", "debug")
+    setting = preset_of("flow", "debug")
     setting = dataclasses.replace(setting, names=("raw",), seeds=1, drawn=3, learning=(
         dataclasses.replace(setting.learning, steps=2)))
     runs = Trainings(setting, tmp_path)
@@ -337,7 +338,7 @@ def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> Non
 def test_presets_fit_their_networks() -> None:
     for task in ("video", "flow"):
         for preset in ("debug", "small", "full"):
-            s = see_better.preset_of(task, preset)
+            s = preset_of(task, preset)
             assert min(s.shape) >= s.learning.data.crop
             assert s.skipped < s.windows
             assert s.learning.data.crop % s.network.stride == 0

@@ -1,0 +1,62 @@
+"""Every compared system, and ours, on one recording of a known camera, with their errors."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from evflow import Recording, estimate_camera
+from evflow.baselines import Fitted, Match, System
+from evflow.camera import Camera
+from experiments.shared import alone
+from experiments.shared.cameras import Hidden
+from experiments.shared.compared import CONSTANT, KNOWN, OURS, POLARITIES
+
+
+def all_fits(params: Any, recording: Recording, systems: dict[str, System]) -> dict[str, Fitted]:
+    """Every system and ours on one recording."""
+    return {name: s.fit(recording) for name, s in systems.items()} | ours(params, recording)
+
+
+def ours(params: Any, recording: Recording) -> dict[str, Fitted]:
+    """`estimate_camera` as one of the systems, whose thresholds are those of the summary, after
+    what is in it by itself."""
+    start = time.perf_counter()
+    span = min(40_000, int(recording.frame_times[-1] - recording.frame_times[0]))
+    found = estimate_camera(recording, params, min_window_us=span)
+    seconds = time.perf_counter() - start
+    theta = np.array([float(found.summary.theta_on), float(found.summary.theta_off)])
+    return alone.fitted(params, recording, found, span) | {
+        OURS: Fitted(found.camera, np.stack([found.valid] * 2), theta, seconds)}
+
+
+def flat(recording: Recording, theta: float) -> Fitted:
+    """A constant, as one of the systems."""
+    width, height = recording.events.size
+    return Fitted(Camera.constant((height, width), theta, theta),
+                  np.zeros((2, height, width), bool), np.full(2, theta), 0.0)
+
+
+def score(params: Any, hidden: Hidden, systems: dict[str, System]) -> dict[str, Any]:
+    """Errors of every system on one recording."""
+    recording = hidden.recording
+    fits = all_fits(params, recording, systems)
+    fits[CONSTANT] = flat(recording, 0.3)
+    dense = Recording(recording.events, hidden.video.astype(np.float32),
+                      1000 * np.arange(len(hidden.video)))
+    fits[KNOWN] = Match("given", start="fresh").fit(dense)
+    result: dict[str, Any] = {"signal": hidden.signal_events().tolist()}
+    for name, fit in fits.items():
+        row: dict[str, Any] = {"seconds": fit.seconds, "told": bool(fit.found.all())}
+        for i, polarity in enumerate(POLARITIES):
+            seen = np.asarray(getattr(fit.camera, f"theta_{polarity}"))
+            pixels = np.asarray(getattr(hidden.camera, f"theta_{polarity}"))
+            true = float(getattr(hidden.nominal, f"theta_{polarity}"))
+            row |= {f"mae_sequence/{polarity}": float(np.abs(seen - true).mean()),
+                    f"mae_pixel/{polarity}": float(np.abs(seen - pixels).mean()),
+                    f"median/{polarity}": float(abs(fit.theta[i] - true)),
+                    f"signed/{polarity}": float(fit.theta[i] - true)}
+        result[name] = row
+    return result

@@ -1,0 +1,51 @@
+"""Runs that continue in a folder: of the same setting, and with nothing left out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from evflow.errors import EvflowDataError
+from evflow.training.config import as_dict
+from experiments.shared.common import write_result
+from experiments.shared.conditions import Condition
+from experiments.shared.trainings import Setting
+
+
+def same_setting(out: Path, shared: dict[str, Any], setting: Setting) -> None:
+    """Write down what the runs in `out` share; EV013 where they were made by another setting."""
+    # What may grow from one command to the next: everything is trained and scored by itself.
+    free = ("names", "cameras", "circuits", "seeds")
+    wanted = shared | {k: v for k, v in as_dict(setting).items() if k not in free}
+    wanted = json.loads(json.dumps(wanted))
+    path = out / "setting.json"
+    if path.is_file():
+        before = json.loads(path.read_text())["config"]
+        if before != wanted:
+            differ = [k for k in wanted if before.get(k) != wanted[k]]
+            raise EvflowDataError("EV013", f"{out} holds runs of another setting ({differ}).",
+                                  "Choose another --out.")
+        return
+    write_result(path, {}, wanted)
+
+
+def nothing_lost(out: Path, conditions: Iterable[Condition], seeds: int) -> None:
+    """EV013 where the tables in `out` have targets, conditions or seeds that these leave out."""
+    path = out / "see_better.json"
+    if not path.is_file():
+        return
+    made = {(t.name, c.label) for c in conditions for t in c.targets}
+    targets, lost = {target for target, _ in made}, set()
+    for target, rows in json.loads(path.read_text())["result"]["targets"].items():
+        if target not in targets:
+            lost.add(target)
+            continue
+        lost |= {label for label in rows if (target, label) not in made}
+        lost |= {f"seed {seed}" for measures in rows.values() for entry in measures.values()
+                 for seed in entry["seeds"] if seed >= seeds}
+    if lost:
+        raise EvflowDataError(
+            "EV013", f"{path} has {', '.join(sorted(lost))}, which this command leaves out.",
+            "Give all --names, --targets and other conditions that it has, or another --out.")
