@@ -27,20 +27,17 @@ import itertools
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from evflow import Recording, load_weights, read_recording
+from evflow import load_weights, read_recording
 from evflow.baselines import SYSTEMS, Lgan, System
-from evflow.baselines.base import usable
 from evflow.errors import EvflowDataError
 from evflow.report import plots
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
-from experiments.shared.compared import POLARITIES, averages, picture, table
-from experiments.shared.fits import all_fits, score
+from experiments.shared.compared import averages, picture, table
+from experiments.shared.fits import score
 from experiments.shared.many import Setup, scores
 from experiments.shared.protocols import ENOUGH, protocols
-from experiments.shared.second_half import CHANGED, carried, changes, halves
+from experiments.shared.second_half import held_out
 
 REAL = ("newton_cradle_davis346.aedat4", "ijrr_slider_depth")
 
@@ -80,33 +77,6 @@ def systems_of(options: Options) -> dict[str, System]:
 def lively(_params: Any, hidden: Hidden, _protocol: Protocol) -> Hidden | None:
     """A recording with enough events of both polarities."""
     return hidden if (hidden.signal_events() >= ENOUGH).all() else None
-
-
-def held_out(
-    params: Any, recording: Recording, systems: dict[str, System]
-) -> dict[str, Any]:
-    """Each system's thresholds from the first half, and how well they foretell the second:
-    residual over the change, root mean squares, of pixels that changed; `frame regression` is
-    fitted to the second half itself and bounds what two numbers can do."""
-    first, second = halves(recording)
-    n, d = changes(second)
-    used = np.abs(d) > CHANGED
-    design = np.stack([n[:, 0][used], -n[:, 1][used]], -1).astype(np.float64)
-    best, *_ = np.linalg.lstsq(design, d[used].astype(np.float64), rcond=None)
-    size = float(np.sqrt(np.mean(d[used] ** 2)))
-
-    def left(on: np.ndarray, off: np.ndarray) -> float:
-        rest = d - carried(n, on, off)
-        return float(np.sqrt(np.mean(rest[used] ** 2)) / size)
-
-    result = {"frame regression": {"theta": best.tolist(), "left": left(*(np.full(
-        d.shape[1:], t, np.float32) for t in best)), "seconds": 0.0, "notes": [
-            f"{used.sum()} changes of {len(usable(second))} frame intervals"]}}
-    for name, fit in all_fits(params, first, systems).items():
-        maps = (np.asarray(getattr(fit.camera, f"theta_{p}")) for p in POLARITIES)
-        result[name] = {"theta": fit.theta.tolist(), "left": left(*maps),
-                        "seconds": fit.seconds, "notes": list(fit.notes)}
-    return result
 
 
 def main(options: Options) -> dict[str, Any]:

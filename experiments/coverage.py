@@ -13,25 +13,17 @@ summary over recordings, and for the maps over pixels. Draws the calibration cur
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jax.scipy.stats import norm
 
 from evflow import estimate_camera
 from evflow.camera import PARAMETERS
-from evflow.report import plots
-from evflow.report.plots import TITLES
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
+from experiments.shared.coverage_pages import LEVELS, curves, deviations, draw, strata
 from experiments.shared.many import Setup, study
-
-LEVELS = np.concatenate([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.68, 0.8, 0.9, 0.95, 0.99]])
-EDGES = {"signal events": (0, 50, 200, 1000, 5000, np.inf),
-         "seconds": (0, 0.15, 0.25, 0.5, 2.0, 10.0, np.inf)}
-Rows = list[dict[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,54 +79,6 @@ def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, Any] | N
                 f"valid/{name}": (away[found.valid][:, None] < deviations()).mean(0)
                 if found.valid.any() else np.full(len(LEVELS), np.nan)}
     return row
-
-
-def deviations() -> np.ndarray:
-    """Half-widths in standard deviations of the central intervals of probability LEVELS."""
-    return np.asarray(norm.ppf(0.5 + 0.5 * LEVELS))
-
-
-def curves(rows: Rows) -> dict[str, dict[str, list[float]]]:
-    """Coverage at LEVELS per parameter: of the summary, of all pixels, of valid ones."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for name in PARAMETERS:
-        away = np.array([r[f"summary/{name}"] for r in rows])
-        found[name] = {"summary": (away[:, None] < deviations()).mean(0).tolist()}
-        for kind in ("pixels", "valid"):
-            found[name][kind] = np.nanmean([r[f"{kind}/{name}"] for r in rows], 0).tolist()
-    return found
-
-
-def strata(rows: Rows) -> dict[str, dict[str, float]]:
-    """Coverage of the summary's 68 % and 95 % intervals by stratum."""
-    found = {}
-    for name in PARAMETERS:
-        away = np.array([r[f"summary/{name}"] for r in rows])
-        values = {"signal events": np.array([r[f"signal/{name}"] for r in rows]),
-                  "seconds": np.array([r["seconds"] for r in rows])}
-        for label, value in values.items():
-            for low, high in itertools.pairwise(EDGES[label]):
-                used = (np.maximum(value, 0.0) >= low) & (value < high)
-                if used.any():
-                    found[f"{name}, {label} {low}-{high}"] = {
-                        "recordings": int(used.sum()), "inside 68": float((away[used] < 1).mean()),
-                        "inside 95": float((away[used] < 1.96).mean())}
-    return found
-
-
-def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
-    figure = plots.new_figure(12, 3.4)
-    for i, name in enumerate(PARAMETERS):
-        axis = figure.add_subplot(1, 4, i + 1)
-        axis.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-        for kind, label in (("summary", "camera's summary"), ("pixels", "pixels"),
-                            ("valid", "valid pixels")):
-            axis.plot(LEVELS, found[name][kind], marker="o", markersize=3, label=label)
-        axis.set(title=TITLES[name], xlabel="interval", xlim=(0, 1), ylim=(0, 1), aspect="equal")
-        if i == 0:
-            axis.set_ylabel("share that holds the truth")
-            axis.legend(frameon=False, fontsize=8)
-    plots.save_figure(figure, path)
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -19,9 +19,9 @@ import numpy as np
 from evflow import estimate_camera, finish
 from evflow.camera import CameraPrior
 from evflow.estimation.pooled import pool_recording
-from evflow.report import plots
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
+from experiments.shared.curves_pages import draw, table
 from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH
 
@@ -106,35 +106,6 @@ def main(options: Options) -> dict[str, Any]:
     conclude(options, "curves", result, table(result))
     draw(result, options.out / "curves.png")
     return result
-
-
-def table(result: dict[str, Any]) -> str:
-    lines = ["| setting | value | recordings | theta, refined | theta, network | eta, refined | "
-             "eta, network |", "|" + "---|" * 7]
-    for name, points in result.items():
-        for value, kinds in points.items():
-            figures = [kinds.get(kind, {}).get(p, np.nan)
-                       for p in ("theta", "eta") for kind in ("refined", "network")]
-            lines.append(f"| {name} | {value} | {kinds['network']['recordings']} | " + " | ".join(
-                f"{v:.4f}" for v in figures) + " |")
-    return "\n".join(lines) + "\n\nPaper: theta .023 / .022, eta .045 / .027."
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
-    figure = plots.new_figure(3.2 * len(result), 5.6)
-    for i, (name, points) in enumerate(result.items()):
-        for j, parameter in enumerate(("theta", "eta")):
-            axis = figure.add_subplot(2, len(result), j * len(result) + i + 1)
-            for kind in ("refined", "network"):
-                shown = {v: k[kind][parameter] for v, k in points.items() if kind in k}
-                axis.plot(list(shown), list(shown.values()), marker="o", markersize=3, label=kind)
-            axis.set(xscale="log", ylim=(0, None), xlabel=name if j else None)
-            axis.set_xticks(list(points), [f"{v:g}" for v in points], rotation=60)
-            axis.minorticks_off()
-            if i == 0:
-                axis.set_ylabel(f"|{'θ' if parameter == 'theta' else 'η'} − true|")
-                axis.legend(frameon=False, fontsize=8)
-    plots.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import operator
 from pathlib import Path
 from typing import Any
@@ -32,8 +31,8 @@ from experiments.shared.common import StudyOptions, begin, conclude, estimator, 
 from experiments.shared.known_video import known_path, noise_told
 from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH, protocols
+from experiments.shared.video_strata import mean, strata
 
-EDGES = {"signal": (200, 1000, 5000, np.inf), "speed": (0, 2, 6, np.inf)}
 NAMES = ("theta_on", "theta_off")
 HEADS = ("protocol", "figure, stratum", "recordings", "ours", "true video", "ratio")
 FAR = 20.0  # times the network's std
@@ -78,40 +77,14 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
             f"signal/{name}": float(signal[i]),
             f"ours/{name}": abs(float(getattr(found.summary, name)) - true),
             f"known/{name}": abs(float(getattr(best, name)) - true),
-            f"ours/{name} of pixels that fired": _mean(np.abs(
+            f"ours/{name} of pixels that fired": mean(np.abs(
                 np.asarray(getattr(found.camera, name)) - pixels)[fired]),
-            f"known/{name} of pixels that fired": _mean(np.abs(maps[i] - pixels)[fired]),
+            f"known/{name} of pixels that fired": mean(np.abs(maps[i] - pixels)[fired]),
             f"ours/{eta}": abs(float(getattr(found.summary, eta)) - noise),
             f"known/{eta}": float(np.sqrt(2 / np.pi * noise / exposure)),
             f"ours/{eta} beside the known video": abs(float(getattr(found.summary, eta)) - noise),
             f"known/{eta} beside the known video": abs(float(told[i]) - noise)}
     return result
-
-
-def _mean(values: Any) -> float:
-    return float(np.mean(values)) if len(values) else np.nan
-
-
-def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Ours, with the true video and their ratio, per figure; all recordings with enough events,
-    then by stratum."""
-    found: dict[str, dict[str, float]] = {}
-    for figure in [k.split("/")[1] for k in rows[0] if k.startswith("ours/")]:
-        polarity = "off" if "off" in figure else "on"
-        signal = np.array([r[f"signal/theta_{polarity}"] for r in rows])
-        speed = np.array([r["speed"] for r in rows])
-        ours, known = (np.array([r[f"{k}/{figure}"] for r in rows]) for k in ("ours", "known"))
-        choices = {"all": signal >= ENOUGH}
-        for name, value in (("signal", signal), ("speed", speed)):
-            for low, high in itertools.pairwise(EDGES[name]):
-                choices[f"{name} {low}-{high}"] = (
-                    (signal >= ENOUGH) & (value >= low) & (value < high))
-        for label, used in choices.items():
-            if used.any():
-                a, b = float(np.nanmean(ours[used])), float(np.nanmean(known[used]))
-                found[f"{figure}, {label}"] = {
-                    "recordings": int(used.sum()), "ours": a, "known": b, "ratio": a / b}
-    return found
 
 
 def main(options: Options) -> dict[str, Any]:

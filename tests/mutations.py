@@ -57,7 +57,7 @@ MUTATIONS = (
     Mutation("bins of Eq. 2", "voxel.py",
              "position = (inside.t - t0_us) * ((bins - 1) / window_us)",
              "position = (inside.t - t0_us) * (bins / window_us)", f"{VOXEL} -k equation_2"),
-    Mutation("polarity", "voxel.py", "(pixel * 2 + ~inside.p)", "(pixel * 2 + inside.p)",
+    Mutation("polarity", "voxel.py", "* 2 + ~inside.p)", "* 2 + inside.p)",
              f"{VOXEL} -k on_channels"),
     Mutation("beta of Eq. 6", "training/losses.py", "beta: float = 2.0", "beta: float = 1.0",
              "tests/training/test_losses.py -k condition"),

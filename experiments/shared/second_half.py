@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import cv2
 import numpy as np
 
 from evflow import Recording
+from evflow.baselines import System
 from evflow.baselines.base import intervals, usable
+from experiments.shared.compared import POLARITIES
+from experiments.shared.fits import all_fits
 
 CHANGED = 0.1  # log units: pixels that change by less between two frames say little
 SMOOTH = 1.0  # pixels: frames and counts are blurred alike, against noise and misregistration
@@ -40,3 +44,30 @@ def blurred(image: np.ndarray) -> np.ndarray:
 def carried(n: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
     """What the events carry (N, H, W) at thresholds (H, W)."""
     return n[:, 0] * on[None] - n[:, 1] * off[None]
+
+
+def held_out(
+    params: Any, recording: Recording, systems: dict[str, System]
+) -> dict[str, Any]:
+    """Each system's thresholds from the first half, and how well they foretell the second:
+    residual over the change, root mean squares, of pixels that changed; `frame regression` is
+    fitted to the second half itself and bounds what two numbers can do."""
+    first, second = halves(recording)
+    n, d = changes(second)
+    used = np.abs(d) > CHANGED
+    design = np.stack([n[:, 0][used], -n[:, 1][used]], -1).astype(np.float64)
+    best, *_ = np.linalg.lstsq(design, d[used].astype(np.float64), rcond=None)
+    size = float(np.sqrt(np.mean(d[used] ** 2)))
+
+    def left(on: np.ndarray, off: np.ndarray) -> float:
+        rest = d - carried(n, on, off)
+        return float(np.sqrt(np.mean(rest[used] ** 2)) / size)
+
+    result = {"frame regression": {"theta": best.tolist(), "left": left(*(np.full(
+        d.shape[1:], t, np.float32) for t in best)), "seconds": 0.0, "notes": [
+            f"{used.sum()} changes of {len(usable(second))} frame intervals"]}}
+    for name, fit in all_fits(params, first, systems).items():
+        maps = (np.asarray(getattr(fit.camera, f"theta_{p}")) for p in POLARITIES)
+        result[name] = {"theta": fit.theta.tolist(), "left": left(*maps),
+                        "seconds": fit.seconds, "notes": list(fit.notes)}
+    return result

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import evaluate
-from experiments.shared import alone
+from experiments.shared import alone, evaluated
 
 SHAPE = (4, 6)
 
@@ -39,13 +38,13 @@ def test_a_scene_at_rest_has_no_rows() -> None:
 
 
 def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:
-    rows = [{f"{k}/{name}": 0.5 for name in evaluate.PAPER for k in (
+    rows = [{f"{k}/{name}": 0.5 for name in evaluated.PAPER for k in (
         "true", "summary", "mae_sequence", "mae_pixel", "mae_fired", "constant", "constant_truth",
-        "map_gain", *(f"{alone.PAPER_FLOW}: {metric}" for metric in evaluate.METRICS))}
-        | {f"{k}/{name}": np.nan for name in evaluate.PAPER
+        "map_gain", *(f"{alone.PAPER_FLOW}: {metric}" for metric in evaluated.METRICS))}
+        | {f"{k}/{name}": np.nan for name in evaluated.PAPER
            for k in ("network", "inside_68", "inside_95")}
-        | {f"signal/{name}": 1e3 for name in evaluate.PAPER} for _ in range(3)]
-    text = evaluate.table({"0.03": evaluate.averages(rows)})
+        | {f"signal/{name}": 1e3 for name in evaluated.PAPER} for _ in range(3)]
+    text = evaluated.table({"0.03": evaluated.averages(rows)})
     assert f"| {alone.PAPER_FLOW} | 0.03 | theta_on | 0.5000 |" in text
     assert f"| {alone.FLOW} |" not in text
     first = text.splitlines()[2].split(" | ")
@@ -55,5 +54,5 @@ def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:
 
 @pytest.mark.parametrize(("error", "width", "within"), [(0.1, 0.2, 1.0), (-0.3, 0.2, 0.0)])
 def test_within(error: float, width: float, within: float) -> None:
-    assert evaluate.inside(error, width) == within
-    assert np.isnan(evaluate.inside(error, float("nan")))
+    assert evaluated.inside(error, width) == within
+    assert np.isnan(evaluated.inside(error, float("nan")))
