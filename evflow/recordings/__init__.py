@@ -1,4 +1,4 @@
-"""Recordings as they are: windows between frames, gaps, glitches, faulty pixels, and `check`.
+"""Recordings: windows between frames, gaps, glitches, faulty pixels, and `check`.
 
 NumPy only: judging a recording never imports JAX.
 """

@@ -1,6 +1,6 @@
-"""A recording put right: frames from elsewhere, another clock, turned round, linear in light.
+"""Corrections to a recording: frames from another file, clock offset, mirroring, response curve.
 
-Each function returns a new `Recording` with a note of what was done; events are never touched.
+Each function returns a new `Recording` with a note on what was done; events are never changed.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from evflow.light.colour import are_luma, as_seen, mosaic_luma, mosaic_note
 from evflow.notes import Note
 from evflow.types import Recording
 
-MARGIN_US = 1_000_000  # frames that far outside the events are kept: their clock may be off
+MARGIN_US = 1_000_000  # frames this far outside the events are kept: their clock may be off
 
 
 def linearised(recording: Recording, response: str) -> Recording:
     """The recording with frames proportional to light: the camera's tone curve undone.
 
-    Thresholds are measured against the log of light. Of frames with a gamma of 2.2 they come out
-    2.2 times too small.
+    Thresholds refer to the log of light. Measured from frames with a gamma of 2.2 they come out 2.2
+    times too small.
 
     Args:
         recording: with frames as they were stored.
@@ -47,11 +47,11 @@ def linearised(recording: Recording, response: str) -> Recording:
 
 
 def demosaiced(recording: Recording, pattern: str) -> Recording:
-    """The recording whose frames are a raw mosaic, with their luma in its place, of the same size
-    and dtype. EV020 where they were colour images already; errors of `colour.mosaic_luma`."""
+    """The recording with frames that are a raw mosaic converted to luma, of the same size and
+    dtype. EV020 if they were colour images already; errors of `colour.mosaic_luma`."""
     if are_luma(recording.notes):
         raise EvflowDataError(
-            "EV020", "the frames are luma of colour images already, and no "
+            "EV020", "the frames are already luma of colour images, not a "
             f"{pattern.upper()} mosaic.", "Leave out --bayer.")
     frames = np.empty(recording.frames.shape, recording.frames.dtype)
     for i, frame in enumerate(recording.frames):
@@ -63,7 +63,7 @@ def shifted(recording: Recording, offset_us: int) -> Recording:
     """The recording with offset_us added to its frame times."""
     if not offset_us:
         return recording
-    moved = Note("frames.moved", f"frame times moved by {offset_us / 1e3:+g} ms")
+    moved = Note("frames.moved", f"frame times shifted by {offset_us / 1e3:+g} ms")
     return _changed(recording, moved, frame_times=recording.frame_times + offset_us)
 
 
@@ -78,12 +78,12 @@ def flipped(recording: Recording, side: str) -> Recording:
 def with_frames(
     recording: Recording, path: str | os.PathLike, *, offset_us: int = 0, **hints: Any
 ) -> Recording:
-    """The recording with the frames of `path` in place of its own: a folder of images, a video, a
+    """The recording with the frames of `path` instead of its own: a folder of images, a video, a
     NumPy stack, another recording.
 
     hints: fps, timestamps, time_unit, full_scale, partial, bayer, colour, as in `open_frames`;
-    times are those of the events' clock, after offset_us is added. Frames more than a second away
-    from all events are left out.
+    times are on the events' clock after offset_us is added. Frames more than a second away from all
+    events are left out.
     Raises EV012 (no frame near the events), EV015 (another size), and what `open_frames` raises.
     """
     try:
@@ -97,7 +97,7 @@ def with_frames(
         raise EvflowDataError(
             "EV015", f"frames of {path} are {source.size[0]}x{source.size[1]}, the events "
             f"{recording.events.size[0]}x{recording.events.size[1]}.",
-            "Both must come from one sensor, uncropped.")
+            "Both must come from the same sensor, uncropped.")
     kept, times, seen = [], [], []
     for frame, time in as_seen(source.open(), hints.get("colour", "luma")):
         seen.append(time + offset_us)
@@ -108,16 +108,16 @@ def with_frames(
         raise EvflowDataError(
             "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but the frames of {path} "
             f"{seen[0]:,}..{seen[-1]:,} us.",
-            "On another clock? Pass --frames-offset-ms "
-            f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; in another "
-            "unit, --timestamps-unit.")
-    notes = (*recording.notes, Note("frames.replaced", f"frames are those of {path}"),
+            "Another clock? Pass --frames-offset-ms "
+            f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; for another "
+            "unit pass --timestamps-unit.")
+    notes = (*recording.notes, Note("frames.replaced", f"frames come from {path}"),
              *(Note(note.code, _reworded(note.text)) for note in source.notes))
     return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes)
 
 
 def _reworded(text: str) -> str:
-    """Beside a recording, --time-unit is that of the events, and --fps a video's to be written."""
+    """Next to a recording, --time-unit is the events', and --fps that of a video to be written."""
     return text.replace("--time-unit", "--timestamps-unit").replace("--fps", "--frames-fps")
 
 

@@ -1,9 +1,9 @@
 """Events that bunch at the frames: the readout of a camera's frames disturbs its pixels.
 
-In `slider_depth` of a DAVIS240C pixels all over the sensor send ON events at twenty times the rate
-of before, half a millisecond before the time of each frame, and OFF events a millisecond later: a
-fifth of all ON events. As they lie at one phase of the frames' period and are short, light that
-flickers, motion by jumps and a simulator's time slots look otherwise.
+In `slider_depth` of a DAVIS240C, pixels all over the sensor send ON events at twenty times the
+previous rate half a millisecond before the time of each frame, and OFF events a millisecond later:
+a fifth of all ON events. Bunches are short and at one phase of the frame period, unlike flickering
+light, jerky motion and a simulator's time slots.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 from evflow.types import Events, Recording, release
 
 BIN_US = 250
-MOST_FRAMES = 64  # looked at, evenly spread
-LEAST_FRAMES, LEAST_BINS, MOST_BINS = 3, 16, 400  # bins: of what is looked at around a frame
+MOST_FRAMES = 64  # examined, evenly spread
+LEAST_FRAMES, LEAST_BINS, MOST_BINS = 3, 16, 400  # bins: of the time examined around a frame
 PEAK, RAISED = 4.0, 2.0  # times the usual rate: in the middle of a bunch, and at its edges
-PRESENT = 0.8  # of the frames have it
+PRESENT = 0.8  # share of the frames that must have it
 GAP_BINS = 4  # between a bunch and its rebound
-LONGEST_US, LONGEST_SHARE = 4_000, 0.15  # of a bunch; of the frames' period
-LEAST_SHARE, LEAST_EVENTS = 0.02, 300  # of a polarity's, too many for the rate around them
-LEAST_USUAL = 1.0  # events a bin of a frame's period, elsewhere
+LONGEST_US, LONGEST_SHARE = 4_000, 0.15  # of a bunch; relative to the frame period
+LEAST_SHARE, LEAST_EVENTS = 0.02, 300  # of a polarity's events, in excess of the usual rate
+LEAST_USUAL = 1.0  # events per bin elsewhere in the frame period
 
 
 class Bunch(NamedTuple):
-    """When it comes, us after a frame (below 0: before); the shares of the ON and OFF events that
-    are beyond the rate around it."""
+    """begin_us, end_us: its time relative to a frame (below 0: before); on, off: shares of the ON
+    and OFF events in excess of the rate around it."""
 
     begin_us: int
     end_us: int
@@ -36,7 +36,7 @@ class Bunch(NamedTuple):
 
 
 def beside(events: Events, frame_times: np.ndarray, found: Bunch) -> Events:
-    """The events outside of the bunch of each frame."""
+    """The events outside the bunch of each frame."""
     kept = np.ones(len(events), bool)
     ends = np.searchsorted(events.t, [frame_times + found.begin_us, frame_times + found.end_us])
     for first, last in ends.T:
@@ -46,7 +46,7 @@ def beside(events: Events, frame_times: np.ndarray, found: Bunch) -> Events:
 
 
 def bunch(recording: Recording) -> Bunch | None:
-    """The bunch of events that comes with each frame; None where there is none."""
+    """The bunch of events that comes with each frame; None if there is none."""
     counts, start_us = _by_phase(recording)
     total = counts.sum(0)
     usual = np.median(total, 1) if len(counts) else np.zeros(2)

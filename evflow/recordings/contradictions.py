@@ -1,10 +1,10 @@
-"""Frames that the events contradict: what changes from frame to frame is what a pixel's events
-add up to, a threshold each.
+"""Frames that the events contradict: between frames, log brightness changes by the sum of a pixel's
+events, one threshold each.
 
-Over a recording the change of log brightness is regressed on the ON and the OFF events of the
-same interval. What the events leave of it is alike in all intervals of a sound recording. Where
-they leave much more on both sides of a frame, and hardly go with it, that frame shows something
-else; where all pixels change by something that no events account for, the exposure did.
+The change of log brightness is regressed on the ON and OFF events of the same interval, over the
+whole recording. In a sound recording the residual is alike in all intervals. If it is much larger
+on both sides of a frame and hardly correlated with events, that frame shows something else; if all
+pixels change together without events, the exposure changed.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from evflow.types import Recording, release
 
 Array = np.ndarray
 
-PIXELS = 4096  # looked at, evenly spread
-DARK_DN, BRIGHT_DN = 15.0, 252.0  # beyond, the change of log brightness means little
-FRAMES = 64  # looked at before their memory is given back: they may lie on the disk
+PIXELS = 4096  # examined, evenly spread
+DARK_DN, BRIGHT_DN = 15.0, 252.0  # outside, changes of log brightness are unreliable
+FRAMES = 64  # read before their memory is released: they may be memory-mapped
 LEAST_PIXELS, LEAST_INTERVALS = 100, 6
-FOLLOWS = 0.4  # median correlation of change and net events: below, they cannot judge frames
-LITTLE, MUCH = 0.5, 2.0  # of the median correlation, of the median rest
-STEP, STEP_SPREAD = 0.08, 9.0  # log units; times the median deviation of an interval's mean rest
+FOLLOWS = 0.4  # median correlation of change and net events, below which events cannot judge frames
+LITTLE, MUCH = 0.5, 2.0  # times the median correlation, times the median residual
+STEP, STEP_SPREAD = 0.08, 9.0  # log units; median deviations of an interval's mean residual
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rests:
-    """Of each interval that the events cover, arrays (K,): its number, the correlation of change
-    and net events, the rms and the mean of the change that events leave, in log units."""
+    """For each interval that the events cover, arrays (K,): its number, the correlation of change
+    and net events, and the rms and mean of the residual in log units."""
 
     interval: Array
     correlation: Array
@@ -38,7 +38,7 @@ class Rests:
 
 
 def contradicted(recording: Recording, start_us: int, stop_us: int) -> tuple[list[int], list[int]]:
-    """Frames that the events contradict, and intervals i (frame i to i + 1) in which all of the
+    """Frames that the events contradict, and intervals i (frame i to i + 1) in which the whole
     frame changes without events; start_us, stop_us: the time that the events cover."""
     found = _rests(recording, start_us, stop_us)
     if found is None or np.median(found.correlation) < FOLLOWS:
@@ -72,13 +72,13 @@ def _rests(recording: Recording, start_us: int, stop_us: int) -> Rests | None:
         return None
     away = np.array([1.0, *-np.linalg.solve(usual[1:, 1:], usual[1:, 0])])
     rest = np.sqrt(np.maximum(np.einsum("i,kij,j->k", away, covariance, away), 0.0))
-    # A frame that hides what the others show is as strange as one that shows something else.
+    # A frame that hides what the others show is as suspect as one that shows something else.
     return Rests(covered, correlation, np.where(shown, rest, np.inf),
                  np.where(shown, mean @ away, np.median(mean @ away)))
 
 
 def _moments(recording: Recording, i: int) -> Array:
-    """(13,): number of pixels that frames i and i + 1 show, then mean and second moments of their
+    """(13,): number of pixels visible in frames i and i + 1, then mean and second moments of their
     change of log brightness, ON events and minus OFF events."""
     height, width = recording.frames.shape[1:]
     stride = max(1, int(np.sqrt(height * width / PIXELS)))

@@ -1,10 +1,9 @@
-"""Pixels that do not measure the scene: hot ones fire by themselves, dead ones never.
+"""Pixels that do not measure the scene: hot ones fire without a signal, dead ones never fire.
 
-One rule says that a pixel fires by itself: it sends several times what it is expected to send,
-and more than that by chance (`fires_alone`). What is expected is the noise while nothing happens
-(`hot_pixels`, of `quiet` times), the mean of the other pixels where all are at rest
-(`hot_at_rest`), or the neighbours' events where the scene may move (`hot_among_neighbours`).
-NumPy and OpenCV only.
+One rule identifies a hot pixel: it sends several times the expected number of events, and more than
+chance allows (`fires_alone`). Expected is the noise while nothing happens (`hot_pixels`, from
+`quiet` times), the mean of the other pixels of a static scene (`hot_at_rest`), or the neighbours'
+events if the scene may move (`hot_among_neighbours`). NumPy and OpenCV only.
 """
 
 from __future__ import annotations
@@ -15,23 +14,23 @@ import cv2
 import numpy as np
 
 HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
-AROUND = 5  # pixels: side of the neighbourhood that a pixel is compared with
+AROUND = 5  # pixels: side of the neighbourhood of a pixel
 PASSES = 10
 MOVING_FACTOR = 10.0  # edges and thresholds make neighbours differ more than noise rates do
-RESTLESS = 1.5  # times the noise that neighbours are expected to send: more, and edges went by
-LEAST_FIRED, LASTING = 2, 0.75  # times with events, and their share of those expected
-TWICE = 2.0  # as many events as the others there: thresholds alone do not make a pixel send them
-OWN_SHARE = 0.5  # of what its quiet rate makes a pixel send it must send beside the edges
+RESTLESS = 1.5  # times the expected noise of neighbours: more means that edges passed
+LEAST_FIRED, LASTING = 2, 0.75  # quiet times with events, and their share of the expected ones
+TWICE = 2.0  # times the events of the neighbours: more than thresholds alone explain
+OWN_SHARE = 0.5  # minimum excess over the neighbours, relative to what its quiet rate predicts
 MANY_FIRED = 4  # quiet times with events: an edge is not missed so often
-QUIET_NEAR = 8.0  # times its own quiet time: that of the neighbourhood that tells of rest
-MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, itself included
-DEAD_EVENTS = 12  # median there: e^-12 by chance alone, and room for a high threshold
+QUIET_NEAR = 8.0  # times its own quiet time: that of a neighbourhood that can show rest
+MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, including itself
+DEAD_EVENTS = 12  # median of the neighbourhood: chance e^-12, with room for a high threshold
 
 
 def fires_alone(
     events: np.ndarray, expected: np.ndarray | float, factor: float = HOT_FACTOR
 ) -> np.ndarray:
-    """Where events exceed `factor` times what a pixel is expected to send, and by chance."""
+    """Where events exceed `factor` times the expected number by more than chance."""
     most = factor * np.asarray(expected)
     return events > most + 5.0 * np.sqrt(most) + HOT_EVENTS
 
@@ -40,22 +39,22 @@ def hot_pixels(
     quiet: np.ndarray, rate_hz: float, counts: np.ndarray | None = None, seconds: float = 0.0
 ) -> np.ndarray:
     """(H, W) bool: pixels that fire far more often than rate_hz (both polarities) while nothing
-    happens in front of them; less than one in a million by chance. quiet (4, H, W): events,
-    seconds and number of such times, and how many of these had events. counts (H, W): events of
-    the whole recording, of so many seconds.
+    happens in front of them; less than one in a million by chance. quiet (4, H, W): events, seconds
+    and number of such times, and how many of them had events. counts (H, W): events of the whole
+    recording, over the given seconds.
 
-    Faults are scattered: where several pixels of a neighbourhood are busy, or the others there
-    send more than noise too, something moved that the frames do not show, such as an edge that
-    went by between two of them. There only what fires at most times is a fault. Where things move,
-    quiet times are few, and some are none: there it must fire at most of them while the others
-    rest, or send more events in all than any other there, by what its rate makes.
+    Faults are scattered: if several pixels of a neighbourhood are busy, or its other pixels send
+    more than noise too, something moved that the frames do not show, such as an edge that passed
+    between two of them. There, only a pixel that fires in most quiet times is a fault. Where things
+    move quiet times are rare: there it must fire in most of them while the others rest, or send
+    more events in all than any neighbour, by what its rate predicts.
     """
     events, seconds_quiet, times, fired = quiet
     expected = rate_hz * seconds_quiet
     busy = fires_alone(events, expected)
     others, noise = _around(np.where(busy, 0.0, events)), _around(np.where(busy, 0.0, expected))
     at_rest = others <= _restless(noise)
-    steady = times * -np.expm1(-events / np.maximum(times, 1))  # times with events, at its own rate
+    steady = times * -np.expm1(-events / np.maximum(times, 1))  # expected times with events
     lasting = (fired >= LEAST_FIRED) & (fired >= LASTING * steady)
     hot: np.ndarray = busy & (_around(busy) <= MOST_HOT_NEAR) & (at_rest | lasting)
     if counts is None:
@@ -63,20 +62,20 @@ def hot_pixels(
     own = OWN_SHARE * seconds * events / np.maximum(seconds_quiet, 1e-9)
     usual = _median_around(counts)
     stands_out = (counts - _most_of_others(counts, hot) >= own) & (counts > TWICE * usual)
-    told = _around(seconds_quiet) >= QUIET_NEAR * seconds_quiet  # do others tell of rest?
+    told = _around(seconds_quiet) >= QUIET_NEAR * seconds_quiet  # whether neighbours can show rest
     return hot & ((usual <= _restless(rate_hz * seconds)) | stands_out
                   | (lasting & told & (at_rest | (fired >= MANY_FIRED))))
 
 
 def _restless(noise: Any) -> Any:
-    """More events than so many, where `noise` are expected, come of edges that went by."""
+    """Number of events, given the expected `noise`, above which edges must have passed."""
     return RESTLESS * noise + 2.0 * np.sqrt(RESTLESS * noise)
 
 
 def hot_at_rest(counts: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels far above the mean of the others, of a scene at rest."""
+    """(H, W) bool: pixels far above the mean of the others, in a static scene."""
     hot = np.zeros(counts.shape, bool)
-    for _ in range(PASSES):  # hot pixels raise the mean that they are judged by
+    for _ in range(PASSES):  # hot pixels raise the mean they are compared with
         more = fires_alone(counts, float(counts[~hot].mean()))
         if (more == hot).all():
             break
@@ -85,8 +84,8 @@ def hot_at_rest(counts: np.ndarray) -> np.ndarray:
 
 
 def hot_among_neighbours(counts: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels far above the median around them, of any scene. Where that is 0, one
-    event is expected, as few events come in clumps."""
+    """(H, W) bool: pixels far above the median of their neighbourhood, in any scene. If that is 0,
+    one event is expected, since few events come in clumps."""
     return fires_alone(counts, np.maximum(_median_around(counts), 1.0), MOVING_FACTOR)
 
 
@@ -96,8 +95,8 @@ def dead_pixels(n_events: np.ndarray) -> np.ndarray:
 
 
 def _most_of_others(counts: np.ndarray, hot: np.ndarray) -> np.ndarray:
-    """The most events (H, W) that a pixel in the neighbourhood of each has sent, itself and hot
-    ones left out."""
+    """The largest number of events (H, W) that a neighbour of each pixel has sent, without itself
+    and hot ones."""
     others = np.ones((AROUND, AROUND), np.uint8)
     others[AROUND // 2, AROUND // 2] = 0
     return cv2.dilate(np.where(hot, 0, counts).astype(np.float32), others)

@@ -1,9 +1,9 @@
-"""Light that flickers: a lamp on the mains, a screen that is dimmed by pulses.
+"""Flickering light: a lamp on the mains, or a screen dimmed by pulses.
 
-As light rises ON events come all over the sensor, and as it falls OFF events, period by period: the
-rates of the two have a line at one frequency, against each other. Motion has no line, what comes
-with frames and a simulator's time slots have both polarities at once, and a lamp that blinks in the
-scene is seen in few places.
+As light rises ON events come all over the sensor, as it falls OFF events, period by period: both
+rates have a spectral line at one frequency, in antiphase. Motion has no line; what comes with
+frames and a simulator's time slots affect both polarities at once; a blinking lamp in the scene is
+seen in few places.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import numpy as np
 from evflow.types import Events
 
 BIN_US = 500
-LEAST_HZ = 45.0  # looked for from: what moves by itself is slower
-SEGMENT, LEAST_SEGMENT, MOST_SEGMENTS = 1024, 256, 16  # bins; of a recording, evenly spread
+LEAST_HZ = 45.0  # lowest frequency searched: moving things are slower
+SEGMENT, LEAST_SEGMENT, MOST_SEGMENTS = 1024, 256, 16  # bins; segments evenly spread
 LINE = 8.0  # times the usual amplitude
-DEPTH = 0.2  # of the mean, by which both rates must rise and fall
-AGAINST = -0.5  # cosine between the two, at most
-PLACES, EVENTS_A_PLACE, SPREAD = 4, 50, 0.6  # a side; the least to tell; the share that joins
+DEPTH = 0.2  # minimum modulation of both rates, relative to the mean
+AGAINST = -0.5  # maximum cosine between the two
+PLACES, EVENTS_A_PLACE, SPREAD = 4, 50, 0.6  # per side; minimum events; share that must agree
 
 
 class Flicker(NamedTuple):
-    """Its frequency, and by how much of their mean the rates of ON and OFF rise and fall with it:
-    0 to 1, more where events come in a part of the period alone."""
+    """Its frequency, and the modulation of ON and OFF rates relative to their mean: 0 to 1, more if
+    events come only in part of the period."""
 
     hz: float
     on: float
@@ -34,7 +34,7 @@ class Flicker(NamedTuple):
 
 
 def flicker(events: Events) -> Flicker | None:
-    """The flicker of the light that the whole sensor sees; None where there is none."""
+    """The flicker of light over the whole sensor; None if there is none."""
     length = min(SEGMENT, events.duration_us // BIN_US)
     if length < LEAST_SEGMENT:
         return None
@@ -61,7 +61,7 @@ def flicker(events: Events) -> Flicker | None:
 
 
 def _parts(events: Events, length: int) -> Iterator[tuple[Events, int]]:
-    """Segments of a recording and when they begin, evenly spread."""
+    """Segments of a recording and their start times, evenly spread."""
     rest_us = events.duration_us - length * BIN_US
     count = 1 + min(MOST_SEGMENTS - 1, rest_us // (length * BIN_US))
     for begin in int(events.t[0]) + np.linspace(0, rest_us, count).astype(np.int64):
@@ -69,14 +69,14 @@ def _parts(events: Events, length: int) -> Iterator[tuple[Events, int]]:
 
 
 def _counts(part: Events, begin: int, length: int) -> np.ndarray:
-    """ON and OFF events a bin, (2, length)."""
+    """ON and OFF events per bin, (2, length)."""
     at = (part.t - begin) // BIN_US + length * ~part.p
     return np.bincount(at, minlength=2 * length).reshape(2, length)
 
 
 def _joining(parts: list[Events], hz: float) -> float:
-    """The share of the sensor's places, of those with enough events, whose light flickers at this
-    frequency and with the others."""
+    """The share of places on the sensor, among those with enough events, whose light flickers at
+    this frequency in phase with the others."""
     joined, told = 0, 0
     for part in parts:
         turn = np.where(part.p, 1.0, -1.0) * np.exp(-2j * np.pi * hz / 1e6 * part.t)

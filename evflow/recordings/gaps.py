@@ -10,16 +10,16 @@ from evflow.files.spool import forget
 
 Array = np.ndarray
 
-PACKET = 64  # events: the time they take says how dense the recording is
-SAMPLES = 1_000_000  # packets looked at
-GAP_PACKETS, GAP_US = 10, 10_000  # a gap is longer than both
-BLOCK = 1 << 22  # events looked at at a time
-TICKS = 3.0  # and than this many of the pauses between two times: some simulators know few times
+PACKET = 64  # events: the time they span gives the density of the recording
+SAMPLES = 1_000_000  # packets examined
+GAP_PACKETS, GAP_US = 10, 10_000  # a gap exceeds both
+BLOCK = 1 << 22  # events examined at a time
+TICKS = 3.0  # and this many usual pauses between two times: some simulators use few times
 
 
 def event_gaps(t: Array) -> Array:
-    """Indices i of the times t (N,) int64 us, ascending, between which and t[i + 1] events are
-    missing; none where there are too few to tell."""
+    """Indices i of the ascending times t (N,) int64 us such that events are missing between t[i]
+    and t[i + 1]; none if there are too few to decide."""
     if len(t) < 4 * PACKET:
         return np.zeros(0, np.int64)
     packet = float(np.median(_packets(t)))
@@ -32,7 +32,7 @@ def event_gaps(t: Array) -> Array:
 
 
 def _packets(t: Array) -> Array:
-    """How long SAMPLES packets took, block by block: the times may lie on the disk."""
+    """Time spans of SAMPLES packets, in blocks, as times may be memory-mapped."""
     stride = len(t) // SAMPLES + 1
     some = []
     for first in range(0, len(t) - PACKET, BLOCK // stride * stride):
@@ -43,14 +43,14 @@ def _packets(t: Array) -> Array:
 
 
 def _pauses(t: Array) -> Iterator[tuple[int, Array]]:
-    """(number of the first, t[i + 1] - t[i]) block by block: the times may lie on the disk."""
+    """(number of the first, t[i + 1] - t[i]) in blocks, as times may be memory-mapped."""
     for first in range(0, len(t) - 1, BLOCK):
         yield first, np.diff(t[first : first + BLOCK + 1])
         forget(t)
 
 
 def _usual_pause(t: Array) -> float:
-    """What 95 % of the pauses between two different times do not exceed, of SAMPLES of them."""
+    """The 95th percentile of pauses between distinct times, from SAMPLES of them."""
     stride = sum(int(np.count_nonzero(d)) for _, d in _pauses(t)) // SAMPLES + 1
     some, before = [], 0
     for _, d in _pauses(t):

@@ -1,8 +1,8 @@
-"""Frames that do not show what the pixels saw: flashes and black frames, exposure changes.
+"""Frames that do not show what the pixels saw: flashes, black frames, exposure changes.
 
-A recording's frames come from another circuit than its events. Where the frame camera alone
-stumbles, the change of brightness between two frames says nothing about thresholds. The frames
-alone tell flashes and changes of what stands still; beside the events they tell the rest.
+Frames and events come from different circuits. If only the frame camera stumbles, the change of
+brightness between two frames says nothing about thresholds. Flashes and changes of static parts are
+found in the frames alone, other faults by comparison with the events.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import numpy as np
 from evflow.recordings.contradictions import FRAMES, contradicted
 from evflow.types import Recording, release
 
-DARK_DN, LEAST = 15.0, 0.1  # pixels below do not count; so many of all must be brighter
-STRIDE = 4  # every 4th pixel of every 4th row tells a whole frame's fault
+DARK_DN, LEAST = 15.0, 0.1  # pixels below are ignored; minimum share of brighter ones
+STRIDE = 4  # every 4th pixel of every 4th row is enough for a whole frame's fault
 JUMP = 0.15  # log units: more than frame noise
 GLITCH_SHARE = 0.3  # of the pixels, all brighter or all darker: fast textures are both
 OTHER_SHARE = 0.02
-EXPOSURE = 0.08  # log units: change that most pixels share
+EXPOSURE = 0.08  # log units: change shared by most pixels
 ALIKE, ALIKE_SHARE = 0.05, 0.6  # log units, share of pixels
 SATURATED_DN, BLACK_DN = 252.0, 0.5  # a frame at either end hides what its pixel saw
-LIT_SHARE = 0.3  # of the pixels, more ON than OFF or the reverse, where the light itself changed
+LIT_SHARE = 0.3  # of the pixels: more ON than OFF or the reverse, if the light itself changed
 
 
 def faulty_frames(
@@ -29,10 +29,11 @@ def faulty_frames(
     """({frame: fault}, {i: fault of the step from frame i to i + 1}), a short reason each.
     start_us, stop_us: the time that the events cover."""
     frames, intervals = contradicted(recording, start_us, stop_us)
-    glitches = dict.fromkeys(frames, "a frame that shows something else than the events (old, or "
+    glitches = dict.fromkeys(frames, "a frame that does not match the events (old, or "
                              "damaged?)")
     steps = dict.fromkeys((i for i in intervals if not _lit(recording, i)),
-                          "all of the frame changes by more than the events say (auto-exposure?)")
+                          "the whole frame changes by more than the events account for "
+                          "(auto-exposure?)")
     shown: list[np.ndarray] = []
     for i in range(len(recording.frame_times)):
         if i % FRAMES == 0:
@@ -42,8 +43,8 @@ def faulty_frames(
         if len(shown) == 3 and _glitch(*shown) and not _lit(recording, i - 1):
             glitches[i - 1] = "a frame unlike the one before and the one after (a glitch?)"
         if len(shown) > 1 and (shift := _exposure(*shown[-2:])) and not _lit(recording, i - 1):
-            steps[i - 1] = (f"all of the frame changes by {np.expm1(shift):+.0%} and no events "
-                            "say so (auto-exposure?)")
+            steps[i - 1] = (f"the whole frame changes by {np.expm1(shift):+.0%} without "
+                            "events (auto-exposure?)")
     return glitches, steps
 
 
@@ -53,7 +54,7 @@ def exposed(*frames: np.ndarray) -> np.ndarray:
 
 
 def _glitch(before: np.ndarray, frame: np.ndarray, after: np.ndarray) -> bool:
-    """Much of the frame is brighter, or darker, than both neighbours, which agree."""
+    """Whether much of the frame is brighter, or darker, than both neighbours, which agree."""
     bright = _bright(before, after)
     there, back = (frame - before)[bright], (frame - after)[bright]
     agree = np.abs(after - before)[bright] < 0.5 * JUMP
@@ -65,7 +66,7 @@ def _glitch(before: np.ndarray, frame: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _exposure(before: np.ndarray, after: np.ndarray) -> float:
-    """The log change that most pixels share, 0 where there is none."""
+    """The log change shared by most pixels, 0 if there is none."""
     bright = _bright(before, after)
     if bright.mean() < LEAST:
         return 0.0
@@ -80,7 +81,7 @@ def _bright(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _lit(recording: Recording, i: int) -> bool:
-    """Whether many pixels fire alike between frames i and i + 1."""
+    """Whether many pixels fire with one polarity between frames i and i + 1."""
     t0, t1 = (int(t) for t in recording.frame_times[i:i + 2])
     on, off = recording.events.slice(t0, t1).count_map()
     return bool(abs((on > off).mean() - (off > on).mean()) > LIT_SHARE)

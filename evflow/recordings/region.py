@@ -1,5 +1,5 @@
-"""Parts of a sensor: what its events and frames are in a rectangle of pixels, and bands of rows, by
-which large sensors are gone through."""
+"""Regions of a sensor: events and frames within a rectangle of pixels, and bands of rows for large
+sensors."""
 
 from __future__ import annotations
 

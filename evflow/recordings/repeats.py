@@ -1,9 +1,9 @@
-"""Frames of a recording that repeat the one before while its pixels fire: shown twice by a
-converter, or by a camera that had no new one.
+"""Frames of a recording that repeat the one before while its pixels fire: inserted by a converter,
+or by a camera that had no new frame.
 
-The time of a repeat is no time of what it shows. Without repeats a frame stands at its first
-showing; where a converter made more frames of fewer at regular places (24 to 30 a second), those in
-between were evenly spaced before, and are again.
+The time of a repeat is not the time of its content. Without repeats, a frame has the time of its
+first showing; if a converter inserted repeats at regular positions (24 to 30 a second), the frames
+in between were evenly spaced before, and are made so again.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from evflow.types import Recording, release
 Array = np.ndarray
 
 NOTED = "frames.repeated"
-LONGEST = 4  # showings of a frame; more often, and the scene stands still
-FIRING_SHARE = 0.01  # of the pixels have events where a frame should have changed
+LONGEST = 4  # times a frame is shown; more, and the scene is static
+FIRING_SHARE = 0.01  # of the pixels have events when a frame should have changed
 STRIDE = 4  # every 4th pixel of every 4th row is compared first
 
 
 def repeated_frames(recording: Recording) -> Array:
-    """Indices (R,) of frames that equal the one before while pixels fire; of frames that are all
-    of one value none, as any two of these are equal."""
+    """Indices (R,) of frames that equal the one before while pixels fire; frames of a single value
+    are never repeats, since any two of them are equal."""
     frames, times = recording.frames, recording.frame_times
     found = []
     for i in range(1, len(frames)):
@@ -40,8 +40,8 @@ def repeated_frames(recording: Recording) -> Array:
 
 
 def without_repeats(recording: Recording) -> Recording:
-    """The recording without frames shown up to LONGEST times, and a note; itself where there is
-    none, or its notes say that it was done."""
+    """The recording without frames shown up to LONGEST times, and a note; unchanged if there are
+    none, or if its notes say that it was done."""
     if any(note.code == NOTED for note in recording.notes):
         return recording
     found = repeated_frames(recording)
@@ -53,7 +53,7 @@ def without_repeats(recording: Recording) -> Recording:
     times = recording.frame_times[kept]
     even = _evenly(recording, kept)
     note = Note(NOTED, f"{len(at)} of {len(recording.frames)} frames repeat the one "
-                "before while pixels fire, and are left out"
+                "before while pixels fire; they are left out"
                 + ("" if even is None else "; the others are evenly spaced again") + ".")
     return dataclasses.replace(
         recording, frames=recording.frames[kept], frame_times=times if even is None else even,
@@ -61,8 +61,8 @@ def without_repeats(recording: Recording) -> Recording:
 
 
 def _evenly(recording: Recording, kept: Array) -> Array | None:
-    """Times (K,) of the kept frames where a converter repeated frames at regular places, else
-    None (`cadence`)."""
+    """Times (K,) of the kept frames if a converter repeated frames at regular positions, else None
+    (`cadence`)."""
     some = recording.frames[:, ::STRIDE, ::STRIDE].astype(np.float32)[kept]
     changes = np.abs(np.diff(some, axis=0)).mean((1, 2))
     return evened(recording.frame_times[kept], changes,

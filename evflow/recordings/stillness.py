@@ -1,10 +1,10 @@
-"""Does anything move? What events and frames of a recording say.
+"""Does anything move? Decided from a recording's events and frames.
 
-Noise comes alone, events of a moving edge come in company: other pixels near by send the same
-polarity within milliseconds. Given how many events each cell of pixels sent in all, independent
-noise makes pairs within a time bin at a known rate; the excess over it, per event, tells whether
-anything moved. Measured: .016 in 2 s of a static scene (DVXplorer), .13 to 15 in nine recordings
-with motion.
+Noise events are independent, events of a moving edge come together: nearby pixels send the same
+polarity within milliseconds. Given the number of events in each cell of pixels, independent noise
+makes pairs within a time bin at a known rate; the excess over it, per event, shows whether anything
+moved.
+Measured: .016 in 2 s of a static scene (DVXplorer), .13 to 15 in nine recordings with motion.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from evflow.types import Events, Recording
 CELL, BIN_US = 8, 2_000  # pixels, us: what counts as near by
 MOVING = 0.05  # excess pairs per event
 LEAST_US, LEAST_EVENTS = 500_000, 1_000
-MOST_EVENTS = 4_000_000  # looked at for company: the first ones
-MOST_HOT, MOST_SCATTERED = 0.01, 0.1  # of the pixels: faults, gathered anywhere or at random
-STILL = 0.1  # log units: what frames may change by, their noise averaged over 9x9 pixels
+MOST_EVENTS = 4_000_000  # used to count pairs: the first ones
+MOST_HOT, MOST_SCATTERED = 0.01, 0.1  # of the pixels: faults anywhere, or scattered at random
+STILL = 0.1  # log units: allowed change of frames, averaged over 9x9 pixels
 SMOOTH, DARK_DN = 9, 15.0
 
 
 def stands_still(recording: Recording) -> bool:
-    """Whether neither the frames nor the events of a recording show that anything moves, and
-    there are enough events to tell. Then every event is noise, and counting them is the best
-    that can be done: on still scenes the error is a third of the network's."""
+    """Whether neither frames nor events of a recording show motion, and there are enough events to
+    decide. Then every event is noise, and counting them is the best estimate: on static scenes its
+    error is a third of the network's."""
     events = recording.events
     if events.duration_us < LEAST_US:
         return False
@@ -39,39 +39,38 @@ def stands_still(recording: Recording) -> bool:
 
 
 def unlike_noise(events: Events, hot: np.ndarray) -> str:
-    """What says that events are not the noise of a scene at rest, with its hot (H, W) pixels, or
-    that they are too few to tell; empty where nothing does."""
+    """Why events are not the noise of a static scene, given its hot (H, W) pixels, or are too few
+    to decide; empty if nothing speaks against it."""
     if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
         return (f"there are only {len(events):,} events in {events.duration_us / 1e6:.3f} s to "
                 "tell it.")
     excess = company(events, hot)
     if excess > MOVING:
-        return (f"the scene moves (events come in company: {excess:.2f} pairs per event beyond "
-                f"chance; {MOVING} is the most of noise).")
+        return (f"the scene moves ({excess:.2f} pairs of nearby events per event beyond chance; "
+                f"noise has at most {MOVING}).")
     share = float(hot.mean())
     if share > MOST_SCATTERED or (share > MOST_HOT and gathered(hot)):
         return (f"{share:.1%} of the pixels are far busier than the others, more than the "
-                f"{MOST_HOT:.0%} that faults may be where they lie together and the "
-                f"{MOST_SCATTERED:.0%} where they are scattered: light that flickers, or something "
-                "small that moves?")
+                f"{MOST_HOT:.0%} that can be faults if adjacent and the {MOST_SCATTERED:.0%} if "
+                "scattered: flickering light, or something small that moves?")
     return ""
 
 
 def gathered(hot: np.ndarray) -> bool:
-    """Whether more of the hot (H, W) pixels are neighbours than of pixels picked at random."""
+    """Whether hot (H, W) pixels are adjacent more often than pixels picked at random."""
     pairs = int((hot[1:] & hot[:-1]).sum() + (hot[:, 1:] & hot[:, :-1]).sum())
     chance = float(hot.mean()) ** 2 * (hot[1:].size + hot[:, 1:].size)
     return pairs > chance + 5.0 * np.sqrt(chance) + 3.0
 
 
 def smooth(frame: np.ndarray) -> np.ndarray:
-    """Log intensity (H, W) without the noise of a frame, nor what is nearly black."""
+    """Log intensity (H, W) with the frame's noise averaged out, ignoring nearly black pixels."""
     return np.log(np.maximum(cv2.blur(frame, (SMOOTH, SMOOTH)), DARK_DN))
 
 
 def company(events: Events, hot: np.ndarray) -> float:
-    """Pairs of events of one polarity, of different pixels of a cell and within a time bin, beyond
-    those of independent noise, per event; hot (H, W) pixels left out."""
+    """Pairs of events of one polarity, from different pixels of a cell and within a time bin, in
+    excess of independent noise, per event; hot (H, W) pixels are left out."""
     events = events.slice(int(events.t[0]), int(events.t[min(len(events), MOST_EVENTS) - 1]) + 1)
     kept = ~hot[events.y, events.x]
     x, y, t = (getattr(events, n)[kept].astype(np.int64) for n in ("x", "y", "t"))
@@ -86,6 +85,6 @@ def company(events: Events, hot: np.ndarray) -> float:
 
 
 def _squares(key: np.ndarray) -> float:
-    """Sum of squares of how often each value occurs."""
+    """Sum of the squared number of occurrences of each value."""
     counts = np.unique(key, return_counts=True)[1].astype(np.float64)
     return float(counts @ counts)

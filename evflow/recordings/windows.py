@@ -1,8 +1,9 @@
 """Windows: the pieces of a recording between two frames, from which a camera is estimated.
 
-A window runs from one frame to the first that is at least `min_us` later; the next begins where
-it ends. Only windows that the events cover are used, and none across a gap of theirs, a dropped or
-a faulty frame: there the brightness path between its two frames is unknown for too long, or wrong.
+A window runs from one frame to the first that is at least `min_us` later; the next begins where it
+ends. Only windows covered by the events are used, and none across a gap in them or a dropped or
+faulty
+frame: there the path of brightness is unknown for too long, or wrong.
 """
 
 from __future__ import annotations
@@ -22,17 +23,18 @@ from evflow.recordings.glitches import faulty_frames
 from evflow.types import Recording, Window
 
 MIN_US = 40_000  # two frames of a 50 Hz camera, one of a DAVIS346 at 25 Hz
-EDGE_US = 5_000  # the events may begin or end this much inside the first or last frame: of a camera
-# that starts at the first frame the first one comes when brightness has changed by a threshold
-EDGE_EVENTS = 10  # or this many of the intervals at which events come there
-BEYOND = 0.1  # of the recording's time, events without frames at its beginning or end
+EDGE_US = 5_000  # events may begin or end this far inside the first or last frame: the first event
+# comes only when brightness has changed by a threshold
+EDGE_EVENTS = 10  # or this many of the local intervals between events
+BEYOND = 0.1  # share of the recording's time with events before the first or after the last frame
 NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
-DROPPED = 3.0  # a frame interval beyond this many medians means that frames are missing
+DROPPED = 3.0  # a frame interval of more than this many medians means missing frames
 
 
 @dataclasses.dataclass(frozen=True)
 class Skipped:
-    """A window left out, between the frames first and last, and why; its `str` is a sentence."""
+    """A window that is left out, between frames first and last, and why; its `str` is a
+    sentence."""
 
     first: int
     last: int
@@ -48,7 +50,7 @@ class Skipped:
 
 @dataclasses.dataclass(frozen=True)
 class WindowPlan:
-    """pairs: (first, last) frame of each window. skipped: the windows left out."""
+    """pairs: (first, last) frame of each window. skipped: windows that are left out."""
 
     pairs: tuple[tuple[int, int], ...]
     skipped: tuple[Skipped, ...]
@@ -62,8 +64,8 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     """
     if not isinstance(min_us, int | np.integer) or min_us < 1:
         raise EvflowDataError("EV020", f"min_us={min_us}.",
-                              "A window takes a whole number of microseconds, 1 or more.")
-    need(recording, Recording, "recording", "Of a path: evflow.read_recording(path).")
+                              "Give a whole number of microseconds, 1 or more.")
+    need(recording, Recording, "recording", "For a path: evflow.read_recording(path).")
     check_overlap(recording)
     times = recording.frame_times
     start, stop = _covered(recording)
@@ -88,8 +90,9 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Obstacles:
-    """What no window may cross. times: of the frames; late: (N,) intervals with frames missing;
-    silent: (M, 2) us, begin and end of gaps in the events; glitches, steps: of `faulty_frames`."""
+    """What no window may cross. times: of the frames; late: (N,) intervals with missing frames;
+    silent: (M, 2) us, begin and end of gaps in the events; glitches, steps: from
+    `faulty_frames`."""
 
     times: np.ndarray
     late: np.ndarray
@@ -98,7 +101,7 @@ class _Obstacles:
     steps: dict[int, str]
 
     def between(self, first: int, last: int) -> tuple[str, int] | None:
-        """What is wrong between two frames, and where to go on."""
+        """What is wrong between two frames, and the frame to continue from."""
         dropped = self.late[(self.late >= first) & (self.late < last)]
         if len(dropped):
             i = int(dropped[0])
@@ -107,8 +110,8 @@ class _Obstacles:
         begin, end = self.silent.T
         silent = self.silent[(begin < self.times[last]) & (end > self.times[first])]
         if len(silent):
-            return (f"no events for {np.ptp(silent[0]) / 1e3:.1f} ms (lost packets, or a scene "
-                    "that stood still?)"), last
+            return (f"no events for {np.ptp(silent[0]) / 1e3:.1f} ms (lost packets, or a static "
+                    "scene?)"), last
         faults = [(i, why) for i, why in self.glitches.items() if first <= i <= last] + [
             (i, why) for i, why in self.steps.items() if first <= i < last]
         if faults:
@@ -120,7 +123,7 @@ _KNOWN: weakref.WeakKeyDictionary[Recording, _Obstacles] = weakref.WeakKeyDictio
 
 
 def _obstacles(recording: Recording, start: int, stop: int) -> _Obstacles:
-    """Looked for once in a recording, which cannot change: it takes a pass over all events."""
+    """Searched once per recording, which cannot change: it needs a pass over all events."""
     if recording not in _KNOWN:
         _KNOWN[recording] = _look(recording, start, stop)
     return _KNOWN[recording]
@@ -139,21 +142,20 @@ def iter_windows(
 ) -> Iterator[Window]:
     """The windows of a recording from which a camera is estimated, in time order.
 
-    A window runs from one frame to the first that is at least min_us later. Left out are windows
-    that the events do not cover, or that contain a gap in the events, a dropped frame or a faulty
-    one.
+    A window runs from one frame to the first that is at least min_us later. Windows that the events
+    do not cover, or that contain a gap in the events or a dropped or faulty frame, are left out.
 
     Args:
         recording: events and frames on one clock.
         min_us: shortest window, integer microseconds.
-        plan: of `plan_windows`, made before; None makes it.
+        plan: from `plan_windows`; None makes it.
 
     Returns:
         An iterator over the windows; their events are views. Errors are raised by the call.
 
     Raises:
         EvflowDataError: EV001 (no events), EV011 (fewer than two frames), EV012 (frames and events
-            do not overlap), EV017 (no window is left), EV020 (min_us, or no `Recording`).
+            do not overlap), EV017 (no usable window), EV020 (min_us, or not a `Recording`).
 
     Example:
         >>> for window in ef.iter_windows(ef.read_recording("flight.h5")):
@@ -163,14 +165,14 @@ def iter_windows(
     if not plan.pairs:
         why = "; ".join(map(str, plan.skipped[:3])) or "the frames span less than that"
         raise EvflowDataError(
-            "EV017", f"no window of {min_us / 1e3:g} ms or more can be used ({why}).",
-            "Record longer, or take shorter windows (min_us, --window-ms).")
+            "EV017", f"no window of {min_us / 1e3:g} ms or more is usable ({why}).",
+            "Record longer, or use shorter windows (min_us, --window-ms).")
     return (window_at(recording, pair, index) for index, pair in enumerate(plan.pairs))
 
 
 def condensed(skipped: tuple[Skipped, ...]) -> tuple[Note, ...]:
-    """What was skipped, windows of one reason in one note: reasons that differ in a number are one,
-    which spans these."""
+    """Notes on skipped windows, one per reason: reasons that differ only in a number are merged
+    into a range."""
     reasons: dict[str, list[Skipped]] = {}
     for window in skipped:
         reasons.setdefault(NUMBER.sub("#", window.why, count=1), []).append(window)
@@ -181,22 +183,22 @@ def condensed(skipped: tuple[Skipped, ...]) -> tuple[Note, ...]:
 
 
 def _spanned(of: list[Skipped]) -> str:
-    """The reason of windows that differ in one number at most."""
+    """The reason for windows whose reasons differ in at most one number."""
     numbers = [found[0] for window in of if (found := NUMBER.search(window.why))]
     low, high = (pick(numbers, key=float) if numbers else "" for pick in (min, max))
     return of[0].why if low == high else NUMBER.sub(f"{low} to {high}", of[0].why, count=1)
 
 
 def left_out(recording: Recording, plan: WindowPlan) -> tuple[Note, ...]:
-    """What of a recording no window holds: those skipped, and events before the first frame or
-    after the last, where they are many."""
+    """Notes on what no window contains: skipped windows, and events before the first frame or after
+    the last, if there are many."""
     t, times = recording.events.t, recording.frame_times
     whole = max(int(t[-1]) - int(t[0]), 1)
     sides = ((int(times[0]) - int(t[0]), "before the first frame"),
              (int(t[-1]) - int(times[-1]), "after the last frame"))
     return (*condensed(plan.skipped), *(Note(
-        "windows.beyond", f"{us * 1e-6:.2f} of {whole * 1e-6:.2f} s of events come {where}, and "
-        "are not used: no frame shows what moved then") for us, where in sides
+        "windows.beyond", f"{us * 1e-6:.2f} of {whole * 1e-6:.2f} s of events come {where} and "
+        "are not used, as no frame shows what moved") for us, where in sides
         if us > max(BEYOND * whole, 1.5 * float(np.median(np.diff(times))))))
 
 
@@ -208,8 +210,8 @@ def window_at(recording: Recording, pair: tuple[int, int], index: int) -> Window
 
 
 def _covered(recording: Recording) -> tuple[int, int]:
-    """The time range of the events, widened by `EDGE_US` or a few of the intervals at which they
-    come near its ends: a slow scene has its first event some time after the camera started."""
+    """The time range of the events, widened by `EDGE_US` or a few local intervals between events: a
+    slow scene has its first event some time after the camera started."""
     t = recording.events.t
     if len(t) < 2:
         return int(t[0]) - EDGE_US, int(t[-1]) + EDGE_US

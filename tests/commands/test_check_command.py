@@ -92,7 +92,7 @@ def test_late_frames_are_put_right(
     assert run("check", folder / "late.npz", "--json", "--frames-offset-ms", offset) == 0
     assert found(capsys) == {}
     assert run("info", folder / "late.npz", "--frames-offset-ms", offset) == 0
-    assert "frame times moved by -" in capsys.readouterr().out
+    assert "frame times shifted by -" in capsys.readouterr().out
 
 
 def test_frames_from_elsewhere(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

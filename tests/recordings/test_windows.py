@@ -92,7 +92,7 @@ def test_no_window_crosses_a_gap_in_the_events() -> None:
     assert plan.pairs == ((0, 1), (1, 2), (5, 6))
     assert condensed(plan.skipped) == (Note(
         "windows.skipped", "3 windows skipped (frames 2-3 to frames 4-5): no events for 75.2 ms "
-        "(lost packets, or a scene that stood still?)"),)
+        "(lost packets, or a static scene?)"),)
     assert [note.text for note in condensed(plan.skipped[:1])] == [
         f"frames 2-3 skipped: {plan.skipped[0].why}"]
     dropped = tuple(Skipped(i, i + 1, f"no frame for {ms:.1f} ms (dropped?)")
@@ -197,4 +197,4 @@ def test_events_without_frames_at_either_end_are_named(
     recording = Recording(Events(zeros, zeros, t, zeros > 0, (4, 4)),
                           np.zeros((len(times), 4, 4), np.uint8), times)
     notes = left_out(recording, WindowPlan((), ()))
-    assert [note.text.partition(", and")[0] for note in notes] == said
+    assert [note.text.partition(" and are")[0] for note in notes] == said

@@ -1,4 +1,4 @@
-"""Is this recording what it claims to be? Every rule looks at a whole `Recording` and reports.
+"""Is this recording what it claims to be? Each rule examines a whole `Recording` and reports.
 
     findings.py   Finding and Report: what was seen, what it means, the option that fixes it
     agreement.py  brightness changes against events: polarity, alignment, mirrored frames
@@ -6,8 +6,8 @@
     contents.py   polarities, amount of events, hot pixels
     images.py     saturated, black, repeated frames; bit depth, colour
 
-What no `Recording` can be (unsorted, outside the sensor, NaN, wrong shape) is refused where it is
-made, with a code of the same list. NumPy only: checking never loads JAX.
+What no `Recording` can be (unsorted, outside the sensor, NaN, wrong shape) is refused at
+construction, with codes of the same list. NumPy only: checking never loads JAX.
 """
 
 from evflow.recordings.check.agreement import frames_offset

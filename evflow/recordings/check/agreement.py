@@ -1,10 +1,10 @@
-"""Do the events say what the frames say? Net events of a pixel (ON less OFF) follow the change of
-its log brightness; the correlation of the two, over cells of pixels and frame intervals, tells
-whether polarity, clock and orientation are those of one camera.
+"""Do events and frames agree? A pixel's net events (ON minus OFF) follow the change of its log
+brightness; their correlation over cells of pixels and frame intervals shows whether polarity, clock
+and orientation are those of one camera.
 
-The sweep of the frames' clock peaks late: a pixel fires once brightness has moved by a threshold,
-so events trail it, by 0-10 ms in the recordings measured. The mean of that is taken off, and an
-offset only said beyond max(half a frame interval, 10 ms).
+The sweep over the frames' clock peaks late: a pixel fires once brightness has moved by a threshold,
+so events trail it, by 0-10 ms in the recordings measured. The mean delay is subtracted, and an
+offset is only reported beyond max(half a frame interval, 10 ms).
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from evflow.recordings.windows import plan_windows
 from evflow.types import Events, Recording
 
 MIN_STEP_US = 20_000  # frames closer than that change too little
-MOST_STEPS = 24  # frame intervals looked at, evenly spread
+MOST_STEPS = 24  # frame intervals examined, evenly spread
 CELLS = 160  # along the longer side: pooling averages out quantisation by the thresholds
-DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, a log change means little
-LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer cannot tell
+DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, log changes are unreliable
+LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer are not enough to decide
 INVERTED = -0.2  # correlation below which polarity is inverted
-AGREES, BETTER = 0.2, 0.1  # least correlation of another reading, and its gain over the present
-UNRELATED = 0.06  # the most of any reading; the least of 26 recordings that agree is .12
-STRONG = 0.3  # mean change of log brightness of a cell's pixels that neither noise nor drift makes
-LEAST_CHANGE, MOST_THETA = 500.0, 10.0  # log units in all; the least of real ones is .4 per event
-SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # that many leave chance .03 at most
-SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # the sweep reaches that far: intervals, at most us
+AGREES, BETTER = 0.2, 0.1  # minimum correlation of another interpretation, and its gain
+UNRELATED = 0.06  # maximum over all interpretations; 26 recordings that agree have at least .12
+STRONG = 0.3  # mean change of log brightness in a cell, above noise and drift
+LEAST_CHANGE, MOST_THETA = 500.0, 10.0  # log units in all; real recordings have >= .4 per event
+SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # with this many, chance correlations are at most .03
+SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # range of the sweep: frame intervals, at most us
 SWEEP_STEP_US = 5_000
 LATENCY_US = 4_000
 LEAST_OFFSET_US = 10_000
@@ -43,9 +43,9 @@ FLIPS = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Steps:
-    """Frame steps to hold events against. changes: {flip: (K, cells)} change of log brightness,
-    NaN in cells without a pixel well exposed in both frames; bounds: (K, 2) int64 us; cell: side
-    of a cell in pixels; interval_us: the median of all frame intervals."""
+    """Frame steps to compare with events. changes: {flip: (K, cells)} change of log brightness, NaN
+    in cells without a pixel that is well exposed in both frames; bounds: (K, 2) int64 us; cell:
+    side of a cell in pixels; interval_us: the median of all frame intervals."""
 
     events: Events
     changes: dict[str, np.ndarray]
@@ -54,7 +54,7 @@ class Steps:
     interval_us: float
 
     def correlations(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
-        """Pearson's r, frames' clock moved by each offset; NaN where there is too little."""
+        """Pearson's r with the frames' clock shifted by each offset; NaN if there are too few."""
         sums = np.zeros((6, len(offsets_us)))
         for change, (t0, t1) in zip(self.changes[flip], self.bounds, strict=True):
             known = np.isfinite(change)
@@ -77,11 +77,11 @@ class Steps:
         return np.where(enough, r, np.nan)
 
     def correlation(self, flip: str = "") -> float:
-        """Pearson's r as the recording is."""
+        """Pearson's r of the recording as it is."""
         return float(self.correlations(np.zeros(1, np.int64), flip)[0])
 
     def enough(self) -> bool:
-        """Whether a correlation near zero means that there is none."""
+        """Whether there is enough data for a correlation near zero to mean that there is none."""
         first, last = int(self.bounds[0, 0]), int(self.bounds[-1, 1])
         cells = int(np.isfinite(self.changes[""]).sum())
         return cells >= SURE_CELLS and len(self.events.slice(first, last)) >= SURE_EVENTS
@@ -95,8 +95,8 @@ class Steps:
 
 
 def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLIPS) -> Steps | None:
-    """The steps to look at, and as they are in mirrored frames; None without frames, events or a
-    common time."""
+    """The steps to examine, also for mirrored frames; None without frames, events or a common
+    time."""
     try:
         pairs = plan_windows(recording, MIN_STEP_US).pairs
     except EvflowDataError:
@@ -120,7 +120,7 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
 
 def agreement(recording: Recording) -> list[Finding]:
     """EV021 (polarity inverted), EV023 (times stretched), EV024 (clocks not aligned), EV029 (frames
-    mirrored), EV034 (no reading of the frames agrees with the events)."""
+    mirrored), EV034 (frames and events unrelated)."""
     steps = frame_steps(recording)
     if steps is None:
         return []
@@ -141,7 +141,7 @@ def agreement(recording: Recording) -> list[Finding]:
         return [Finding(
             "EV021", "error", "events and frame brightness anti-correlate "
             f"({over}{f', {-best:+.2f} at its clearest' if late else ''}): ON and OFF are swapped.",
-            "Pass --polarity invert (polarity='invert'), or leave it out where it was passed; or "
+            "Pass --polarity invert (polarity='invert'), or remove it if it was passed; or "
             f"check the exporter.{also}")]
     offset, best = _peak(offsets, r)
     if _is_offset(steps, offset, best, here):
@@ -150,44 +150,44 @@ def agreement(recording: Recording) -> list[Finding]:
         return [Finding(
             "EV024", severity, f"frame times are about {abs(offset) / 1e3:.1f} ms too {side} for "
             f"the events (r {here:+.2f}, {best:+.2f} where they agree best).",
-            f"Pass --frames-offset-ms {offset / 1e3:.1f}, added to what was passed, or "
+            f"Pass --frames-offset-ms {offset / 1e3:.1f}, in addition to what was passed, or "
             "--frames-offset-ms auto.")]
     if max(best, abs(flips[flip])) < UNRELATED and steps.enough():
         return [Finding(
-            "EV034", "error", f"events and frames have nothing to do with each other ({over}, and "
-            "no shift, flip or polarity makes it better).",
-            "Are they of one camera and one time? Coordinates transposed, another time unit "
-            "(--time-unit)? Nothing can be measured from them.")]
+            "EV034", "error", f"events and frames are unrelated ({over}; no shift, flip or "
+            "polarity improves it).",
+            "Are they from one camera and one time? Are coordinates transposed, or is the time "
+            "unit wrong (--time-unit)? Nothing can be measured from them.")]
     return []
 
 
 def _mirrored(flip: str, here: float, best: float) -> Finding:
-    """EV029: r as the recording is, and with its frames mirrored."""
+    """EV029, given r of the recording and of the one with mirrored frames."""
     swapped = " and with ON and OFF swapped" if best < 0 else ""
     also = " --polarity invert" if best < 0 else ""
     axis = "both axes" if flip == "both" else f"the {flip} axis"
     return Finding(
         "EV029", "error", f"events and frames agree only with the frames mirrored in {axis}"
         f"{swapped} (r {here:+.2f} -> {abs(best):+.2f}).",
-        f"Pass --flip-frames {flip}{also}, or leave out what was passed.")
+        f"Pass --flip-frames {flip}{also}, or remove what was passed.")
 
 
 def _missing(steps: Steps) -> list[Finding]:
-    """EV023 where frames change by far more than any threshold makes of so few events: a short cut
-    of events whose times are stretched."""
+    """EV023 if frames change far more than so few events allow at any threshold: a short excerpt of
+    events whose times are stretched."""
     change = np.abs(steps.changes[""])
     shown = float(change[change > STRONG * steps.cell**2].sum())
     count = sum(len(steps.events.slice(int(t0), int(t1))) for t0, t1 in steps.bounds)
     if shown < LEAST_CHANGE or count > shown / MOST_THETA:
         return []
     wrong = too_few(count, shown)
-    return [Finding("EV023", "warning", wrong.seen, f"Event times too long? Pass --time-unit "
-                    f"{wrong.unit}; or frames of another recording.")]
+    return [Finding("EV023", "warning", wrong.seen, f"Are event times too long? Pass --time-unit "
+                    f"{wrong.unit}; or are the frames from another recording?")]
 
 
 def frames_offset(recording: Recording) -> int:
-    """By how many us the frame times should move to agree with the events, of either polarity; 0
-    where they do, or where nothing can be told."""
+    """By how many us to shift the frame times so that they agree with the events, of either
+    polarity; 0 if they already do, or if it cannot be determined."""
     steps = frame_steps(recording)
     if steps is None or np.isnan(here := steps.correlation()):
         return 0
@@ -198,7 +198,7 @@ def frames_offset(recording: Recording) -> int:
 
 
 def _inverted(r: np.ndarray) -> bool:
-    """Whether the sweep is at its clearest where events and frames disagree."""
+    """Whether the sweep has its largest magnitude where events and frames anti-correlate."""
     return bool(np.nanmin(r) < min(INVERTED, -np.nanmax(r)))
 
 
@@ -208,8 +208,8 @@ def _is_offset(steps: Steps, offset: int, best: float, here: float) -> bool:
 
 
 def _peak(offsets: np.ndarray, r: np.ndarray) -> tuple[int, float]:
-    """The offset of the largest r, between samples by a parabola and without the events' latency,
-    and that r."""
+    """The offset of the largest r (interpolated by a parabola, without the events' latency), and
+    that r."""
     i = int(np.nanargmax(r))
     if 0 < i < len(r) - 1 and np.isfinite(r[i - 1:i + 2]).all():
         left, top, right = r[i - 1:i + 2]

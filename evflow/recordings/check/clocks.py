@@ -1,4 +1,5 @@
-"""Time: its unit, gaps and jumps of the events' clock, dropped frames, events that keep time."""
+"""Rules on time: unit, gaps and jumps of the events' clock, dropped frames, events tied to a
+clock."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from evflow.recordings.gaps import event_gaps
 from evflow.recordings.windows import DROPPED
 from evflow.types import Recording
 
-JUMP_US = 10_000_000  # a jump is longer, and longer than all the rest of the recording
+JUMP_US = 10_000_000  # a jump is longer than this, and longer than the rest of the recording
 
 
 def clocks(recording: Recording) -> list[Finding]:
@@ -22,7 +23,7 @@ def clocks(recording: Recording) -> list[Finding]:
     if wrong is None:
         return [*_gaps(recording), *_dropped(recording)]
     severity: Severity = "error" if wrong.certain else "warning"
-    if said:  # by the reader, who knows the unit that it took
+    if said:  # reported by the reader, which knows the unit it used
         return [Finding("EV023", severity, f"{said[0]}.")]
     return [Finding("EV023", severity, wrong.seen, f"Pass --time-unit {wrong.unit}.")]
 
@@ -40,13 +41,13 @@ def _gaps(recording: Recording) -> list[Finding]:
         return [Finding(
             "EV026", "warning", f"event times jump from {from_s:.3f} s to {to_s:.3f} s, by more "
             f"than the {rest / 1e6:.3f} s that hold events: another clock from event "
-            f"{longest + 1:,} on?", f"Read the parts alone: --stop {from_s:.3f} and "
+            f"{longest + 1:,} on?", f"Read the parts separately: --stop {from_s:.3f} and "
             f"--start {to_s:.3f}.")]
     more = f" ({len(at)} gaps, {lost.sum() / 1e6:.2f} s in all)" if len(at) > 1 else ""
     return [Finding(
         "EV025", "warning", f"no events between {from_s:.3f} s and {to_s:.3f} s{more}: dropped "
         "packets, or a scene that stood still?",
-        "Windows there are left out of an estimate. To leave it out elsewhere: "
+        "An estimate leaves out windows there. To exclude it elsewhere: "
         f"--stop {from_s:.3f} or --start {to_s:.3f}.")]
 
 
@@ -63,28 +64,28 @@ def _dropped(recording: Recording) -> list[Finding]:
     places = "1 place" if len(at) == 1 else f"{len(at)} places"
     return [Finding(
         "EV030", "warning", f"about {lost} frames are missing in {places}, first after frame "
-        f"{at[0]} ({between[at[0]] / 1e3:.1f} ms where {usual / 1e3:.1f} ms are usual).",
+        f"{at[0]} ({between[at[0]] / 1e3:.1f} ms instead of the usual {usual / 1e3:.1f} ms).",
         "No window crosses them; lower the camera's frame rate or its load.")]
 
 
 def bunches(recording: Recording) -> list[Finding]:
-    """EV035 where events bunch at the frames."""
+    """EV035 if events bunch at the frames."""
     found = bunch(recording)
     return [] if found is None else [Finding(
         "EV035", "warning", f"between {found.begin_us / 1e3:+.2f} and {found.end_us / 1e3:+.2f} ms "
-        f"of each frame come {found.on:.0%} of the ON and {found.off:.0%} of the OFF events, "
-        "beyond the rate around them.",
-        "The readout of frames that disturbs the pixels (as in a DAVIS240C), or light that flashes "
-        "with them: a simulation does not make these events, so expect that many fewer.")]
+        f"of each frame come {found.on:.0%} of the ON and {found.off:.0%} of the OFF events in "
+        "excess of the usual rate.",
+        "The readout of frames disturbs the pixels (as in a DAVIS240C), or light flashes with the "
+        "frames: simulations lack these events, so expect that many fewer.")]
 
 
 def flickers(recording: Recording) -> list[Finding]:
-    """EV036 where the light flickers."""
+    """EV036 if the light flickers."""
     found = flicker(recording.events)
     return [] if found is None else [Finding(
         "EV036", "warning", f"the light flickers at {found.hz:.1f} Hz: all over the sensor the "
-        f"rates of ON and OFF events rise and fall with it, by {found.on:.0%} and {found.off:.0%} "
-        "of their mean.",
+        f"rates of ON and OFF events rise and fall by {found.on:.0%} and {found.off:.0%} of their "
+        "mean.",
         "Lamps on the mains flicker at 100 or 120 Hz, dimmed screens faster. Frames hardly show "
-        "it, so that an estimate finds thresholds too low (by some 10 % in simulations) and noise "
-        "too high: record in daylight or by a DC lamp.")]
+        "it, so an estimate finds thresholds too low (by about 10 % in simulations) and noise too "
+        "high: record in daylight or with a DC lamp.")]

@@ -1,4 +1,4 @@
-"""What the events are: both polarities, enough of them, and not of a few pixels alone."""
+"""Rules on the events: both polarities, enough of them, and not from a few pixels only."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from evflow.recordings.check.findings import Finding
 from evflow.recordings.faulty_pixels import MOVING_FACTOR, hot_among_neighbours
 from evflow.types import Recording
 
-LEAST_EVENTS = 1_000  # of which one polarity alone is no accident
+LEAST_EVENTS = 1_000  # with this many, a single polarity is no accident
 ONE_SHARE = 0.99
 VALID_EVENTS = 3  # fewer say next to nothing about a pixel
-ACTIVE_SHARE = 0.05  # of the pixels should have as many
+ACTIVE_SHARE = 0.05  # of the pixels should have this many
 HOT_SHARE = 0.05  # of the events
 
 
@@ -27,8 +27,8 @@ def contents(recording: Recording) -> list[Finding]:
     found = [] if recording.has_frames else [Finding(
         "EV011", "warning", "the recording has events but no frames"
         f"{why_no_frames(recording.notes)}: thresholds cannot be measured without intensity.",
-        "Give frames, --frames DIR --timestamps FILE, or let a network guess them (evflow estimate "
-        "--reconstruct); of a static scene the noise alone can be estimated.")]
+        "Provide frames, --frames DIR --timestamps FILE, or let a network guess them (evflow "
+        "estimate --reconstruct); for a static scene the noise alone can be estimated.")]
     return [*found, *_one_polarity(counts), *_few(counts), *_hot(counts.sum(0))]
 
 
@@ -49,7 +49,7 @@ def _few(counts: np.ndarray) -> list[Finding]:
         return []
     return [Finding(
         "EV017", "warning", f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
-        "elsewhere maps show the camera's summary.", "Record more motion and texture.")]
+        "elsewhere the maps show the camera's summary.", "Record more motion and texture.")]
 
 
 def _hot(counts: np.ndarray) -> list[Finding]:
@@ -60,6 +60,6 @@ def _hot(counts: np.ndarray) -> list[Finding]:
     y, x = np.unravel_index(int(np.argmax(np.where(hot, counts, 0))), counts.shape)
     return [Finding(
         "EV033", "note", f"{hot.sum():,} pixels ({hot.mean():.2%}) send {share:.0%} of the events, "
-        f"each {MOVING_FACTOR:g} times as many as those around; most of them x={x}, y={y} "
-        f"({counts[y, x]:,}): hot, or of very low threshold.",
+        f"each {MOVING_FACTOR:g} times as many as its neighbours; the busiest is x={x}, y={y} "
+        f"({counts[y, x]:,}): hot pixels, or very low thresholds.",
         "An estimate lists hot pixels in camera.json and leaves them out of its summary.")]

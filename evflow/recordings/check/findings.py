@@ -1,4 +1,4 @@
-"""What a check says: findings with stable codes, and the report that collects them."""
+"""Findings with stable codes, and the report that collects them."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Finding:
 
     @staticmethod
     def of(error: EvflowDataError) -> Finding:
-        """A finding of what a reader or a constructor refused.
+        """A finding from an error that a reader or a constructor raised.
 
         Args:
-            error: the refusal.
+            error: the error.
 
         Returns:
             A finding of severity "error".
@@ -43,7 +43,7 @@ class Finding:
         return Finding(error.code, "error", error.seen, error.fix)
 
     def note(self) -> Note:
-        """The finding as a note of its code."""
+        """The finding as a note with its code."""
         return Note(self.code, str(self))
 
     def error(self) -> EvflowDataError:
@@ -89,7 +89,7 @@ class Report:
             raise self.errors[0].error()
 
     def strict(self) -> Report:
-        """The same, every warning an error."""
+        """The same with every warning turned into an error."""
         return Report(tuple(
             dataclasses.replace(f, severity="error") if f.severity == "warning" else f
             for f in self.findings))

@@ -1,4 +1,4 @@
-"""What the frames are: exposed, each another one, of which depth."""
+"""Rules on the frames: exposure, repeats, bit depth, colour."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def _exposure(recording: Recording) -> list[Finding]:
             which = f"; frame {bad[0]} by {share[bad[0]]:.0%}" if len(bad) else ""
             found.append(Finding(
                 "EV027", "warning", f"{share.mean():.1%} of the frames' pixels are {name}{which} "
-                f"({len(bad)} of {len(share)} frames by more than half): they tell no thresholds.",
+                f"({len(bad)} of {len(share)} frames by more than half): they determine no "
+                "thresholds.",
                 f"{fix}; such pixels are left out."))
     return found
 
@@ -51,7 +52,7 @@ def _repeated(recording: Recording) -> list[Finding]:
     return [Finding(
         "EV028", "warning", f"{len(same)} of {len(recording.frames)} frames repeat the one "
         f"before while pixels fire, first frame {same[0]}: shown twice by a converter?",
-        "An estimate leaves them out; better, export at the camera's own frame rate.")]
+        "An estimate leaves them out; better export at the camera's own frame rate.")]
 
 
 def _depth(recording: Recording) -> list[Finding]:
@@ -59,12 +60,12 @@ def _depth(recording: Recording) -> list[Finding]:
     if recording.frames.dtype == np.uint16:
         white = recording.full_scale
         found.append(Finding(
-            "EV031", "note", f"16-bit frames, kept whole; their largest value "
-            f"{int(recording.frames.max()):,} makes them {DEPTHS[white]}-bit data, white at "
-            f"{white:,}.", "If white lies elsewhere, rescale them to that."))
+            "EV031", "note", f"16-bit frames, kept at full depth; their largest value, "
+            f"{int(recording.frames.max()):,}, suggests {DEPTHS[white]}-bit data with white at "
+            f"{white:,}.", "If white lies elsewhere, rescale them."))
     colour = [note.text for note in recording.notes if note.code in LUMA]
     if colour:
         found.append(Finding(
             "EV032", "note", f"{colour[0].rstrip('.')}.", "A pixel behind a colour filter sees "
-            "its own channel alone: expect larger errors of its thresholds."))
+            "only its own colour: expect larger errors of its thresholds."))
     return found

@@ -1,4 +1,4 @@
-"""All rules in a row."""
+"""Runs all rules."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from evflow.types import Recording, release
 
 
 def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told]) -> Report:
-    """Look for what usually goes wrong with a recording, before any estimate.
+    """Look for common faults of a recording before any estimate.
 
-    A recording without frames is checked for what can be told from events alone. Faults of the
-    data are findings, never exceptions; `report.raise_if_failed()` raises the first error.
+    Without frames, the rules that need only events are applied. Faults of the data are findings,
+    never exceptions; `report.raise_if_failed()` raises the first error.
 
     Codes of the findings: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events or no
     window, EV021 polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned,
     EV025 gaps, EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029
     mirrored frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034
-    unrelated frames, EV035 events that bunch at the frames, EV036 flickering light; and, of a path,
+    unrelated frames, EV035 events that bunch at the frames, EV036 flickering light; and for a path,
     whatever the reader refuses.
 
     Args:
-        recording_or_path: the recording, or a file or folder of any known format.
+        recording_or_path: the recording, or a file or folder in any known format.
         **hints: for the reader of a path, as in `read_recording`.
 
     Returns:
@@ -49,7 +49,7 @@ def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told
     """
     if not isinstance(recording_or_path, Recording):
         need(recording_or_path, str | os.PathLike, "recording_or_path",
-             "Of events: Recording.of_events(events).")
+             "For events: Recording.of_events(events).")
         try:
             recording_or_path = io.read_recording(Path(recording_or_path), **hints)
         except EvflowDataError as error:
@@ -71,7 +71,7 @@ def _findings(recording: Recording) -> list[Finding]:
         except EvflowDataError as error:
             return [*found, Finding.of(error)]
         found += bunches(recording)
-        if not stands_still(recording):  # else noise agrees with nothing, as it should
+        if not stands_still(recording):  # noise alone rightly agrees with nothing
             try:
                 iter_windows(recording)
             except EvflowDataError as error:

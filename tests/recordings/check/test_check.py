@@ -90,7 +90,7 @@ def test_mistake_4_frames_misaligned(sound: Recording, offset_ms: int) -> None:
     assert finding.code == "EV024"
     assert "--frames-offset-ms" in finding.fix
     assert frames_offset(moved) == pytest.approx(-offset_ms * 1000, abs=6_000)
-    assert moved.notes == (Note("frames.moved", f"frame times moved by {offset_ms:+g} ms"),)
+    assert moved.notes == (Note("frames.moved", f"frame times shifted by {offset_ms:+g} ms"),)
 
 
 def test_mistake_4_small_offsets_are_within_the_latency(sound: Recording) -> None:
@@ -127,7 +127,7 @@ def test_mistake_7_nan(sound: Recording) -> None:
 def test_mistake_8_colour_frames(sound: Recording) -> None:
     colour = np.repeat(sound.frames[..., None], 3, -1)
     assert refused(lambda: dataclasses.replace(sound, frames=colour)).code == "EV002"
-    elsewhere = Note("frames.replaced", "frames are those of colour.mp4")
+    elsewhere = Note("frames.replaced", "frames come from colour.mp4")
     noted = dataclasses.replace(sound, notes=(elsewhere,))
     assert not check(noted).notes
     noted = dataclasses.replace(sound, notes=(CONVERTED,))
@@ -257,7 +257,7 @@ def test_events_that_begin_at_the_end_leave_no_window(sound: Recording) -> None:
 def test_mirrored_frames(sound: Recording, side: str) -> None:
     (error,) = check(flipped(sound, side)).errors
     assert error.code == "EV029"
-    assert error.fix == f"Pass --flip-frames {side}, or leave out what was passed."
+    assert error.fix == f"Pass --flip-frames {side}, or remove what was passed."
 
 
 def test_saturated_black_and_repeated_frames(sound: Recording) -> None:

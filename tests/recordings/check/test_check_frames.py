@@ -68,7 +68,7 @@ def test_frames_move_and_turn(watched: tuple[Recording, Camera]) -> None:
     recording = watched[0]
     moved = shifted(recording, 12_500)
     assert (moved.frame_times == recording.frame_times + 12_500).all()
-    assert moved.notes == (Note("frames.moved", "frame times moved by +12.5 ms"),)
+    assert moved.notes == (Note("frames.moved", "frame times shifted by +12.5 ms"),)
     assert shifted(recording, 0) is recording
     for side, axis in (("horizontal", 2), ("vertical", 1)):
         turned = flipped(recording, side)

@@ -134,7 +134,7 @@ def test_a_lamp_that_flickers_is_no_fault() -> None:
     columns = ((events.x, x[which]), (events.y, y[which]), (events.t, t),
                (events.p, np.arange(15_000) % 2 == 0))
     both = Events(*(np.concatenate(c)[order] for c in columns), SIZE)
-    with pytest.raises(EvflowDataError, match=r"EV011.*1\.2% of the pixels.*lie together"):
+    with pytest.raises(EvflowDataError, match=r"EV011.*1\.2% of the pixels.*adjacent"):
         estimate_camera(Recording.of_events(both))
 
 
