@@ -76,6 +76,7 @@ class Simulate(Pixels, Footage, Compiling):
         import jax
 
         from evflow import io
+        from evflow.process import early
         from evflow.process.memory import keep
         from evflow.process.terminal import bar
         from evflow.process.threads import ahead, behind, beside, prompt
@@ -87,6 +88,7 @@ class Simulate(Pixels, Footage, Compiling):
         self._check(io.registry.writer_of(self.out, format))
         source = self.source(self.video)
         keep()
+        early.settle()
         count = frames = 0
 
         def shown(done: int, total: int) -> None:

@@ -109,8 +109,17 @@ def length(flow: np.ndarray) -> np.ndarray:
 
 
 def speed(flow: np.ndarray) -> float:
-    """How far the fast pixels of a flow (H, W, 2) move."""
-    return float(np.percentile(length(flow), MOTION_QUANTILE))
+    """How far the fast pixels of a flow (H, W, 2) move: as np.percentile of their lengths, which
+    takes three times as long."""
+    found = length(flow).ravel()
+    place = (found.size - 1) * MOTION_QUANTILE / 100
+    low = int(place)
+    parted, share = np.partition(found, low), place - low
+    below = above = parted[low]
+    if low + 1 < found.size:
+        above = parted[low + 1 :].min()
+    apart = above - below
+    return float(below + apart * share if share < 0.5 else above - apart * (1 - share))
 
 
 def _coded(frame: np.ndarray) -> np.ndarray:

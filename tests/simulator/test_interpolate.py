@@ -17,7 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.notes import Note
 from evflow.simulator.between import _edges, intervals
 from evflow.simulator.interpolate import AHEAD, MAX_STEPS, unzip, upsample
-from evflow.simulator.motion import length, motion_between
+from evflow.simulator.motion import MOTION_QUANTILE, length, motion_between, speed
 
 SIZE = 96
 
@@ -32,6 +32,12 @@ def shifted(dx: float, dy: float = 0.0) -> np.ndarray:
         along = np.cos(angle) * (x - dx) + np.sin(angle) * (y - dy)
         total += np.sin(2 * np.pi * along / wave + phase)
     return (127.5 + 120 * np.tanh(total / 5)).astype(np.float32)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (43, 57), (120, 160)])
+def test_the_speed_is_a_percentile_of_the_motion(shape: tuple[int, int]) -> None:
+    flow = np.random.default_rng(0).normal(0, 3, (*shape, 2)).astype(np.float32)
+    assert speed(flow) == float(np.percentile(length(flow), MOTION_QUANTILE))
 
 
 def between(a: np.ndarray, b: np.ndarray, dt: int = 40_000, **options: float) -> list:
