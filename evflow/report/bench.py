@@ -1,7 +1,7 @@
 """The report on a camera measured on a bench: a page to hand to a colleague.
 
-Thresholds in log units and in percent of contrast with their errors, maps and histograms, the
-curve of the pixels that respond, what each step sent, noise and speed over light.
+Thresholds in log units and in percent of contrast with their errors, maps and histograms, S-curves,
+what each step sent, noise and speed against light.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from evflow.report.verdict import ERROR, GRADES, HOT, Grade, graded, known
 from evflow.types import Recording
 
 UNITS = {"DN": "DN", "lux": "lux", "light": ""}
-BOUNDS = (f"Good (green): thresholds known to {ERROR[0]:.0%}, and nothing noted that spoils them. "
-          f"Poor (red): errors above {ERROR[1]:.0%}, or light that does not rest.")
+BOUNDS = (f"Good (green): thresholds known to {ERROR[0]:.0%}, and no note that impairs them. "
+          f"Poor (red): errors above {ERROR[1]:.0%}, or light that is not constant between steps.")
 GRAVE: dict[str, Grade] = {"scene.restless": "poor", "pixels.unsure": "fair", "levels.few": "fair"}
-FEW_NOISE = 100  # noise events of a polarity: with fewer, a rate is known to worse than a tenth
+FEW_NOISE = 100  # noise events of a polarity: with fewer, the rate's error exceeds a tenth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,8 +57,8 @@ def write_bench_report(
 
     Args:
         path: of the HTML file.
-        found: of `calibrate_step` or `estimate_noise`.
-        recording: the one that it was measured from (the first, where there are several).
+        found: from `calibrate_step` or `estimate_noise`.
+        recording: the one it was measured from (the first, if there are several).
         source: files and command line, which are shown.
         overwrite: replace a file that exists.
 
@@ -101,7 +101,7 @@ def verdict(found: CameraEstimate) -> tuple[Grade, list[str]]:
             few = eta < eta_error * np.sqrt(FEW_NOISE)
             grades.append("fair" if few else "good")
             said.append(f"Few {name} noise events: their rate is known to "
-                        f"{number(eta_error, 2)} Hz per pixel. Record longer to know it better."
+                        f"{number(eta_error, 2)} Hz per pixel. Record longer to reduce this error."
                         if few else f"η {name} is known to {eta_error / eta:.1%}.")
     grades += [GRAVE[note.code] for note in found.notes if note.code in GRAVE]
     if found.hot.mean() > HOT:
@@ -111,7 +111,7 @@ def verdict(found: CameraEstimate) -> tuple[Grade, list[str]]:
 
 
 def _summary(found: CameraEstimate, grade: Grade, said: list[str]) -> Panel:
-    heads = {"good": "Measured well.", "fair": "Measured, with something to mend.",
+    heads = {"good": "Measured well.", "fair": "Measured, with room for improvement.",
              "poor": "Not measured well enough."}
     body = (f'<div class="verdict {grade}"><strong class="grade">{heads[grade]}</strong>'
             f"{paragraph(' '.join([_from(found), *said]))}</div>")
@@ -135,28 +135,28 @@ def _summary(found: CameraEstimate, grade: Grade, said: list[str]) -> Panel:
                                          1e3 * found.bench.dead.std_s) + " ms", ""])
     notes = texts(found.notes)
     return Panel("summary", "What was measured", body + table(["", "value", "contrast"], rows)
-                 + (f"<h3>To know</h3>{bullets(notes)}" if notes else "")
+                 + (f"<h3>Notes</h3>{bullets(notes)}" if notes else "")
                  + paragraph("Contrast in percent is 100 · (exp(θ) − 1): by how much the brighter "
                              f"light exceeds the darker. {BOUNDS}", "note"))
 
 
 def _from(found: CameraEstimate) -> str:
-    """What the measurement rests on."""
+    """What the measurement is based on."""
     bench = found.bench
     seconds = sum(level.seconds for level in bench.levels) if bench else 0.0
     events = f"{int(found.n_events.sum()):,} events"
     if found.windows and bench:
         return (f"From {events} of {plural(found.windows, 'step')} between "
                 f"{plural(len(bench.levels), 'level')} of light, and {seconds:.1f} s at rest; "
-                f"{found.valid.mean():.0%} of the pixels were measured on their own.")
+                f"{found.valid.mean():.0%} of the pixels were measured individually.")
     if bench and len(bench.levels) > 1:
         return (f"Noise at {len(bench.levels)} illuminances, {seconds:.1f} s in all; maps and "
-                f"numbers here are of the first recording ({events}).")
-    return f"From {events} of a scene at rest{f', {seconds:.1f} s' if bench else ''}."
+                f"numbers here are those of the first recording ({events}).")
+    return f"From {events} of a static scene{f', {seconds:.1f} s' if bench else ''}."
 
 
 def _thetas(found: CameraEstimate) -> bench_figures.Sides:
-    """Thresholds of the pixels that were measured on their own."""
+    """Thresholds of the pixels that were measured individually."""
     used = found.valid if found.valid.any() else ~found.hot
     return {side: np.asarray(getattr(found.camera, f"theta_{side}"))[used]
             for side in ("on", "off") if known(found, side) and used.any()}
@@ -164,10 +164,11 @@ def _thetas(found: CameraEstimate) -> bench_figures.Sides:
 
 def _contrast(found: CameraEstimate, thetas: bench_figures.Sides) -> Panel:
     drawn = [figure(page.drawing(bench_figures.distribution(thetas), "thresholds in percent"),
-                    "Of the pixels' estimates, which their own errors widen: humps no further "
-                    "apart than those are counts of events, not kinds of pixels."),
+                    "Distribution of the pixels' estimates, widened by their errors: humps no "
+                    "further apart than these errors come from counting whole events, not from "
+                    "kinds of pixels."),
              figure(page.drawing(bench_figures.s_curve(thetas), "S-curves"),
-                    "The share of the pixels whose threshold a change of light exceeds; dashed: "
+                    "Share of pixels whose threshold a change of light exceeds; dashed: "
                     "half of them.")]
     rows = [[side.upper(), *(number(float(bench_figures.contrast(np.quantile(theta, q))), 3)
                              for q in (0.1, 0.5, 0.9)),
@@ -181,15 +182,15 @@ def _contrast(found: CameraEstimate, thetas: bench_figures.Sides) -> Panel:
 
 
 def _by_light(found: CameraEstimate, bench: Bench, thetas: bench_figures.Sides) -> list[Panel]:
-    """Panels of what depends on the light, and on the steps."""
+    """Panels on what depends on the light and on the steps."""
     panels = []
     if bench.steps:
         ups = sum(step.change > 0 for step in bench.steps)
         panels.append(Panel("steps", "What each step sent", grid([figure(
             page.drawing(bench_figures.steps(bench.steps, thetas), "events over size of a step"),
-            "A point is a step, the mean over the pixels. Dashed: size over threshold. A step "
-            "after one in the other direction sends up to an event less: the pixel's memory has "
-            "to come back first.")], 26) + paragraph(
+            "Each point is a step, averaged over the pixels. Dashed: size over threshold. A step "
+            "that follows one in the other direction sends up to one event less, because the "
+            "pixel's memory must first return.")], 26) + paragraph(
                 f"{plural(ups, 'step')} up, {len(bench.steps) - ups} down.", "note")))
     several = len(bench.levels) > 1
     unit = f" [{UNITS[bench.unit]}]" if UNITS[bench.unit] else ""
@@ -216,13 +217,13 @@ def _latency(bench: Bench, unit: str) -> Panel:
              number(1e3 * v.jitter_s), f"{v.responded:.0%}"] for v in bench.latency]
     return Panel("latency", "Latency against contrast and light", grid([figure(
         page.drawing(bench_figures.latency(bench), "latency over size of a step"),
-        "Bars: jitter. Darker: towards more light.")], 26) + table(
+        "Bars: jitter. Darker colours: steps to brighter light.")], 26) + table(
             [f"to light{unit}", "change [%]", "steps", "latency [ms]", "jitter [ms]",
              "pixels that answer"], rows) + paragraph(
-            "From a step's trigger to a pixel's first event of its direction: median over pixels "
-            "and repetitions, with the error that follows from how much these differ; jitter is "
-            "half of what the middle 68 % span. The light's own edge is part of it, and so is what "
-            "the pixel still had to go to its threshold, more of it after a step in the other "
+            "From a step's trigger to a pixel's first event in its direction: median over pixels "
+            "and repetitions, with the error that follows from their spread; jitter is half the "
+            "width of the central 68 %. It includes the light's own edge and the remaining "
+            "distance to the pixel's threshold, which is larger after a step in the other "
             "direction.", "note"))
 
 
@@ -236,14 +237,14 @@ def _speed(bench: Bench, unit: str) -> Panel:
         " Latency needs the instants of the edges: --triggers.")
     dead = (f"Dead time of a pixel: {spread(1e3 * bench.dead.seconds, 1e3 * bench.dead.std_s)} ms."
             if bench.dead.measured else
-            "No dead time is seen: no step makes enough pixels fire as fast as they can.")
+            "No dead time is visible: no step makes enough pixels fire as fast as they can.")
     return Panel("speed", "Speed against light", grid([figure(
         page.drawing(bench_figures.speed(bench), "duration of steps over light"))], 26) + table(
             [f"light{unit}", "up to it [ms]", "cutoff at least [Hz]", "down to it [ms]",
              "cutoff at least [Hz]"], rows) + paragraph(
-            "From half to nine tenths of a step, as its events tell, steps of three thresholds or "
-            "more; the light's own edge is part of it: the pixels are at least as fast. The "
-            f"cutoff is that of a first-order low-pass which takes as long. {dead}{seen}", "note"))
+            "Time from half to nine tenths of a step, from its events, for steps of at least three "
+            "thresholds; it includes the light's own edge, so the pixels are at least as fast. The "
+            f"cutoff is that of a first-order low-pass of the same duration. {dead}{seen}", "note"))
 
 
 def _facts(recording: Recording, source: Source) -> Panel:

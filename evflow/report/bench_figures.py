@@ -1,5 +1,5 @@
-"""Charts of a bench: distribution of the thresholds in percent of contrast, events over the size of
-a step, noise and speed over light. As in figures.py, ON is red and OFF is blue."""
+"""Charts of a bench: distribution of thresholds in percent of contrast, events over step size,
+noise and speed over light. As in figures.py, ON is red and OFF is blue."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ SOFT = "#5d6673"
 BINS = 60
 WIDTH, HEIGHT = 5.0, 3.0
 
-Sides = dict[str, np.ndarray]  # "on", "off" -> values of pixels (N,), those that were measured
+Sides = dict[str, np.ndarray]  # "on", "off" -> values (N,) of the pixels that were measured
 
 
 def contrast(theta: np.ndarray | float) -> Any:
-    """Percent by which the light must rise, or by which the brighter exceeds the darker."""
+    """Percent by which the brighter light exceeds the darker, for a change in log units."""
     return 100.0 * np.expm1(theta)
 
 
@@ -42,7 +42,7 @@ def distribution(thetas: Sides) -> bytes:
 
 
 def s_curve(thetas: Sides) -> bytes:
-    """Share of the pixels that a contrast makes fire, over that contrast."""
+    """Share of the pixels that fire, over the contrast of a change."""
     def draw(axis: Any) -> None:
         low, high = _range(thetas)
         for side, theta in thetas.items():
@@ -64,7 +64,7 @@ def _range(thetas: Sides) -> tuple[float, float]:
 
 
 def steps(taken: Sequence[Step], thetas: Sides) -> bytes:
-    """Events per pixel and step over its size; the lines are what the thresholds foretell."""
+    """Events per pixel and step over its size; lines are predicted from the thresholds."""
     def draw(axis: Any) -> None:
         top = max(abs(step.change) for step in taken)
         for (side, (title, colour)), sign in zip(SIDES.items(), (1, -1), strict=True):
@@ -105,7 +105,7 @@ def noise(bench: Bench) -> bytes:
 
 
 def speed(bench: Bench) -> bytes:
-    """How long steps last, over the light they lead to."""
+    """Duration of steps over the light they lead to."""
     def draw(axis: Any) -> None:
         for name, (side, title) in (("up_s", ("on", "up to it (ON)")),
                                     ("down_s", ("off", "down to it (OFF)"))):
@@ -122,7 +122,7 @@ def speed(bench: Bench) -> bytes:
 
 
 def latency(bench: Bench) -> bytes:
-    """Median latency and jitter over the size of a step, the darker the more light it leads to."""
+    """Median latency and jitter over step size; darker colours for brighter light."""
     lights = sorted({v.light for v in bench.latency})
 
     def draw(axis: Any) -> None:

@@ -1,7 +1,7 @@
 """The report on an estimated camera: panels in one HTML file, as evidence for the estimate.
 
-The recording's own frames are simulated again with the estimate and laid beside what was
-recorded; an estimate from the first half is tried on the second. What cannot be shown says why.
+The recording's own frames are simulated with the estimate and compared with the recorded events; an
+estimate from the first half is tested on the second. Panels that cannot be shown say why.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ STAGES = 4
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """trial: the estimate, re-simulated; half: the estimate from the first half; held: that one
-    on the second half, and foretold what it explains there. Where one is None, the reason stands in
-    why_not or why_not_held."""
+    """trial: the estimate, re-simulated; half: the estimate from the first half; held: its test on
+    the second half, and what it explains there. If one is None, the reason is in why_not or
+    why_not_held."""
 
     trial: Trial | None
     half: CameraEstimate | None
@@ -89,14 +89,14 @@ def write_report(
 ) -> dict[str, Any]:
     """Write a self-contained HTML report on an estimated camera, and return its numbers.
 
-    The camera is put to the test: the recording's own frames are simulated with it (at most 3 s,
-    the busiest) and compared with what was recorded, and an estimate from the first half is tried
-    on the second.
+    The camera is tested: the recording's own frames are simulated with it (at most 3 s, the
+    busiest) and compared with what was recorded, and an estimate from the first half is tested on
+    the second.
 
     Args:
         path: of the HTML file.
         found: of `estimate_camera(recording)`.
-        recording: the one that the camera was estimated from.
+        recording: the one the camera was estimated from.
         weights: those it was estimated with, for the held-out half; as in `load_weights`.
         source: file or folder of the recording, whose name and sha256 are shown.
         command: the command line, shown.
@@ -104,18 +104,18 @@ def write_report(
         seed: of the re-simulations.
         overwrite: replace a file that exists.
         progress: progress(done, total) is called after each stage.
-        simulators: also try the pixels of v2e, ESIM and DVS-Voltmeter, each with its own best
-            constants of the first half, on the second; takes about as long as the rest.
-        first: what the estimate has made of the first half (`measure`); None makes it again, of at
-            most its last 5 s.
-        checked: of `check(recording)`; None looks again.
+        simulators: also test the pixels of v2e, ESIM and DVS-Voltmeter, each with its own best
+            constants from the first half, on the second; takes about as long as the rest.
+        first: what the estimate computed from the first half (`measure`); None computes it again,
+            from at most its last 5 s.
+        checked: from `check(recording)`; None checks again.
         stage: stage(name) is called when one begins.
 
     Returns:
-        JSON-ready numbers, which also lie in the page: "grade" ("good", "fair", "poor"),
-        "verdict" (what was seen and what to do, a sentence each), "trial"
-        and "held_out" (each None, or what `compare` says, with the "ceiling" of the counts' r);
-        "simulators" where they were tried, the nearest first, and "nearest", a sentence on them.
+        JSON-ready numbers, also stored in the page: "grade" ("good", "fair", "poor"), "verdict"
+        (what was seen and what to do, one sentence each), "trial" and "held_out" (each None, or the
+        result of `compare`, with the "ceiling" of the counts' r); "simulators" if they were tested,
+        the nearest first, and "nearest", a sentence on them.
 
     Raises:
         EvflowDataError: EV010 (matplotlib is missing), EV013 (exists), EV015 (a recording of
@@ -198,17 +198,17 @@ def _verdict(found: CameraEstimate, evidence: Evidence, judged: list[Judged]) ->
         worse = poorer(judged)
         gravest = max((j for j in judged if j.about == worse), key=lambda j: j.badness)
         headline, tail = HEADLINES[grade], f"The poorer polarity is {worse}. " + (
-            f"What speaks most against it: {gravest.seen}" if gravest.grade != "good" else "")
+            f"Main reason: {gravest.seen}" if gravest.grade != "good" else "")
     else:
-        headline = ("Measured, but not put to the test." if known(found, "on")
+        headline = ("Measured, but not tested." if known(found, "on")
                     and known(found, "off") else "Not all of the camera is known.")
-        tail = f"The estimate could not be put to the test: {evidence.why_not}"
+        tail = f"The estimate could not be tested: {evidence.why_not}"
         grade = max(grade, "fair", key=GRADES.index)
     body = (f'<div class="verdict {grade}"><strong class="grade">{headline}</strong>'
             f"{paragraph(f'{_measured(found)} {tail}')}</div>" + verdict_rows(judged)
             + "<h3>What to do</h3>" + bullets(advice(judged) or [
                 "Nothing: simulate with it (evflow simulate VIDEO --camera camera.npz -o "
-                "synth.h5)." if evidence.trial else "Record with frames, to test it."]))
+                "synth.h5)." if evidence.trial else "Record with frames in order to test it."]))
     return Panel("verdict", "Verdict", body + paragraph(RULE, "note"))
 
 
@@ -227,7 +227,7 @@ def _measured(found: CameraEstimate) -> str:
 
 
 def _trial_panels(recording: Recording, evidence: Evidence) -> list[Panel]:
-    """The four panels that lay the re-simulation beside the recording."""
+    """The four panels that compare the re-simulation with the recording."""
     trial = evidence.trial
     if trial is None:
         return [Panel(name, title, paragraph(f"Absent: {evidence.why_not}", "note"))
@@ -253,7 +253,7 @@ def _stretch(recording: Recording, trial: Trial) -> str:
              "camera. ")
     if trial.span_us[0] > t0:
         words += (f"The first {(trial.span_us[0] - t0) / 1e3:.0f} ms are left out: there the "
-                  "simulation still remembers its first frame. ")
+                  "simulation still depends on its first frame. ")
     return words + f"At most {SECONDS:g} s, the busiest, are simulated. " + " ".join(
         text[0].upper() + text[1:] for text in texts(trial.notes))
 
@@ -291,8 +291,8 @@ def _assumptions(
 
 
 def _agreement(recording: Recording) -> str:
-    """How the events' polarity goes with the frames."""
+    """How the events' polarity agrees with the frames."""
     steps = frame_steps(recording, {})
     r = steps.correlation() if steps else float("nan")
-    return (f" ON minus OFF goes with the frames' change of brightness, r = {r:+.2f}."
+    return (f" ON minus OFF correlates with the frames' change of brightness, r = {r:+.2f}."
             if np.isfinite(r) else "")

@@ -1,4 +1,4 @@
-"""Two cameras side by side: a table in words, and a page to hand to a colleague."""
+"""Two cameras compared: a text table, and a page to hand to a colleague."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ LABELS = {
     "cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz/pixel]",
     "shot_hz": "shot noise [Hz, dark]"}
 COLOURS = ("#444b57", "#d98200")
-NOTE = ("Apart: the difference over its standard deviation; beyond 3 they differ. r: over the "
+NOTE = ("Apart: the difference in standard deviations; above 3 they differ. r: over the "
         "pixels of the maps; two cameras of one type have none, the same camera at other biases "
         "has.")
 
 
 def describe_cameras(numbers: dict[str, Any], names: tuple[str, str]) -> str:
-    """A line a parameter, and which differ for sure."""
+    """One line per parameter, and which ones certainly differ."""
     rows = [["", *(name[:24] for name in names), "ratio", "apart", "r"], *(
         [name, _shown(row, "a"), _shown(row, "b"), number(row["ratio"]), _signed(row["apart"]),
          number(row["r"], 2)] for name, row in numbers.items())]
@@ -89,7 +89,7 @@ def _percent(row: dict[str, Any], side: str) -> str:
 
 
 def _histograms(cameras: tuple[Camera, Camera], name: str, names: tuple[str, str]) -> bytes:
-    """Shares of the pixels of both over a parameter."""
+    """Distributions of a parameter over the pixels of both cameras."""
     maps = [np.asarray(getattr(camera, name)).ravel() for camera in cameras]
 
     def draw(axis: Any) -> None:

@@ -1,4 +1,4 @@
-"""A line of text beneath a picture: its time, and what its colours mean. Pillow's own font."""
+"""A caption below a picture: its time, and what its colours mean. Uses Pillow's own font."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-LEAST, SHARE = 16, 28  # pixels high, and that part of the width, whichever is more
+LEAST, SHARE = 16, 28  # minimum height in pixels, or this fraction of the width if more
 INK, GROUND = 40, 255
 
 
@@ -24,8 +24,8 @@ def captioned(picture: np.ndarray, words: str) -> np.ndarray:
 
 
 def _font(words: str, width: int, strip: int) -> Any:
-    """The largest that the words, their numbers as wide as any, fit in."""
-    plain = "".join("0" if c.isdigit() else c for c in words)  # one size for all of a film
+    """The largest font in which the words fit, with all digits assumed to be the widest."""
+    plain = "".join("0" if c.isdigit() else c for c in words)  # one size for a whole film
     return next((font for size in range(round(0.62 * strip), 7, -1)
                  if (font := _sized(size)).getlength(plain) <= width), _sized(7))
 

@@ -9,7 +9,7 @@ from evflow.report.page import Panel, paragraph, plural, spread, table
 
 
 def extent_panel(found: CameraEstimate) -> Panel:
-    """What was read, and the thirds of it beside each other."""
+    """What was read, and a comparison of its thirds."""
     return Panel("extent", "What was read, and did the camera stay the same",
                  paragraph(_read(found)) + _thirds(found))
 
@@ -25,8 +25,8 @@ def _read(found: CameraEstimate) -> str:
 
 def _thirds(found: CameraEstimate) -> str:
     if not found.thirds:
-        return paragraph("Too few stretches were read to compare the thirds of the recording: it "
-                         "takes three in each.", "note")
+        return paragraph("Too few stretches were read to compare the thirds of the recording, "
+                         "which takes three in each.", "note")
     zero = found.thirds[0].begin_us
     rows = [[f"{(t.begin_us - zero) / 1e6:.1f} to {(t.end_us - zero) / 1e6:.1f} s",
              str(t.stretches), spread(t.theta_on, t.std_on), spread(t.theta_off, t.std_off)]
@@ -35,5 +35,5 @@ def _thirds(found: CameraEstimate) -> str:
     verdict = (f"θ {' and θ '.join(names)} changed by more than the errors allow." if names else
                "They agree within their errors.")
     return table(["third", "stretches", "θ ON", "θ OFF"], rows) + paragraph(
-        f"{verdict} Thresholds of the regression of all pixels together, a little beside the "
-        "estimate's own; their errors are the scatter of the stretches.")
+        f"{verdict} Thresholds are from the pooled regression and differ slightly from the "
+        "estimate's own; their errors are from the scatter of the stretches.")

@@ -1,8 +1,8 @@
 """The report's charts as SVG: rates, counts, intervals, histograms, scatter plots.
 
-Text stays text, in the reader's own sans-serif. ON is red and OFF is blue; what was recorded is
-solid, what was simulated dashed. A figure's size is in inches of 96 CSS pixels. What stands around
-an axis is known beforehand and has a fixed width: to measure it takes as long as to draw it.
+Text remains text, in the reader's own sans-serif font. ON is red and OFF is blue; recorded data are
+solid, simulated ones dashed. A figure's size is in inches of 96 CSS pixels. Margins around axes are
+fixed: measuring them would take as long as drawing.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def histogram(values: np.ndarray, summary: float, colour: Any, unit: str) -> byt
 
 
 def explained(curve: np.ndarray, ideal: float, found_hz: float) -> bytes:
-    """Share of the brightness that events explain, over the cutoff: curve (K, 2) of cutoff in Hz,
-    inf at the right edge, and share; ideal: of an ideal pixel and frames as they are, dashed;
-    found_hz: the cutoff that was found, 0 for none."""
+    """Share of the brightness that events explain, over the cutoff: curve (K, 2) of cutoff in Hz
+    (inf at the right edge) and share; ideal: for an ideal pixel and ideal frames, dashed; found_hz:
+    the measured cutoff, 0 for none."""
     def draw(axis: Any) -> None:
         finite = curve[np.isfinite(curve[:, 0])]
         edge = 3.0 * finite[:, 0].max()

@@ -7,15 +7,14 @@ import numpy as np
 
 from evflow.types import Events
 
-WHEEL = 6  # the wheel that explains the colours takes this part of the shorter side
+WHEEL = 6  # the colour wheel takes this fraction of the shorter side
 REST = 1.0  # white, where nothing moves
-GROUND = 0.13  # dark, where there are no events: on white, slow motion would be lost
+GROUND = 0.13  # dark, where there are no events: on white, slow motion would be invisible
 
 
 def flow_colours(flow: np.ndarray, full_px: float) -> np.ndarray:
-    """RGB (H, W, 3) on 0..1 of flow (2, H, W) = (x, y): red to the right, then by the way of a
-    clock orange and green down, cyan to the left, violet up; white at rest, full colour from
-    full_px on."""
+    """RGB (H, W, 3) on 0..1 from flow (2, H, W) = (x, y): red to the right, then clockwise orange
+    and green down, cyan to the left, violet up; white at rest, full colour from full_px on."""
     x, y = np.asarray(flow, np.float32)
     hue = np.degrees(np.arctan2(y, x)) % 360.0
     saturation = np.minimum(np.hypot(x, y) / np.float32(full_px), 1.0)
@@ -24,7 +23,7 @@ def flow_colours(flow: np.ndarray, full_px: float) -> np.ndarray:
 
 
 def flow_image(flow: np.ndarray, events: Events, full_px: float) -> np.ndarray:
-    """The colours at pixels with events, dark elsewhere, the wheel in the upper right corner;
+    """The colours at pixels with events, dark elsewhere, with a wheel in the upper right corner;
     (H, W, 3) on 0..1."""
     active = events.count_map().sum(0) > 0
     image = np.where(active[..., None], flow_colours(flow, full_px), GROUND)

@@ -1,4 +1,4 @@
-"""An estimate from a recording's first part, tried on the second, as a panel of the report."""
+"""Panel: an estimate from the first part of a recording, tested on the second."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ NAMES: Names = ("recorded", "re-simulated")
 def held_panel(
     found: CameraEstimate, half: CameraEstimate | None, held: Trial | None, why_not: str
 ) -> Panel:
-    """half: the estimate from the first part; held: that one on the second; where they are None,
-    why_not says why."""
-    title = "Held out: estimated on the first half, tried on the second"
+    """half: the estimate from the first part; held: its test on the second; if they are None,
+    why_not gives the reason."""
+    title = "Held out: estimated on the first half, tested on the second"
     if half is None or held is None:
         return Panel("held-out", title, paragraph(f"Absent: {why_not}", "note"))
     rates, r = held.numbers["rate_hz"], held.numbers["counts"]["r"]
@@ -31,8 +31,8 @@ def held_panel(
               ["r of two re-simulations, the ceiling", *(number(held.ceiling[k], 3)
                                                          for k in ("on", "off", "both"))]]
     return Panel("held-out", title, paragraph(
-        "The longest stretch without a gap is divided near its middle. The camera is estimated "
-        f"from {plural(half.windows, 'window')} of its first part and has not seen the second, of "
+        "The longest stretch without a gap is divided near its middle. The camera was estimated "
+        f"from {plural(half.windows, 'window')} of its first part, without the second, of "
         f"which {held.numbers['duration_s']:.3f} s are simulated.")
         + table(["second half", *NAMES, "ratio"], rows)
         + table(["events per pixel", "ON", "OFF", "both"], counts)

@@ -14,7 +14,7 @@ from evflow.report.verdict import known
 TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON", "eta_off": "η OFF"}
 UNITS = {"theta": "natural log units", "eta": "Hz per pixel"}
 LEVELS = 100
-PALE = 0.7  # how far a pixel without events of its own is taken towards white
+PALE = 0.7  # blend towards white for pixels without events of their own
 LISTED = 60  # faulty pixels that are listed, the rest are in camera.json
 
 
@@ -24,11 +24,11 @@ def map_panel(found: CameraEstimate) -> Panel:
             "show the camera's summary." if found.valid.any() else "")
     body = paragraph(
         "Thresholds θ in natural-log units of brightness, noise rates η in Hz per pixel, each "
-        "above its standard deviation. Colours span the middle 98 % of the pixels of a map, "
-        "a tenth of its value at least. " + pale)
+        "above its standard deviation. Colours span the central 98 % of a map's pixels, "
+        "but at least a tenth of its value. " + pale)
     k = page.blocks(found.n_events)[1]
     if k > 1:
-        body += paragraph(f"A point of a map is the mean of {k}×{k} pixels.", "note")
+        body += paragraph(f"Each point of a map is the mean of {k}×{k} pixels.", "note")
     return Panel("maps", "The camera, pixel by pixel",
                  body + grid([_card(found, name) for name in PARAMETERS], 13.5))
 
@@ -36,7 +36,7 @@ def map_panel(found: CameraEstimate) -> Panel:
 def _card(found: CameraEstimate, name: str) -> str:
     kind, _, side = name.partition("_")
     if kind == "theta" and not known(found, side):
-        return figure(paragraph("Undetermined: the recording does not tell.", "note"),
+        return figure(paragraph("Not determined by this recording.", "note"),
                       title=TITLES[name])
     parts = []
     for maps, label in ((found.camera, TITLES[name]), (found.std, "std")):
@@ -121,8 +121,8 @@ def fault_panel(found: CameraEstimate) -> Panel:
              f'style="image-rendering:pixelated" '
              f'href="{page.png_uri(np.repeat(grey[..., None], 3, -1))}"/>{marks}</svg>')
     lists = "".join(_listed(found, mask, what) for mask, what in (
-        (found.hot, "Hot (red): they fire by themselves"),
-        (found.dead, "Dead (blue): never an event amid pixels that fire")))
+        (found.hot, "Hot (red): fire without a signal"),
+        (found.dead, "Dead (blue): never fire although their neighbours do")))
     return Panel("faults", "Hot and dead pixels", grid([
         figure(image, "Grey: events per pixel in the windows used, logarithmic."),
         f"<div>{lists}</div>"], 22))

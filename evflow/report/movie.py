@@ -30,12 +30,11 @@ GAP = 8  # pixels between the pictures of a sheet
 
 @dataclasses.dataclass(frozen=True)
 class Film:
-    """How events become pictures. fps: pictures per second; window_us: how long one gathers
-    events; window_events: instead, of how many events one is, the next of those that follow;
-    slow: times slower than life; over_frames: on the frames nearest in time; scale:
-    screen pixels per pixel, None for as many as make it 640 wide; caption: time, length and
-    colours in a line beneath;
-    codec: of .mp4, "mpeg4" (players) or "vp9" (browsers too; some 50 times slower). Raises
+    """How events become pictures. fps: pictures per second; window_us: time over which a picture
+    collects events; window_events: instead, number of consecutive events per picture; slow: times
+    slower than life; over_frames: drawn on the frames nearest in time; scale: screen pixels per
+    pixel, None makes the film about 640 wide; caption: time, duration and colours in a line below;
+    codec: of .mp4, "mpeg4" (video players) or "vp9" (also browsers; some 50 times slower). Raises
     EV020."""
 
     fps: float = 30.0
@@ -62,8 +61,8 @@ class Film:
     def check_target(self, path: Path, *, overwrite: bool) -> None:
         """EV013 where it exists, EV020 where it is neither .mp4, .gif nor .png."""
         if path.suffix.lower() not in SUFFIXES:
-            raise EvflowDataError("EV020", f"{path.name} is none of {', '.join(SUFFIXES)}.",
-                                  "The ending says what is made.")
+            raise EvflowDataError("EV020", f"{path.name} does not end in {', '.join(SUFFIXES)}.",
+                                  "The extension selects the format.")
         if path.exists() and not overwrite:
             raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite.")
 
@@ -89,7 +88,7 @@ def write_sheet(
     path: str | os.PathLike, recording: Recording, film: Film, *, at_s: float | None = None,
     overwrite: bool = False,
 ) -> str:
-    """Write a .png of one window: events, and where there are frames the frame and both together.
+    """Write a .png of one window: events and, if there are frames, the frame and both together.
 
     at_s: seconds from the first event to the window's middle; None for the busiest. Returns what
     was written, in words. Raises EV001, EV013, EV020 (outside the recording).
@@ -158,8 +157,8 @@ def _caption(events: Events, begin: int, end: int, more: str = "") -> str:
 
 
 def _windows(recording: Recording, film: Film) -> list[tuple[int, int]]:
-    """Begin and end in us of what each picture gathers: the time around evenly spaced instants, or
-    so many events after each other (and those at the same microsecond as the last)."""
+    """Begin and end in us of each picture's events: around evenly spaced times, or consecutive
+    events by number (including others at the time of the last one)."""
     t = recording.events.t
     if film.window_events is None:
         count = max(1, math.ceil(recording.events.duration_us / film.step_us))
@@ -178,7 +177,7 @@ def _around(events: Events, at_us: int, count: int) -> tuple[int, int]:
 
 
 def _white(recording: Recording) -> float:
-    """The DN that is shown as white: what 99.5 % of the pixels of a few frames stay below."""
+    """The DN shown as white: 99.5 % of the pixels of a few frames are below it."""
     some = np.unique(np.linspace(0, len(recording.frames) - 1, 8).astype(int))
     return max(1.0, float(np.percentile([recording.frame_dn(i) for i in some], 99.5)))
 
@@ -190,6 +189,6 @@ def _frame(recording: Recording, at_us: int, white: float) -> np.ndarray:
 
 
 def _over(frame: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    """An event image on a frame: where there are no events, the frame shows."""
+    """An event image over a frame, which shows where there are no events."""
     strength = np.minimum(1.0, 1.5 * (1.0 - shown.min(-1, keepdims=True)))
     return (1 - strength) * frame + strength * shown

@@ -1,7 +1,7 @@
 """Self-contained HTML pages: panels of text, tables and pictures in one file.
 
-Pictures of pixels are PNGs with a palette, drawings are SVG, both inlined; there is no script and
-no network. Made for a screen, a phone and paper alike.
+Pixel images are PNGs with a palette, drawings are SVG, both inlined; there are no scripts and no
+network access. Made for screens, phones and paper.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from evflow.files.atomic import atomic_text
 
 WIDEST = 480  # pixels of a map: larger sensors are shown in blocks
 COLOURS = 256
-QUICK_PNG = 4  # level of compression: the best takes ten times as long for a twentieth less
+QUICK_PNG = 4  # compression level: the best takes ten times as long for a twentieth less
 
 STYLE = """
 :root { --ink: #1d2129; --soft: #5d6673; --line: #dfe3e8; --wash: #f6f7f9;
@@ -90,7 +90,7 @@ def write_page(
     path: str | os.PathLike, title: str, subtitle: str, panels: Sequence[Panel],
     numbers: dict[str, Any], *, overwrite: bool = False,
 ) -> None:
-    """The page, whole or not at all; `numbers` lie in it as JSON (id "numbers") for machines.
+    """Write the page, completely or not at all; `numbers` are embedded as JSON (id "numbers").
 
     Raises EV013 (exists), EV019 (cannot be written).
     """
@@ -122,7 +122,7 @@ def bullets(sentences: Iterable[str]) -> str:
 
 
 def badge(grade: str, words: str) -> str:
-    """Words behind a dot in the grade's colour: "good", "fair" or "poor"."""
+    """Words after a dot in the grade's colour: "good", "fair" or "poor"."""
     return f'<span class="badge {grade}">{text(words)}</span>'
 
 
@@ -138,7 +138,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: bool = Tr
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """At so many significant digits, without an exponent; a dash where there is none."""
+    """A number with `digits` significant digits and no exponent; a dash if there is none."""
     if value is None or not np.isfinite(value):
         return "–"
     if value == 0:
@@ -162,7 +162,7 @@ def spread(value: float, std: float) -> str:
 
 
 def grid(figures: Iterable[str], cell_rem: float = 15.0, kind: str = "wide") -> str:
-    """Figures side by side, as many as fit at cell_rem wide."""
+    """Figures side by side, as many as fit at cell_rem width."""
     return f'<div class="grid {kind}" style="--cell:{cell_rem}rem">{"".join(figures)}</div>'
 
 

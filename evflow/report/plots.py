@@ -22,7 +22,7 @@ TITLES = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON [Hz]", "e
 SYMBOLS = {"theta_on": "θ ON", "theta_off": "θ OFF", "eta_on": "η ON", "eta_off": "η OFF"}
 UNITS = {"the": "natural log units", "eta": "Hz per pixel"}
 PRINT_DPI = 250
-FAST_PNG = 2  # level of compression: 6 takes four times as long for a tenth less
+FAST_PNG = 2  # compression level: 6 takes four times as long for a tenth less
 PRINT: Any = {
     "font.size": 7, "axes.titlesize": 8, "axes.linewidth": 0.6, "xtick.major.width": 0.6,
     "ytick.major.width": 0.6, "xtick.major.size": 2.5, "ytick.major.size": 2.5,
@@ -31,11 +31,11 @@ PRINT: Any = {
     "svg.hashsalt": "evflow"}
 ON_COLOUR, OFF_COLOUR = (0.80, 0.20, 0.18), (0.13, 0.35, 0.75)  # red and blue, as in the paper
 FIGURES = ("png", "pdf", "svg")
-LEAST_RANGE = 0.05  # of a map's middle value, to either side
+LEAST_RANGE = 0.05  # minimum colour range to either side, relative to a map's middle value
 
 
 def require() -> None:
-    """Raise EV010 where matplotlib is missing, before any long work."""
+    """Raise EV010 if matplotlib is missing, before any long work."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as e:
@@ -47,8 +47,8 @@ def require() -> None:
 def new_figure(
     width: float, height: float, layout: Literal["constrained"] | None = "constrained"
 ) -> Any:
-    """An off-screen figure of width x height inches; EV010 without matplotlib. layout: None where
-    each axis is told where it stands, which takes half of the time."""
+    """An off-screen figure of width x height inches; EV010 without matplotlib. layout: None for
+    axes with explicit positions, which takes half the time."""
     require()
     from matplotlib.figure import Figure
 
@@ -56,7 +56,7 @@ def new_figure(
 
 
 def save_figure(figure: Any, path: str | os.PathLike, dpi: float = 110) -> None:
-    """Write it as PNG, or PDF or SVG where the path ends so; an existing file is replaced."""
+    """Write it as PNG, or as PDF or SVG by the extension; an existing file is replaced."""
     kind = os.fspath(path).rpartition(".")[2].lower()
     atomic_text(path, printed(figure, kind if kind in FIGURES else "png", dpi), overwrite=True)
 
@@ -93,8 +93,8 @@ def event_image(events: Events, t0_us: int, t1_us: int) -> np.ndarray:
 
 
 def robust_range(values: np.ndarray, share: float = 1.0) -> tuple[float, float]:
-    """(low, high): all but `share` per cent of the finite values at either end; at least a tenth of
-    their middle apart, or a map that is all but even would look as uneven as any."""
+    """(low, high): excludes `share` per cent of the finite values at either end; at least a tenth
+    of their middle apart, so that a nearly uniform map looks uniform."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0
@@ -108,8 +108,8 @@ def _map(
     axis: Any, values: np.ndarray, title: str, unit: str = "", cmap: str = "viridis",
     below: Any = None,
 ) -> None:
-    """A map in a colour range that hot pixels do not stretch; arrows where values lie outside.
-    below: the axis of its colour bar, if there is one."""
+    """A map with a colour range that is robust to hot pixels; arrows mark values outside. below:
+    the axis of its colour bar, if any."""
     low, high = robust_range(values)
     finite = values[np.isfinite(values)]
     less, more = bool((finite < low).any()), bool((finite > high).any())
@@ -184,8 +184,8 @@ class _Page:
 
 
 def _histogram(axis: Any, found: CameraEstimate, name: str, truth: Camera | None) -> None:
-    """Pixels of a map that have events of their own (the others show the camera's summary, and
-    would be a spike beside which nothing is seen), and the truth (black, dashed)."""
+    """Histogram of the pixels that have events of their own (the others show the camera's summary
+    and would be one dominant spike), and of the truth (black, dashed)."""
     values = np.asarray(getattr(found.camera, name))
     own = found.valid & np.isfinite(values)
     shown, label = (own, f"{own.mean():.0%}, with events") if 0 < own.sum() < own.size else (
@@ -215,7 +215,7 @@ def _histogram(axis: Any, found: CameraEstimate, name: str, truth: Camera | None
 def camera_histograms(
     found: CameraEstimate, path: str | os.PathLike, truth: Camera | None = None
 ) -> None:
-    """Histograms of the four maps; the truth beside them where it is known; .png, .pdf or .svg."""
+    """Histograms of the four maps, with the truth if known; .png, .pdf or .svg."""
     require()
     with _printed():
         page = _Page(7.2, 2.2)
@@ -252,7 +252,7 @@ def comparison(
     axes[0, 0].imshow(frame, cmap="gray", vmin=0, vmax=255)
     axes[0, 0].set_title("frame")
     for axis, events, title in ((axes[0, 1], real, "recorded events"),
-                                (axes[0, 2], made, "re-made with the estimate")):
+                                (axes[0, 2], made, "re-simulated with the estimate")):
         axis.imshow(event_image(events, *span_us))
         axis.set_title(f"{title}, {(span_us[1] - span_us[0]) / 1000:.0f} ms")
     for axis in axes[0, :3]:
@@ -266,7 +266,7 @@ def comparison(
 
 
 def _rates(axis: Any, real: Events, made: Events, step_us: int = 5_000) -> None:
-    """Events per pixel and second over time, per polarity: recorded solid, re-made dashed."""
+    """Events per pixel and second over time, per polarity: recorded solid, re-simulated dashed."""
     start, stop = int(min(real.t[0], made.t[0])), int(max(real.t[-1], made.t[-1]))
     edges = np.arange(start, stop + step_us, step_us)
     for events, style, label in ((real, "-", "recorded"), (made, "--", "re-made")):

@@ -1,4 +1,4 @@
-"""Panel of what the pixels see the frames by: the photoreceptor, added light, the clocks."""
+"""Panel on the pixels' response: photoreceptor, additional light, delay."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from evflow.estimation.result import CameraEstimate
 from evflow.report import figures, page
 from evflow.report.page import Panel, figure, grid, number, paragraph, spread, table
 
-TITLE = "What the pixels see the frames by"
+TITLE = "Photoreceptor, additional light and delay"
 
 
 def receptor_panel(found: CameraEstimate, foretold: tuple[float, float] | None) -> Panel:
-    """Share explained over the cutoff, what was measured, and how it does on the other half.
-    foretold: shares of the second half that the first one's constants explain, as an ideal pixel
-    and as found; None where it was not tried."""
+    """Share explained over the cutoff, what was measured, and its test on the other half. foretold:
+    shares of the second half explained with the first one's constants, for an ideal pixel and as
+    measured; None if it was not tested."""
     receptor = found.receptor
     if receptor is None:
         return Panel("receptor", TITLE, paragraph(
-            "Absent: nothing was looked for, or too little happens to tell.", "note"))
+            "Absent: not measured, or too little happens to measure it.", "note"))
     sensor, std, optics = found.sensor, found.sensor_std, found.optics
     drawn = page.drawing(
         figures.explained(receptor.curve, receptor.explained[0], sensor.cutoff_hz),
@@ -29,19 +29,19 @@ def receptor_panel(found: CameraEstimate, foretold: tuple[float, float] | None) 
             ["events after frames [ms]", spread(1e3 * optics.delay_s, 1e3 * optics.delay_s_std)],
             ["dead time [ms]", spread(1e3 * sensor.refractory_s, 1e3 * std["refractory_s"])
              if sensor.refractory_s else "not seen"],
-            *([f"{label} [Hz per pixel]", spread(value, std[name]) if value else "not told apart"]
+            *([f"{label} [Hz per pixel]", spread(value, std[name]) if value else "not separated"]
               for label, name, value in (("leak", "leak_hz", sensor.leak_hz),
                                          ("shot noise in the dark", "shot_hz", sensor.shot_hz)))]
     shares = [["all that was read", *(number(v, 3) for v in receptor.explained)]]
     if foretold is not None:
         shares.append(["second half, by the first", *(number(v, 3) for v in foretold)])
-    said = ("The estimate is of pixels with these constants." if receptor.needed else
-            "An ideal pixel is as probable: the estimate is of one.")
+    said = ("The estimate assumes pixels with these constants." if receptor.needed else
+            "An ideal pixel is as probable: the estimate assumes one.")
     return Panel("receptor", TITLE, grid([
-        figure(drawn, "Line: offset and delay as found. Dashed: an ideal pixel, frames as they "
-               "are. Red: the cutoff that was found."),
+        figure(drawn, "Line: offset and delay as measured. Dashed: an ideal pixel and ideal "
+               "frames. Red: the measured cutoff."),
         table(["", "measured"], rows)
-        + table(["variance explained", "ideal pixel", "as found"], shares)], 22)
-        + paragraph("At an event a pixel remembers the brightness that it sees: the thresholds "
-                    "explain a share of that brightness along the frames, the more the truer the "
-                    f"photoreceptor is. {said}", "note"))
+        + table(["variance explained", "ideal pixel", "as measured"], shares)], 22)
+        + paragraph("At each event a pixel stores the brightness it sees. Thresholds and events "
+                    "explain a share of that brightness along the frames, which is larger the "
+                    f"better the photoreceptor is described. {said}", "note"))

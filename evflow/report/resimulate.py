@@ -1,7 +1,7 @@
 """Validation of an estimate: the recording's own frames, simulated with the estimated camera.
 
-A stretch of the recording is simulated twice, with two keys: what the two have in common is the
-most that the recording and one of them could. Bounded work: the busiest seconds, and for the
+A stretch of the recording is simulated twice, with two keys: the agreement of the two is the most
+that recording and simulation could reach. Work is bounded: the busiest seconds, and for the
 held-out half an estimate from the seconds before its middle. Host side.
 """
 
@@ -32,13 +32,13 @@ from evflow.simulator.interpolate import MIN_SIDE, Seen, notes_on, unzip, upsamp
 from evflow.simulator.photoreceptor import IDEAL, as_measured, seen_frames
 from evflow.types import Events, Recording, release
 
-SECONDS = 3.0  # of recording at most that are simulated
-PIXELS = 100 * 346 * 260  # of frames at most: 100 frames of a DAVIS346
-LEARNT_SECONDS = 5.0  # of the first half that the held-out estimate is made from
-SETTLING = 3  # intervals from which on the first is left out of the comparison
-INSTANT_US = 30_000  # an event image
-USUAL = 25  # pictures to a frame, where much moves
-MOST_KEPT = 160_000_000  # bytes of pictures, which are those of half a second of a DAVIS346
+SECONDS = 3.0  # of recording, at most, that are simulated
+PIXELS = 100 * 346 * 260  # of frames, at most: 100 frames of a DAVIS346
+LEARNT_SECONDS = 5.0  # of the first half that are used for the held-out estimate
+SETTLING = 3  # with at least this many intervals, the first is left out of the comparison
+INSTANT_US = 30_000  # duration of an event image
+USUAL = 25  # interpolated pictures per frame, where much moves
+MOST_KEPT = 160_000_000  # bytes of pictures: half a second of a DAVIS346
 
 Run = tuple[int, int]  # first and last frame
 Picture = tuple[np.ndarray, int]  # (H, W) in DN, time in us
@@ -48,10 +48,10 @@ Picture = tuple[np.ndarray, int]  # (H, W) in DN, time in us
 class Trial:
     """A stretch of a recording beside its re-simulation.
 
-    real, made: their events over span_us = (t0, t1), which begins a frame after the simulation
-    where there is room; frames: (first, last) of those simulated; numbers: `compare(real,
-    made)`; ceiling: correlation of the counts of two re-simulations, per polarity; instant_us:
-    when the busiest 30 ms begin; notes: what the interpolation said.
+    real, made: their events over span_us = (t0, t1), which begins one frame after the simulation if
+    there is room; frames: (first, last) of those simulated; numbers: `compare(real, made)`;
+    ceiling: correlation of the counts of two re-simulations, per polarity; instant_us: start of the
+    busiest 30 ms; notes: from the interpolation.
     """
 
     real: Events
@@ -67,7 +67,7 @@ class Trial:
 def usable_runs(recording: Recording) -> list[Run]:
     """(first, last) frames of the runs without a gap or fault that the events cover.
 
-    Raises EV011, EV012 where frames are missing, EV017 where no two neighbours can be used.
+    Raises EV011, EV012 if there are no frames or no overlap, EV017 if no two neighbours are usable.
     """
     runs: list[Run] = []
     for first, last in plan_windows(recording, 1).pairs:
@@ -76,7 +76,7 @@ def usable_runs(recording: Recording) -> list[Run]:
         else:
             runs.append((first, last))
     if not runs or max(recording.frames.shape[1:]) < MIN_SIDE:
-        raise EvflowDataError("EV017", "no two frames that the events cover can be used.",
+        raise EvflowDataError("EV017", "no two successive frames that the events cover are usable.",
                               "Re-simulation needs a moving picture.")
     return runs
 
@@ -100,8 +100,8 @@ def busiest(recording: Recording, runs: list[Run], seconds: float = SECONDS) -> 
 
 
 class Pictures:
-    """A recording's frames and what `upsample` puts between them; those of the last run are kept
-    while they are few, as parts of it may be asked for again. seen: of that run's intervals."""
+    """A recording's frames and what `upsample` adds between them; those of the last run are kept if
+    they are few, since parts of it may be needed again. seen: of that run's intervals."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording, self.run = recording, (0, 0)
@@ -121,7 +121,7 @@ class Pictures:
         return made if many else self._kept(made)
 
     def notes(self, run: Run) -> tuple[Note, ...]:
-        """What the interpolation of these frames, which were asked for, could not do well."""
+        """Notes on difficulties in interpolating these frames, after they were requested."""
         begin, end = (int(self.recording.frame_times[i]) for i in run)
         return tuple(notes_on([s for s in self.seen if begin <= s.t0 and s.t1 <= end]))
 
@@ -141,16 +141,16 @@ def resimulate(
     recording: Recording, found: CameraEstimate, run: Run, seed: int,
     pictures: Pictures | None = None,
 ) -> Trial:
-    """Simulate the frames of `run` twice, interpolated by `upsample` and seen by the camera as it
-    was measured, and compare; beside the bunches of events that come with frames, as no camera
-    makes those. pictures: of the recording, where another part of it is simulated as well."""
+    """Simulate the frames of `run` twice, interpolated by `upsample` and seen by the measured
+    camera, and compare, without the bunches of events at frames, which no simulation makes.
+    pictures: of the recording, if another part of it is simulated as well."""
     pictures = pictures or Pictures(recording)
     seen_by, model = as_measured(found.sensor, found.optics)
     streams = [
         simulate_stream(key, *unzip(shown), found.camera, model=model) for key, shown in zip(
             jax.random.split(jax.random.key(seed)),
             itertools.tee(seen_frames(pictures.of(run), seen_by)), strict=True)]
-    parts = list(zip(*streams, strict=True))  # in step, so that few frames are kept for the other
+    parts = list(zip(*streams, strict=True))  # in parallel, so that few frames are buffered
     begin = run[0] + 1 if run[1] - run[0] >= SETTLING else run[0]
     span = (int(recording.frame_times[begin]), int(recording.frame_times[run[1]]))
     made, again = (Events.concatenate(p).slice(*span) for p in zip(*parts, strict=True))
@@ -179,10 +179,9 @@ def held_out(
     recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int,
     first: First | None = None, pictures: Pictures | None = None,
 ) -> tuple[CameraEstimate, Trial, tuple[float, float] | None]:
-    """An estimate from the first part of a recording, tried on the rest, and what it foretells of
-    that (`foretold`). first: of what an estimate has read; without it that is the first half of
-    the longest run, its last LEARNT_SECONDS. Raises EV017 where a half is too short to estimate
-    from."""
+    """An estimate from the first part of a recording, tested on the rest, and what it predicts
+    there (`foretold`). first: what an estimate computed; without it, that is the first half of the
+    longest run, its last LEARNT_SECONDS. Raises EV017 if a half is too short to estimate from."""
     if first is not None:
         found, rest = first.estimate(), first.rest
     else:
@@ -207,8 +206,8 @@ def _halved(recording: Recording, runs: list[Run]) -> tuple[Recording, Run]:
 
 def foretold(recording: Recording, found: CameraEstimate, run: Run) -> tuple[float, float] | None:
     """Shares of the variance of brightness at the events of other frames (first, last) that an
-    estimate's thresholds explain: with an ideal pixel, and with the photoreceptor that was found.
-    None where one of the two says nothing."""
+    estimate's thresholds explain: with an ideal pixel, and with the measured photoreceptor. None if
+    one of the two is undefined."""
     intervals = [(recording, i) for i in range(*run)]
     places = [(recording, tuple(i for _, i in intervals[k:k + INTERVALS]))
               for k in range(0, len(intervals), INTERVALS)]

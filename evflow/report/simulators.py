@@ -1,10 +1,10 @@
-"""Which simulator foretells this camera? The pixels of v2e, ESIM and DVS-Voltmeter side by side.
+"""Which simulator predicts this camera best? The pixels of v2e, ESIM and DVS-Voltmeter compared.
 
-Each has its own best constants, from the first half of a recording, and is tried on the same frames
-of the second. v2e's pixel is the measured camera, pixel by pixel, behind its photoreceptor; ESIM's
-has one threshold per polarity and no noise; DVS-Voltmeter's is that of
-`baselines/voltmeter_fit.py`. All thresholds are scaled so that the first half has as many events
-as were recorded; the camera is shown as measured, too.
+Each has its own best constants, from the first half of a recording, and is tested on the same
+frames of the second. v2e's pixel is the measured camera, pixel by pixel, with its photoreceptor;
+ESIM's has one threshold per polarity and no noise; DVS-Voltmeter's comes from
+`baselines/voltmeter_fit.py`. All thresholds are scaled so that the first half gets as many events
+as were recorded; the camera as measured is shown too.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from evflow.types import Events, Recording
 
 Array = np.ndarray
 Run = tuple[int, int]  # first and last frame
-Pixels = Callable[[Array], tuple[Camera, SensorModel]]  # of thresholds (2,), ON and OFF
+Pixels = Callable[[Array], tuple[Camera, SensorModel]]  # given thresholds (2,), ON and OFF
 
-LEARNT, TRIED = 4, 5  # frame intervals at most, the busiest of each half
-TRIES = 4  # simulations of the first half, by which thresholds are scaled
-CLOSE = 0.02  # distances that differ by less are alike
+LEARNT, TRIED = 4, 5  # maximum frame intervals of each half, the busiest ones
+TRIES = 4  # simulations of the first half to scale thresholds
+CLOSE = 0.02  # distances that differ by less count as equal
 DARKEST = 0.255  # DN: ESIM's log(L / 255 + .001)
 LABELS = {"measured": "the camera as measured", "v2e": "v2e", "esim": "ESIM",
           "voltmeter": "DVS-Voltmeter"}
@@ -48,10 +48,10 @@ LABELS = {"measured": "the camera as measured", "v2e": "v2e", "esim": "ESIM",
 
 @dataclasses.dataclass(frozen=True)
 class Tried:
-    """name: of LABELS; constants: its best; untold: those of them that the recording does not tell;
-    numbers: "counts_r" and "space_time_r", recorded against made, and the same of two simulations,
-    "counts_ceiling" and "space_time_ceiling"; "intervals" (distance in decades); "events_on" and
-    "events_off" (made over recorded); distance: of `distance`."""
+    """name: from LABELS; constants: its best; untold: those that the recording does not determine;
+    numbers: "counts_r" and "space_time_r", recorded against simulated, and the same for two
+    simulations, "counts_ceiling" and "space_time_ceiling"; "intervals" (distance in decades);
+    "events_on" and "events_off" (simulated over recorded); distance: from `distance`."""
 
     name: str
     constants: dict[str, float]
@@ -62,8 +62,8 @@ class Tried:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Film:
-    """Frames (T, H, W) in DN, filled up by optical flow, at times_us (T,); real: what was
-    recorded in the span of time, which begins a frame later where there is room."""
+    """Frames (T, H, W) in DN, interpolated by optical flow, at times_us (T,); real: what was
+    recorded in that span, which begins a frame later if there is room."""
 
     frames: Array
     times_us: Array
@@ -72,7 +72,7 @@ class Film:
 
     @staticmethod
     def of(recording: Recording, run: Run, most: int) -> Film:
-        """The busiest frame intervals of a run, at most so many."""
+        """The busiest frame intervals of a run, at most `most`."""
         times = recording.frame_times
         before = np.searchsorted(recording.events.t, times)
         n = min(most, run[1] - run[0])
@@ -87,8 +87,8 @@ class Film:
     def simulated(
         self, key: jax.Array, camera: Camera, model: SensorModel, seen_by: Photoreceptor = IDEAL
     ) -> Events:
-        """Events of a camera in the span. As that of one that has been running, its memory lies
-        anywhere between its thresholds when it begins, which the first frame is changed for."""
+        """Events of a camera in the span. Like a running camera's, its pixels' memories start
+        anywhere between the thresholds, by adjusting the first frame."""
         pairs = zip(self.frames, self.times_us.tolist(), strict=True)
         frames, times = zip(*seen_frames(pairs, seen_by), strict=True)
         video = np.stack(frames).astype(np.float32)
@@ -105,14 +105,14 @@ class Film:
 def which_simulator(
     recording: Recording, found: CameraEstimate, first: Run, second: Run, seed: int = 0
 ) -> tuple[Tried, ...]:
-    """The pixels on frames of the second run, the nearest first. found: the estimate of the
-    first run. Raises EV017 where too little happens to tell."""
+    """The pixels on frames of the second run, the nearest first. found: the estimate of the first
+    run. Raises EV017 if too little happens."""
     run = tuple(range(*first))
     data = receptor_sample([(recording, run[k:k + INTERVALS])
                             for k in range(0, len(run), INTERVALS)])
     learnt, tried = Film.of(recording, first, LEARNT), Film.of(recording, second, TRIED)
     if data is None or not len(learnt.real) or not len(tried.real):
-        raise EvflowDataError("EV017", "too little happens to tell simulators apart.",
+        raise EvflowDataError("EV017", "too little happens to distinguish simulators.",
                               "Record more motion.")
     key, shape = jax.random.key(seed), found.n_events.shape
     seen_by, own = as_measured(found.sensor, found.optics)
@@ -152,10 +152,10 @@ def which_simulator(
 def try_simulators(
     recording: Recording, half: CameraEstimate | None, held: Trial | None, seed: int = 0
 ) -> tuple[tuple[Tried, ...], str]:
-    """`which_simulator` of what a report holds out: the estimate of the first half, and the frames
-    on which it was tried; or why not."""
+    """`which_simulator` on a report's held-out half: the estimate of the first half, and the frames
+    it was tested on; or why not."""
     if half is None or held is None:
-        return (), "there is no second half to try them on."
+        return (), "there is no second half to test them on."
     times, end = recording.frame_times, held.frames[0]
     runs = [(a, min(b, end)) for a, b in usable_runs(recording) if a < end]
     first, last = max(runs, key=lambda run: run[1] - run[0])
@@ -167,13 +167,13 @@ def try_simulators(
 
 
 def _even(shape: tuple[int, ...], theta: Array) -> Camera:
-    """Pixels that are all alike, without noise of their own."""
+    """Identical pixels, without noise of their own."""
     return Camera.constant(shape, theta_on=float(theta[0]), theta_off=float(theta[1]), eta_on=0.0,
                            eta_off=0.0)
 
 
 def _constants(found: CameraEstimate, scale: Array) -> dict[str, float]:
-    """What a camera's pixel is made of, its thresholds scaled."""
+    """The constants of a camera's pixel, with its thresholds scaled."""
     return {"theta_on": float(found.summary.theta_on) * float(scale[0]),
             "theta_off": float(found.summary.theta_off) * float(scale[1]),
             "sigma_on": float(found.summary.sigma_on), "sigma_off": float(found.summary.sigma_off),
@@ -194,8 +194,8 @@ def matched(
     key: jax.Array, theta: Array, pixels: Pixels, film: Film, seen_by: Photoreceptor = IDEAL, *,
     tied: bool = False,
 ) -> Array:
-    """theta (2,) at which as many events are made as were recorded: steps in the logs of both, with
-    the slope between them, -1 at first. tied: the same for both polarities."""
+    """theta (2,) at which as many events are simulated as were recorded: secant steps in the logs
+    of both, with slope -1 at first. tied: the same for both polarities."""
     def counts(events: Events) -> Array:
         on = float(events.p.sum())
         return np.log((np.full(2, len(events)) if tied else np.array([on, len(events) - on])) + 0.5)
@@ -233,10 +233,9 @@ def likeness(film: Film, made: Events, again: Events) -> dict[str, float | None]
 
 
 def distance(numbers: dict[str, float | None]) -> float:
-    """The mean of four: how far r of the counts, and r in space and time, are from that of two
-    simulations, in parts of it (noise makes both less, as does a memory that nobody knows, and
-    a pixel without noise foretells it no better); the distance of the intervals in decades; the
-    logs of both ratios of events, their mean. What is undefined counts as nothing in common."""
+    """The mean of four: relative shortfall of r of the counts, and of r in space and time, from
+    that of two simulations (noise and unknown memory reduce both); the distance of the intervals in
+    decades; the mean log ratio of events. Undefined values count as nothing in common."""
     def known(name: str, worst: float) -> float:
         value = numbers[name]
         return worst if value is None else value
@@ -248,13 +247,13 @@ def distance(numbers: dict[str, float | None]) -> float:
 
 
 def verdict(tried: Sequence[Tried], why_not: str = "") -> str:
-    """Which is nearest, in a sentence; why_not: the reason where none was tried."""
+    """A sentence that names the nearest; why_not: the reason if none was tested."""
     if not tried:
-        return f"No simulator was tried: {why_not}"
+        return f"No simulator was tested: {why_not}"
     best = [LABELS[t.name] for t in tried if t.distance < tried[0].distance + CLOSE]
     if len(best) == 1:
         return f"Nearest to what was recorded: {best[0]}."
-    return f"Alike, and nearest to what was recorded: {', '.join(best[:-1])} and {best[-1]}."
+    return f"Equally near to what was recorded: {', '.join(best[:-1])} and {best[-1]}."
 
 
 def as_dicts(tried: Sequence[Tried]) -> list[dict[str, Any]]:
@@ -264,19 +263,19 @@ def as_dicts(tried: Sequence[Tried]) -> list[dict[str, Any]]:
 
 def simulators_panel(tried: Sequence[Tried], why_not: str) -> Panel:
     """The table; why_not: the reason where it is empty."""
-    title = "Which simulator foretells this camera?"
+    title = "Which simulator predicts this camera best?"
     if not tried:
         return Panel("simulators", title, paragraph(f"Absent: {why_not}", "note"))
     rows = [[LABELS[t.name], *(number(t.numbers[n], 3) for n in t.numbers), number(t.distance, 3)]
             for t in tried]
     constants = [[LABELS[t.name], ", ".join(
-        f"{k} {'not told' if k in t.untold else format(v, '.3g')}" for k, v in t.constants.items())]
+        f"{k} {'unknown' if k in t.untold else format(v, '.3g')}" for k, v in t.constants.items())]
                  for t in tried]
     return Panel("simulators", title, paragraph(
         f"{verdict(tried)} Constants are those of the first half, thresholds scaled to its number "
-        f"of events (but for the camera as measured); tried on at most {TRIED} frame intervals of "
-        "the second. Ceilings are those of two simulations with other noise and "
-        "another memory at the beginning: the nearer to them, the truer.")
+        f"of events (except for the camera as measured); tested on at most {TRIED} frame intervals "
+        "of the second. Ceilings compare two simulations with different noise and "
+        "initial memory: the nearer to them, the better.")
         + table(["pixel", "counts r", "its ceiling", "space-time r", "its ceiling",
                  "intervals [decades]", "ON made / recorded", "OFF", "distance"], rows)
         + table(["pixel", "constants"], constants, numeric=False))

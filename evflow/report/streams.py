@@ -1,4 +1,5 @@
-"""Two streams side by side, as panels of a page; and a page of their own (`evflow compare`)."""
+"""Two event streams compared, as panels of a page, and as a page of their own (`evflow
+compare`)."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ def image_panel(
     real: Events, made: Events, instant_us: int, t0_us: int, names: Names,
     frame: np.ndarray | None = None,
 ) -> Panel:
-    """Events of one instant, and the frame of that moment where there is one."""
+    """Events of one instant, and the frame at that time if there is one."""
     cells = []
     if frame is not None:
         white = max(1.0, float(np.percentile(frame, 99.5)))
@@ -78,13 +79,13 @@ def count_panel(
     drawn = [figure(page.drawing(figures.counts(a, b, key, names), f"{key.upper()} per pixel"))
              for key, a, b in zip(("on", "off"), real.count_map(), made.count_map(), strict=True)]
     return Panel("counts", "Events per pixel", grid(drawn, 22) + paragraph(
-        "A pixel that fires in either stream is a point; colour: how many pixels, on a logarithmic "
-        "scale. Dashed: equal.", "note")
+        "Each pixel that fires in either stream is a point; colour: number of pixels, on a "
+        "logarithmic scale. Dashed: equal.", "note")
         + table(["correlation over pixels", "ON", "OFF", "both"], rows)
-        + paragraph(f"{active['real']:.1%} of the pixels fire in what was {names[0]}, "
-                    f"{active['synthetic']:.1%} in what was {names[1]}; of those that fire in "
+        + paragraph(f"{active['real']:.1%} of the pixels fire in the {names[0]} stream, "
+                    f"{active['synthetic']:.1%} in the {names[1]} one; of those that fire in "
                     f"either, {active['common'] or 0:.1%} fire in both. In space and time (ON "
-                    "less OFF events in cubes of 3×3 pixels and 2 ms): r = "
+                    "minus OFF events in cubes of 3×3 pixels and 2 ms): r = "
                     f"{number(numbers['space_time_r'], 3)}.", "note"))
 
 

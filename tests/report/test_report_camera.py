@@ -139,7 +139,7 @@ def test_without_frames_it_says_why(
     assert re.findall(r'<section id="([\w-]+)">', text) == list(PANELS)
     assert numbers["trial"] is None
     assert text.count("Absent: ") == 5
-    assert text.count("Undetermined: the recording does not tell.") == 2
+    assert text.count("Not determined by this recording.") == 2
     assert "Not all of the camera is known." in text
     assert "of a static scene" in text
 

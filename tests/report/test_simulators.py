@@ -54,7 +54,7 @@ def test_the_nearest_is_named_and_those_that_are_alike() -> None:
     assert "v2e and ESIM" in said
     rows = [tried("voltmeter", 0.1), tried("measured", 0.3)]
     panel = simulators_panel(rows, "")
-    assert "k3 not told" in panel.body
+    assert "k3 unknown" in panel.body
     assert panel.body.index("DVS-Voltmeter") < panel.body.index("as measured")
     assert as_dicts(rows)[0]["untold"] == ["k3"]
     assert "no second half" in simulators_panel((), "there is no second half.").body
