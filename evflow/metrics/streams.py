@@ -166,53 +166,53 @@ def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:
 
 def _company(sides: dict[str, Events]) -> dict[str, Any]:
     """What the events of a pixel have to do with those before and around it."""
-    keys = {name: _by_pixel(events) for name, events in sides.items()}
-    found = {name: _own_intervals(events, keys[name]) for name, events in sides.items()}
+    sorts = {name: _by_pixel(events) for name, events in sides.items()}
+    found = {name: _own_intervals(events, sorts[name][1]) for name, events in sides.items()}
     intervals = _times_alike({name: own for name, (own, _) in found.items()})
     same = {name: share for name, (_, share) in found.items()}
     del found  # as large as the events
-    around = {name: _neighbour_delays(events, keys[name]) for name, events in sides.items()}
+    around = {name: _neighbour_delays(events, *sorts[name]) for name, events in sides.items()}
     alone = {name: float((d > ALONE_US).mean()) if d.size else None for name, d in around.items()}
     near = {name: d[np.isfinite(d)] for name, d in around.items()}
     return {"intervals": intervals, "neighbours": {**_times_alike(near), "alone": alone},
             "same_polarity": same}
 
 
-def _by_pixel(events: Events) -> np.ndarray:
-    """(N,) pixel * N + number of the events, by pixel and then by time: sorted in a fifth of the
-    time that an order takes."""
+def _by_pixel(events: Events) -> tuple[np.ndarray, np.ndarray]:
+    """Of the events by pixel and then by time: pixel * N + number (N,), which is sorted in a fifth
+    of the time that an order takes, and number."""
     keys = _pixels(events) * len(events)
     keys += np.arange(len(events))
     keys.sort()
-    return keys
+    return keys, keys % max(len(events), 1)
 
 
-def _own_intervals(events: Events, keys: np.ndarray) -> tuple[np.ndarray, float | None]:
-    """(M,) us between successive events of a pixel; the share of them of one polarity. keys: of
+def _own_intervals(events: Events, order: np.ndarray) -> tuple[np.ndarray, float | None]:
+    """(M,) us between successive events of a pixel; the share of them of one polarity. order: of
     `_by_pixel`."""
-    pixel, order = np.divmod(keys, max(len(events), 1))
-    t, p = events.t[order], events.p[order]
+    pixel, t, p = _pixels(events)[order], events.t[order], events.p[order]
     same = pixel[1:] == pixel[:-1]
     repeats = (p[1:] == p[:-1])[same]
     return np.diff(t)[same].astype(np.float64), float(repeats.mean()) if repeats.size else None
 
 
-def _neighbour_delays(events: Events, keys: np.ndarray) -> np.ndarray:
+def _neighbour_delays(events: Events, keys: np.ndarray, order: np.ndarray) -> np.ndarray:
     """(M,) us from the latest event of the eight pixels around to an event, inf without one;
-    M <= ASKED_EVENTS events, evenly taken. keys: of `_by_pixel`."""
+    M <= ASKED_EVENTS events, evenly taken. keys, order: of `_by_pixel`."""
     n = len(events)
     width, height = events.size
-    asked = np.linspace(0, n - 1, min(n, ASKED_EVENTS)).astype(np.int64)
-    asked = asked[np.argsort(_pixels(events)[asked], kind="stable")]  # found in order: in the cache
+    chosen = np.zeros(n, bool)
+    chosen[np.linspace(0, n - 1, min(n, ASKED_EVENTS)).astype(np.int64)] = True
+    asked = order[chosen[order]]  # those of a pixel together: found in the cache
     x, y = events.x[asked].astype(np.int64), events.y[asked].astype(np.int64)
     latest = np.full(len(asked), -1)
     for dx, dy in NEIGHBOURS:
         inside = (x + dx >= 0) & (x + dx < width) & (y + dy >= 0) & (y + dy < height)
         pixel = (y + dy) * width + x + dx
-        before = np.searchsorted(keys, pixel * n + asked) - 1
-        key = keys[np.maximum(before, 0)]
-        known = inside & (before >= 0) & (key // n == pixel)
-        latest = np.maximum(latest, np.where(known, key % n, -1))
+        pixel *= n
+        before = np.searchsorted(keys, pixel + asked) - 1
+        number = keys.take(np.maximum(before, 0)) - pixel  # below 0: an event of another pixel
+        np.maximum(latest, np.where(inside & (before >= 0), number, -1), out=latest)
     delay = (events.t[asked] - events.t[np.maximum(latest, 0)]).astype(np.float64)
     return np.where(latest >= 0, delay, np.inf)
 
@@ -237,7 +237,7 @@ def distances(a: np.ndarray, b: np.ndarray) -> tuple[float | None, float | None]
     (N,), (M,); None for both where one is empty."""
     if not (a.size and b.size):
         return None, None
-    at = np.sort(np.concatenate([a, b]))
+    at = np.sort(np.concatenate([a, b]), kind="stable")  # merges the two
     apart = np.searchsorted(a, at, side="right") / a.size
     apart -= np.searchsorted(b, at, side="right") / b.size
     np.abs(apart, out=apart)

@@ -51,11 +51,12 @@ def measure(trace: Trace, path: Array, dt_s: Array, bright: Array, steps: int) -
     counts = trace.counts.reshape(len(dt_s), 2, -1)
     known = np.flatnonzero((first != NEVER) & bright.ravel())
     step = first[known]
-    origin = flat[step, known]
-    origin = origin + trace.fraction.ravel()[known] * (flat[step + 1, known] - origin)
-    since = _since_first(counts[..., known], trace.first_on.ravel()[known], step // steps)
+    at = step.astype(np.int64) * flat.shape[1] + known  # `take` is faster than a pair of indices
+    origin, after = flat.take(at), flat.take(at + flat.shape[1])
+    origin = origin + trace.fraction.ravel()[known] * (after - origin)
+    since = _since_first(counts.take(known, -1), trace.first_on.ravel()[known], step // steps)
     begun = np.arange(len(since))[:, None] * steps > step
-    changes = np.where(begun, flat[::steps][:, known] - origin, np.float32(0.0))
+    changes = np.where(begun, flat[::steps].take(known, 1) - origin, np.float32(0.0))
     balance = []
     for lag in LAGS:
         n = since[lag:] - since[:-lag] if lag else since[1:]
@@ -81,8 +82,8 @@ def _sides(n: Array, dL: Array, *, squares: bool) -> Array:
     few pixels at the threshold's clamp, with most of the events, decide alone."""
     rows = []
     for side in (1, -1):
-        at = np.nonzero(side * dL > DEAD)
-        on, off, change = (a[at].astype(np.float64) for a in (n[:, 0], n[:, 1], dL))
+        at = np.flatnonzero(dL > DEAD if side > 0 else dL < -DEAD)
+        on, off, change = (a.take(at).astype(np.float64) for a in (n[:, 0], n[:, 1], dL))
         weight = np.minimum(side * change - DEAD, FULL) / (1 + on + off)
         terms = ((on * on, off * off, on * off, on * change, off * change, change * change, 1.0)
                  if squares else (on, off, change, np.abs(change)))
