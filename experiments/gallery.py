@@ -34,6 +34,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
 from evflow.files.atomic import atomic_text
 from evflow.report import bench_figures, plots
+from evflow.report.cameras import histograms as camera_pair
 from evflow.report.caption import captioned
 from evflow.report.flow import flow_image
 from evflow.report.movie import Film, write_sheet
@@ -43,6 +44,9 @@ from experiments.shared.hidden_scene import hidden_camera, simulate_again
 
 SPAN_US = 30_000
 COLOURS = 64  # of a picture: files stay small
+LEVELS = (40, 220, 55, 100, 40, 100, 220, 55, 220, 100, 40, 220, 40, 55, 100)  # DN of the screen
+REST, EDGE = 200, 4  # ms of a level, and of the step to it
+EDGES_US = 1000 * (REST - 1 + (REST + EDGE) * np.arange(len(LEVELS) - 1))  # when steps begin
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +79,11 @@ class Material:
 
     @cached_property
     def bench(self) -> CameraEstimate:
-        return calibrate_step(screen(self.options.seed))
+        return calibrate_step(screen(self.options.seed), triggers_us=EDGES_US)
+
+    @cached_property
+    def other(self) -> CameraEstimate:
+        return calibrate_step(screen(self.options.seed + 1))
 
     @property
     def span(self) -> tuple[int, int]:
@@ -86,14 +94,14 @@ class Material:
 
 def screen(seed: int) -> Recording:
     """A v2e-like camera before a screen that steps between four levels of light."""
-    shape, levels = (48, 64), [40, 220, 55, 100, 40, 100, 220, 55, 220, 100, 40, 220, 40, 55, 100]
+    shape = (48, 64)
     k_camera, k_events = jax.random.split(jax.random.key(seed))
     camera = Camera.sample(k_camera, shape, CameraPrior(theta=(0.2, 0.24), noise="none"))
     model = SensorModel(cutoff_hz=200.0, refractory_s=5e-4, leak_hz=0.1, shot_hz=2.0,
                         noise_resets_memory=True)
-    logs = [np.full(200, np.log(levels[0]))]
-    for a, b in itertools.pairwise(np.log(levels)):
-        logs += [np.linspace(a, b, 5)[1:], np.full(200, b)]
+    logs = [np.full(REST, np.log(LEVELS[0]))]
+    for a, b in itertools.pairwise(np.log(LEVELS)):
+        logs += [np.linspace(a, b, EDGE + 1)[1:], np.full(REST, b)]
     light = np.exp(np.concatenate(logs)).astype(np.float32)
     frames = np.broadcast_to(light[:, None, None], (len(light), *shape))
     times = 1000 * np.arange(len(light))
@@ -184,9 +192,20 @@ def speed(made: Material, path: Path) -> None:
     atomic_text(path.with_suffix(".svg"), bench_figures.speed(made.bench.bench), overwrite=True)
 
 
+def latency(made: Material, path: Path) -> None:
+    assert made.bench.bench is not None
+    atomic_text(path.with_suffix(".svg"), bench_figures.latency(made.bench.bench), overwrite=True)
+
+
+def compared(made: Material, path: Path) -> None:
+    drawn = camera_pair((made.bench.camera, made.other.camera), "theta_on", ("one", "another"))
+    atomic_text(path.with_suffix(".svg"), drawn, overwrite=True)
+
+
 PICTURES: dict[str, Callable[[Material, Path], None]] = {
     draw.__name__: draw
-    for draw in (recording, maps, histograms, again, sensors, flow, video, bench, light, speed)}
+    for draw in (recording, maps, histograms, again, sensors, flow, video, bench, light, speed,
+                 latency, compared)}
 
 
 def side_by_side(streams: list[tuple[str, Events]], span_us: tuple[int, int]) -> np.ndarray:

@@ -53,7 +53,7 @@ def write_cameras(
         if name.startswith("theta"):
             rows.append(["in % of contrast", _percent(row, "a"), _percent(row, "b"), "", "", ""])
     head = ["", *(page.text(name) for name in names), "ratio", "apart", "r"]
-    drawn = [figure(page.drawing(_histograms(cameras, name, names), LABELS[name]), "", LABELS[name])
+    drawn = [figure(page.drawing(histograms(cameras, name, names), LABELS[name]), "", LABELS[name])
              for name in ("theta_on", "theta_off", "eta_on", "eta_off")
              if numbers[name]["a"] is not None or numbers[name]["b"] is not None]
     panels = [
@@ -88,7 +88,7 @@ def _percent(row: dict[str, Any], side: str) -> str:
             spread(slope - 100.0, slope * row[f"{side}_std"]))
 
 
-def _histograms(cameras: tuple[Camera, Camera], name: str, names: tuple[str, str]) -> bytes:
+def histograms(cameras: tuple[Camera, Camera], name: str, names: tuple[str, str]) -> bytes:
     """Distributions of a parameter over the pixels of both cameras."""
     maps = [np.asarray(getattr(camera, name)).ravel() for camera in cameras]
 

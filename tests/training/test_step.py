@@ -132,19 +132,13 @@ def test_the_summary_learns(bank: TextureBank, fresh: TrainState, step) -> None:
 def test_resume_is_bit_exact(
     tmp_path: Path, bank: TextureBank, fresh: TrainState, step
 ) -> None:
-    straight = fresh
-    for _ in range(4):
-        straight, _ = step(straight, bank)
-    half = fresh
-    for _ in range(2):
-        half, _ = step(half, bank)
+    half, _ = step(fresh, bank)
+    straight, _ = step(half, bank)
     with Checkpoints(tmp_path) as checkpoints:
-        checkpoints.save(2, half)
+        checkpoints.save(1, half)
     with Checkpoints(tmp_path) as checkpoints:
-        assert checkpoints.latest == 2
-        resumed = checkpoints.restore(fresh)
-    for _ in range(2):
-        resumed, _ = step(resumed, bank)
+        assert checkpoints.latest == 1
+        resumed, _ = step(checkpoints.restore(fresh), bank)
     for a, b in zip(leaves(resumed), leaves(straight), strict=True):
         np.testing.assert_array_equal(a, b)
     assert jax.random.key_data(resumed.key).tolist() == jax.random.key_data(fresh.key).tolist()
