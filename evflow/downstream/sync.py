@@ -57,8 +57,8 @@ def sync_times(
     if windows > MOST_WINDOWS:
         raise EvflowDataError(
             "EV026", f"events from {t[0]:,} to {t[-1]:,} us, {windows:,} windows of "
-            f"{window_us:,} us.", "Does the clock jump (read the parts alone: --start, --stop), or "
-            "is the time unit wrong (--time-unit)?")
+            f"{window_us:,} us.", "Does the clock jump (read the parts separately: --start, "
+            "--stop), or is the time unit wrong (--time-unit)?")
     return t[0] + window_us * np.arange(1, windows + 1)
 
 

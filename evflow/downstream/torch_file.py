@@ -89,8 +89,8 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
         return _checkpoint(path, _read_zip(path) if is_zip(path) else _read_chain(path))
     except pickles.Refused as e:
         raise EvflowDataError(
-            "EV009", f"{path}: {e}.", "Nothing but weights is read. Where the file does load, save "
-            "them alone: torch.save(model.state_dict(), 'weights.pth').") from e
+            "EV009", f"{path}: {e}.", "Only weights are read. Where the file can be loaded, save "
+            "only them: torch.save(model.state_dict(), 'weights.pth').") from e
     except (ValueError, struct.error) as e:
         raise EvflowDataError(
             "EV009", f"{path}: {e}.",

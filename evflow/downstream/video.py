@@ -59,8 +59,8 @@ def with_reconstructed_frames(
     times = sync_times(recording, sync, window_us=window_us)
     if len(times) < warm_up + 2:
         raise EvflowDataError(
-            "EV017", f"the events give {len(times)} images, of which the first {warm_up} are the "
-            "network's warm-up.", "Two more are needed: take a longer recording.")
+            "EV017", f"the events give {len(times)} images, and the first {warm_up} are the "
+            "network's warm-up.", "Two more are needed: use a longer recording.")
     frames = np.empty((len(times) - warm_up, *recording.events.size[::-1]), np.float32)
     images = reconstructions(
         trained.network, trained.params, recording.events, times, **trained.how, hold=True)

@@ -42,8 +42,8 @@ def unlike_noise(events: Events, hot: np.ndarray) -> str:
     """Why events are not the noise of a static scene, given its hot (H, W) pixels, or are too few
     to decide; empty if nothing speaks against it."""
     if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
-        return (f"there are only {len(events):,} events in {events.duration_us / 1e6:.3f} s to "
-                "tell it.")
+        return (f"there are only {len(events):,} events in {events.duration_us / 1e6:.3f} s, too "
+                "few to decide.")
     excess = company(events, hot)
     if excess > MOVING:
         return (f"the scene moves ({excess:.2f} pairs of nearby events per event beyond chance; "

@@ -32,8 +32,8 @@ def held_panel(
                                                          for k in ("on", "off", "both"))]]
     return Panel("held-out", title, paragraph(
         "The longest stretch without a gap is divided near its middle. The camera was estimated "
-        f"from {plural(half.windows, 'window')} of its first part, without the second, of "
-        f"which {held.numbers['duration_s']:.3f} s are simulated.")
+        f"from {plural(half.windows, 'window')} of its first part only; of the second, "
+        f"{held.numbers['duration_s']:.3f} s are simulated.")
         + table(["second half", *NAMES, "ratio"], rows)
         + table(["events per pixel", "ON", "OFF", "both"], counts)
         + table(["estimate", "first half", "all"], estimates))

@@ -92,15 +92,15 @@ def _threshold(found: CameraEstimate, key: str) -> Judged:
     if not known(found, key):
         return Judged("poor", name, 9.0, f"θ {name} is undetermined.", THRESHOLD,
                       "undetermined", "Record moving texture in good light, together with "
-                      "frames: without it thresholds cannot be told.")
+                      "frames: without it thresholds cannot be measured.")
     if any(note.code == f"theta_{key}.extrapolated" for note in found.notes):
         return Judged("fair", name, 1.5, f"θ {name} lies outside what the network was trained on.",
                       THRESHOLD, spread(theta, std), "A threshold outside the trained "
                       "range is an extrapolation: are the frames linear in light (--response), "
                       "and dark ones without an offset?")
     if not np.isfinite(std):
-        return Judged("fair", name, 1.5, f"How well θ {name} is known these weights do not tell.",
-                      THRESHOLD, spread(theta, std), "Measure with weights that tell errors "
+        return Judged("fair", name, 1.5, f"These weights do not estimate the error of θ {name}.",
+                      THRESHOLD, spread(theta, std), "Measure with weights that estimate errors "
                       "(--weights default) to know how far to trust it.")
     error = std / theta
     grade = graded(error, ERROR)
@@ -165,7 +165,7 @@ def _rate_advice(ratio: float, *, tested: bool, lost: bool) -> str:
                 "with a gamma, flickering light, or clocks that are not aligned (evflow check).")
     return (f"Too {how} synthetic events. If the thresholds of the simulation were chosen, "
             f"{'raise' if ratio > 1 else 'lower'} them, or measure them (evflow estimate). If they "
-            "were measured on this recording, its report tells what is amiss.")
+            "were measured on this recording, its report says what is wrong.")
 
 
 def _pixels(found: CameraEstimate) -> list[Judged]:

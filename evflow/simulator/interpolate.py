@@ -111,7 +111,7 @@ def notes_on(seen: list[Seen]) -> Iterator[Note]:
         yield Note("frames.flow", f"optical flow fails in {worst.failed:.0%} of the pixels that "
                    f"change between the frames at {worst.t0} and {worst.t1} us{_many(failed, seen)}"
                    ": noise, or motion too fast or too intricate to follow. Events there "
-                   "are those of a fade; more frames a second would tell.")
+                   "are those of a fade; a higher frame rate helps.")
 
 
 def _many(some: list[Seen], seen: list[Seen]) -> str:

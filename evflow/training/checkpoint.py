@@ -209,7 +209,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is damaged ({e}).",
-            f"Restore it from a copy, or {ANEW}: without it nobody can tell what the run was."
+            f"Restore it from a copy, or {ANEW}: without it the run cannot be identified."
         ) from e
     return saved
 

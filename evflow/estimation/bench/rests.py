@@ -113,6 +113,6 @@ def check_steps(levels: np.ndarray) -> None:
         together = float((np.abs(step - 1.25 * median) <= 0.75 * abs(median)).mean())
         if not median or together < LEAST_TOGETHER:
             raise EvflowDataError(
-                "EV017", f"step {k + 1} of {len(levels) - 1} is none of the whole view: the median "
+                "EV017", f"step {k + 1} of {len(levels) - 1} does not fill the view: the median "
                 f"pixel changes by {median:+.2f} log units, and {together:.0%} of the pixels by "
                 "half to twice that.", FILL_THE_VIEW)

@@ -183,7 +183,7 @@ def test_frames_must_show_a_screen_that_steps() -> None:
         calibrate_step(textured(0, part=0.3))
     several = textured(0, part=0.3)
     rests = [(0, 90_000), (120_000, 210_000)]
-    with pytest.raises(EvflowDataError, match=r"EV017.*step 1 of 1 is none of the whole view"):
+    with pytest.raises(EvflowDataError, match=r"EV017.*step 1 of 1 does not fill the view"):
         calibrate_step(several, rests_us=rests)
 
 
