@@ -49,7 +49,7 @@ def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Arra
     shared = [np.log(left + 1e-3), np.log((1 - ideal + 1e-3) / (1 - seen + 1e-3)),
               *found.smear[:, 0]]
     chance = np.clip(found.chance, 1e-9, 1 - 1e-9)
-    log_odds = np.log(chance / (1 - chance))
+    log_odds = np.log(chance / (1 - chance)) + found.few
     odds = np.clip(log_odds, -MOST_ODDS, MOST_ODDS) / MOST_ODDS
     missed = unneeded / (1.0 + np.exp(-log_odds - LENIENT))
     change = np.log(found.theta / found.ideal_theta)

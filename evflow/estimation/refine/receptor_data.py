@@ -27,7 +27,8 @@ class Sample(NamedTuple):
     pixel and time: pixel (0..P-1), at (in fine steps), on, off (counts so far), weight, and group,
     with whose events one shares a constant: those of its pixel, unless a readout (readouts.py) or
     noise (receptor_noise.py) came between; block (C, P); noise_hz (C, 2): of `noise_rates`; told
-    (C, 2): the offset and its std by net_changes.py, of all stretches."""
+    (C, 2): the offset and its std by net_changes.py, of all stretches; watched (C,): pixel seconds
+    of the stretch, whichever pixels are looked at."""
 
     dn: Array
     dt_s: Array
@@ -39,6 +40,7 @@ class Sample(NamedTuple):
     group: Array
     block: Array
     noise_hz: Array
+    watched: Array
     told: Array | None = None
 
 
@@ -131,5 +133,5 @@ def _row(
     part = filled(np.cumsum(new) - 1, EVENTS).astype(np.int32)
     row = (light, dt_s.astype(np.float32), pixel, *events, part,
            filled(_block(where, s.shape, number), PIXELS).astype(np.int32),
-           noise_rates(s, interval_s))
+           noise_rates(s, interval_s), np.asarray(dt_s.sum() * dn[0].size, np.float32))
     return row, s.on[kept]

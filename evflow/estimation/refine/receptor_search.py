@@ -15,7 +15,7 @@ from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.refine.receptor_data import Sample, smeared_sample
 from evflow.estimation.refine.receptor_noise import parted
-from evflow.estimation.refine.receptor_prior import Prior
+from evflow.estimation.refine.receptor_prior import DOUBT, Prior, few
 from evflow.estimation.refine.receptor_profile import Other, along_offset
 from evflow.estimation.refine.receptor_regression import SCALE, Regression, Slopes
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor
@@ -33,7 +33,6 @@ PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
 # of what is left says nothing of the pixel, and so much is left open of what is found:
 BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
 FLOOR = np.array([0.5, 1e-4, 5e-4])
-DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
 ALONE = 2.0  # log odds, beside those of the changes from frame to frame, that it takes to say that
 # the frames of an ideal pixel lack light
 BY_OFFSET = 5.0  # log odds that it takes to say that a slow pixel's frames lack light
@@ -51,15 +50,15 @@ CUTOFFS = (np.inf, 1000.0, 500.0, 300.0, 200.0, 140.0, 100.0, 70.0, 50.0, 30.0, 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Found:
-    """seen: the most probable photoreceptor; theta, ideal_theta (2,): of the pooled
-    regression, with it and with an ideal pixel; covariance
-    (3, 3) of (offset, tau, delay); theta_error (2,): relative errors of theta that not knowing the
-    three leaves; explained: shares of the variance that the regression
-    explains, with an ideal pixel and as found; chance: probability that the ideal pixel is not
-    enough; size: how many independent events the sample is worth; smear (2, 3): for each of SMEARS,
-    by how much the memory's mean over it is explained better (log of what is left), and how the
-    logs of theta_on and theta_off change with it; curve (K, 2): the share that is explained with
-    each of CUTOFFS, Hz, offset and delay as found."""
+    """seen: the most probable photoreceptor; theta, ideal_theta (2,): of the pooled regression,
+    with it and with an ideal pixel; covariance (3, 3) of (offset, tau, delay); theta_error (2,):
+    relative errors of theta that not knowing the three leaves; explained: shares of the variance
+    that the regression explains, with an ideal pixel and as found; chance: probability that the
+    ideal pixel is not enough; few: by how much its log odds were lowered, as little was watched;
+    size: how many independent events the sample is worth; smear (2, 3): for each of SMEARS, by how
+    much the memory's mean over it is explained better (log of what is left), and how the logs of
+    theta_on and theta_off change with it; curve (K, 2): the share that is explained with each of
+    CUTOFFS, Hz, offset and delay as found."""
 
     seen: Photoreceptor
     theta: np.ndarray
@@ -68,6 +67,7 @@ class Found:
     theta_error: np.ndarray
     explained: tuple[float, float]
     chance: float
+    few: float
     size: float
     smear: np.ndarray
     curve: np.ndarray
@@ -143,7 +143,7 @@ def find(data: Sample) -> Found:
     return Found(_receptor(phi, by_light=model.by_light), np.abs(fits), np.abs(ideal_fits),
                  covariance, open_,
                  (float(1 - np.exp(plain)), float(1 - np.exp(value))),
-                 float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), size,
+                 float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), few(data), size,
                  _smear(phi if odds > 0 else PLAIN, model), _curve(phi, model))
 
 
@@ -177,8 +177,8 @@ def _with_law(
 
 def _odds(phi: np.ndarray, model: Regression, size: float, plain: float) -> float:
     """Log odds of the constants against an ideal pixel, which leaves `plain`."""
-    gain = 0.5 * size * (plain - model.unexplained(phi))
-    return gain - DOUBT - Prior().unlikely(phi) + model.prior.likelier(float(phi[0]))
+    gain = 0.5 * size * (plain - model.unexplained(phi)) - DOUBT - few(model.data)
+    return gain - Prior().unlikely(phi) + model.prior.likelier(float(phi[0]))
 
 
 def _offset_alone(model: Regression, size: float, plain: float) -> tuple[np.ndarray, float]:

@@ -19,11 +19,11 @@ SUMMARY = Summary(*(np.float32(v) for v in (0.2, 0.3, 0.1, 0.1, 0.03, 0.03)))
 STD = Summary(*(np.float32(v) for v in (0.01, 0.02, 0.03, 0.04, 0.005, 0.006)))
 
 
-def found(chance: float) -> Found:
+def found(chance: float, few: float = 0.0) -> Found:
     return Found(
         Photoreceptor(20.0, 1e-3, 0.0), np.array([0.19, 0.27]), np.array([0.25, 0.36]),
         np.diag([4.0, 1e-7, 1e-7]), np.array([0.04, 0.06]), (0.7, 0.9),
-        chance, 400.0, np.array([[0.01, 0.02, 0.03], [0.04, 0.05, 0.06]]), np.zeros((2, 2)))
+        chance, few, 400.0, np.array([[0.01, 0.02, 0.03], [0.04, 0.05, 0.06]]), np.zeros((2, 2)))
 
 
 def test_signs_are_those_that_are_named() -> None:
@@ -75,3 +75,11 @@ def test_the_fit_finds_whose_errors_are_larger() -> None:
     error = relative_error(net, fresh) / (0.05 * np.exp(0.6 * np.clip(fresh[:, 1], -2.0, 2.0)))
     # Held by RIDGE, and of Student's t: a little less steep, a little narrower.
     assert np.abs(np.log(error)).mean() < 0.15
+
+
+def test_where_little_was_watched_a_slow_pixel_is_missed_as_easily() -> None:
+    """What it takes to believe in one makes no camera the more ideal."""
+    odds = -7.0
+    less = 1 / (1 + np.exp(-odds + 3.0))
+    assert signs(found(less, 3.0), 1.5, SUMMARY, STD) == pytest.approx(
+        signs(found(1 / (1 + np.exp(-odds))), 1.5, SUMMARY, STD))

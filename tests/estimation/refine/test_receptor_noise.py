@@ -62,7 +62,7 @@ def one_pixel(noise_hz: float) -> Sample:
     weight, zeros = np.array([1, 1, 1, 1, 1, 1, 0.0]), np.zeros(7, np.int32)
     return Sample(*(np.asarray(v)[None] for v in (
         light[:, None].astype(np.float32), np.full(80, 1e-3, np.float32), zeros, at, on, off,
-        weight, zeros, np.zeros(1, np.int32), np.full(2, noise_hz, np.float32))))
+        weight, zeros, np.zeros(1, np.int32), np.full(2, noise_hz, np.float32), np.float32(0.08))))
 
 
 @pytest.mark.parametrize(("noise_hz", "tau_s", "groups"), [

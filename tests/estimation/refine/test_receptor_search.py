@@ -9,6 +9,7 @@ import pytest
 from evflow.estimation.refine import receptor_search
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
+from evflow.estimation.refine.receptor_prior import FEW, FEWER, few
 from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_search import find
@@ -195,6 +196,15 @@ def test_events_that_no_frame_shows_tell_nothing(shown: bool) -> None:
     s = sight(events, times, lin_log(dn), STEPS, np.full((INTERVALS + 1, *SHAPE), shown))
     found = sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s, no_readouts(s))])
     assert (found is not None) == shown
+
+
+def test_the_less_was_watched_the_more_it_takes() -> None:
+    """To take a pixel for slow, or frames for lacking light."""
+    data = looked_at(0.0, 0.0)
+    assert data.watched == pytest.approx(INTERVALS * FRAME_S * SHAPE[0] * SHAPE[1], rel=1e-5)
+    much, less, least = (few(data._replace(watched=np.array([seconds])))
+                         for seconds in (2 * FEW, FEW / np.e, FEW / np.e**2))
+    assert (much, less, least) == pytest.approx((0.0, FEWER, 2 * FEWER))
 
 
 def test_the_less_probable_law_widens_what_is_left_open() -> None:
