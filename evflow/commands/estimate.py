@@ -72,7 +72,7 @@ class Estimate(Compiling, Reading):
     """How much of a long recording to read. normal: parts spread over it, until the errors stop
     shrinking or a minute's work is done (DAVIS346); quick: a third of that; full: everything."""
     budget_s: Annotated[float | None, value("SECONDS")] = None
-    """Stop reading after this many seconds of work; at least one part is read."""
+    """Stop reading after this many seconds of work (0: read one part)."""
     on_interrupt: Literal["stop", "save"] = "stop"
     """What Ctrl-C does while the recording is read. stop: end without a result; save: measure the
     camera from what was read (a second Ctrl-C ends)."""
@@ -123,8 +123,7 @@ class Estimate(Compiling, Reading):
         moving = self.protocol == "motion"
         need_folder(self.out)
         if self.budget_s is not None and self.budget_s < 0:
-            raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.",
-                                  "Give 0 or more; 0 reads one part.")
+            raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.", "It must be >= 0.")
         self._check_light()
         if not moving:
             refuse(self, ("weights", "window_ms", "reconstruct", *READ),
@@ -181,8 +180,7 @@ class Estimate(Compiling, Reading):
                 "estimate A B --protocol static --lux 5 200.")
 
     def _recorded(self, path: Path) -> tuple[Recording, Report, list[Note]]:
-        """A recording, the findings of `evflow check`, and its doubts; raises its errors unless
-        told not to."""
+        """A recording, the findings of `evflow check`, and its doubts; raises its errors."""
         from evflow.files.spool import SOME, on_disk
         from evflow.process.terminal import bar
         from evflow.recordings.check import check
