@@ -166,16 +166,21 @@ def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:
 
 def _company(sides: dict[str, Events]) -> dict[str, Any]:
     """What the events of a pixel have to do with those before and around it."""
-    sorts = {name: _by_pixel(events) for name, events in sides.items()}
-    found = {name: _own_intervals(events, sorts[name][1]) for name, events in sides.items()}
-    intervals = _times_alike({name: own for name, (own, _) in found.items()})
-    same = {name: share for name, (_, share) in found.items()}
+    found = {name: _of_pixels(events) for name, events in sides.items()}
+    around = {name: delays for name, (_, _, delays) in found.items()}
+    same = {name: share for name, (_, share, _) in found.items()}
+    intervals = _times_alike({name: own for name, (own, _, _) in found.items()})
     del found  # as large as the events
-    around = {name: _neighbour_delays(events, *sorts[name]) for name, events in sides.items()}
     alone = {name: float((d > ALONE_US).mean()) if d.size else None for name, d in around.items()}
     near = {name: d[np.isfinite(d)] for name, d in around.items()}
     return {"intervals": intervals, "neighbours": {**_times_alike(near), "alone": alone},
             "same_polarity": same}
+
+
+def _of_pixels(events: Events) -> tuple[np.ndarray, float | None, np.ndarray]:
+    """`_own_intervals` and `_neighbour_delays`, from one sort, which is as large as the events."""
+    keys, order = _by_pixel(events)
+    return *_own_intervals(events, order), _neighbour_delays(events, keys, order)
 
 
 def _by_pixel(events: Events) -> tuple[np.ndarray, np.ndarray]:
