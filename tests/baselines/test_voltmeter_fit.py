@@ -35,7 +35,7 @@ def crossed(theta_on: float, theta_off: float, k2: float, pixels: int = 48) -> S
     pixel, at, on, off = np.array(rows, np.float64).T
     own = pixel.astype(int)
     fields = (dn, np.full(steps, 1e-3), own, at, on, off, np.ones(len(pixel)), own,
-              np.zeros(pixels, int), np.zeros(2))
+              np.zeros(pixels, int), np.zeros(2), np.float32(1e-3 * steps * pixels))
     return Sample(*(v[None] for v in fields))
 
 

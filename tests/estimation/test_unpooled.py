@@ -58,7 +58,7 @@ def test_no_error_is_made_up(found: Any, tmp_path: Path) -> None:
     assert known(found, "on")
     judged = judge_estimate(found, None, None)
     assert [j.grade for j in judged[:2]] == ["fair", "fair"]
-    assert "do not tell" in judged[0].seen
+    assert "do not estimate the error" in judged[0].seen
     assert "± –" in describe(found)
     told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert told["summary_std"]["theta_on"] is None
@@ -81,5 +81,5 @@ def test_the_flow_itself_is_run(params: dict[str, Any]) -> None:
 def test_an_estimator_of_pieces_needs_weights_that_pool(params: dict[str, Any]) -> None:
     estimator = CameraEstimator(params, refine="off")
     estimator.add(hidden(3)[0])
-    with pytest.raises(EvflowDataError, match=r"EV018.*every pixel alone"):
+    with pytest.raises(EvflowDataError, match=r"EV018.*every pixel separately"):
         estimator.estimate()

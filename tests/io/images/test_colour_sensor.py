@@ -72,7 +72,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(path), str(out), "--colour", "rggb"]) == 0
     np.testing.assert_array_equal(read_recording(out).frames, SEEN)
     assert main(["info", str(path), "--colour", "rggb", "--bayer", "rggb"]) == 2
-    assert "Give one of them" in capsys.readouterr().err
+    assert "Give only one of them" in capsys.readouterr().err
 
 
 def test_frames_from_elsewhere(tmp_path: Path) -> None:
