@@ -17,7 +17,7 @@ MISLED = 0.05  # of cameras, whose changes tell a wrong offset
 DOUBT = 6.0  # log odds, a priori and for the volume of the three, that a camera is ideal
 # A short recording of few pixels shows few motions, and the path errs in its own way about each. Of
 # 41 ideal cameras of 64x64 pixels, seen for .05 to .2 s, 14 would be taken for others by DOUBT
-# alone, 2 with this; 79 of 113 cutoffs of 30 to 300 Hz are found, not 90, 28 of 72 offsets, not 40.
+# alone, 2 with this; 78 of 113 cutoffs of 30 to 300 Hz are found, not 90, 28 of 72 offsets, not 40.
 FEW, FEWER = 3000.0, 5.0  # pixel seconds watched; log odds for a factor e below
 
 
