@@ -18,18 +18,17 @@ import jax
 import optax
 import tyro
 
-from evflow.commands.writing import need_absent, need_suffix
 from evflow.network import architecture, flow
 from evflow.network.api import config_of
 from evflow.network.coordinates import unsquash_summary
-from evflow.network.weights import model_card, save_weights
 from evflow.process.terminal import bar
 from evflow.scenes import make_bank
 from evflow.training import losses
 from evflow.training.batch import Batch, sample_batch
 from evflow.training.config import TrainConfig, preset
 from evflow.training.objective import cut_block
-from experiments.shared.common import at_least, estimator, run_script
+from experiments.shared.common import at_least, run_script
+from experiments.shared.weight_parts import begin_fit, save_part
 
 Array = jax.Array
 
@@ -63,9 +62,7 @@ def spread_loss(spread: Any, net: Any, batch: Batch, key: Array, config: TrainCo
 
 def main(options: Options) -> float:
     at_least(1, steps=options.steps)
-    need_suffix(options.out, ".safetensors")
-    need_absent(options.out, options.overwrite)
-    name, net = estimator(options.weights, "spread")
+    name, net = begin_fit(options, "spread")
     config = dataclasses.replace(
         preset("default"), model=config_of({name: net}), block=(16, 16), windows=1)
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))
@@ -90,9 +87,8 @@ def main(options: Options) -> float:
     tail = losses_seen[-options.steps // 10:]
     figures = {"first": losses_seen[0], "last_tenth": sum(tail) / len(tail)}
     print(f"negative log-likelihood: {figures['first']:.3f} -> {figures['last_tenth']:.3f}")
-    card = model_card(options.weights) | {"calibration": {
-        "steps": options.steps, "seed": options.seed, "negative_log_likelihood": figures}}
-    save_weights(options.out, {name: {**net, "spread": spread}}, card, overwrite=options.overwrite)
+    save_part(options, name, net, {"spread": spread}, {"calibration": {
+        "steps": options.steps, "seed": options.seed, "negative_log_likelihood": figures}})
     return figures["last_tenth"]
 
 

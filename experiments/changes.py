@@ -20,27 +20,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from evflow import Recording, encode, load_weights, read_recording
+from evflow import Recording, load_weights
 from evflow.camera import CameraPrior
 from evflow.light.log_maps import lin_log
 from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
-from evflow.training.batch import Batch, sample_batch
-from evflow.training.config import preset
 from experiments.shared import change_systems as systems
 from experiments.shared.cameras import Protocol, hidden_recording
+from experiments.shared.change_windows import window_errors
 from experiments.shared.changes_pages import MEASURES, picture, table
 from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.images import mean_ci
-from experiments.shared.recordings import held_recordings
+from experiments.shared.recordings import real_recordings
 
-Array = jax.Array
-LOG_255 = float(np.log(255.0))
-ACTIVE = 0.02  # log units: least mean absolute change of a window that counts
 FRAME_MS = 32  # of simulated recordings: 16 parts of 2 frames of the 1 kHz video
 
 
@@ -62,51 +57,12 @@ class Options:
     """Simulated recordings (default: the preset's)."""
 
 
-def errors(params: Any, batch: Batch) -> dict[str, Array]:
-    """Sums of absolute errors of the change up to each part, over pixels of active windows."""
-    window = {"window_s": batch.window_s, "intensity": batch.intensity[:, 0]}
-    voxels, dlogI, changes = batch.voxels[:, 0], batch.dlogI[:, 0], batch.changes[:, 0]
-    code = encode(params, voxels, dlogI, summary=batch.nominal, **window)
-    up, down = jnp.split(code.changes, 2, -1)
-    true = jnp.cumsum(changes, -1)
-    on, off = jnp.split(voxels, 2, -1)
-    theta_on, theta_off = (t[:, None, None, None]
-                           for t in (batch.nominal.theta_on, batch.nominal.theta_off))
-    parts = changes.shape[-1]
-    found = {
-        "encoder": jnp.cumsum(up - down, -1),
-        "frames alone": jnp.stack([dlogI * (i + 1) / parts for i in range(parts)], -1),
-        "events alone": jnp.cumsum(on * theta_on - off * theta_off, -1),
-        "no change": jnp.zeros_like(true)}
-    active = (jnp.abs(changes).sum(-1).mean((1, 2)) > ACTIVE).astype(true.dtype)
-    return {"windows": active.sum(), **{
-        k: (jnp.abs(v - true).mean((1, 2, 3)) * active).sum() for k, v in found.items()}}
-
-
-def windows(options: Options, params: Any) -> dict[str, Any]:
-    """Errors over the windows of simulated scenes."""
-    config = dataclasses.replace(preset("default"), windows=1)
-    count = options.batches or {"debug": 2, "full": 40}[options.preset]
-    k_bank, k_data = jax.random.split(jax.random.key(options.seed))
-    bank = make_bank(k_bank, 96, photos=False)
-    step = jax.jit(lambda key: errors(params, sample_batch(key, bank, config)))
-    total: dict[str, float] = {}
-    with bar("batches") as progress:
-        for i in range(count):
-            made = jax.device_get(step(jax.random.fold_in(k_data, i)))
-            total = {k: total.get(k, 0.0) + float(v) for k, v in made.items()}
-            progress(i + 1, count)
-    found = total.pop("windows")
-    return {**{k: {"log": v / found, "log_255": v / found / LOG_255} for k, v in total.items()},
-            "windows": found}
-
-
 def recordings(options: Options) -> Iterator[tuple[str, Recording, np.ndarray | None]]:
     """(name, recording, true log video between its frames): the real ones, then simulated ones of
     as many cameras. debug: the first real one."""
     full = options.preset == "full"
-    for path in options.recording or held_recordings()[:None if full else 1]:
-        yield path.stem, systems.cut(read_recording(path), options.span_s), None
+    for name, recording in real_recordings(options.recording, options.span_s, None if full else 1):
+        yield name, recording, None
     if options.recording:
         return
     k_bank, k_data = jax.random.split(jax.random.key(options.seed + 1))
@@ -122,42 +78,20 @@ def recordings(options: Options) -> Iterator[tuple[str, Recording, np.ndarray | 
         yield "simulated", hidden.recording, video.reshape(*fine.shape, *video.shape[1:])
 
 
-def scored(
-    scene: systems.Scene, params: Any
-) -> tuple[dict[str, dict[str, np.ndarray]], systems.Told | None]:
-    """Mean MEASURES (4,) of each protocol and system over a recording's intervals; and what was
-    told of the held-out frame that changed most, None where there is no such frame."""
-    rows: dict[str, dict[str, list[list[float]]]] = {}
-    most, largest = None, -1.0
-    for name, task in (("next", systems.next_frame), ("middle", systems.middle_frame)):
-        for told in task(scene, params):
-            fired = told.made["integration"][-1] != 0
-            for system, change in told.made.items():
-                row = rows.setdefault(name, {}).setdefault(system, [])
-                row.append(systems.errors(told.true[-1:], change[-1:], fired))
-                if len(told.true) > 1:
-                    rows.setdefault("path", {}).setdefault(system, []).append(
-                        systems.errors(told.true, change, fired))
-            size = float(np.abs(told.true).mean())
-            if name == "middle" and size > largest:
-                most, largest = told, size
-    return {task: {s: np.nanmean(found, 0) for s, found in row.items()}
-            for task, row in rows.items()}, most
-
-
 def main(options: Options) -> dict[str, Any]:
     begin(options, "changes")
     plots.require()
     params = load_weights(options.weights)
-    result = windows(options, params)
+    batches = options.batches or {"debug": 2, "full": 40}[options.preset]
+    result = window_errors(params, options.seed, batches)
     found: dict[str, list[dict[str, dict[str, np.ndarray]]]] = {}
-    shown: dict[str, systems.Told] = {}
+    shown: dict[str, systems.Predicted] = {}
     with bar("recordings") as progress:
         for number, (name, recording, video) in enumerate(recordings(options), 1):
-            scores, told = scored(systems.make_scene(params, recording, video), params)
+            scores, predicted = systems.scored(systems.make_scene(params, recording, video), params)
             found.setdefault(name, []).append(scores)
-            if told is not None:
-                shown.setdefault(name, told)
+            if predicted is not None:
+                shown.setdefault(name, predicted)
             progress(number, number)
     result["recordings"] = {name: {task: {system: {
         m: mean_ci(np.array([s[task][system][i] for s in every]))

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 import tyro
 
-from evflow.commands.writing import need_absent, need_suffix
-from evflow.network.weights import model_card, save_weights, weights_hash
+from evflow.network.weights import weights_hash
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
-from experiments.shared.common import at_least, estimator, run_script
-from experiments.shared.doubting import FOLDS, cross_validated, figures_of, fit, flat
+from experiments.shared.common import at_least, run_script
+from experiments.shared.doubt_fit import FOLDS, cross_validated, figures_of, fit, flat
 from experiments.shared.many import Setup
 from experiments.shared.real_cameras import draw_other, draw_real
 from experiments.shared.refinement import undoubted
 from experiments.shared.rows import collected
+from experiments.shared.weight_parts import begin_fit, save_part
 
 FIRST = 480  # recordings as cameras may be; those after are of other pixels, or longer
 COVERED = 0.74  # by one std: tails are heavy, and 1.96 of them are to hold more than nine in ten
@@ -71,9 +71,7 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarra
 def main(options: Options) -> dict[str, float]:
     at_least(FOLDS, recordings=options.recordings)
     at_least(1, workers=options.workers)
-    need_suffix(options.out, ".safetensors")
-    need_absent(options.out, options.overwrite)
-    name, net = estimator(options.weights, "summary")
+    name, net = begin_fit(options, "summary")
     origin = f"{options.seed} {weights_hash(options.weights)}"
     protocols = [drawn(options.seed, i) for i in range(options.recordings)]
     setup = Setup(str(options.weights), options.seed, photos=True)
@@ -87,9 +85,8 @@ def main(options: Options) -> dict[str, float]:
                **figures_of(both["left"], std * widen, "after")}
     made = {**fit(both["signs"], both["left"], both["before"]), "widen": np.array(widen)}
     print("\n".join(f"{k:20s} {v:.4f}" for k, v in figures.items()))
-    card = model_card(options.weights) | {"doubt": {
-        "recordings": options.recordings, "seed": options.seed, "figures": figures}}
-    save_weights(options.out, {name: {**net, "doubt": made}}, card, overwrite=options.overwrite)
+    save_part(options, name, net, {"doubt": made}, {"doubt": {
+        "recordings": options.recordings, "seed": options.seed, "figures": figures}})
     return figures
 
 

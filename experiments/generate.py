@@ -26,23 +26,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow import Camera, code_from_video, generate, load_weights, log_prob
-from evflow.camera import THETA_MIN, CameraPrior
+from evflow import code_from_video, generate, load_weights, log_prob
+from evflow.camera import CameraPrior
 from evflow.network.api import Params
 from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
 from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.generated import Row, Windows, compare, figures, scene_of, simulated
+from experiments.shared.generated_cameras import CHANGED, variants
+from experiments.shared.generated_pages import separation, table
 
 Array = jax.Array
 
-SCALES = {  # of theta_on, theta_off
-    "as it is": (1.0, 1.0), "halved": (0.5, 0.5), "doubled": (2.0, 2.0),
-    "ON halved": (0.5, 1.0), "ON doubled": (2.0, 1.0),
-    "OFF halved": (1.0, 0.5), "OFF doubled": (1.0, 2.0)}
-CHANGED = ("halved", "doubled")  # which log_prob is to tell from the camera as it is
-REFERENCES = 4  # simulations whose mean log_prob is what is typical
-SINGLE_PIXELS = 0.1  # share of pixels whose thresholds change at an unchanged summary
+REFERENCES = 4  # simulations whose mean log_prob is taken as typical
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,37 +55,6 @@ class Options:
     """Halved and doubled, its thresholds stay inside those of the training."""
     window_s: float = 0.05
     shape: tuple[int, int] = (64, 64)
-
-
-def scaled(camera: Camera, on: Array | float, off: Array | float) -> Camera:
-    return dataclasses.replace(camera, theta_on=jnp.maximum(camera.theta_on * on, THETA_MIN),
-                               theta_off=jnp.maximum(camera.theta_off * off, THETA_MIN))
-
-
-def variants(key: Array, camera: Camera) -> dict[str, tuple[Camera, Array]]:
-    """Cameras to compare, and the pixels (H, W) that count."""
-    everywhere = jnp.ones(camera.shape, bool)
-    found = {name: (scaled(camera, *scale), everywhere) for name, scale in SCALES.items()}
-    some = jax.random.bernoulli(key, SINGLE_PIXELS, camera.shape)
-    for name, scale in (("single pixels halved", 0.5), ("single pixels doubled", 2.0)):
-        factor = jnp.where(some, scale, 1.0)
-        found[name] = scaled(camera, factor, factor), some
-    return found
-
-
-def auroc(inside: np.ndarray, outside: np.ndarray) -> float:
-    """How often a draw of `inside` (scenes, n) exceeds one of `outside` of the same scene; equal
-    ones, as of a scene that stands still, count half."""
-    apart = inside[:, :, None] - outside[:, None, :]
-    return float((0.5 * (1.0 + np.sign(apart))).mean())
-
-
-def separation(scores: dict[str, np.ndarray]) -> dict[str, float]:
-    """AUROC of log_prob, and of its nearness to the reference, for each change of thresholds."""
-    near = {name: -np.abs(row - scores["reference"]) for name, row in scores.items()}
-    return {f"{name}, by {kind}": auroc(found["as it is"], found[name])
-            for name in CHANGED
-            for kind, found in (("height", scores), ("typicality", near))}
 
 
 def compared(
@@ -140,18 +105,6 @@ def main(options: Options) -> dict[str, Any]:
     result["auroc"] = separation({name: np.array([s[name] for s in scores]) for name in scores[0]})
     conclude(options, "generate", result, table(result))
     return result
-
-
-def table(result: dict[str, Any]) -> str:
-    names = ("on", "off", "empty", "correlation", "two simulations", "relative")
-    lines = ["| camera | events ON, generated / simulated | OFF | mean \\|value\\| of empty pixels "
-             "| correlation with a simulation | of two simulations | ratio |", "|" + "---|" * 7]
-    for name, row in result.items():
-        if name != "auroc":
-            lines.append(f"| {name} | " + " | ".join(f"{row[k]:.3f}" for k in names) + " |")
-    lines += ["", "AUROC of log_prob: " + "; ".join(
-        f"{k} {v:.2f}" for k, v in result["auroc"].items())]
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

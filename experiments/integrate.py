@@ -22,28 +22,27 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import numpy as np
 
-from evflow import load_weights, read_recording
+from evflow import load_weights
 from evflow.baselines import SYSTEMS
-from evflow.baselines.base import usable
 from evflow.camera import CameraPrior
 from evflow.errors import EvflowDataError
 from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import SceneConfig, make_bank
+from experiments.shared import integrated
 from experiments.shared.cameras import Protocol, hidden_recording
-from experiments.shared.change_systems import cut
 from experiments.shared.common import begin, conclude, run_script
-from experiments.shared.images import SCORES, mean_ci
-from experiments.shared.integrated import Case, halves, image, scored, spans, thresholds
 from experiments.shared.integrated_pages import picture, table
-from experiments.shared.recordings import held_recordings
+from experiments.shared.recordings import real_recordings
 
 SIZES = {"DAVIS240": (180, 240), "DAVIS346": (260, 346), "VGA": (480, 640)}
 SCENE = SceneConfig(speed_px_s=(60.0, 300.0), static_fraction=0.0, contrast=(0.6, 1.0))
 # In the picture, beside the systems that were asked for
 SHOWN = ("no events", "default .2", "ecc", "ecc median", "ours, maps")
+QUICK = ("ecc", "ecc offset 40", "ecc median", "jaer normalised", "s2r")
+# All but what learns from each recording for minutes; `--systems lgan` asks for that.
+EACH = tuple(name for name, system in SYSTEMS.items() if math.isinf(system.most_recordings))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,20 +68,12 @@ class Options:
     """Images per recording and horizon at most, evenly spread."""
 
 
-LEAST = 4  # usable intervals of a half: fewer tell no thresholds
-QUICK = ("ecc", "ecc offset 40", "ecc median", "jaer normalised", "s2r")
-# All but what learns from each recording for minutes; `--systems lgan` asks for that.
-EACH = tuple(name for name, system in SYSTEMS.items() if math.isinf(system.most_recordings))
-
-
-def cases(options: Options) -> Iterator[Case]:
-    """Real recordings, then simulated ones of cameras of each size (debug: one, and a small
-    one)."""
+def cases(options: Options) -> Iterator[integrated.Case]:
+    """Real recordings, then simulated ones of each size (debug: one, and a small one)."""
     full = options.preset == "full"
-    for path in options.recording or held_recordings()[:None if full else 1]:
-        recording = cut(read_recording(path), options.span_s)
+    for name, recording in real_recordings(options.recording, options.span_s, None if full else 1):
         kind = {240: "DAVIS240", 346: "DAVIS346"}.get(recording.events.size[0], "")
-        yield Case(path.stem, kind, recording)
+        yield integrated.Case(name, kind, recording)
     if options.recording:
         return
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))
@@ -93,8 +84,8 @@ def cases(options: Options) -> Iterator[Case]:
         for seed in range(options.seeds or (5 if full else 3)):
             key = jax.random.fold_in(jax.random.fold_in(k_data, size), seed)
             hidden = hidden_recording(key, bank, protocol)
-            yield Case(f"simulated {shape[1]}x{shape[0]}", kind, hidden.recording,
-                       hidden.camera, hidden.nominal)
+            yield integrated.Case(f"simulated {shape[1]}x{shape[0]}", kind, hidden.recording,
+                                  hidden.camera, hidden.nominal)
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -102,34 +93,24 @@ def main(options: Options) -> dict[str, Any]:
     plots.require()
     params = load_weights(options.weights)
     systems = options.systems or (QUICK if options.preset == "debug" else EACH)
-    unknown = sorted(set(systems) - set(SYSTEMS))
-    if unknown:
+    if unknown := sorted(set(systems) - set(SYSTEMS)):
         raise EvflowDataError("EV020", f"systems {unknown}.", f"Choose from {sorted(SYSTEMS)}.")
     seen = (*SHOWN, *options.systems)
-    collected: dict[str, dict[str, dict[str, list[Any]]]] = {}
-    shown: dict[str, tuple[str, np.ndarray, dict[str, np.ndarray]]] = {}
+    collected: integrated.Found = {}
+    shown: dict[str, integrated.Example] = {}
     with bar("recordings") as progress:
-        for number, case in enumerate(cases(options), 1):
-            part, title = case.recording, f"{case.name} (in sample)"
-            if options.held_out and len(usable(part)) >= 2 * LEAST:
-                part, rest = halves(part)
-                case, title = dataclasses.replace(case, recording=rest), case.name
-            by = thresholds(case, part, params, systems)
+        for number, whole in enumerate(cases(options), 1):
+            part, case, title = integrated.calibrated_and_scored(whole, options.held_out)
+            by = integrated.thresholds(case, part, params, systems)
             group = f"{title}, {case.camera}"
-            for horizon, row in scored(case, by, options.images).items():
-                for name, values in row.items():
-                    place = collected.setdefault(group, {}).setdefault(horizon, {})
+            for horizon, scores in integrated.scored(case, by, options.images).items():
+                place = collected.setdefault(group, {}).setdefault(horizon, {})
+                for name, values in scores.items():
                     place.setdefault(name, []).append([*values, by[name].seconds])
-            chosen = spans(case.recording, 5, 1) or spans(case.recording, 1, 1)
-            if chosen and group not in shown:
-                shown[group] = (case.name, case.recording.frame_dn(chosen[0][1]), {
-                    n: image(case.recording, chosen[0], by[n]) for n in by if n in seen})
+            if group not in shown and (row := integrated.example(case, by, seen)):
+                shown[group] = row
             progress(number, number)
-    result = {group: {horizon: {name: {
-        **{s: mean_ci(np.array(found)[:, i]) for i, s in enumerate(SCORES)},
-        "images": sum(r[-2] for r in found), "seconds": float(np.mean([r[-1] for r in found]))}
-        for name, found in row.items()} for horizon, row in horizons.items()}
-        for group, horizons in collected.items()}
+    result = integrated.averages(collected)
     conclude(options, "integrate", result, table(result))
     picture(options.out / "integrate.png", list(shown.values()))
     return result

@@ -19,25 +19,14 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from evflow import simulate
-from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
 from evflow.process.terminal import bar
 from evflow.report import plots
 from experiments.shared import pages
 from experiments.shared.common import begin, run_script, write_result, write_text
-from experiments.shared.noise_laws import (
-    SCREEN_DT_S,
-    camera_of,
-    judged,
-    model_of,
-    rest_law,
-    screen,
-    screen_law,
-)
+from experiments.shared.noise_counts import figure_five, table_two
 from experiments.shared.noise_tables import MODELS, cells, table, totals
 from experiments.shared.sources import figure_four, sources
-from experiments.shared.table_two import LEVELS, LUX, SCP, TABLE_TWO
+from experiments.shared.table_two import LUX, SCP, TABLE_TWO
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,48 +52,6 @@ class Options:
         return {"debug": 160, "full": 1000}[self.preset]
 
 
-def table_two(key: jax.Array, options: Options, name: str, row: int) -> dict[str, Any]:
-    """Signal events of a brightening (ON) and a darkening (OFF) screen, each as step and ramp."""
-    k_camera, key = jax.random.split(key)
-    camera, model = camera_of(k_camera, name, row, options.size, spread=True), model_of(name)
-    found: dict[str, Any] = {}
-    for polarity, up in (("on", True), ("off", False)):
-        for way in ("step", "ramp"):
-            dn = screen(way, up)
-            frames = np.broadcast_to(dn[:, None, None].astype(np.float32),
-                                     (len(dn), *camera.shape))
-            times = np.arange(len(dn)) * round(1e6 * SCREEN_DT_S)
-            events, noise = simulate(jax.random.fold_in(key, 2 * up + (way == "step")), frames,
-                                     times, camera, model=model, labels=True)
-            found[f"{polarity} {way}"] = judged(((events.p == up) & ~noise).sum(),
-                                                screen_law(model, camera, dn, up))
-    return found
-
-
-def duration(model: SensorModel, camera: Camera, options: Options) -> float:
-    """Seconds in which each of the noise sources sends `events` at each luminance."""
-    pixels = options.size**2 / len(LEVELS)
-    hz = rest_law(model, camera, 3000.0) / 3000.0
-    return float(np.clip(options.events / pixels / hz[hz > 0.005].min(), 5.0, 3000.0))
-
-
-def figure_five(key: jax.Array, options: Options, name: str, row: int) -> dict[str, Any]:
-    """Noise of vertical bands at rest, by luminance."""
-    k_camera, key = jax.random.split(key)
-    camera, model = camera_of(k_camera, name, row, options.size, spread=False), model_of(name)
-    seconds = duration(model, camera, options)
-    times = np.linspace(0, seconds * 1e6, options.intervals + 1).round().astype(np.int64)
-    band = np.repeat(LEVELS, options.size // len(LEVELS)).astype(np.float32)
-    frames = np.broadcast_to(band, (len(times), *camera.shape))
-    counts = simulate(key, frames, times, camera, model=model).count_map()
-    counts = counts.reshape(2, options.size, len(LEVELS), -1).sum((1, 3))
-    pixels = options.size**2 / len(LEVELS)
-    law = rest_law(model, camera, seconds) * pixels
-    return {"seconds": seconds, "pixels": pixels,
-            **{p: [judged(*pair) for pair in zip(counts[i], law[i], strict=True)]
-               for i, p in enumerate(("on", "off"))}}
-
-
 def main(options: Options) -> dict[str, Any]:
     begin(options, "noise")
     plots.require()
@@ -115,8 +62,9 @@ def main(options: Options) -> dict[str, Any]:
         for k, name in enumerate(MODELS):
             for row in range(len(SCP)):
                 k_step, k_rest = jax.random.split(jax.random.fold_in(key, 100 * k + row))
-                result["table II"][name].append(table_two(k_step, options, name, row))
-                result["figure 5"][name].append(figure_five(k_rest, options, name, row))
+                result["table II"][name].append(table_two(k_step, options.size, name, row))
+                result["figure 5"][name].append(figure_five(
+                    k_rest, options.size, name, row, options.events, options.intervals))
                 progress(k * len(SCP) + row + 1, len(MODELS) * len(SCP))
     result |= {"totals": totals(result), "cells": cells(result)}
     text = table(result)

@@ -33,16 +33,13 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-from evflow.errors import EvflowDataError
-from evflow.network.weights import weights_path
-from evflow.process.provenance import provenance
 from evflow.report import plots
 from evflow.training.config import as_dict
 from experiments.shared import gains, held_out
 from experiments.shared.common import at_least, run_script, write_result, write_text
-from experiments.shared.conditions import Files, digest
+from experiments.shared.conditions import Files, named_files
 from experiments.shared.same_runs import nothing_lost, same_setting
-from experiments.shared.see_better_settings import Preset, Task, preset_of
+from experiments.shared.see_better_settings import Preset, Task, heading, preset_of
 from experiments.shared.trainings import Setting, Trainings
 
 
@@ -83,68 +80,33 @@ def chosen(options: Options) -> Setting:
     """The preset with what the options change; EV020 where they contradict each other."""
     at_least(1, seeds=options.seeds, steps=options.steps)
     setting = preset_of(options.task, options.preset)
-    learning = setting.learning
-    if options.normalised:
-        learning = dataclasses.replace(learning, normalised=True)
-    if options.steps is not None:
-        learning = dataclasses.replace(learning, steps=options.steps)
+    learning = dataclasses.replace(
+        setting.learning, normalised=options.normalised or setting.learning.normalised,
+        steps=options.steps or setting.learning.steps)
     given: dict[str, Any] = {"names": options.names, "cameras": options.targets,
                              "circuits": options.circuits, "seeds": options.seeds}
-    return dataclasses.replace(
-        setting, learning=learning, **{k: v for k, v in given.items() if v})
-
-
-def files(given: tuple[str, ...]) -> dict[str, Path]:
-    """NAME=PATH by name; EV020 for anything else."""
-    found: dict[str, Path] = {}
-    for entry in given:
-        name, _, path = entry.partition("=")
-        if not name or not path or name in found:
-            raise EvflowDataError("EV020", f"{entry!r}.", "Give NAME=PATH, each name once.")
-        found[name] = Path(path)
-    return found
-
-
-def heading(options: Options, setting: Setting) -> str:
-    """What was trained how, on what."""
-    learning, made = setting.learning, provenance()
-    data = learning.data
-    return (f"# {options.task}, preset {options.preset}\n\n"
-            f"{type(setting.network).__name__} of base {setting.network.base}, {setting.seeds} "
-            f"seeds, {learning.steps} steps of {data.sequences} sequences of {data.windows} windows"
-            f" of {1e3 * data.window_s:g} ms at {data.crop} px; {setting.scenes} held-out clips. "
-            f"evflow {made['evflow']}, jax {made['versions']['jax']}, "
-            f"{made['machine']['device']}, {made['machine']['cpus']} CPUs.")
+    return dataclasses.replace(setting, learning=learning, **{k: v for k, v in given.items() if v})
 
 
 def main(options: Options) -> dict[str, Any]:
     """Train and test what is missing; returns the tables' figures of all there is."""
     plots.require()
     began, setting = time.monotonic(), chosen(options)
-    shared = {"task": options.task, "weights": options.weights,
-              "estimator": digest(weights_path(options.weights))}
     runs = Trainings(setting, options.out, options.weights)
     conditions = runs.conditions(
-        Files(*map(files, (options.estimators, options.eventgan, options.cameras))))
-    same_setting(options.out, shared, setting)
+        Files(*map(named_files, (options.estimators, options.eventgan, options.cameras))))
+    same_setting(options.out, options.task, options.weights, setting)
     nothing_lost(options.out, conditions, setting.seeds)
-    left = setting.seeds * len(conditions)
-    for seed in range(setting.seeds):
-        for condition in conditions:
-            if time.monotonic() - began > options.max_seconds and not runs.done(condition, seed):
-                continue
-            runs.complete(condition, seed)
-            left -= 1
-    scores = runs.scores(conditions)
-    result = {target: gains.compared(of_target) for target, of_target in scores.items()}
+    left = runs.complete_all(conditions, began + options.max_seconds)
+    result = {k: gains.compared(scores) for k, scores in runs.scores(conditions).items()}
     untrained = runs.untrained(options.task)
-    text = "\n\n".join((heading(options, setting), gains.report(
+    text = "\n\n".join((heading(options.task, options.preset, setting), gains.report(
         result, options.task, runs.told(conditions), left, untrained)))
-    how = held_out.scored_by(options.task, runs.lpips is not None)
-    write_result(options.out / "see_better.json",
-                 {"targets": result, "without_network": untrained, "missing": left,
-                  "scored_by": how},
-                 as_dict(options) | {"setting": as_dict(setting)})
+    write_result(
+        options.out / "see_better.json",
+        {"targets": result, "without_network": untrained, "missing": left,
+         "scored_by": held_out.scored_by(options.task, runs.lpips is not None)},
+        as_dict(options) | {"setting": as_dict(setting)})
     write_text(options.out / "see_better.md", text)
     gains.picture(result, options.out / "see_better.png")
     if options.task == "video":

@@ -11,35 +11,27 @@ factor that makes the std cover 70 %; the network that ships has seen all of the
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import tyro
 
 from evflow.camera import Summary
-from evflow.commands.writing import need_absent, need_suffix
 from evflow.estimation.refine import Chunk, fused, refine_summary
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.points import Points, chunk_points
-from evflow.estimation.refine.signal import joined, log_intensity, rate_at
+from evflow.estimation.refine.signal import joined
 from evflow.network.coordinates import squash_summary, summary_std, unsquash_summary
-from evflow.network.weights import model_card, save_weights
-from experiments.shared.cameras import Hidden, Protocol, draw_protocol
-from experiments.shared.common import at_least, estimator, run_script
+from experiments.shared.cameras import Hidden, Protocol, draw_protocols
+from experiments.shared.common import at_least, run_script
 from experiments.shared.many import Setup, study
-from experiments.shared.refinement import COVERED, before_refinement
+from experiments.shared.refinement import before_refinement
+from experiments.shared.signal_fit import Row, judged, train
+from experiments.shared.weight_parts import begin_fit, save_part
 
-Array = jax.Array
-Row = dict[str, Any]
-
-WIDTHS = (32, 16)
-BATCH = 4096
 HELD_OUT = 5  # every n-th recording
 
 
@@ -93,69 +85,19 @@ def fused_summary(
     return squash_summary(y), summary_std(squash_summary(y), y_std)
 
 
-def train(rows: list[Row], options: Options) -> dict[str, Any]:
-    """The network's parameters: logistic regression of signal events against random points."""
-    features, event, density = (np.concatenate([getattr(r["points"], name) for r in rows])
-                                for name in ("features", "event", "density"))
-    kept = ~np.concatenate([r["noise"] for r in rows])
-    x, offset = features[kept], np.log(density[kept]).astype(np.float32)
-    y = (event >= 0)[kept].astype(np.float32)
-    fixed = {"mean": jnp.asarray(x.mean(0)), "scale": jnp.asarray(x.std(0) + 1e-3)}
-    sizes = (x.shape[1], *WIDTHS, 1)
-    rng = np.random.default_rng(options.seed)
-    layers = {str(i): {"kernel": jnp.asarray(rng.normal(0, np.sqrt(2 / a), (a, b)), jnp.float32),
-                       "bias": jnp.zeros(b)}
-              for i, (a, b) in enumerate(itertools.pairwise(sizes))}
-
-    def loss(layers: Any, x: Array, y: Array, offset: Array) -> Array:
-        odds = log_intensity({**fixed, "layers": layers}, x) - offset
-        return (jax.nn.softplus(odds) - y * odds).mean()
-
-    tx = optax.adamw(optax.cosine_decay_schedule(3e-3, options.steps), weight_decay=1e-3)
-
-    @jax.jit
-    def step(layers: Any, state: Any, batch: tuple[Array, ...]) -> tuple[Any, Any]:
-        updates, state = tx.update(jax.grad(loss)(layers, *batch), state, layers)
-        return optax.apply_updates(layers, updates), state
-
-    state = tx.init(layers)
-    for _ in range(options.steps):
-        used = rng.integers(0, len(x), BATCH)
-        layers, state = step(layers, state, (x[used], y[used], offset[used]))
-    return {**fixed, "layers": layers}
-
-
-def judged(rows: list[Row], net: dict[str, Any]) -> tuple[float, dict[str, float]]:
-    """The factor that widens the std, and figures of recordings that the network has not seen."""
-    plain = jax.tree.map(np.asarray, net)
-    found = np.array([rate_at(plain, r["points"], *r["before"]) for r in rows])
-    true = np.array([r["true"] for r in rows])
-    away = np.abs(found[:, 0] - np.log(np.maximum(true, 1e-3))) / found[:, 1]
-    widen = float(np.quantile(away, COVERED))
-    used = np.array([r["signal"] >= 200 for r in rows])
-    error = np.abs(np.exp(found[:, 0]) - true)[used]
-    return widen, {"recordings": len(rows) // 2, "mean": float(error.mean()),
-                   "median": float(np.median(error)), "widen": widen,
-                   "inside_95": float((away < 1.96 * widen).mean())}
-
-
 def main(options: Options) -> dict[str, float]:
     at_least(1, recordings=options.recordings, workers=options.workers)
-    need_suffix(options.out, ".safetensors")
-    need_absent(options.out, options.overwrite)
-    name, net = estimator(options.weights, "summary")
+    name, net = begin_fit(options, "summary")
     setup = Setup(str(options.weights), options.seed, photos=True)
-    protocols = [draw_protocol(np.random.default_rng((options.seed, i)))
-                 for i in range(options.recordings)]
+    protocols = draw_protocols(options.seed, options.recordings)
     made = study(row, setup, protocols, options.workers, "recordings")
     part = partial(_some, made)
-    widen, figures = judged(part(True), train(part(False), options))
-    signal = {**train(part(True) + part(False), options), "widen": jnp.float32(widen)}
+    fit = partial(train, steps=options.steps, seed=options.seed)
+    widen, figures = judged(part(True), fit(part(False)))
+    signal = {**fit(part(True) + part(False)), "widen": jnp.float32(widen)}
     print("\n".join(f"{k:24s} {v:.4f}" for k, v in figures.items()))
-    card = model_card(options.weights) | {"signal": {
-        "recordings": options.recordings, "seed": options.seed, "figures": figures}}
-    save_weights(options.out, {name: {**net, "signal": signal}}, card,
-                 overwrite=options.overwrite)
+    save_part(options, name, net, {"signal": signal}, {"signal": {
+        "recordings": options.recordings, "seed": options.seed, "figures": figures}})
     return figures
 
 

@@ -18,27 +18,20 @@ from typing import Any, Literal
 
 import jax
 
-from evflow import read_recording
 from evflow.camera import Camera
 from evflow.downstream.evflownet import EVFlowNet
-from evflow.downstream.network import Network, Params
 from evflow.downstream.presets import training
-from evflow.downstream.recorded import recorded_bank, sample_recorded
-from evflow.downstream.released import load_network, save_network
-from evflow.downstream.simulated import sample_sequences
-from evflow.downstream.train import LearningConfig, init_state, make_step, optimiser
-from evflow.errors import EvflowDataError
+from evflow.downstream.released import save_network
+from evflow.downstream.train import init_state, make_step, optimiser
 from evflow.metrics.perceptual import load_lpips
-from evflow.network.weights import weights_path
 from evflow.process.provenance import provenance
-from evflow.scenes import make_bank
 from evflow.training.config import as_dict
 from evflow.training.loop import train
 from evflow.training.options import RunOptions
 from experiments.shared.common import at_least, run_script, write_result
-from experiments.shared.conditions import digest
 from experiments.shared.held_out import ENDPOINTS, scored_by
 from experiments.shared.network_figures import measure, table
+from experiments.shared.network_runs import Run, run_of, source, start_params
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,23 +60,6 @@ class Options(RunOptions):
     """Held-out batches to measure on."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What a run is; another one does not go on in its folder. Files are told by what they hold:
-    the same one by another path is the same, another one by the same path is not."""
-
-    network: Network
-    learning: LearningConfig
-    lpips: str | None
-    camera: str | None
-    recordings: tuple[str, ...] = ()
-    start: str | None = None
-
-    @property
-    def steps(self) -> int:
-        return self.learning.steps
-
-
 def main(options: Options) -> dict[str, Any]:
     """One run; returns the figures on held-out sequences."""
     at_least(1, batches=options.batches, save_every=options.save_every)
@@ -95,7 +71,7 @@ def main(options: Options) -> dict[str, Any]:
     bank, sample = source(options.recordings, learning)
     tx = optimiser(learning)
     step = jax.jit(make_step(network, learning, tx, sample))
-    fresh = init_state(network, learning, tx, begun(options.start, config))
+    fresh = init_state(network, learning, tx, start_params(options.start, config))
     state = train(lambda: (lambda state: step(state, bank, camera, loss_weights), fresh),
                   config, options).completed()
     figures = measure(network, state.params, learning, camera, options.batches)
@@ -114,31 +90,10 @@ def main(options: Options) -> dict[str, Any]:
     return result
 
 
-def source(recordings: tuple[Path, ...], learning: LearningConfig) -> tuple[Any, Any]:
-    """What the steps draw from, and how."""
-    if recordings:
-        read = [read_recording(path) for path in recordings]
-        return recorded_bank(read, learning.data), sample_recorded
-    return make_bank(jax.random.fold_in(jax.random.key(learning.seed), 7)), sample_sequences
-
-
 def named(options: Options) -> dict[str, str]:
-    """The files whose content `Run` tells, as they were given."""
+    """The files that `Run` identifies by content, as they were given."""
     names = ("lpips", "camera", "start")
     return {k: str(v) for k in names if (v := getattr(options, k)) is not None}
-
-
-def begun(start: str | None, config: Run) -> Params | None:
-    """Params to go on from, None for fresh ones; EV018 where they are another network's."""
-    if start is None:
-        return None
-    trained = load_network(start)
-    if (trained.network, trained.normalised) != (config.network, config.learning.normalised):
-        raise EvflowDataError(
-            "EV018", f"{start} is {trained.network}, normalised={trained.normalised}; "
-            f"this run trains {config.network}, normalised={config.learning.normalised}.",
-            "Start from weights of the same network and preset, or leave --start out.")
-    return trained.params
 
 
 def configuration(options: Options) -> Run:
@@ -148,20 +103,8 @@ def configuration(options: Options) -> Run:
     learning = dataclasses.replace(
         learning, seed=options.seed, normalised=options.normalised or learning.normalised,
         **changes)
-    if options.recordings and isinstance(network, EVFlowNet) and network.scales == 1:
-        raise EvflowDataError("EV020", "recordings have no true flow for this form of EV-FlowNet.",
-                              "Pass --preset original, which learns from their frames.")
-    if options.recordings and options.camera:
-        raise EvflowDataError("EV020", "--camera with --recordings, which have their own.",
-                              "Leave one out.")
-    lpips = options.lpips if options.lpips in (None, "auto") else digest(Path(options.lpips))
-    camera = None if options.camera is None else digest(options.camera)
-    # A folder's content may be hours of images: it is known by its place.
-    recordings = tuple(str(path.resolve()) if path.is_dir() else digest(path)
-                       for path in options.recordings)
-    start = None if options.start is None else digest(
-        path if (path := Path(options.start)).is_file() else weights_path(path))
-    return Run(network, learning, lpips, camera, recordings, start)
+    return run_of(network, learning, lpips=options.lpips, camera=options.camera,
+                  recordings=options.recordings, start=options.start)
 
 
 if __name__ == "__main__":

@@ -157,3 +157,8 @@ def draw_protocol(rng: np.random.Generator) -> Protocol:
         model=config.sensors[int(rng.choice(len(config.sensors), p=[0.4, 0.2, 0.3, 0.1]))],
         frame_ms=int(rng.choice(FRAME_MS)), intervals=int(rng.choice(INTERVALS)),
         frame_noise_dn=float(rng.choice([0.0, 0.5])), fresh=bool(rng.random() < 0.4))
+
+
+def draw_protocols(seed: int, count: int) -> list[Protocol]:
+    """So many of them, each by its own number."""
+    return [draw_protocol(np.random.default_rng((seed, i))) for i in range(count)]

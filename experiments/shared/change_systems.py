@@ -2,8 +2,8 @@
 
 All systems know the same thresholds, those that `estimate_camera` finds, and answer alike: the
 change of their state since a frame was taken in. "next": up to the next frame, the paper's
-protocol; the encoder and the published filter are told that frame, which makes it easy for them.
-"middle": up to the middle one of three frames, when only the outer two are known: nobody is told
+protocol; the encoder and the published filter see that frame, which makes it easy for them.
+"middle": up to the middle one of three frames, when only the outer two are known: no system sees
 the answer. "path": up to instants between two frames, against a fast video (simulated only).
 """
 
@@ -53,7 +53,7 @@ class Scene:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Told:
+class Predicted:
     """Changes since `frame` (H, W) DN: the true ones (T, H, W), and every system's."""
 
     frame: np.ndarray
@@ -61,22 +61,12 @@ class Told:
     made: Changes
 
 
-def cut(recording: Recording, span_s: tuple[float, float] | None) -> Recording:
-    """The part between two instants, in seconds after the first frame."""
-    if span_s is None or not recording.has_frames:
-        return recording
-    begin, end = (int(recording.frame_times[0] + 1e6 * s) for s in span_s)
-    first, last = np.searchsorted(recording.frame_times, [begin, end])
-    return Recording(recording.events.slice(begin, end), recording.frames[first:last],
-                     recording.frame_times[first:last])
-
-
 def make_scene(params: Any, recording: Recording, video: np.ndarray | None = None) -> Scene:
     found = estimate_camera(recording, params)
     return Scene(recording, found.camera, found.summary, usable(recording), video)
 
 
-def next_frame(scene: Scene, params: Any) -> Iterator[Told]:
+def next_frame(scene: Scene, params: Any) -> Iterator[Predicted]:
     """The changes in each usable interval; T is 1, the next frame, or PARTS with a video (whose
     last is the next frame)."""
     times = scene.recording.frame_times
@@ -94,12 +84,12 @@ def next_frame(scene: Scene, params: Any) -> Iterator[Told]:
         made["encoder"] = _encoded(scene, params, i, i + 1)[PARTS // steps::PARTS // steps]
         made["no change"] = np.zeros_like(true)
         true = true - (start if scene.video is None else scene.video[i, 0])[None]
-        yield Told(scene.recording.frame_dn(i), true, made)
+        yield Predicted(scene.recording.frame_dn(i), true, made)
 
 
-def middle_frame(scene: Scene, params: Any) -> Iterator[Told]:
-    """For each two usable intervals: the change (1, H, W) from the first frame to the second, as
-    told by the first and the third."""
+def middle_frame(scene: Scene, params: Any) -> Iterator[Predicted]:
+    """For each two adjacent usable intervals: the change (1, H, W) from the first frame to the
+    second, predicted from the first and the third."""
     times, pairs = scene.recording.frame_times, [i for i in scene.good if i + 1 in scene.good]
     for parity in (0, 1):
         mine = [i for i in pairs if i % 2 == parity]
@@ -115,7 +105,7 @@ def middle_frame(scene: Scene, params: Any) -> Iterator[Told]:
             made["encoder"] = _between(_encoded(scene, params, i, i + 2), share)[None]
             made["no change"] = np.zeros((1, *start.shape))
             true = (scene.log_frame(i + 1) - start)[None]
-            yield Told(scene.recording.frame_dn(i), true, made)
+            yield Predicted(scene.recording.frame_dn(i), true, made)
 
 
 def _instants(ends: np.ndarray, steps: int) -> np.ndarray:
@@ -153,6 +143,29 @@ def _between(path: np.ndarray, share: float) -> np.ndarray:
     """A path (PARTS + 1, H, W) at a share of its length, (H, W)."""
     low = min(int(share * PARTS), PARTS - 1)
     return path[low] + (share * PARTS - low) * (path[low + 1] - path[low])
+
+
+def scored(
+    scene: Scene, params: Any
+) -> tuple[dict[str, dict[str, np.ndarray]], Predicted | None]:
+    """Mean `errors` (4,) of each protocol and system over a recording's intervals; and the
+    predictions of the held-out frame that changed most, None where there is no such frame."""
+    rows: dict[str, dict[str, list[list[float]]]] = {}
+    most, largest = None, -1.0
+    for name, task in (("next", next_frame), ("middle", middle_frame)):
+        for predicted in task(scene, params):
+            fired = predicted.made["integration"][-1] != 0
+            for system, change in predicted.made.items():
+                row = rows.setdefault(name, {}).setdefault(system, [])
+                row.append(errors(predicted.true[-1:], change[-1:], fired))
+                if len(predicted.true) > 1:
+                    rows.setdefault("path", {}).setdefault(system, []).append(
+                        errors(predicted.true, change, fired))
+            size = float(np.abs(predicted.true).mean())
+            if name == "middle" and size > largest:
+                most, largest = predicted, size
+    return {task: {s: np.nanmean(found, 0) for s, found in row.items()}
+            for task, row in rows.items()}, most
 
 
 def errors(true: np.ndarray, made: np.ndarray, fired: np.ndarray) -> list[float]:

@@ -16,19 +16,20 @@ TITLES = {"next": "up to the next frame", "middle": "up to the held-out middle o
 SHOWN = ("AKF", "AKF, latest frame", "complementary", "integration", "encoder")
 
 
-def picture(out: Path, shown: list[tuple[str, systems.Told]]) -> None:
+def picture(out: Path, shown: list[tuple[str, systems.Predicted]]) -> None:
     """Fig. 15: a frame, the change to the held-out next one, and what every system says of it."""
     figure = plots.new_figure(2.6 * (len(SHOWN) + 2), 2.2 * len(shown))
     axes = figure.subplots(len(shown), len(SHOWN) + 2, squeeze=False)
-    for row, (name, told) in zip(axes, shown, strict=True):
-        row[0].imshow(told.frame, cmap="gray", vmin=0, vmax=255)
+    for row, (name, predicted) in zip(axes, shown, strict=True):
+        row[0].imshow(predicted.frame, cmap="gray", vmin=0, vmax=255)
         row[0].set_title(name, fontsize=9)
-        row[1].imshow(told.true[-1], **CHANGE)
+        row[1].imshow(predicted.true[-1], **CHANGE)
         row[1].set_title("change of the frames", fontsize=9)
         for axis, system in zip(row[2:], SHOWN, strict=True):
-            change = told.made[system][-1]
+            change = predicted.made[system][-1]
             axis.imshow(change, **CHANGE)
-            axis.set_title(f"{system}: {np.abs(change - told.true[-1]).mean():.3f}", fontsize=9)
+            off = np.abs(change - predicted.true[-1]).mean()
+            axis.set_title(f"{system}: {off:.3f}", fontsize=9)
         for axis in row:
             axis.set_axis_off()
     plots.save_figure(figure, out)

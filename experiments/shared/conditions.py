@@ -72,6 +72,17 @@ class Files:
 NONE = Files()
 
 
+def named_files(given: tuple[str, ...]) -> dict[str, Path]:
+    """NAME=PATH by name; EV020 for anything else."""
+    found: dict[str, Path] = {}
+    for entry in given:
+        name, _, path = entry.partition("=")
+        if not name or not path or name in found:
+            raise EvflowDataError("EV020", f"{entry!r}.", "Give NAME=PATH, each name once.")
+        found[name] = Path(path)
+    return found
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workshop:
     """What conditions are made of. record: a target's recording; count: K; folder: where

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -12,7 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.downstream import Network, normalise, run
-from evflow.metrics import PROTOCOLS, FwlConvention, frame_scores, log_map, mse, score_flow
+from evflow.errors import EvflowDataError
+from evflow.metrics import (
+    PROTOCOLS,
+    FwlConvention,
+    frame_scores,
+    load_lpips,
+    log_map,
+    mse,
+    score_flow,
+)
 from evflow.metrics.flow_scores import OUTLIER_PX
 from evflow.types import Events
 from experiments.shared.targets import Clip
@@ -53,6 +62,16 @@ def scored_by(task: str, perceptual: bool = True) -> dict[str, Any]:
     if task == "flow":
         return {"fwl": CONVENTION.as_dict(), **ENDPOINTS}
     return {**dataclasses.asdict(PROTOCOL), "lpips_net": "alex v0.1" if perceptual else None}
+
+
+def installed_lpips(say: Callable[[str], object] | None = None) -> Params | None:
+    """Weights of LPIPS; None where they are not installed, and why to `say`."""
+    try:
+        return load_lpips()
+    except EvflowDataError as error:
+        if say is not None:
+            say(f"without LPIPS: {error}")
+        return None
 
 
 def gather(clips: Iterable[Clip]) -> Clips:

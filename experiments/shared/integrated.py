@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,13 @@ from evflow.baselines.base import usable
 from evflow.baselines.integration import Integration
 from evflow.camera import Camera, Summary
 from experiments.shared import alone
-from experiments.shared.images import score
+from experiments.shared.images import SCORES, mean_ci, score
 
 HORIZONS = {"1 frame": 1, "5 frames": 5, "10 frames": 10, "1e5 events": 100_000,
             "5e5 events": 500_000}  # frames, or events from 1000 on
+LEAST = 4  # usable intervals of a half: fewer do not determine the thresholds
+Example = tuple[str, np.ndarray, dict[str, np.ndarray]]  # name, frame, images by system
+Found = dict[str, dict[str, dict[str, list[Any]]]]  # group, horizon, system: scores of a recording
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,6 +43,15 @@ def halves(recording: Recording) -> tuple[Recording, Recording]:
                      for a, b, late in ((cuts[0], cuts[1], 0), (cuts[1], cuts[2], 1)))
     return (Recording(first, recording.frames[:middle + 1], times[:middle + 1]),
             Recording(second, recording.frames[middle:], times[middle:]))
+
+
+def calibrated_and_scored(case: Case, held_out: bool) -> tuple[Recording, Case, str]:
+    """The recording to calibrate on, what is scored, and a title. held_out: the two halves of the
+    recording, where each has enough usable intervals; else both are all of it ("in sample")."""
+    if held_out and len(usable(case.recording)) >= 2 * LEAST:
+        first, second = halves(case.recording)
+        return first, dataclasses.replace(case, recording=second), case.name
+    return case.recording, case, f"{case.name} (in sample)"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,3 +125,21 @@ def scored(case: Case, by: dict[str, Thresholds], most: int) -> dict[str, dict[s
             means = score(images, frames).mean(0).tolist()
             rows.setdefault(horizon, {})[name] = [*means, len(chosen)]
     return rows
+
+
+def example(case: Case, by: dict[str, Thresholds], names: Sequence[str]) -> Example | None:
+    """A row of the picture, by those of these names; None where no interval is usable."""
+    chosen = spans(case.recording, 5, 1) or spans(case.recording, 1, 1)
+    if not chosen:
+        return None
+    return case.name, case.recording.frame_dn(chosen[0][1]), {
+        name: image(case.recording, chosen[0], one) for name, one in by.items() if name in names}
+
+
+def averages(collected: Found) -> dict[str, dict[str, dict[str, Any]]]:
+    """Means over the recordings of a group: scores with their intervals, images, seconds."""
+    return {group: {horizon: {name: {
+        **{s: mean_ci(np.array(found)[:, i]) for i, s in enumerate(SCORES)},
+        "images": sum(r[-2] for r in found), "seconds": float(np.mean([r[-1] for r in found]))}
+        for name, found in row.items()} for horizon, row in horizons.items()}
+        for group, horizons in collected.items()}

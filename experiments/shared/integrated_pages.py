@@ -9,6 +9,7 @@ import numpy as np
 
 from evflow.report import plots
 from experiments.shared.images import SCORES
+from experiments.shared.integrated import Example
 
 PAPER = {  # Table X: RMSE, PSNR, SSIM
     "DAVIS240": {"ecc": (37.56, 16.82, .41), "s2r": (32.37, 18.10, .45),
@@ -36,7 +37,7 @@ def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
     return "\n".join(lines)
 
 
-def picture(out: Path, shown: list[tuple[str, np.ndarray, dict[str, np.ndarray]]]) -> None:
+def picture(out: Path, shown: list[Example]) -> None:
     """Frames beside what the systems predict of them, with the RMSE of each."""
     columns = 1 + len(shown[0][2])
     figure = plots.new_figure(3.0 * columns, 2.6 * len(shown))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from typing import Any
 
@@ -15,12 +14,10 @@ from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, run
 from evflow.downstream.simulated import Sequences, has_events, sample_sequences
 from evflow.downstream.train import LearningConfig
-from evflow.errors import EvflowDataError
 from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import frame_scores
-from evflow.metrics.perceptual import load_lpips
 from evflow.scenes import make_bank
-from experiments.shared.held_out import PROTOCOL
+from experiments.shared.held_out import PROTOCOL, installed_lpips
 
 Array = jax.Array
 
@@ -36,10 +33,7 @@ def measure(
     each window's median."""
     k_bank, k_data = jax.random.split(jax.random.key(HELD_OUT))
     bank = make_bank(k_bank, 48, photos=False)
-    weights = None
-    # The figure is left out where its weights are not installed, or the images too small for it.
-    with contextlib.suppress(EvflowDataError):
-        weights = load_lpips() if learning.data.crop >= 32 else None
+    weights = installed_lpips() if learning.data.crop >= 32 else None  # smaller images have none
     score = _flow_figures if isinstance(network, EVFlowNet) else _image_figures
     sample = jax.jit(functools.partial(sample_sequences, config=learning.data))
     rows = []

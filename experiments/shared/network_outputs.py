@@ -1,7 +1,8 @@
-"""What networks make of real recordings and of synthetic cameras, scored."""
+"""Images and flow that networks make of real recordings and of synthetic cameras, scored."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,11 +11,48 @@ import numpy as np
 from evflow.downstream import EVFlowNet, prepared, reconstruct
 from evflow.downstream.released import Trained
 from evflow.downstream.simulated import SequenceConfig
-from evflow.metrics import FwlConvention, fwl, score_flow
+from evflow.errors import EvflowDataError
+from evflow.metrics import FwlConvention, ImageProtocol, fwl, score_flow, score_images
 from experiments.shared import held_out, targets
-from experiments.shared.recorded import Part, Rotation
+from experiments.shared.recorded import Part, Rotation, equalised, stretched
 
 SKIPPED, WINDOWS = 6, 20  # of synthetic clips
+
+
+def images_of(
+    trained: Trained, part: Part, histeq: str, robust: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Images and frames (T, H, W) of the part that counts, equalised; images stretched where
+    `robust`. Raises EV011 without frames."""
+    if part.frames is None:
+        raise EvflowDataError("EV011", f"{part.name} has no frames of this camera.",
+                              "Score flow on it: FWL needs events alone.")
+    made = reconstruct(trained.network, trained.params, part.events, part.edges_us[1:],
+                       **trained.how)[part.warmup:]
+    made = stretched(made) if robust else made
+    return equalised(made, histeq), equalised(part.frames[part.warmup:], histeq)
+
+
+def real_video(
+    trained: Trained, found: list[Part], protocol: ImageProtocol, lpips: Any, *,
+    histeq: str = "none", robust: bool = False,
+) -> tuple[dict[str, Any], dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Scores of recordings, linear and (`log_mse`) in the log domain, and `images_of` each. A
+    recording without frames is reported and left out."""
+    pairs = {}
+    for part in found:
+        try:
+            pairs[part.name] = images_of(trained, part, histeq, robust)
+        except EvflowDataError as error:
+            print(f"{part.name} left out: {error}")
+    if not pairs:
+        return {}, pairs
+    linear = score_images(pairs, protocol, lpips)
+    log = score_images(pairs, dataclasses.replace(protocol, domain="log", clip=True))
+    for row, same in ((linear, log), *((linear["sequences"][n], log["sequences"][n])
+                                       for n in pairs)):
+        row["log_mse"] = same["mse"]
+    return linear, pairs
 
 
 def real_flow(trained: Trained, found: list[Part], slices: dict[str, Rotation]) -> dict[str, Any]:

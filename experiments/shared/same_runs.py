@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from evflow.errors import EvflowDataError
+from evflow.network.weights import weights_path
 from evflow.training.config import as_dict
 from experiments.shared.common import write_result
-from experiments.shared.conditions import Condition
+from experiments.shared.conditions import Condition, digest
 from experiments.shared.trainings import Setting
 
 
-def same_setting(out: Path, shared: dict[str, Any], setting: Setting) -> None:
-    """Write down what the runs in `out` share; EV013 where they were made by another setting."""
+def same_setting(out: Path, task: str, weights: str, setting: Setting) -> None:
+    """Record the setting of the runs in `out`; EV013 where they were made by another."""
     # What may grow from one command to the next: everything is trained and scored by itself.
     free = ("names", "cameras", "circuits", "seeds")
+    shared = {"task": task, "weights": weights, "estimator": digest(weights_path(weights))}
     wanted = shared | {k: v for k, v in as_dict(setting).items() if k not in free}
     wanted = json.loads(json.dumps(wanted))
     path = out / "setting.json"

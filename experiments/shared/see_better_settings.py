@@ -8,6 +8,7 @@ from typing import Literal
 from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet
 from evflow.downstream.simulated import SequenceConfig
 from evflow.downstream.train import LearningConfig
+from evflow.process.provenance import provenance
 from experiments.shared.conditions import E2V, RAW
 from experiments.shared.targets import CAMERAS, SCENES
 from experiments.shared.trainings import SIMULATED, Setting
@@ -49,3 +50,15 @@ def preset_of(task: Task, preset: Preset) -> Setting:
     large = dataclasses.replace(large, windows=4, sequences=16, noise=0.0, hot_pixels=0.0)
     return dataclasses.replace(setting, network=EVFlowNet(), learning=LearningConfig(
         large, steps=5000, warmup=200, rate=2e-4))
+
+
+def heading(task: Task, preset: Preset, setting: Setting) -> str:
+    """The title of the tables: network, training, data, and the machine."""
+    learning, made = setting.learning, provenance()
+    data = learning.data
+    return (f"# {task}, preset {preset}\n\n"
+            f"{type(setting.network).__name__} of base {setting.network.base}, {setting.seeds} "
+            f"seeds, {learning.steps} steps of {data.sequences} sequences of {data.windows} windows"
+            f" of {1e3 * data.window_s:g} ms at {data.crop} px; {setting.scenes} held-out clips. "
+            f"evflow {made['evflow']}, jax {made['versions']['jax']}, "
+            f"{made['machine']['device']}, {made['machine']['cpus']} CPUs.")

@@ -25,7 +25,6 @@ from evflow.downstream.recorded import RecordedBank, sample_recorded
 from evflow.downstream.released import save_network
 from evflow.downstream.train import LearningConfig, LearningState, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
-from evflow.metrics import load_lpips
 from evflow.network.weights import model_card
 from evflow.process.provenance import provenance
 from evflow.process.terminal import bar
@@ -111,10 +110,7 @@ class Trainings:
     @functools.cached_property
     def lpips(self) -> Params | None:
         """Weights of LPIPS, where they are installed."""
-        try:
-            return load_lpips()
-        except EvflowDataError:
-            return None
+        return held_out.installed_lpips()
 
     def clips(self, target: targets.Target) -> held_out.Clips:
         if target.name not in self._clips:
@@ -140,6 +136,18 @@ class Trainings:
     def done(self, condition: Condition, seed: int) -> bool:
         return all(self.scored(condition, seed, t).is_file() for t in condition.targets)
 
+    def complete_all(self, wanted: list[Condition], until: float) -> int:
+        """Complete the seeds of each condition, beginning none after `until` (time.monotonic());
+        returns how many trainings are missing."""
+        missing = 0
+        for seed in range(self.setting.seeds):
+            for condition in wanted:
+                if time.monotonic() > until and not self.done(condition, seed):
+                    missing += 1
+                else:
+                    self.complete(condition, seed)
+        return missing
+
     def complete(self, condition: Condition, seed: int) -> None:
         """Train and test what is missing. Raises EV013 where a run rests on another file."""
         if self.done(condition, seed):
@@ -147,7 +155,7 @@ class Trainings:
         path = self.folder(condition, seed) / "weights.safetensors"
         if not path.is_file():
             self.train(condition, seed, path)
-        if model_card(path)["source"] != condition.source:
+        if model_card(path).get("made_from") != condition.source:
             raise EvflowDataError(
                 "EV013", f"{path.parent} was trained for another {condition.label}.",
                 "Give it another name, or choose another --out.")
@@ -186,7 +194,7 @@ class Trainings:
         if not math.isfinite(loss):
             raise EvflowDataError("EV007", f"{condition.name}, seed {seed}: the loss is {loss}.")
         card = {"condition": condition.name, "seed": seed, "steps": steps, "loss": loss,
-                "seconds": time.monotonic() - began, "source": condition.source,
+                "seconds": time.monotonic() - began, "made_from": condition.source,
                 "cameras": told(camera) if camera is not None else {}, **provenance()}
         path.parent.mkdir(parents=True, exist_ok=True)
         save_network(path, network, state.params, card,

@@ -19,11 +19,11 @@ from evflow.downstream import E2VID, EVFlowNet, Network, event_tensor, normalise
 from evflow.downstream.released import load_network, save_network
 from evflow.errors import EvflowDataError
 from evflow.io import write_recording
-from evflow.metrics import FwlConvention, fwl
+from evflow.metrics import PROTOCOLS, FwlConvention, fwl
 from evflow.types import Events
 from experiments import evaluate_network
 from experiments.evaluate_network import Options
-from experiments.shared import network_outputs, recorded, targets
+from experiments.shared import network_outputs, recorded, recorded_parts, targets
 
 SIZE = (32, 24)
 
@@ -153,16 +153,15 @@ def test_video_and_flow_are_scored_and_written(
         evaluate_network.main(Options(weights=names, data=(tmp_path / "no",), out=tmp_path))
     twins = (tmp_path / "a/mine.npz", tmp_path / "b/mine_cut.npz")
     with pytest.raises(EvflowDataError, match=r"EV020.*\['mine'\]"):
-        evaluate_network.parts(Options(data=twins))
-    aggregates = {p: evaluate_network.protocol_of(Options(protocol=p)).aggregate
-                  for p in ("evreal", "etnet")}
+        recorded_parts.parts(twins, 10.0, 33.0)
+    aggregates = {p: PROTOCOLS[p].aggregate for p in ("evreal", "etnet")}
     assert aggregates == {"evreal": "frames", "etnet": "sequences"}
 
 
 def test_images_that_are_not_clipped_are_for_the_log_domain(tmp_path: Path) -> None:
     trained = load_network(saved(tmp_path, E2VID(base=4, encoders=1, blocks=0)))
     part = recorded.part_of(recording(1.0), "x", 0.0, np.inf, 0.0, 33.0)
-    scores, _ = evaluate_network.real_video(trained, [part], Options(protocol="etnet"), None)
+    scores, _ = network_outputs.real_video(trained, [part], PROTOCOLS["etnet"], None)
     assert scores["protocol"]["clip"] is False
     assert np.isfinite([scores["mse"], scores["log_mse"]]).all()
 
@@ -193,7 +192,7 @@ def test_recordings_that_give_nothing_are_an_error(
     assert asked == [{"size": SIZE}]
     assert not options.out.exists()
     with pytest.raises(EvflowDataError, match=r"EV020.*WxH"):
-        evaluate_network.parts(dataclasses.replace(options, size="32"))
+        evaluate_network.main(dataclasses.replace(options, size="32"))
 
 
 @pytest.mark.slow

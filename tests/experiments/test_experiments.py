@@ -29,6 +29,7 @@ from experiments import (
     true_video,
 )
 from experiments.shared import hidden_scene
+from experiments.shared.generated_pages import auroc
 
 
 def test_quickstart_draws_truth_beside_estimate(
@@ -149,7 +150,7 @@ def test_generated_events_are_compared_with_simulated_ones(
 
 def test_equal_scores_count_half() -> None:
     inside, outside = np.array([[1.0, 2.0]]), np.array([[0.0, 2.0]])
-    assert generate.auroc(inside, outside) == (1 + 0 + 1 + 0.5) / 4
+    assert auroc(inside, outside) == (1 + 0 + 1 + 0.5) / 4
 
 
 @pytest.mark.slow

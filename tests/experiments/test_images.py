@@ -12,8 +12,8 @@ from evflow.camera import Camera
 from evflow.types import Events, Recording
 from experiments import changes, integrate
 from experiments.shared import integrated, integrated_pages
-from experiments.shared.change_systems import cut
 from experiments.shared.images import mean_ci, score
+from experiments.shared.recordings import cut
 
 SHAPE = (40, 48)
 

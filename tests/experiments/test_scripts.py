@@ -22,9 +22,7 @@ from experiments.shared.many import Setup, study
 FOLDER = Path(next(iter(experiments.__path__)))
 SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem != "__init__")
 LINES = 120
-# Longer ones, whose steps depend on their own options.
-LONG = {"ablate", "changes", "evaluate_network", "fuse", "gallery", "generate", "integrate",
-        "long_recordings", "noise", "see_better", "tell_apart", "train_network"}
+LONG = {"ablate"}  # whose steps depend on their own options
 NO_DEBUG = {
     "quickstart": "one small recording, whose size is asked for",
     "evaluate_network": "as long as the recordings it is given",

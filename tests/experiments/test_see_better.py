@@ -22,10 +22,17 @@ from evflow.errors import EvflowDataError
 from evflow.scenes import make_bank
 from evflow.types import Events
 from experiments import see_better
-from experiments.see_better import Options, files
+from experiments.see_better import Options
 from experiments.shared import eventgan_sequences, gains, held_out, same_runs, targets
 from experiments.shared.common import slug
-from experiments.shared.conditions import Files, Workshop, conditions, network_maps, told
+from experiments.shared.conditions import (
+    Files,
+    Workshop,
+    conditions,
+    named_files,
+    network_maps,
+    told,
+)
 from experiments.shared.see_better_settings import preset_of
 from experiments.shared.trainings import SIMULATED, Trainings
 
@@ -161,8 +168,8 @@ def test_unclear_conditions_are_refused(tmp_path: Path) -> None:
             conditions(shop, [target()], (), absent)
     for given in (("x",), ("=y",), ("a=b", "a=c")):
         with pytest.raises(EvflowDataError, match="EV020"):
-            files(given)
-    assert files(("8 steps=a/b.npz",)) == {"8 steps": Path("a/b.npz")}
+            named_files(given)
+    assert named_files(("8 steps=a/b.npz",)) == {"8 steps": Path("a/b.npz")}
     assert slug("L_P + L_F/x") == "L_P_+_L_F_x"
 
 

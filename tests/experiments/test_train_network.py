@@ -17,6 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.network.weights import model_card
 from experiments import ablate, train_eventgan
 from experiments import train_network as command
+from experiments.shared.network_runs import Run, start_params
 
 MOST_BYTES = 2_000_000  # of released weights
 
@@ -63,13 +64,13 @@ def test_a_preset_may_ask_for_normalised_tensors() -> None:
 
 def test_a_run_goes_on_from_weights_of_its_own_network() -> None:
     asked = command.Options(out=Path(), network="e2vid", start="e2vid-small")
-    begun = command.begun(asked.start, command.configuration(asked))
+    begun = start_params(asked.start, command.configuration(asked))
     jax.tree.map(np.testing.assert_array_equal, begun, load_network("e2vid-small").params)
-    assert command.begun(None, command.configuration(command.Options(out=Path()))) is None
+    assert start_params(None, command.configuration(command.Options(out=Path()))) is None
     for other in ({"network": "firenet"}, {"normalised": True}):
         config = command.configuration(dataclasses.replace(asked, **other))
         with pytest.raises(EvflowDataError, match=r"EV018 .*e2vid-small"):
-            command.begun(asked.start, config)
+            start_params(asked.start, config)
 
 
 def test_files_of_a_run_are_known_by_what_they_hold(
@@ -79,7 +80,7 @@ def test_files_of_a_run_are_known_by_what_they_hold(
     path = tmp_path / "camera.npz"
     path.write_bytes(b"one")
 
-    def run(**files: object) -> command.Run:
+    def run(**files: object) -> Run:
         return command.configuration(command.Options(out=Path(), **files))
 
     for name, kind in (("camera", Path), ("start", str), ("lpips", str)):

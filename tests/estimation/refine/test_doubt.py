@@ -13,7 +13,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.refine.doubt import LENIENT, NAMES, doubted, relative_error, signs
 from evflow.estimation.refine.receptor_search import Found
 from evflow.simulator.photoreceptor import Photoreceptor
-from experiments.shared import doubting
+from experiments.shared import doubt_fit
 
 SUMMARY = Summary(*(np.float32(v) for v in (0.2, 0.3, 0.1, 0.1, 0.03, 0.03)))
 STD = Summary(*(np.float32(v) for v in (0.01, 0.02, 0.03, 0.04, 0.005, 0.006)))
@@ -70,7 +70,7 @@ def test_the_fit_finds_whose_errors_are_larger() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(1500, 3))
     true = 0.05 * np.exp(0.6 * np.clip(x[:, 1], -2.0, 2.0))
-    net = doubting.fit(x, true * rng.normal(size=1500), np.full(1500, 0.05))
+    net = doubt_fit.fit(x, true * rng.normal(size=1500), np.full(1500, 0.05))
     fresh = rng.normal(size=(400, 3))
     error = relative_error(net, fresh) / (0.05 * np.exp(0.6 * np.clip(fresh[:, 1], -2.0, 2.0)))
     # Held by RIDGE, and of Student's t: a little less steep, a little narrower.

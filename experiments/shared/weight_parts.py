@@ -1,0 +1,37 @@
+"""Scripts that fit one part of an estimator's weights: their checks, and how the part is saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+from evflow.commands.writing import need_absent, need_suffix
+from evflow.network.weights import model_card, save_weights
+from experiments.shared.common import estimator
+
+
+class FitOptions(Protocol):
+    """Options of such a script."""
+
+    @property
+    def weights(self) -> Path: ...
+    @property
+    def out(self) -> Path: ...
+    @property
+    def overwrite(self) -> bool: ...
+
+
+def begin_fit(options: FitOptions, part: str) -> tuple[str, dict[str, Any]]:
+    """The architecture's name and the network in `options.weights`. Raises EV020 or EV013 where
+    `options.out` cannot be written, EV018 where the weights lack the part."""
+    need_suffix(options.out, ".safetensors")
+    need_absent(options.out, options.overwrite)
+    return estimator(options.weights, part)
+
+
+def save_part(
+    options: FitOptions, name: str, net: dict[str, Any], part: dict[str, Any], card: dict[str, Any]
+) -> None:
+    """Write the network with one part replaced; `card` is added to the model card."""
+    save_weights(options.out, {name: {**net, **part}}, model_card(options.weights) | card,
+                 overwrite=options.overwrite)
