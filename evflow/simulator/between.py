@@ -20,6 +20,7 @@ from collections.abc import Iterable, Iterator
 import cv2
 import numpy as np
 
+from evflow.process.threads import behind
 from evflow.simulator.motion import (
     Motion,
     grid,
@@ -35,8 +36,8 @@ REACH = 33  # halved pixels: from how far away acceleration is taken where flow 
 COVERED = 5  # halved pixels around flow that is not trusted: parts of DIS' patches
 MIDDLE = np.array([9, -50, 225, 225, -50, 9], np.float32) / 368  # Lanczos' kernel of 3 pixels half
 # way between two
-BAND, TOGETHER = 1 << 15, 1 << 24  # pixels a thread whose ways are worked out at a time, so that
-# caches hold much of them, for pictures of so many bytes
+BAND, TOGETHER = 1 << 15, 1 << 24  # pixels filled by a thread of OpenCV's at a time, so that caches
+# hold much of their ways, and bytes of pictures that are filled together
 BENT_PX = 0.05  # an acceleration that moves less is left out
 
 
@@ -94,15 +95,18 @@ class Interval:
             return
         frames = (self.a.doubled, self.b.doubled) if sharp else (self.a.dn, self.b.dn)
         shares, shape, reach = list(fractions), self.a.dn.shape, self._reach()
-        height, band = shape[0], max(1, BAND * cv2.getNumThreads() // shape[1])
         most = max(1, TOGETHER // self.a.dn.nbytes)
         for first in range(0, len(shares), most):
             some = shares[first : first + most]
             pictures = np.empty((len(some), *shape), np.float32)
-            for top in range(0, height, band):
-                rows = slice(top, min(top + band, height))
-                edges = list(_edges(rows, shape, reach))
-                self._fill(pictures[:, rows], some, rows, edges, frames, sharp)
+            with behind(shape[0]) as later:
+                for number, rows in enumerate(_bands(shape)):
+                    work = (pictures[:, rows], some, rows, list(_edges(rows, shape, reach)),
+                            frames, sharp)
+                    if number % 2 and cv2.getNumThreads() == 1:
+                        later(self._fill, *work)
+                    else:
+                        self._fill(*work)
             yield from pictures
 
     def _fill(
@@ -141,6 +145,14 @@ class Interval:
         bent = sum(cv2.norm(bend, cv2.NORM_INF) for bend in self.bends or ())
         flows = (cv2.norm(flow, cv2.NORM_INF) for flow in (self.motion.there, self.motion.back))
         return math.ceil(max(flows) + bent) + 1
+
+
+def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
+    """The rows of a frame (H, W) in bands, an even number of them: two threads share them where
+    OpenCV has a single one."""
+    pairs = math.ceil(math.prod(shape) / (2 * BAND * cv2.getNumThreads()))
+    band = math.ceil(shape[0] / (2 * pairs))
+    yield from (slice(top, min(top + band, shape[0])) for top in range(0, shape[0], band))
 
 
 def _edges(rows: slice, shape: tuple[int, ...], reach: int) -> Iterator[tuple[slice, slice]]:

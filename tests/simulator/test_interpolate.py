@@ -167,16 +167,22 @@ def test_edges_hold_all_that_is_near_the_border_once(
     assert (seen[near] == 1).all()
 
 
+@pytest.mark.parametrize("threads", [1, 2])
 def test_pictures_do_not_depend_on_how_much_is_made_at_a_time(
-    monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
+    """Of OpenCV's threads one: half of the bands are filled by another."""
     *_, interval = intervals([(shifted(4 * k), 1_000 * k) for k in range(4)])
-    shares = [0.1, 0.4, 0.7, 0.9]
+    shares, before = [0.1, 0.4, 0.7, 0.9], cv2.getNumThreads()
     for sharp in (True, False):
         whole = list(interval.at(shares, sharp=sharp))
         monkeypatch.setattr(ways_between, "BAND", 3 * whole[0].shape[1])
         monkeypatch.setattr(ways_between, "TOGETHER", 3 * whole[0].nbytes)
-        np.testing.assert_array_equal(list(interval.at(shares, sharp=sharp)), whole)
+        try:
+            cv2.setNumThreads(threads)
+            np.testing.assert_array_equal(list(interval.at(shares, sharp=sharp)), whole)
+        finally:
+            cv2.setNumThreads(before)
         monkeypatch.undo()
 
 
