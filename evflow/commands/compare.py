@@ -28,6 +28,7 @@ class Compare(Reading):
     measured cameras (camera.npz) parameter by parameter.
 
     Example: evflow compare flight.aedat4 synth.h5 -o comparison/
+
     Example: evflow compare cam/camera.npz later/camera.npz
     """
 
