@@ -75,8 +75,8 @@ class Interval:
     """Two frames and what moves between them.
 
     bends: half the acceleration at a and at b, (H, W, 2) in pixels per squared interval; None
-    where nothing accelerates. speed_px: how far the fast pixels would move at their greatest
-    velocity, 0 where motion is lost. grid: of `motion.grid`.
+    where nothing accelerates. speed_px: how far the fast pixels of trusted flow would move at their
+    greatest velocity, 0 where motion is lost. grid: of `motion.grid`.
     """
 
     a: Frame
@@ -244,8 +244,8 @@ def _interval(
     at the frames next to them, which tell how it changes."""
     if pair.motion.lost:
         return Interval(pair.a, pair.b, pair.motion, None, 0.0, places)
-    there, back = pair.motion.halves
-    fast, bends = speed(there), None
+    (there, back), (on_a, on_b) = pair.motion.halves, pair.motion.trusted
+    fast, bends = _speed(there, on_a), None
     first, second = (after if before is None else before), (before if after is None else after)
     if before is not None and after is not None:  # the velocity of a swing, to the fourth order
         first = before if earlier is None else before + (after - earlier) / np.float32(6)
@@ -254,10 +254,16 @@ def _interval(
         square = np.float32(pair.length) ** 2
         bent = _limited(first * square, there), _limited(second * square, back)
         if max(map(speed, bent)) > BENT_PX:
-            fast = max(fast, speed(there - bent[0]), speed(back - bent[1]))
+            fast = max(fast, _speed(there - bent[0], on_a), _speed(back - bent[1], on_b))
             size = pair.a.dn.shape[::-1]
             bends = cv2.resize(bent[0], size), cv2.resize(bent[1], size)
     return Interval(pair.a, pair.b, pair.motion, bends, fast, places)
+
+
+def _speed(flow: np.ndarray, trusted: np.ndarray) -> float:
+    """`speed` of a flow (h, w, 2) where it is trusted: elsewhere, as where something comes into
+    view, it may be twice as fast as all that moves."""
+    return speed(flow[trusted] if trusted.any() else flow)
 
 
 def _limited(bend: np.ndarray, flow: np.ndarray) -> np.ndarray:

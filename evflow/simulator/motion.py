@@ -109,7 +109,7 @@ def length(flow: np.ndarray) -> np.ndarray:
 
 
 def speed(flow: np.ndarray) -> float:
-    """How far the fast pixels of a flow (H, W, 2) move: as np.percentile of their lengths, which
+    """How far the fast pixels of a flow (..., 2) move: as np.percentile of their lengths, which
     takes three times as long."""
     found = length(flow).ravel()
     place = (found.size - 1) * MOTION_QUANTILE / 100

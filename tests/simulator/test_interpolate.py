@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 import pytest
+import skimage.data
 from helpers.videos import code_of
 
 import evflow.simulator.between as ways_between
@@ -312,6 +313,15 @@ def test_fast_pans_of_fine_textures_are_followed(dx: int) -> None:
     made = at_middle([first, last], 0, (0, 1))
     error, faded = (np.abs(m - middle)[:, 16:-16].mean() for m in (made, (first + last) / 2))
     assert error < 0.1 * faded
+
+
+def test_what_comes_into_view_takes_no_more_steps() -> None:
+    """Flow there is a guess, and often faster than the pan."""
+    photo = skimage.data.camera().astype(np.float32)
+    pan = [photo[120:240, 20 * k:20 * k + 160].copy() for k in range(4)]
+    found = list(intervals(zip(pan, range(0, 4_000, 1_000), strict=True)))
+    assert max(speed(interval.motion.there) for interval in found) > 24
+    assert [interval.speed_px for interval in found] == pytest.approx([20] * 3, rel=0.05)
 
 
 FOLDED = np.where(np.arange(SIZE) < SIZE * 0.6, shifted(5.0), shifted(0)[::-1])
