@@ -48,6 +48,8 @@ CODES: dict[str, str] = {
     "EV034": "events and frames are unrelated",
     "EV035": "events bunch at the frames",
     "EV036": "the light flickers",
+    "EV037": "frames and events displaced",
+    "EV038": "repeated events",
 }
 
 

@@ -24,7 +24,7 @@ from evflow.network.weights import load_weights, weights_hash
 from evflow.notes import texts
 from evflow.process.provenance import sha256, told
 from evflow.recordings.check import Report, check
-from evflow.recordings.check.agreement import frame_steps
+from evflow.recordings.check.steps import frame_steps
 from evflow.report import page
 from evflow.report.extent import extent_panel
 from evflow.report.held import NAMES, held_panel

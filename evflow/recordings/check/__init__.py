@@ -1,9 +1,10 @@
 """Is this recording what it claims to be? Each rule examines a whole `Recording` and reports.
 
     findings.py   Finding and Report: what was seen, what it means, the option that fixes it
-    agreement.py  brightness changes against events: polarity, alignment, mirrored frames
+    steps.py      changes between frames, and how well events follow them
+    agreement.py  rules on that: polarity, alignment, mirrored, displaced and frozen frames
     clocks.py     time unit, gaps, jumps, dropped frames
-    contents.py   polarities, amount of events, hot pixels
+    contents.py   polarities, amount of events, repeated events, hot pixels
     images.py     saturated, black, repeated frames; bit depth, colour
 
 What no `Recording` can be (unsorted, outside the sensor, NaN, wrong shape) is refused at

@@ -9,128 +9,51 @@ offset is only reported beyond max(half a frame interval, 10 ms).
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 
-from evflow.errors import EvflowDataError
-from evflow.files.spool import forget
 from evflow.io.decode.units import too_few
 from evflow.recordings.check.findings import Finding
-from evflow.recordings.windows import plan_windows
-from evflow.types import Events, Recording
+from evflow.recordings.check.steps import (
+    LEAST_CELLS,
+    LEAST_EVENTS,
+    SWEEP_STEP_US,
+    TURNED,
+    Steps,
+    displacement,
+    frame_steps,
+)
+from evflow.recordings.stillness import MOVING, company
+from evflow.types import Recording
 
-MIN_STEP_US = 20_000  # frames closer than that change too little
-MOST_STEPS = 24  # frame intervals examined, evenly spread
-CELLS = 160  # along the longer side: pooling averages out quantisation by the thresholds
-DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, log changes are unreliable
-LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer are not enough to decide
 INVERTED = -0.2  # correlation below which polarity is inverted
 AGREES, BETTER = 0.2, 0.1  # minimum correlation of another interpretation, and its gain
+CHANCE = 8.0  # over the root of the number of cells: more than r of any displacement by chance
 UNRELATED = 0.06  # maximum over all interpretations; 26 recordings that agree have at least .12
 STRONG = 0.3  # mean change of log brightness in a cell, above noise and drift
 LEAST_CHANGE, MOST_THETA = 500.0, 10.0  # log units in all; real recordings have >= .4 per event
-SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # with this many, chance correlations are at most .03
-SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # range of the sweep: frame intervals, at most us
-SWEEP_STEP_US = 5_000
 LATENCY_US = 4_000
 LEAST_OFFSET_US = 10_000
-
-FLIPS = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Steps:
-    """Frame steps to compare with events. changes: {flip: (K, cells)} change of log brightness, NaN
-    in cells without a pixel that is well exposed in both frames; bounds: (K, 2) int64 us; cell:
-    side of a cell in pixels; interval_us: the median of all frame intervals."""
-
-    events: Events
-    changes: dict[str, np.ndarray]
-    bounds: np.ndarray
-    cell: int
-    interval_us: float
-
-    def correlations(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
-        """Pearson's r with the frames' clock shifted by each offset; NaN if there are too few."""
-        sums = np.zeros((6, len(offsets_us)))
-        for change, (t0, t1) in zip(self.changes[flip], self.bounds, strict=True):
-            known = np.isfinite(change)
-            forget(self.events.x, self.events.y, self.events.t, self.events.p)
-            near = self.events.slice(int(t0 + offsets_us.min()), int(t1 + offsets_us.max()))
-            code = _codes(near, self.cell)
-            edges = np.searchsorted(near.t, np.stack([t0 + offsets_us, t1 + offsets_us]))
-            a = change[known]
-            sum_a, sum_aa = a.sum(), (a * a).sum()  # no BLAS: its threads cost more than they give
-            for i, (first, last) in enumerate(edges.T):
-                sign = np.bincount(code[first:last], minlength=2 * len(change)).reshape(-1, 2)
-                b = (sign[:, 1] - sign[:, 0])[known].astype(np.float64)
-                sums[:, i] += (
-                    sum_a, b.sum(), sum_aa, (b * b).sum(), (a * b).sum(), last - first)
-        a, b, aa, bb, ab, count = sums
-        cells = max(int(np.isfinite(self.changes[flip]).sum()), 1)
-        power = (aa - a**2 / cells) * (bb - b**2 / cells)
-        enough = (count >= LEAST_EVENTS) & (cells >= LEAST_CELLS) & (power > 0)
-        r = (ab - a * b / cells) / np.sqrt(np.where(enough, power, 1.0))
-        return np.where(enough, r, np.nan)
-
-    def correlation(self, flip: str = "") -> float:
-        """Pearson's r of the recording as it is."""
-        return float(self.correlations(np.zeros(1, np.int64), flip)[0])
-
-    def enough(self) -> bool:
-        """Whether there is enough data for a correlation near zero to mean that there is none."""
-        first, last = int(self.bounds[0, 0]), int(self.bounds[-1, 1])
-        cells = int(np.isfinite(self.changes[""]).sum())
-        return cells >= SURE_CELLS and len(self.events.slice(first, last)) >= SURE_EVENTS
-
-    def sweep(self) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets of the frames' clock in us, and r at each."""
-        reach = min(SWEEP_INTERVALS * self.interval_us, SWEEP_US)
-        count = int(reach // SWEEP_STEP_US)
-        offsets = SWEEP_STEP_US * np.arange(-count, count + 1)
-        return offsets, self.correlations(offsets)
-
-
-def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLIPS) -> Steps | None:
-    """The steps to examine, also for mirrored frames; None without frames, events or a common
-    time."""
-    try:
-        pairs = plan_windows(recording, MIN_STEP_US).pairs
-    except EvflowDataError:
-        return None
-    if not pairs:
-        return None
-    if len(pairs) > MOST_STEPS:
-        pairs = tuple(pairs[round(i)] for i in np.linspace(0, len(pairs) - 1, MOST_STEPS))
-    cell = max(1, round(max(recording.events.size) / CELLS))
-    changes: dict[str, list[np.ndarray]] = {flip: [] for flip in ("", *flips)}
-    for first, last in pairs:
-        change = _change(recording.frame_dn(first), recording.frame_dn(last))
-        changes[""].append(_pooled(change, cell))
-        for flip, axes in flips.items():
-            changes[flip].append(_pooled(np.flip(change, axes), cell))
-    bounds = recording.frame_times[np.array(pairs)]
-    interval = float(np.median(np.diff(recording.frame_times)))
-    return Steps(recording.events, {k: np.stack(v) for k, v in changes.items()}, bounds, cell,
-                 interval)
 
 
 def agreement(recording: Recording) -> list[Finding]:
     """EV021 (polarity inverted), EV023 (times stretched), EV024 (clocks not aligned), EV029 (frames
-    mirrored), EV034 (frames and events unrelated)."""
+    mirrored), EV034 (frames and events unrelated), EV037 (frames displaced)."""
     steps = frame_steps(recording)
     if steps is None:
         return []
-    if (missing := _missing(steps)) or np.isnan(here := steps.correlation()):
-        return missing
+    if found := _missing(steps) or _frozen(recording, steps):
+        return found
+    if np.isnan(here := steps.correlation()):
+        return []
     offsets, r = steps.sweep()
-    flips = {flip: steps.correlation(flip=flip) for flip in FLIPS}
+    flips = {flip: steps.correlation(flip=flip) for flip in steps.changes if flip}
     flip = max(flips, key=lambda f: abs(flips[f]))
     if abs(flips[flip]) > AGREES and abs(flips[flip]) > np.nanmax(np.abs(r)) + BETTER:
         return [_mirrored(flip, here, flips[flip])]
+    if found := _displaced(steps, here, float(np.nanmax(np.abs(r)))):
+        return found
     over = f"r={here:+.2f} over {len(steps.bounds)} frame steps"
     inverted = _inverted(r)
     if inverted:
@@ -165,7 +88,15 @@ def _mirrored(flip: str, here: float, best: float) -> Finding:
     """EV029, given r of the recording and of the one with mirrored frames."""
     swapped = " and with ON and OFF swapped" if best < 0 else ""
     also = " --polarity invert" if best < 0 else ""
+    turned, flip = TURNED in flip, flip.removesuffix(TURNED)
     axis = "both axes" if flip == "both" else f"the {flip} axis"
+    if turned:
+        then = f", then mirrored in {axis}" if flip else ""
+        return Finding(
+            "EV029", "error", f"events and frames agree only with rows and columns of the frames "
+            f"swapped{then}{swapped} (r {here:+.2f} -> {abs(best):+.2f}).",
+            "Are x and y of the events swapped, or are the frames rotated? Swap those columns in "
+            f"the export{f', pass{also}' if also else ''}, then check again.")
     return Finding(
         "EV029", "error", f"events and frames agree only with the frames mirrored in {axis}"
         f"{swapped} (r {here:+.2f} -> {abs(best):+.2f}).",
@@ -183,6 +114,35 @@ def _missing(steps: Steps) -> list[Finding]:
     wrong = too_few(count, shown)
     return [Finding("EV023", "warning", wrong.seen, f"Are event times too long? Pass --time-unit "
                     f"{wrong.unit}; or are the frames from another recording?")]
+
+
+def _frozen(recording: Recording, steps: Steps) -> list[Finding]:
+    """EV034 if the frames never change while something moves past the pixels."""
+    events = recording.events
+    still = all(not np.nan_to_num(change).any() for change in steps.changes[""])
+    if not still or np.isnan(steps.changes[""]).all() or len(events) < LEAST_EVENTS:
+        return []
+    if company(events, np.zeros(events.size[::-1], bool)) <= MOVING:
+        return []
+    return [Finding(
+        "EV034", "error", f"all frames that were examined ({len(steps.bounds) + 1}) are alike, but "
+        f"the {len(events):,} events are those of a scene that moves.",
+        "Did the frame camera stop, or was one frame written again and again? Nothing can be "
+        "measured from such frames; --no-frames uses the events alone.")]
+
+
+def _displaced(steps: Steps, here: float, best: float) -> list[Finding]:
+    """EV037 if events and frames agree better some pixels apart than at any time offset."""
+    cells = int(np.isfinite(steps.changes[""]).sum())
+    r, dx, dy = displacement(steps)
+    if r < AGREES or r < best + max(BETTER, CHANCE / np.sqrt(cells)) or cells < LEAST_CELLS:
+        return []
+    return [Finding(
+        "EV037", "error", f"events lie about {abs(dx)} px to the {'right' if dx > 0 else 'left'} "
+        f"and {abs(dy)} px {'below' if dy > 0 else 'above'} what the frames show (r {here:+.2f}, "
+        f"{r:+.2f} so far apart).",
+        "Is one of them a part (ROI) of the sensor whose corner was not added, or from a second "
+        f"sensor? Write the events with x {-dx:+d} and y {-dy:+d}, then check again.")]
 
 
 def frames_offset(recording: Recording) -> int:
@@ -217,32 +177,3 @@ def _peak(offsets: np.ndarray, r: np.ndarray) -> tuple[int, float]:
         shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
         return round(float(offsets[i] + shift * SWEEP_STEP_US)) - LATENCY_US, float(top)
     return int(offsets[i]) - LATENCY_US, float(r[i])
-
-
-def _change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Change of log brightness (H, W), NaN where a frame is near black or saturated."""
-    low, high = np.minimum(before, after), np.maximum(before, after)
-    known = (low >= DARK_DN) & (high <= BRIGHT_DN)
-    change = np.log(np.maximum(after, 1.0) / np.maximum(before, 1.0))
-    return np.where(known, change, np.nan)
-
-
-def _pooled(change: np.ndarray, cell: int) -> np.ndarray:
-    """The sum over each cell (cells,) of its known pixels, NaN without any."""
-    shape = change.shape[0], -(-change.shape[1] // cell) * cell
-    known = np.isfinite(change)
-    total, count = (_cells(np.where(known, a, 0.0), shape, cell) for a in (change, 1.0))
-    return np.where(count > 0, total, np.nan)
-
-
-def _cells(image: np.ndarray, shape: tuple[int, int], cell: int) -> np.ndarray:
-    rows = -(-shape[0] // cell)
-    padded = np.zeros((rows * cell, shape[1]))
-    padded[: image.shape[0], : image.shape[1]] = image
-    return padded.reshape(rows, cell, -1, cell).sum((1, 3)).ravel()
-
-
-def _codes(events: Events, cell: int) -> np.ndarray:
-    """2 (number of the cell) + (1 if ON), of each event."""
-    columns = -(-events.size[0] // cell)
-    return 2 * ((events.y // cell).astype(np.int64) * columns + events.x // cell) + events.p

@@ -1,4 +1,5 @@
-"""Rules on the events: both polarities, enough of them, and not from a few pixels only."""
+"""Rules on the events: both polarities, enough of them, each once, and not from a few pixels
+only."""
 
 from __future__ import annotations
 
@@ -7,13 +8,16 @@ import numpy as np
 from evflow.notes import why_no_frames
 from evflow.recordings.check.findings import Finding
 from evflow.recordings.faulty_pixels import MOVING_FACTOR, hot_among_neighbours
-from evflow.types import Recording
+from evflow.types import Events, Recording
 
 LEAST_EVENTS = 1_000  # with this many, a single polarity is no accident
 ONE_SHARE = 0.99
 VALID_EVENTS = 3  # fewer say next to nothing about a pixel
 ACTIVE_SHARE = 0.05  # of the pixels should have this many
 HOT_SHARE = 0.05  # of the events
+BLOCKS, BLOCK = 8, 1 << 17  # events searched for repeats, evenly spread
+REPEATED_SHARE, MOST_REPEATED = 0.01, 0.1  # of the events: a warning, an error
+COARSE = 0.25  # distinct times, as a share of those of events at random: fewer lie on a grid
 
 
 def contents(recording: Recording) -> list[Finding]:
@@ -50,6 +54,30 @@ def _few(counts: np.ndarray) -> list[Finding]:
     return [Finding(
         "EV017", "warning", f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
         "elsewhere the maps show the camera's summary.", "Record more motion and texture.")]
+
+
+def repeated(events: Events) -> list[Finding]:
+    """EV038 if events repeat others exactly. A pixel cannot send one polarity twice in the same
+    microsecond; events of a simulator whose clock is coarse can."""
+    count = repeats = 0
+    for first in np.unique(np.linspace(0, max(len(events) - BLOCK, 0), BLOCKS).astype(np.int64)):
+        part = np.s_[first: first + BLOCK]
+        t = events.t[part] - events.t[first]
+        pixel = events.y[part].astype(np.int64) * events.size[0] + events.x[part]
+        code = np.sort((t * (events.size[0] * events.size[1]) + pixel) * 2 + events.p[part])
+        span, distinct = int(t[-1]) + 1, 1 + int((np.diff(t) > 0).sum())
+        if distinct < COARSE * span * -np.expm1(-len(t) / span):
+            continue
+        count, repeats = count + len(t), repeats + int((np.diff(code) == 0).sum())
+    if repeats <= REPEATED_SHARE * max(count, LEAST_EVENTS):
+        return []
+    share = repeats / count
+    return [Finding(
+        "EV038", "error" if share > MOST_REPEATED else "warning",
+        f"{share:.0%} of {count:,} events repeat another of the same pixel, time and polarity, "
+        "which no camera sends: were they written twice, or overlapping parts joined? Thresholds "
+        "would come out too low.",
+        "Keep each once: in Python, np.unique(np.stack([t, x, y, p], 1), axis=0).")]
 
 
 def _hot(counts: np.ndarray) -> list[Finding]:

@@ -12,7 +12,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.hints import Told
 from evflow.recordings.check.agreement import agreement
 from evflow.recordings.check.clocks import bunches, clocks, flickers
-from evflow.recordings.check.contents import contents
+from evflow.recordings.check.contents import contents, repeated
 from evflow.recordings.check.findings import Finding, Report
 from evflow.recordings.check.images import images
 from evflow.recordings.stillness import stands_still
@@ -29,9 +29,10 @@ def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told
     Codes of the findings: EV001 empty, EV011 no frames, EV012 no overlap, EV017 few events or no
     window, EV021 polarity inverted, EV022 polarity lost, EV023 time unit, EV024 clocks not aligned,
     EV025 gaps, EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029
-    mirrored frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot pixels, EV034
-    unrelated frames, EV035 events that bunch at the frames, EV036 flickering light; and for a path,
-    whatever the reader refuses.
+    mirrored or transposed frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot
+    pixels, EV034 unrelated or frozen frames, EV035 events that bunch at the frames, EV036
+    flickering light, EV037 displaced frames, EV038 repeated events; and for a path, whatever the
+    reader refuses.
 
     Args:
         recording_or_path: the recording, or a file or folder in any known format.
@@ -63,7 +64,7 @@ def _findings(recording: Recording) -> list[Finding]:
         return found
     found += clocks(recording)
     timed = all(f.code != "EV023" for f in found)
-    found += flickers(recording) if timed else []
+    found += [*flickers(recording), *repeated(recording.events)] if timed else []
     found += images(recording)
     if recording.has_frames and timed:
         try:

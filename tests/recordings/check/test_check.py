@@ -341,3 +341,60 @@ def test_mirrored_and_inverted_are_told_together(sound: Recording) -> None:
     (finding,) = check(flipped(dataclasses.replace(sound, events=swapped), "horizontal")).errors
     assert finding.code == "EV029"
     assert "--polarity invert" in finding.fix
+
+
+def rows_of(events: Events, rows: Any, **columns: Any) -> Events:
+    """Some rows of the events, with other values in some columns."""
+    kept = {n: getattr(events, n)[rows] for n in ("x", "y", "t", "p")} | {"size": events.size}
+    return Events(**(kept | columns))
+
+
+def transposed(r: Recording, turns: int = 0) -> Recording:
+    """The square part of a recording, its events with x and y swapped; frames turned by 90
+    degrees."""
+    side = min(r.events.size)
+    kept = (r.events.x < side) & (r.events.y < side)
+    frames = np.rot90(r.frames[:, :side, :side], turns, (1, 2)).copy()
+    x, y = r.events.x[kept], r.events.y[kept]
+    return Recording(rows_of(r.events, kept, x=y, y=x, size=(side, side)), frames, r.frame_times)
+
+
+def displaced(r: Recording, dx: int, dy: int) -> Recording:
+    x, y = r.events.x.astype(int) + dx, r.events.y.astype(int) + dy
+    kept = (x >= 0) & (x < r.events.size[0]) & (y >= 0) & (y < r.events.size[1])
+    return dataclasses.replace(r, events=rows_of(r.events, kept, x=x[kept], y=y[kept]))
+
+
+def again(r: Recording, share: float) -> Recording:
+    """The recording with the first part of its events written twice."""
+    n = len(r.events)
+    rows = np.sort(np.concatenate([np.arange(n), np.arange(int(share * n))]))
+    return dataclasses.replace(r, events=rows_of(r.events, rows))
+
+
+def shown(r: Recording, frames: np.ndarray) -> Recording:
+    return dataclasses.replace(r, frames=np.broadcast_to(frames, r.frames.shape).copy())
+
+
+@pytest.mark.parametrize(("make", "code", "severity", "said"), [
+    (transposed, "EV029", "error", "rows and columns of the frames swapped"),
+    (lambda r: transposed(r, 1), "EV029", "error", "mirrored in the"),
+    (lambda r: displaced(r, 9, -6), "EV037", "error", "px to the right and"),
+    (lambda r: displaced(r, -9, 6), "EV037", "error", "px below"),
+    (lambda r: again(r, 1.0), "EV038", "error", "50%"),
+    (lambda r: again(r, 0.04), "EV038", "warning", "4%"),
+    (lambda r: shown(r, r.frames[3]), "EV034", "error", "are alike"),
+    (lambda r: shown(r, np.uint8(90)), "EV034", "error", "are alike")])
+def test_what_makes_thresholds_wrong_is_told(
+    sound: Recording, make: Callable[[Recording], Recording], code: str, severity: str, said: str
+) -> None:
+    findings = {f.code: f for f in check(make(sound)).findings}
+    assert (findings[code].severity, said in str(findings[code])) == (severity, True)
+
+
+def test_a_clock_of_few_digits_may_repeat_events(sound: Recording) -> None:
+    """As a simulator that stamps all events of a step alike does."""
+    coarse = changed(sound, t=sound.events.t // 20_000 * 20_000)
+    assert len(np.unique(np.stack([coarse.events.t, coarse.events.x]), axis=1).T) < len(
+        coarse.events)
+    assert "EV038" not in codes(coarse)

@@ -1,0 +1,171 @@
+"""Frame steps: what changes between two frames, in cells of pixels, and how well the net events of
+the same interval (ON minus OFF) follow it.
+
+Pearson's r is taken over all cells of all steps, for frames as they are, mirrored or transposed,
+for shifts of their clock, and for displacements in the image.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.files.spool import forget
+from evflow.recordings.windows import plan_windows
+from evflow.types import Events, Recording
+
+MIN_STEP_US = 20_000  # frames closer than that change too little
+MOST_STEPS = 24  # frame intervals examined, evenly spread
+CELLS = 160  # along the longer side: pooling averages out quantisation by the thresholds
+DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, log changes are unreliable
+LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer are not enough to decide
+SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # with this many, chance correlations are at most .03
+SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # range of the sweep: frame intervals, at most us
+SWEEP_STEP_US = 5_000
+LEAST_OVERLAP = 0.25  # of the events' power, of displaced frames
+
+FLIPS = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}
+TURNED = " of the transpose"  # square sensors: the same of frames with rows and columns swapped
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Steps:
+    """Frame steps to compare with events. changes: {flip: (K, cells)} change of log brightness, NaN
+    in cells without a pixel that is well exposed in both frames; bounds: (K, 2) int64 us; cell:
+    side of a cell in pixels; interval_us: the median of all frame intervals."""
+
+    events: Events
+    changes: dict[str, np.ndarray]
+    bounds: np.ndarray
+    cell: int
+    interval_us: float
+
+    def correlations(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
+        """Pearson's r with the frames' clock shifted by each offset; NaN if there are too few."""
+        sums = np.zeros((6, len(offsets_us)))
+        for change, (t0, t1) in zip(self.changes[flip], self.bounds, strict=True):
+            known = np.isfinite(change)
+            forget(self.events.x, self.events.y, self.events.t, self.events.p)
+            near = self.events.slice(int(t0 + offsets_us.min()), int(t1 + offsets_us.max()))
+            code = _codes(near, self.cell)
+            edges = np.searchsorted(near.t, np.stack([t0 + offsets_us, t1 + offsets_us]))
+            a = change[known]
+            sum_a, sum_aa = a.sum(), (a * a).sum()  # no BLAS: its threads cost more than they give
+            for i, (first, last) in enumerate(edges.T):
+                sign = np.bincount(code[first:last], minlength=2 * len(change)).reshape(-1, 2)
+                b = (sign[:, 1] - sign[:, 0])[known].astype(np.float64)
+                sums[:, i] += (
+                    sum_a, b.sum(), sum_aa, (b * b).sum(), (a * b).sum(), last - first)
+        a, b, aa, bb, ab, count = sums
+        cells = max(int(np.isfinite(self.changes[flip]).sum()), 1)
+        power = (aa - a**2 / cells) * (bb - b**2 / cells)
+        enough = (count >= LEAST_EVENTS) & (cells >= LEAST_CELLS) & (power > 0)
+        r = (ab - a * b / cells) / np.sqrt(np.where(enough, power, 1.0))
+        return np.where(enough, r, np.nan)
+
+    def correlation(self, flip: str = "") -> float:
+        """Pearson's r of the recording as it is."""
+        return float(self.correlations(np.zeros(1, np.int64), flip)[0])
+
+    def enough(self) -> bool:
+        """Whether there is enough data for a correlation near zero to mean that there is none."""
+        first, last = int(self.bounds[0, 0]), int(self.bounds[-1, 1])
+        cells = int(np.isfinite(self.changes[""]).sum())
+        return cells >= SURE_CELLS and len(self.events.slice(first, last)) >= SURE_EVENTS
+
+    def sweep(self) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets of the frames' clock in us, and r at each."""
+        reach = min(SWEEP_INTERVALS * self.interval_us, SWEEP_US)
+        count = int(reach // SWEEP_STEP_US)
+        offsets = SWEEP_STEP_US * np.arange(-count, count + 1)
+        return offsets, self.correlations(offsets)
+
+
+def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLIPS) -> Steps | None:
+    """The steps to examine, also for mirrored and, if they are square, transposed frames; None
+    without frames, events or a common time."""
+    try:
+        pairs = plan_windows(recording, MIN_STEP_US).pairs
+    except EvflowDataError:
+        return None
+    if not pairs:
+        return None
+    if len(pairs) > MOST_STEPS:
+        pairs = tuple(pairs[round(i)] for i in np.linspace(0, len(pairs) - 1, MOST_STEPS))
+    cell = max(1, round(max(recording.events.size) / CELLS))
+    width, height = recording.events.size
+    changes: dict[str, list[np.ndarray]] = collections.defaultdict(list)
+    for first, last in pairs:
+        change = _change(recording.frame_dn(first), recording.frame_dn(last))
+        turned = {"": change, TURNED: change.T} if flips and width == height else {"": change}
+        for turn, image in turned.items():
+            for flip, axes in ({"": ()} | dict(flips)).items():
+                changes[flip + turn].append(_pooled(np.flip(image, axes), cell))
+    bounds = recording.frame_times[np.array(pairs)]
+    interval = float(np.median(np.diff(recording.frame_times)))
+    return Steps(recording.events, {k: np.stack(v) for k, v in changes.items()}, bounds, cell,
+                 interval)
+
+
+def displacement(steps: Steps) -> tuple[float, int, int]:
+    """The largest r if events lie dx, dy pixels from where the frames show changes, by up to half
+    the sensor; and dx, dy."""
+    columns = -(-steps.events.size[0] // steps.cell)
+    rows = len(steps.changes[""][0]) // columns
+    shape = 2 * rows, columns + 1  # spectra of images beside zeros, so that nothing wraps round
+    product, energy, power = np.zeros(shape, complex), np.zeros(shape, complex), 0.0
+    for change, (t0, t1) in zip(steps.changes[""], steps.bounds, strict=True):
+        code = _codes(steps.events.slice(int(t0), int(t1)), steps.cell)
+        sign = np.bincount(code, minlength=2 * len(change)).reshape(-1, 2)
+        net = (sign[:, 1] - sign[:, 0]).astype(np.float64)
+        known = np.isfinite(change)
+        a = np.where(known, change - change[known].mean() if known.any() else 0.0, 0.0)
+        images = [a, known.astype(np.float64), net - net.mean(), (net - net.mean()) ** 2]
+        a_, known_, net_, square_ = (
+            np.fft.rfft2(i.reshape(rows, columns), (2 * rows, 2 * columns)) for i in images)
+        product = product + a_.conj() * net_
+        energy = energy + known_.conj() * square_
+        power += float(a @ a)
+    up, left = rows // 2, columns // 2
+    near = np.s_[rows - up: rows + up + 1, columns - left: columns + left + 1]
+    along, square = (np.fft.fftshift(np.fft.irfft2(s, (2 * rows, 2 * columns)))[near]
+                     for s in (product, energy))
+    whole = float(square[up, left])
+    if not whole * power > 0:
+        return 0.0, 0, 0
+    r = along / np.sqrt(power * np.maximum(square, LEAST_OVERLAP * whole))
+    y, x = np.unravel_index(int(np.argmax(r)), r.shape)
+    return float(r[y, x]), steps.cell * (int(x) - left), steps.cell * (int(y) - up)
+
+
+def _change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Change of log brightness (H, W), NaN where a frame is near black or saturated."""
+    low, high = np.minimum(before, after), np.maximum(before, after)
+    known = (low >= DARK_DN) & (high <= BRIGHT_DN)
+    change = np.log(np.maximum(after, 1.0) / np.maximum(before, 1.0))
+    return np.where(known, change, np.nan)
+
+
+def _pooled(change: np.ndarray, cell: int) -> np.ndarray:
+    """The sum over each cell (cells,) of its known pixels, NaN without any."""
+    shape = change.shape[0], -(-change.shape[1] // cell) * cell
+    known = np.isfinite(change)
+    total, count = (_cells(np.where(known, a, 0.0), shape, cell) for a in (change, 1.0))
+    return np.where(count > 0, total, np.nan)
+
+
+def _cells(image: np.ndarray, shape: tuple[int, int], cell: int) -> np.ndarray:
+    rows = -(-shape[0] // cell)
+    padded = np.zeros((rows * cell, shape[1]))
+    padded[: image.shape[0], : image.shape[1]] = image
+    return padded.reshape(rows, cell, -1, cell).sum((1, 3)).ravel()
+
+
+def _codes(events: Events, cell: int) -> np.ndarray:
+    """2 (number of the cell) + (1 if ON), of each event."""
+    columns = -(-events.size[0] // cell)
+    return 2 * ((events.y // cell).astype(np.int64) * columns + events.x // cell) + events.p
