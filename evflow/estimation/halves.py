@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from evflow.estimation.dead_time import dead_time
 from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
-from evflow.estimation.refine.path import STEPS, telling
+from evflow.estimation.refine.path import STEPS, receptor_places
 from evflow.estimation.refine.stretches import spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import Eyes, State, add, estimate, first_events
@@ -68,7 +68,7 @@ def _on_its_own(first: First) -> State:
     state, eyes = first.state, first.state.eyes
     runs, told = ([(s.recording, s.run) for s in part] for part in (state.read, first.told))
     found = eyes.found
-    if found is not None and telling(runs) != telling(told):
+    if found is not None and receptor_places(runs) != receptor_places(told):
         found = find_photoreceptor(runs, eyes.noise_dn)
     seen_by = found.seen if found is not None and found.needed else IDEAL
     events = state.read[0].recording.events

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Summary
-from evflow.estimation.refine import Chunk, foreseen, refine_alone
+from evflow.estimation.refine import Chunk, high_threshold_explains, refine_alone
 from evflow.estimation.static import uniform
 from evflow.network.pooling import Stats
 from evflow.training.config import PRESETS
@@ -38,7 +38,7 @@ def without(
     missing events."""
     known = {f"theta_{n}": _theta_prior() for n in names}
     for told, name in enumerate(POLARITIES):
-        if name in names or (chunks and foreseen(chunks, summary, std, told)):
+        if name in names or (chunks and high_threshold_explains(chunks, summary, std, told)):
             continue
         theta, eta = (float(getattr(summary, f"{p}_{name}")) for p in ("theta", "eta"))
         if chunks:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from evflow.estimation.refine.doubt import BEYOND, relative_error
+from evflow.estimation.refine.doubt import MOST_DEVIATIONS, relative_error
 from experiments.shared.rows import Rows
 
 FOLDS, STEPS = 5, 2000
@@ -20,7 +20,7 @@ DEGREES = 8.0  # of Student's t: a few recordings say nothing and must not decid
 def fit(x: np.ndarray, left: np.ndarray, before: np.ndarray) -> dict[str, np.ndarray]:
     """The map from signs (N, F), errors of log theta (N,) and their std before (N,)."""
     net: dict[str, Any] = {"mean": x.mean(0), "scale": x.std(0) + 0.05}
-    z = np.clip((x - net["mean"]) / net["scale"], -BEYOND, BEYOND)
+    z = np.clip((x - net["mean"]) / net["scale"], -MOST_DEVIATIONS, MOST_DEVIATIONS)
     z = jnp.asarray(np.concatenate([z, np.ones((len(z), 1))], -1))
     y, start = jnp.asarray(left), float(np.log(before.mean()))
 

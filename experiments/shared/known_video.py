@@ -13,7 +13,7 @@ from evflow.estimation.refine import Chunk
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.pixels import evidence_of
 from evflow.estimation.refine.sightings import sight
-from evflow.estimation.refine.signal import told_apart
+from evflow.estimation.refine.signal import separated_noise_rates
 from evflow.light.log_maps import lin_log
 from experiments.shared.cameras import Hidden
 
@@ -35,8 +35,9 @@ def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
 
 
 def noise_told(params: Any, known: list[Chunk], best: Summary, start: Summary) -> np.ndarray:
-    """Noise rates (2,) in Hz of events told apart on the true video, next to nothing known."""
+    """Noise rates (2,) in Hz on the true video, by the separation of noise with a wide prior."""
     theta = np.array([float(best.theta_on), float(best.theta_off)])
     before = np.log([float(start.eta_on), float(start.eta_off)])
-    log_eta, _ = told_apart(known, theta, before, np.ones(2), next(iter(params.values()))["signal"])
+    signal = next(iter(params.values()))["signal"]
+    log_eta, _ = separated_noise_rates(known, theta, before, np.ones(2), signal)
     return np.exp(log_eta)

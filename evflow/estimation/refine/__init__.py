@@ -7,16 +7,16 @@
     recorded against simulated Moments --> the summary   fit.py
     the same of one polarity alone --> its threshold     alone.py
     recorded events on the path --> each pixel's theta   pixels.py
-    recorded events on the path --> what pixels see the frames by   receptor_search.py
+    recorded events on the path --> photoreceptor, offset of the frames   receptor_search.py
     recorded events of quiet pixels --> noise rates      noise.py
-    events, random points --> noise told from signal     points.py, signal.py
+    events, random points --> rates of noise beside signal   points.py, signal.py
 
-A network sees windows; this sees what the recording would look like were the estimate true, and
-moves the estimate until the two agree. Each pixel is compared only after its first event, where
-its memory is known: nothing depends on what happened before the recording began.
+The network sees single windows. The refinement simulates the whole recording with the estimated
+camera and moves the estimate until simulated and recorded events agree. A pixel is compared only
+after its first event, when its memory is known: nothing depends on what preceded the recording.
 """
 
-from evflow.estimation.refine.alone import foreseen, refine_alone
+from evflow.estimation.refine.alone import high_threshold_explains, refine_alone
 from evflow.estimation.refine.denoise import frame_noise
 from evflow.estimation.refine.fit import Refined, fused, refine_summary
 from evflow.estimation.refine.path import (
@@ -39,9 +39,9 @@ __all__ = [
     "Stretch",
     "cut",
     "find_photoreceptor",
-    "foreseen",
     "frame_noise",
     "fused",
+    "high_threshold_explains",
     "make_chunk",
     "pixel_posterior",
     "plan_runs",

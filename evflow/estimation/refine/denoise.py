@@ -1,7 +1,7 @@
-"""Noise of the frames: how much there is, and frames without most of it.
+"""Noise of the frames: its standard deviation, and denoised frames.
 
-The path between noisy frames moves where nothing does, which reads as contrast that events lack,
-and thresholds come out too high: by up to 40 % with 3 DN of noise.
+The path between noisy frames changes where the scene does not. The regression reads this as
+contrast without events and returns thresholds that are too high, by up to 40 % at 3 DN of noise.
 """
 
 from __future__ import annotations
@@ -14,17 +14,25 @@ import numpy as np
 from evflow.recordings.glitches import exposed
 from evflow.types import Recording
 
-LEAST_DN = 1.8  # of noise that is taken away: fine textures that move look like up to 1.5
-ENOUGH = 10  # tiles that tell it
-TILE, EVEN = 12, 0.1  # pixels; quantile of the tiles
-PAIRS = 8  # of frames that are looked at
-PATCH, SEARCH = 5, 15  # pixels: sides of what non-local means compares, and where it looks
+LEAST_DN = 1.8  # frames with less noise are not denoised: moving fine textures look like 1.5 DN
+ENOUGH = 10  # quiet tiles needed for a measurement
+TILE, EVEN = 12, 0.1  # side in pixels; quantile over tiles
+PAIRS = 8  # of frames that are measured
+PATCH, SEARCH = 5, 15  # pixels: sides of the patch and of the search window of non-local means
 
 
 def frame_noise(intervals: Sequence[tuple[Recording, int]]) -> float:
-    """Standard deviation in DN of the frames' noise, 0 where too few places are quiet to tell it.
-    intervals: of frames i and i + 1 of a recording. Noise is alike everywhere, what moves is not:
-    the evenest of the tiles without events tell it."""
+    """Standard deviation of the frames' noise.
+
+    Noise is the same everywhere, motion is not: the noise is a low quantile over tiles without
+    events.
+
+    Args:
+        intervals: (recording, i) of frames i and i + 1.
+
+    Returns:
+        DN; 0 where fewer than ENOUGH tiles are quiet.
+    """
     chosen = np.unique(np.linspace(0, len(intervals) - 1, min(PAIRS, len(intervals))).round())
     found = []
     for k in chosen.astype(int):
@@ -38,7 +46,7 @@ def frame_noise(intervals: Sequence[tuple[Recording, int]]) -> float:
 
 
 def _noise(first: np.ndarray, second: np.ndarray, quiet: np.ndarray) -> list[float]:
-    """Standard deviation of the noise of two frames, tile by tile, from their quiet pixels."""
+    """Noise of two frames in DN, of each tile with enough quiet pixels."""
     change = second - first
     away = np.abs(change - cv2.blur(change, (3, 3)))
     height, width = change.shape
@@ -49,8 +57,8 @@ def _noise(first: np.ndarray, second: np.ndarray, quiet: np.ndarray) -> list[flo
 
 
 def denoised(frame: np.ndarray, noise_dn: float) -> np.ndarray:
-    """A frame (H, W) in DN, float32, by non-local means (Buades et al., CVPR 2005) where its noise
-    is worth it."""
+    """A frame (H, W) in DN, float32, denoised by non-local means (Buades et al., CVPR 2005) where
+    its noise is at least LEAST_DN."""
     if noise_dn < LEAST_DN:
         return frame
     whole = np.clip(np.rint(frame), 0, 255).astype(np.uint8)

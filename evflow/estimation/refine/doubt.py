@@ -1,10 +1,10 @@
-"""How far the thresholds may be off, for cameras as they are.
+"""The std of the thresholds for real cameras, whose pixels and frames are not ideal.
 
-The fusion (fit.py) learned its errors on pixels without a low-pass and on frames that show light.
-What an exposure, noise, an offset that stays undetected or a slow photoreceptor adds shows in how
-the pooled regression, the fusion and the path disagree, and above all in how little the path
-explains; a linear map of these signs to the log of the standard deviation, fitted on simulated
-cameras of all these kinds beside ideal ones, says how much.
+The fusion (fit.py) learned its errors on pixels without a low-pass and on frames that measure
+light. Exposure, noise, an undetected offset and a slow photoreceptor add errors. They show in
+disagreement between pooled regression, fusion and path, and above all in a low share of variance
+that the path explains. A linear map from such indicators ("signs") to the log of the std was
+fitted on simulated cameras, ideal ones and others.
 """
 
 from __future__ import annotations
@@ -27,16 +27,25 @@ NAMES = (
     "offset_unneeded", "offset_std", "tau", "tau_std", "even", "open", "open_unneeded",
     "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal",
     "with_missed")
-BEYOND = 2.0  # standard deviations outside of what it learned on, beyond which a sign is held
-NARROWER = 0.5  # of the std before: what a recording leaves open is not learned away
+MOST_DEVIATIONS = 2.0  # signs are clipped to so many standard deviations of those it was fitted to
+NARROWER = 0.5  # the new std is at least this share of the one before
 MOST_ODDS = 10.0
-LENIENT = 3.0  # log odds: how much likelier a camera that is not ideal is than in the search
-POOR = 0.3  # share that a path leaves unexplained, from which on an offset is easily missed
+LENIENT = 3.0  # log odds added to the search's for a camera that is not ideal
+POOR = 0.3  # share of variance left unexplained by the path, above which an offset is often missed
 
 
 def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Array:
-    """(2, F) float64: NAMES of theta_on and theta_off. A photoreceptor that stays undetected is
-    there with some probability all the same, and thresholds are then off by what it changes."""
+    """Indicators of the error of theta_on and theta_off.
+
+    Args:
+        found: the search for the photoreceptor.
+        noise_dn: std of the frames' noise, DN.
+        summary, std: the estimate.
+
+    Returns:
+        (2, F) float64 in the order of NAMES. `with_missed` includes the threshold's change under a
+        photoreceptor that was not detected, times its probability.
+    """
     theta, error = (np.array([float(getattr(s, f"theta_{p}")) for p in ("on", "off")])
                     for s in (summary, std))
     needed = float(found.needed)
@@ -71,16 +80,22 @@ def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Arra
 
 
 def doubted(net: dict[str, Any], rows: Array, summary: Summary, std: Summary) -> Summary:
-    """The std of a summary with those of its thresholds replaced.
+    """The std of a summary, with that of its thresholds replaced.
 
-    net: "mean", "scale" (F,) of the signs that it was fitted to, "map" (F + 1,) to the log of the
-    relative standard deviation, and "widen" (), its calibration; rows: of `signs`. Raises EV018
-    for weights that go by other signs.
+    Args:
+        net: "mean", "scale" (F,) of the signs in the fit, "map" (F + 1,) to the log of the
+            relative std, "widen" (), its calibration.
+        rows: (2, F) of `signs`.
+        summary, std: the estimate.
+
+    Raises:
+        EvflowDataError: EV018 for weights fitted to other signs.
     """
     if np.shape(net["mean"]) != (len(NAMES),):
         raise EvflowDataError(
-            "EV018", f"the weights' doubt goes by {np.size(net['mean'])} signs, this version by "
-            f"{len(NAMES)}.", "They are of another version; refit: python -m experiments.doubt.")
+            "EV018", f"the weights' `doubt` part was fitted to {np.size(net['mean'])} signs, this "
+            f"version computes {len(NAMES)}.",
+            "They are of another version; refit: python -m experiments.doubt.")
     error = relative_error(net, rows) * float(net["widen"])
     return dataclasses.replace(std, **{
         name: jnp.float32(max(float(getattr(summary, name)) * error[p],
@@ -89,7 +104,7 @@ def doubted(net: dict[str, Any], rows: Array, summary: Summary, std: Summary) ->
 
 
 def relative_error(net: dict[str, Any], rows: Array) -> Array:
-    """Standard deviation (N,) of log theta, before "widen", of rows (N, F)."""
+    """Std (N,) of log theta before the calibration "widen", for rows (N, F)."""
     x = (rows - np.asarray(net["mean"])) / np.asarray(net["scale"])
-    x = np.concatenate([np.clip(x, -BEYOND, BEYOND), np.ones((len(x), 1))], -1)
+    x = np.concatenate([np.clip(x, -MOST_DEVIATIONS, MOST_DEVIATIONS), np.ones((len(x), 1))], -1)
     return np.asarray(np.exp(x @ np.asarray(net["map"])))

@@ -1,10 +1,9 @@
 """From moments to the camera's summary: a few Gauss-Newton steps, then a small fusion network.
 
 The steps move log theta until the balance of the simulated recording equals that of the recorded
-one, held by the network's estimate where the data say little; the noise rates come from the quiet
-pixels (noise.py). What is left over (every residual, how many events carry it, how fast things
-move) goes into `FusionNet`, trained on simulated recordings, which corrects the estimate and says
-how sure it is.
+one, with the network's estimate as prior; the noise rates come from quiet pixels (noise.py). The
+residuals, the number of events behind each and the speed of motion are features of `FusionNet`,
+trained on simulated recordings, which corrects the estimate and gives its std.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from evflow.estimation.refine.noise import (
     with_tie,
 )
 from evflow.estimation.refine.path import STEPS, Chunk
-from evflow.estimation.refine.signal import told_apart
+from evflow.estimation.refine.signal import separated_noise_rates
 from evflow.estimation.refine.trace import FRESH, RUNNING, Draws, draw, trace_of_camera
 from evflow.light.log_maps import lin_log_inverse, noise_factor, normalised_intensity
 from evflow.network.coordinates import squashed_summary, unsquash_summary
@@ -41,17 +40,19 @@ Start = tuple[float, float]
 
 OFFSETS = (0.2, 0.08, 0.05)  # log theta: finite differences of the passes
 LONGEST_STEP = 0.5  # log theta per pass
-MODEL_ERROR = 0.04  # of a balance residual, beside the counts' own: what interpolation leaves
-EMPTY = 0.3  # balance weight below which there is no residual to speak of
-FRESH_ODDS = 2.0  # log odds that it takes to call a start fresh: few recordings do
-BEYOND = 0.04  # of the variance, for each feature beyond those of training: measured up to 8 s
-THETA_ERROR = 0.05  # relative error of the stepped thresholds, for the noise that follows them
+MODEL_ERROR = 0.04  # of a balance residual, by interpolation; counts add their own
+EMPTY = 0.3  # balance weight below which a residual is negligible
+FRESH_ODDS = 2.0  # log odds required for a fresh start: few recordings have one
+# Relative increase of the variance for each feature outside of training's range; measured on
+# recordings of up to 8 s.
+VARIANCE_PER_OUTLIER_FEATURE = 0.04
+THETA_ERROR = 0.05  # relative error of the stepped thresholds, where noise follows from them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Refined:
-    """summary, std: the camera; features: (F,) float32, what the fusion saw; fresh: whether the
-    recording starts as a simulation does, with the memory at its first frame."""
+    """summary, std: the camera; features: (F,) float32, the fusion's input; fresh: whether the
+    memory is at the first frame when the recording starts, as in a simulation."""
 
     summary: Summary
     std: Summary
@@ -60,8 +61,8 @@ class Refined:
 
 
 class FusionNet(nn.Module):
-    """features (F,) -> correction of y (6,) and log std of y (6,): a linear map and a little
-    more, as it learns from some thousand recordings."""
+    """features (F,) -> correction of y (6,) and log std of y (6,): a linear map and one small
+    hidden layer, as it learns from only some thousand recordings."""
 
     width: int = 32
 
@@ -77,7 +78,7 @@ def _total(parts: Sequence[Moments]) -> Moments:
 
 
 def balance_residual(moments: Moments, theta: np.ndarray) -> np.ndarray:
-    """Relative excess of what the events carry over dL, (..., lags, 2 sides), at theta (..., 2)."""
+    """Events' contrast minus dL, relative to |dL|: (..., lags, 2 sides), at theta (..., 2)."""
     on, off = theta[..., 0, None, None], theta[..., 1, None, None]
     a, b, d, size = np.moveaxis(np.asarray(moments.balance), -1, 0)
     return np.array([1.0, -1.0]) * (on * a - off * b - d) / (size + EMPTY)
@@ -92,7 +93,7 @@ def square_residual(moments: Moments, theta: np.ndarray) -> np.ndarray:
 
 
 class Fit:
-    """The passes over one recording's chunks; holds what they share."""
+    """State of the Gauss-Newton passes over one recording's chunks."""
 
     def __init__(self, chunks: list[Chunk], start: Summary, std: Summary, seed: int) -> None:
         self.chunks, self.key = chunks, jax.random.key(seed)
@@ -112,8 +113,8 @@ class Fit:
                                 for c in chunks])
 
     def simulate(self, values: np.ndarray, starts: Sequence[Start] = ()) -> Moments:
-        """Summed moments of V cameras, leading axis V. starts: of the first chunk; all others, of
-        a camera that has been running, begin as `later`."""
+        """Moments of V cameras summed over the chunks, leading axis V. starts: of the first chunk;
+        all others begin as `later`, as of a camera that has been running."""
         starts = starts or [self.start] * len(values)
         cameras = list(zip(values.astype(np.float32), np.array(starts, np.float32), strict=True))
         later = np.array(self.later, np.float32)
@@ -123,7 +124,7 @@ class Fit:
         return jax.tree.map(lambda *leaves: np.stack(leaves), *added)
 
     def _moments(self, i: int, row: np.ndarray, start: np.ndarray) -> Moments:
-        """Moments of a camera on chunk i, each once: a pass asks for what the last one asked."""
+        """Moments of a camera on chunk i, cached: passes share cameras."""
         known, c = (i, row.tobytes(), start.tobytes()), self.chunks[i]
         if i not in self.draws:
             self.draws[i] = draw(self.key, i, c.bright.shape, len(c.dt_s), STEPS)
@@ -135,8 +136,8 @@ class Fit:
         return self.simulated[known]
 
     def choose_start(self, others: Sequence[Start] = (FRESH,)) -> None:
-        """Does the recording start as a camera that has been running, or otherwise? Whichever
-        start makes the number of pixels that fire at once the likelier (Poisson)."""
+        """Choose how the recording starts: as of a running camera (`later`), or one of `others`;
+        the one with the highest Poisson likelihood of the number of pixels that fire at once."""
         starts = [self.later, *others]
         made = np.asarray(self.simulate(np.stack([self.values] * len(starts)), starts).early) + 0.5
         log_likelihood = float(self.recorded.early) * np.log(made) - made
@@ -144,7 +145,7 @@ class Fit:
         self.start = starts[int(np.argmax(log_likelihood))]
 
     def step(self, offset: float) -> None:
-        """One Gauss-Newton step of log theta."""
+        """Take one Gauss-Newton step of log theta. offset: of the finite differences."""
         values = np.stack([self.values] * 3)
         values[1, 0] *= np.exp(offset)
         values[2, 1] *= np.exp(offset)
@@ -162,12 +163,12 @@ class Fit:
         self.move(slice(2), change)
 
     def move(self, which: int | slice, change: np.ndarray | float) -> None:
-        """Change log theta, of ON 0 and OFF 1, by no more than a pass may."""
+        """Change log theta of ON (0), OFF (1) or both, by at most LONGEST_STEP."""
         moved = self.values[which] * np.exp(np.clip(change, -LONGEST_STEP, LONGEST_STEP))
         self.values[which] = np.clip(moved, 0.02, 2.0)
 
     def features(self) -> np.ndarray:
-        """Everything the fusion sees, (F,), at the final values."""
+        """The fusion's features (F,) at the current values."""
         made = jax.tree.map(lambda a: a[0], self.simulate(self.values[None]))
         seen, theta = self.recorded, self.values[:2]
 
@@ -194,11 +195,11 @@ class Fit:
             np.float32)
 
     def noise_features(self) -> list[np.ndarray]:
-        """What the strata say beside their combination, and whether the noise follows Eq. 12."""
+        """Rates of the strata against their combination, and agreement with Eq. 12."""
         rates = stratum_rates(self.quiet, self.prior[2:4], self.prior_std[2:4])
         theta, found = self.values[:2], np.log(self.values[2:4])
-        foretold, error = tied_rates(theta, THETA_ERROR * theta, self.factor)
-        away = found - np.log(foretold)
+        predicted, error = tied_rates(theta, THETA_ERROR * theta, self.factor)
+        away = found - np.log(predicted)
         tied = tied_probability(away, np.hypot(error, rate_error(self.quiet)))
         return [np.log(rates) - found, np.log(self.quiet + 1.0), np.clip(away, -2.0, 2.0),
                 tied * away, np.array([tied])]
@@ -217,12 +218,23 @@ def refine_summary(
     chunks: list[Chunk], summary: Summary, std: Summary, fusion: dict[str, Any] | None = None,
     signal: dict[str, Any] | None = None, *, seed: int = 0,
 ) -> Refined:
-    """The camera's summary, from the chunks of a recording and the network's estimate.
+    """Refine the network's estimate of a camera on the chunks of a recording.
 
-    fusion: {"net": parameters of FusionNet, "mean", "scale", "low", "high": (F,) of the features
-    it was trained on, "widen": (6,) calibration of the std}; without it the
-    result is that of the Gauss-Newton steps alone, and std the network's. signal: the network
-    that tells noise from signal (signal.py); without it the noise is that of quiet pixels.
+    Args:
+        chunks: of the recording.
+        summary, std: the network's estimate.
+        fusion: {"net": parameters of FusionNet, "mean", "scale", "low", "high": (F,) of the
+            features in training, "widen": (6,) calibration of the std}; None: only the
+            Gauss-Newton steps, with the network's std.
+        signal: the network that separates noise from signal (signal.py); None: the noise rates are
+            those of quiet pixels.
+        seed: of the simulated noise and mismatch.
+
+    Returns:
+        The refined summary, its std and the features.
+
+    Raises:
+        EvflowDataError: EV018 where `fusion` was trained on another number of features.
     """
     fit = Fit(chunks, summary, std, seed)
     fit.choose_start()
@@ -246,7 +258,7 @@ def refine_summary(
 def _corrected(
     fusion: dict[str, Any], features: Array, stepped: Summary
 ) -> tuple[Array, Array]:
-    """y (6,) of the stepped summary as the fusion corrects it, and its std."""
+    """y (6,) of the stepped summary, corrected by the fusion, and its std."""
     return fused(fusion, features, unsquash_summary(stepped))
 
 
@@ -254,14 +266,14 @@ def _with_noise(
     chunks: list[Chunk], summary: Summary, std: Summary, signal: dict[str, Any] | None,
     factor: float,
 ) -> tuple[Summary, Summary]:
-    """The noise rates of events told apart, drawn to Eq. 12 where they may well follow it."""
+    """Noise rates with noise separated from signal, shrunk towards Eq. 12 where consistent."""
     def both(s: Summary, name: str) -> np.ndarray:
         return np.array([float(getattr(s, f"{name}_{p}")) for p in ("on", "off")])
 
     theta, eta = both(summary, "theta"), both(summary, "eta")
     log_eta, log_std = np.log(eta), both(std, "eta") / eta
     if signal is not None:
-        log_eta, log_std = told_apart(chunks, theta, log_eta, log_std, signal)
+        log_eta, log_std = separated_noise_rates(chunks, theta, log_eta, log_std, signal)
     log_eta, log_std = with_tie(theta, both(std, "theta"), log_eta, log_std, factor)
     rates = dict(zip(("eta_on", "eta_off"), map(jnp.float32, np.exp(log_eta)), strict=True))
     errors = dict(zip(rates, map(jnp.float32, np.exp(log_eta) * log_std), strict=True))
@@ -269,12 +281,15 @@ def _with_noise(
 
 
 def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:
-    """y (..., 6) corrected, and its std; features beyond those of training are held at its
-    edge, so that a longer recording is taken for the longest known, and make the std wider."""
+    """Correct y (..., 6) by the fusion; returns it and its std.
+
+    Features outside of training's range are clipped to it (a longer recording counts as the
+    longest in training) and widen the std.
+    """
     inside = jnp.clip(features, fusion["low"], fusion["high"])
     beyond = (inside != features).sum(-1, keepdims=True)
     outputs: Any = FusionNet().apply(
         {"params": fusion["net"]}, (inside - fusion["mean"]) / fusion["scale"])
     correction, log_std = outputs
     return y + correction, (
-        jnp.exp(log_std) * fusion["widen"] * jnp.sqrt(1.0 + BEYOND * beyond))
+        jnp.exp(log_std) * fusion["widen"] * jnp.sqrt(1.0 + VARIANCE_PER_OUTLIER_FEATURE * beyond))

@@ -1,11 +1,10 @@
-"""Additive statistics of a Trace against the path: what the recorded and the simulated events
-are compared by.
+"""Additive statistics of a Trace against the path, for comparing recorded and simulated events.
 
-Balance: after its first event, a pixel's brightness change dL up to a frame is carried by its
-events, dL = theta_on n_on - theta_off n_off + remainder. Sums of the three terms over pixels that
-got brighter, and over those that got darker, do not care what the brightness did between the
-frames (pairs of ON and OFF cancel): they hold the scale of theta where motion is too fast to
-interpolate. Root counts and active pixels do care, and are the more precise where it is slow.
+Balance: after a pixel's first event, its brightness change dL up to a frame equals the contrast of
+its events, dL = theta_on n_on - theta_off n_off + remainder. Sums of these terms over pixels that
+got brighter, and over those that got darker, are independent of the path between the frames (pairs
+of ON and OFF cancel). They fix the scale of theta where motion is too fast to interpolate. Root
+counts and numbers of active pixels depend on the path, and are more precise where motion is slow.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from evflow.estimation.refine.trace import NEVER, Trace
 Array = np.ndarray
 
 LAGS = (1, 2, 4, 0)  # frames between the ends of dL; 0: from the first event on
-DEAD, FULL = 0.1, 0.5  # log units: changes below do not choose a side, above weigh no more
+DEAD, FULL = 0.1, 0.5  # log units: smaller changes belong to no side; the weight saturates
 
 
 @jax.tree_util.register_dataclass
@@ -46,7 +45,15 @@ class Moments:
 
 
 def measure(trace: Trace, path: Array, dt_s: Array, bright: Array, steps: int) -> Moments:
-    """Moments of one chunk: path (K*steps + 1, H, W), dt_s (K,), bright (H, W) bool."""
+    """Moments of one chunk.
+
+    Args:
+        trace: of its events.
+        path: (K*steps + 1, H, W) log intensity.
+        dt_s: (K,) interval lengths.
+        bright: (H, W) bool, the pixels to use.
+        steps: fine steps per interval.
+    """
     flat, first = path.reshape(len(path), -1), trace.step.ravel()
     counts = trace.counts.reshape(len(dt_s), 2, -1)
     known = np.flatnonzero((first != NEVER) & bright.ravel())
@@ -78,8 +85,8 @@ def _since_first(counts: Array, first_on: Array, interval: Array) -> Array:
 
 
 def _sides(n: Array, dL: Array, *, squares: bool) -> Array:
-    """Weighted sums over the brighter and the darker pixels, (2, 4) or (2, 7). 1/(1+n): else the
-    few pixels at the threshold's clamp, with most of the events, decide alone."""
+    """Weighted sums over the brighter and the darker pixels, (2, 4) or (2, 7). The weight 1/(1+n)
+    keeps the few pixels at the threshold's clamp, with most of the events, from dominating."""
     rows = []
     for side in (1, -1):
         at = np.flatnonzero(dL > DEAD if side > 0 else dL < -DEAD)

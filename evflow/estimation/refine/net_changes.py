@@ -1,11 +1,11 @@
-"""The light that frames lack, from what the events add up to between frames: no path is needed.
+"""The offset of the frames (light that they lack), from net event counts between frames.
 
-Whatever the brightness did between two frames, a pixel's events carry its change, but for what the
-memory left over: theta_on times its ON less theta_off times its OFF events is about one function of
-the change of log light, the same in the dark and where it is bright. Of the wrong offset the
-changes of dark pixels are too large or too small, and the function is none. So the offset is the
-one by which the change foretells the events best. A path that misses what moves does not matter
-here; what a slow pixel has not yet seen does, and differs with the time between the frames.
+No path is needed. Between two frames a pixel's events sum to its change, up to a remainder in the
+memory: theta_on times its ON minus theta_off times its OFF events is one function of the change of
+log light, in dark and bright pixels alike. With a wrong offset the changes of dark pixels are too
+large or too small, and there is no single function. So the estimated offset is the one at which the
+change predicts the events best. Errors of the path have no effect here. The lag of a slow pixel
+has, and depends on the time between the frames.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ from evflow.light.log_maps import log64
 Array = np.ndarray
 
 LAGS = (2, 4)  # frame intervals of a change
-CHANGES = 4000  # of a stretch and a lag that are looked at
-DARK_DN, BRIGHT_DN = 4.0, 230.0  # frames that are darker may be cut off; brighter, what pixels see
-LEAST_DN = 3.0  # of change: whether there are events must not matter
+CHANGES = 4000  # used of a stretch and a lag
+DARK_DN, BRIGHT_DN = 4.0, 230.0  # darker frames may be clipped, brighter ones saturated
+LEAST_DN = 3.0  # of change; a selection by events would bias the result
 OFFSETS = np.array([*np.arange(-24.0, 30.0, 3.0), *np.arange(30.0, 61.0, 6.0)])  # DN
 RATIOS = np.exp(np.linspace(np.log(0.4), np.log(2.5), 13))  # theta_off / theta_on
 BINS = 40  # of the change
 ENOUGH = 1000  # changes
-LEAST_SEEN = 100_000  # pixels times intervals. Of fewer the edges are too few and alike: of 60
-# recordings of 64x64 pixels and 8 intervals half were told 17 DN or more, most by 2 DN of scatter
-FLOOR_DN, SHARE, WIDER = 2.0, 0.35, 1.5  # of the std: of any, of the offset, and of the scatter's
-MOST_LEFT = 0.95  # of the squares: more, and changes foretell no events
-TOO_FAR = 20.0  # DN of std: nothing is told
+LEAST_SEEN = 100_000  # pixels times intervals. Smaller recordings show too few, similar edges: in
+# half of 60 recordings of 64x64 pixels and 8 intervals the offset was 17 DN or more, most with a
+# scatter of only 2 DN
+FLOOR_DN, SHARE, WIDER = 2.0, 0.35, 1.5  # std: its minimum, share of the offset, times the scatter
+MOST_LEFT = 0.95  # share of squares left above which changes do not predict the events
+TOO_FAR = 20.0  # DN of std, from which the offset counts as undetermined
 
 
 class Changes(NamedTuple):
-    """Of pixels between two frames, arrays (N,): before, after: DN; on, off: their events; block:
-    of the image, whose errors are independent."""
+    """Pixels between two frames, arrays (N,). before, after: DN; on, off: event counts; block: of
+    the image (errors of different blocks are independent)."""
 
     before: Array
     after: Array
@@ -47,8 +48,8 @@ class Changes(NamedTuple):
 
 
 def changes(dn: Array, s: Sightings, block: Array, rng: np.random.Generator) -> tuple[Changes, ...]:
-    """Those of each of LAGS in a stretch, of some pixels that are shown. dn: (K + 1, H, W) frames
-    less their noise; block: (H * W,)."""
+    """Changes of a stretch for each of LAGS, of at most CHANGES random visible pixels. dn: (K + 1,
+    H, W) denoised frames; block: (H * W,)."""
     intervals, pixels = s.inner.shape
     place = (s.interval * pixels + s.pixel, s.on)
     sums = [np.concatenate([np.zeros((1, pixels), int), np.bincount(
@@ -71,25 +72,33 @@ def changes(dn: Array, s: Sightings, block: Array, rng: np.random.Generator) -> 
 
 
 def joined(of_stretches: Sequence[tuple[Changes, ...]]) -> tuple[Changes, ...]:
-    """Of each lag, those of all stretches."""
+    """Changes of all stretches, for each lag."""
     return tuple(Changes(*(np.concatenate(c) for c in zip(*some, strict=True)))
                  for some in zip(*of_stretches, strict=True))
 
 
 def offset_by_changes(of_lags: tuple[Changes, ...], seen: int) -> tuple[float, float]:
-    """The offset (DN) that the changes of each of LAGS tell, and its std were it nought (that of
-    another has SHARE of it besides); an infinite one where they tell nothing. seen: pixels times
-    intervals that the changes are of."""
-    told = [_best(c) for c in of_lags if len(c.on) >= ENOUGH] if seen >= LEAST_SEEN else []
-    if len(told) < len(LAGS):
+    """The offset of the frames.
+
+    Args:
+        of_lags: changes for each of LAGS.
+        seen: pixels times intervals from which the changes were taken.
+
+    Returns:
+        Offset in DN, and the std that it would have if it were 0 (Prior.offset_std adds SHARE of
+        the offset); 0 and infinity where it is undetermined.
+    """
+    found = [_best(c) for c in of_lags if len(c.on) >= ENOUGH] if seen >= LEAST_SEEN else []
+    if len(found) < len(LAGS):
         return 0.0, float("inf")
-    offsets, scatter = np.array(told).T
+    offsets, scatter = np.array(found).T
     std = float(np.sqrt(FLOOR_DN**2 + (WIDER * scatter.max()) ** 2 + np.ptp(offsets) ** 2))
     return (float(offsets.mean()), std) if std < TOO_FAR else (0.0, float("inf"))
 
 
 def _best(c: Changes) -> tuple[float, float]:
-    """The offset of the best of OFFSETS and its neighbours, and its scatter over the blocks."""
+    """The best offset, by a parabola through the best of OFFSETS and its neighbours, and its
+    scatter over the blocks."""
     left = np.array([_unexplained(c, offset) for offset in OFFSETS])
     value = np.log(left.sum(1))
     k = int(np.clip(np.argmin(value), 1, len(OFFSETS) - 2))
@@ -107,11 +116,11 @@ def _best(c: Changes) -> tuple[float, float]:
 
 
 def _unexplained(c: Changes, offset: float) -> Array:
-    """Squares (blocks,) of the events' sum that the change leaves, a line in each of BINS, as a
-    share of all of them, at the ratio of the thresholds that leaves least."""
+    """Squared residuals (blocks,) of the net events after regression on the change (a line in each
+    of BINS), as a share of the total, at the best of RATIOS."""
     before, after = (log64(np.maximum(dn + offset, 0.0), "linlog") for dn in (c.before, c.after))
     y = after - before
-    weight = 1.0 / (1.0 + np.minimum(c.on, c.off))  # there and back: the thresholds' mismatch adds
+    weight = 1.0 / (1.0 + np.minimum(c.on, c.off))  # pairs of ON and OFF add mismatch errors
     order = np.argsort(y, kind="stable")
     share = np.cumsum(weight[order])
     part = np.empty(len(y), int)

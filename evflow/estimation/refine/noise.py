@@ -1,10 +1,10 @@
-"""Noise rates from where nothing else happens, and whether they follow from the thresholds.
+"""Noise rates from quiet pixels, and whether they follow Eq. 12.
 
-Events of a moving edge come in company: other pixels near by send the same polarity at about the
-same time. Noise comes alone. A pixel in whose neighbourhood no event of a polarity happens is a
-fair sample of that polarity's noise: whether the pixel itself fires does not enter the choice.
-The wider the neighbourhood, and the stiller the frames have to be, the less signal is left in
-such a sample and the smaller it is; a few `Stratum`s go from one end to the other.
+At a moving edge many neighbouring pixels send the same polarity at about the same time. Noise
+events are isolated. A pixel without events of a polarity in its neighbourhood is an unbiased sample
+of that polarity's noise, as the pixel's own events do not enter the choice. A wider neighbourhood
+and a stricter limit on brightness changes leave less signal in the sample, and fewer pixels; the
+STRATA range from strict to permissive.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ ANY = 1e9  # log units: no limit
 
 @dataclasses.dataclass(frozen=True)
 class Stratum:
-    """size: side of the neighbourhood in pixels; intervals: frame intervals that it spans;
-    in_interval, in_chunk: what the path may range over (log units, 3x3 pixels); climb: how far
-    it may move in the polarity's direction within the chunk (mean of 5x5 pixels, as a drift below
-    a pixel's frame noise still sends events); contamination: the typical share of signal, measured
-    on simulated recordings."""
+    """One rule for quiet pixels.
+
+    size: side of the neighbourhood in pixels; intervals: frame intervals that it spans;
+    in_interval, in_chunk: largest range of the path (log units, over 3x3 pixels); climb: largest
+    movement in the polarity's direction within the chunk (mean of 5x5 pixels, as a drift below a
+    pixel's frame noise still triggers events); contamination: typical share of signal among the
+    events, measured on simulated recordings."""
 
     size: int
     intervals: int
@@ -41,16 +43,17 @@ STRATA = (
     Stratum(9, 1, 0.03, ANY, 0.02, 0.1), Stratum(5, 1, 0.03, ANY, 0.01, 0.15),
     Stratum(9, 3, ANY, ANY, 0.02, 0.25), Stratum(9, 1, ANY, ANY, 0.02, 0.4),
     Stratum(9, 1, ANY, ANY, ANY, 0.8))
-LEAST_PRIOR, MOST_PRIOR = 1.0, 30.0  # events that the network's word on a noise rate is worth
+LEAST_PRIOR, MOST_PRIOR = 1.0, 30.0  # weight of the network's noise rate as a prior, in events
 
-# Of "does the noise follow Eq. 12?": free rates are log-uniform over a factor of a hundred.
+# "Tied" noise follows Eq. 12; free rates are log-uniform over a factor of a hundred.
 FREE_RANGE = np.log(100.0)
-TIED_ODDS = 0.1  # before any data: not more, as it costs where the noise is free
+TIED_ODDS = 0.1  # prior odds; larger ones increase the error where the noise is free
 TIED_ERROR = 0.05  # log units: of the intensity factor
 
 
 def quiet_events(chunk: Chunk, steps: int) -> np.ndarray:
-    """(strata, 2 polarities, 2): events and pixel seconds of the quiet pixels of one chunk."""
+    """(strata, 2 polarities, 2): events and pixel seconds of the quiet pixels of one chunk. steps:
+    fine steps per interval."""
     counts = np.asarray(chunk.recorded.counts, np.float32)
     shape = counts.shape[2:]
     inner = chunk.path[1:].reshape(len(chunk.dt_s), steps, *shape)
@@ -77,7 +80,7 @@ def _widest(span: np.ndarray) -> np.ndarray:
 
 
 def _climbs(frames: np.ndarray) -> np.ndarray:
-    """(2, H, W): the farthest that smoothed frames (K+1, H, W) rise, and that they fall."""
+    """(2, H, W): largest rise and largest fall of the smoothed frames (K+1, H, W)."""
     smooth = np.stack([cv2.blur(np.ascontiguousarray(f, np.float32), (5, 5)) for f in frames])
     rise = (smooth - np.minimum.accumulate(smooth)).max(0)
     fall = (np.maximum.accumulate(smooth) - smooth).max(0)
@@ -99,15 +102,15 @@ def _over_time(near: np.ndarray) -> np.ndarray:
 
 
 def stratum_rates(quiet: np.ndarray, prior: np.ndarray, relative_std: np.ndarray) -> np.ndarray:
-    """Rates (strata, 2) in Hz, each held by the network's estimate `prior` (2,) with its relative
-    std, as if it had seen 1/std^2 events."""
+    """Rates (strata, 2) in Hz, each combined with the network's `prior` (2,) as with 1/std² events
+    (std relative, (2,))."""
     worth = np.clip(relative_std**-2.0, LEAST_PRIOR, MOST_PRIOR)
     return (quiet[..., 0] + worth) / (quiet[..., 1] + worth / prior)
 
 
 def combined_rate(quiet: np.ndarray, prior: np.ndarray, relative_std: np.ndarray) -> np.ndarray:
-    """Noise rates (2,) in Hz: the strata's, weighed by how many events each has and how much
-    signal it usually lets through."""
+    """Noise rates (2,) in Hz: log mean over the strata, weighted by their event counts and typical
+    contamination. Arguments as of `stratum_rates`."""
     rates = stratum_rates(quiet, prior, relative_std)
     contamination = np.array([[s.contamination] for s in STRATA])
     weight = 1.0 / (1.0 / (quiet[..., 0] + 1.0) + contamination**2)
@@ -115,22 +118,23 @@ def combined_rate(quiet: np.ndarray, prior: np.ndarray, relative_std: np.ndarray
 
 
 def rate_error(quiet: np.ndarray) -> np.ndarray:
-    """Relative error (2,) of the combined rates: counts, and a tenth for what signal is left."""
+    """Relative error (2,) of the combined rates: of the counts, and a tenth for residual signal."""
     return np.sqrt(1.0 / (quiet[:, :, 0].max(0) + 1.0) + 0.1**2)
 
 
 def tied_rates(
     theta: np.ndarray, theta_std: np.ndarray, factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Noise rates (2,) in Hz that Eq. 12 foretells at theta (2,), and their relative error."""
+    """Noise rates (2,) in Hz by Eq. 12 at theta (2,), and their relative error. factor: intensity
+    factor of Eq. 12."""
     rates = np.asarray(noise_of_threshold(theta.astype(np.float32)), np.float64) * factor
     slope = 90.0 / np.maximum(90.0 * theta - 5.0, 4.0) * (theta > 0.1)  # -dlog R/dtheta
     return rates, np.sqrt((slope * theta_std) ** 2 + TIED_ERROR**2)
 
 
 def tied_probability(away: np.ndarray, error: np.ndarray) -> float:
-    """Probability that the noise follows Eq. 12: away (2,) log rates less the foretold ones,
-    error (2,) of that difference; against rates that are free of the thresholds."""
+    """Probability that the noise follows Eq. 12, against rates independent of the thresholds. away:
+    (2,) log rates minus those of Eq. 12; error: (2,) of that difference."""
     log_odds = np.log(TIED_ODDS) + (
         -0.5 * (away / error) ** 2 - np.log(error * np.sqrt(2 * np.pi) / FREE_RANGE)).sum()
     return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
@@ -140,13 +144,24 @@ def with_tie(
     theta: np.ndarray, theta_std: np.ndarray, log_eta: np.ndarray, log_std: np.ndarray,
     factor: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """log noise rates (2,) and their std: a mixture of "the noise follows Eq. 12 at these
-    thresholds (2,)" and "it is free", each as probable as the measured rates make it."""
+    """Shrink log noise rates towards Eq. 12 where they are consistent with it.
+
+    The result is the mean and std of a mixture of "tied to the thresholds by Eq. 12" and "free",
+    weighted by their posterior probability.
+
+    Args:
+        theta, theta_std: (2,) thresholds.
+        log_eta, log_std: (2,) measured log rates.
+        factor: intensity factor of Eq. 12.
+
+    Returns:
+        Log noise rates (2,) and their std.
+    """
     rates, error = tied_rates(theta, theta_std, factor)
-    foretold = np.log(rates)
-    tied = tied_probability(log_eta - foretold, np.hypot(error, log_std))
+    predicted = np.log(rates)
+    tied = tied_probability(log_eta - predicted, np.hypot(error, log_std))
     precision = error**-2.0 + log_std**-2.0
-    both = (foretold * error**-2.0 + log_eta * log_std**-2.0) / precision
+    both = (predicted * error**-2.0 + log_eta * log_std**-2.0) / precision
     variance = (tied / precision + (1 - tied) * log_std**2
                 + tied * (1 - tied) * (both - log_eta) ** 2)
     return tied * both + (1 - tied) * log_eta, np.sqrt(variance)

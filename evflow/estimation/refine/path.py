@@ -1,8 +1,8 @@
 """The brightness path between frames: chunks of frames -> fine log frames, on the host.
 
-The frames of a recording are 10-50 ms apart; motion-compensated frames (OpenCV DIS flow) fill
-the gaps, so that what moves between them crosses the pixels in between. A chunk is the unit of
-the refinement: its pixels start anew, so chunks are independent and memory stays bounded.
+The frames of a recording are 10-50 ms apart. Motion-compensated interpolation (OpenCV DIS flow)
+fills the gaps, so that a moving edge crosses the pixels in between. A chunk is the unit of the
+refinement: its pixels start anew, so chunks are independent and memory stays bounded.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from evflow.estimation.refine.denoise import denoised
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
-from evflow.estimation.refine.readouts import beside_readouts
+from evflow.estimation.refine.readouts import without_readouts
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_search import Found, find
 from evflow.estimation.refine.sightings import Sightings, no_sightings, sight
@@ -42,7 +42,7 @@ from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
 from evflow.types import Events, Recording
 
 STEPS = 16  # fine frames per interval: motion of 16 px per frame still moves 1 px a step
-STRETCHES = 3  # that tell the photoreceptor
+STRETCHES = 3  # used in the search for the photoreceptor
 
 Box = tuple[slice, slice]
 WHOLE: Box = (slice(None), slice(None))
@@ -54,12 +54,13 @@ class Chunk:
     """One stretch of a recording, K frame intervals.
 
     path: (K * steps + 1, H, W) float32 log intensity, the frames at every `steps`-th;
-    bright: (H, W) bool, pixels whose frames are neither near black nor saturated; dt_s: (K,)
-    interval lengths; motion_px: (K,) fast motion per interval; recorded: the events' Trace;
-    evidence: about each pixel's thresholds; quiet: (4, H, W) events in intervals in which the
-    pixel's path stays within QUIET, the seconds and number of these, and how many had events.
-    Intervals with a saturated or black frame are in none. sightings: the events beside the path; of
-    large sensors there are none before a part is taken. box: rows and columns of the sensor.
+    bright: (H, W) bool, pixels whose frames are neither near black nor saturated;
+    dt_s: (K,) interval lengths; motion_px: (K,) fast motion per interval;
+    recorded: the events' Trace; evidence: about each pixel's thresholds;
+    quiet: (4, H, W) over intervals in which the pixel's path stays within QUIET and no frame is
+    saturated or black: events, seconds, number of intervals, number of intervals with events;
+    sightings: the events beside the path; empty for large sensors until `simulated_part`;
+    box: rows and columns of the sensor.
     """
 
     path: np.ndarray
@@ -73,15 +74,19 @@ class Chunk:
     box: Box = WHOLE
 
 
-QUIET = 0.05  # log units: less than the smallest threshold of any use
-DARK_DN = 15.0  # below, half a DN of noise is .03 in log
+QUIET = 0.05  # log units: below the thresholds of usable cameras
+DARK_DN = 15.0  # below it, half a DN of noise is .03 log units
 
 
 def refinement_chunks(
     recording: Recording, pairs: Iterable[tuple[int, int]]
 ) -> list[Chunk]:
-    """The stretches of a recording that the refinement simulates, of the windows between the
-    pairs of frames (first, last)."""
+    """The chunks of a recording that the refinement simulates.
+
+    Args:
+        recording: with frames.
+        pairs: (first, last) frames of the windows to use.
+    """
     runs = plan_runs(recording, pairs)
     return [make_chunk(recording, run) for run in plan_chunks(recording, runs)]
 
@@ -90,9 +95,17 @@ def make_chunk(
     recording: Recording, run: Sequence[int], steps: int = STEPS, seen_by: Photoreceptor = IDEAL,
     noise_dn: float = 0.0, *, first: bool | None = None, film: Film | None = None,
 ) -> Chunk:
-    """Interpolate the frames of a run of intervals, put them through what its pixels see them by,
-    and count its events. first: whether the camera's recording begins there, if that is not with
-    the first frame. film: of the run, where it is at hand; of no use afterwards."""
+    """The chunk of a run of frame intervals: interpolated frames, seen by the pixels, and events.
+
+    Args:
+        recording: with frames.
+        run: consecutive intervals i (frame i to i + 1).
+        steps: fine frames per interval.
+        seen_by: the pixels' photoreceptor and the frames' offset and delay.
+        noise_dn: std of the frames' noise, for denoising.
+        first: whether the camera's recording begins here; by default, whether run[0] is 0.
+        film: the interpolated run, if available; its arrays are overwritten.
+    """
     film = film or interpolated(recording, run, steps, noise_dn)
     give_back()
     times = film.times_us + round(seen_by.delay_s * 1e6)
@@ -117,7 +130,7 @@ def _evidence_by_bands(
     events: Events, times: np.ndarray, path: np.ndarray, shown: np.ndarray, steps: int, *,
     first: bool,
 ) -> PixelEvidence:
-    """`evidence_of` all events, of a few rows at a time: what is made on the way is large."""
+    """`evidence_of` all events, a few rows at a time to bound the memory of intermediates."""
     whole = PixelEvidence.nothing(path.shape[1:])
     if first:
         whole = dataclasses.replace(whole, start=whole.start.copy())
@@ -132,8 +145,14 @@ def _evidence_by_bands(
 
 
 def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -> Chunk:
-    """What is simulated of a chunk: all of it, or of large sensors the busiest part, as large as a
-    DAVIS346. The camera's parameters are alike everywhere."""
+    """The part of a chunk to simulate: all of it; of a large sensor the box of a DAVIS346's size
+    with the most events, as the camera's parameters are the same everywhere.
+
+    Args:
+        chunk: to cut.
+        place: its recording and run.
+        seen_by: as of `make_chunk`.
+    """
     height, width = chunk.bright.shape
     if height * width <= LARGE:
         return chunk
@@ -150,15 +169,15 @@ def simulated_part(chunk: Chunk, place: Place, seen_by: Photoreceptor = IDEAL) -
     seen = chunk.sightings.seen.reshape(-1, height, width)[:, *box]
     whole = chunk.evidence
     evidence = PixelEvidence(*(a[:, *box] for a in (whole.equations, whole.bounds, whole.start)))
-    # Copies: a part that is kept would keep the whole.
+    # Copies, since a view of a part would keep the whole in memory.
     return Chunk(path, chunk.bright[box].copy(), chunk.dt_s, chunk.motion_px,
                  trace_of_events(events, times, steps), evidence, chunk.quiet[:, *box].copy(),
                  sight(events, times, path, steps, seen), box)
 
 
 def without_evidence(chunk: Chunk) -> Chunk:
-    """A chunk that is kept to be simulated: what it says of its pixels is in the sums. Of a large
-    sensor, whose maps take most of the memory, the path is put aside meanwhile."""
+    """The chunk with empty per-pixel evidence, to keep for simulation once that is in the sums. The
+    path of a large sensor, which takes most of the memory, is moved to a file."""
     large = chunk.box != WHOLE
     return dataclasses.replace(chunk, evidence=PixelEvidence.nothing((0, 0)),
                                path=put_aside(chunk.path) if large else chunk.path)
@@ -166,9 +185,9 @@ def without_evidence(chunk: Chunk) -> Chunk:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Film:
-    """The frames of a run and what lies between them. frames: (K + 1, H, W) DN; dn: (K * steps +
-    1, H, W) DN; times_us: (K + 1,); dt_s: (K,) interval lengths; motion_px: (K,) fast motion;
-    shown: (K + 1, H, W) bool, frames that are neither saturated nor black."""
+    """Frames of a run and interpolated frames. frames: (K + 1, H, W) DN; dn: (K * steps + 1, H, W)
+    DN; times_us: (K + 1,); dt_s: (K,) interval lengths; motion_px: (K,) fast motion; shown:
+    (K + 1, H, W) bool, neither saturated nor black."""
 
     frames: np.ndarray
     dn: np.ndarray
@@ -182,21 +201,22 @@ Films = dict[tuple[int, ...], Film]  # by `of_place`
 
 
 def of_place(recording: Recording, run: Sequence[int]) -> tuple[int, ...]:
-    """By which a film of these intervals is found again, while the recording is there."""
+    """Key of the film of these intervals; valid while the recording object exists."""
     return id(recording), *run
 
 
 def interpolated(
     recording: Recording, run: Sequence[int], steps: int = STEPS, noise_dn: float = 0.0
 ) -> Film:
-    """The frames of a run of intervals, less their noise, filled up by optical flow."""
+    """The frames of a run of intervals, denoised (std noise_dn), with `steps` - 1 frames
+    interpolated by optical flow in each interval."""
     frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
     times = recording.frame_times[run[0]:run[-1] + 2]
     clean = [denoised(frame, noise_dn) for frame in frames]
     dn, motion = np.empty((len(run) * steps + 1, *clean[0].shape), np.float32), []
     dn[::steps] = clean
     for k, interval in enumerate(intervals(zip(clean, times.tolist(), strict=True), jerk=False)):
-        # not sharp: the fusion network was trained on that contrast, another shifts its thresholds
+        # not sharp: the fusion network was trained on this contrast; sharp frames bias thresholds
         between = interval.at(np.arange(1, steps) / steps, sharp=False)
         for row, picture in zip(dn[k * steps + 1:], between, strict=False):
             row[:] = picture
@@ -207,8 +227,8 @@ def interpolated(
 
 
 def as_seen(film: Film, seen_by: Photoreceptor, out: np.ndarray | None = None) -> np.ndarray:
-    """The path (K * steps + 1, H, W) in log units that a photoreceptor makes of a film. out: where
-    it is put, film.dn itself where that is of no more use. Large sensors go band by band."""
+    """The path (K * steps + 1, H, W) in log units behind a photoreceptor. out: array for the result
+    of large sensors, which are processed in bands; film.dn if that may be overwritten."""
     steps = (len(film.dn) - 1) // len(film.dt_s)
     dt_s = np.repeat(film.dt_s / steps, steps).astype(np.float32)
     values = [np.float32(v) for v in (seen_by.offset_dn, max(seen_by.tau_s, FAST))]
@@ -226,28 +246,36 @@ def as_seen(film: Film, seen_by: Photoreceptor, out: np.ndarray | None = None) -
     return out
 
 
-_seen, _log = jax.jit(seen_path), jax.jit(lin_log)  # one program each, not one an operation
+_seen, _log = jax.jit(seen_path), jax.jit(lin_log)
 
 
-def telling(places: Sequence[Place]) -> list[Place]:
-    """Those of the runs of intervals, each of a recording, that tell the photoreceptor."""
+def receptor_places(places: Sequence[Place]) -> list[Place]:
+    """At most STRETCHES of the places, evenly spread, for the search for the photoreceptor."""
     if not places:
         return []
-    told = spread([len(run) for _, run in places], most_simulated(places[0][0].events.size))
-    chosen = np.unique(np.linspace(0, len(told) - 1, min(STRETCHES, len(told))).round())
-    return [places[told[k]] for k in chosen.astype(int)]
+    longest = spread([len(run) for _, run in places], most_simulated(places[0][0].events.size))
+    chosen = np.unique(np.linspace(0, len(longest) - 1, min(STRETCHES, len(longest))).round())
+    return [places[longest[k]] for k in chosen.astype(int)]
 
 
 def receptor_sample(
     places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None
 ) -> Sample | None:
-    """What a few of the runs of intervals, each of a recording, say of the photoreceptor; None
-    where too little happens. films: where theirs are kept, of few and small ones."""
+    """Pixels and events for the search for the photoreceptor.
+
+    Args:
+        places: runs of frame intervals, of which `receptor_places` are used.
+        noise_dn: std of the frames' noise.
+        films: cache that receives the interpolated runs, if these are few and small.
+
+    Returns:
+        The sample; None with too few events.
+    """
     def parts() -> Iterator[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]]:
-        for recording, run in telling(places):
+        for recording, run in receptor_places(places):
             film = interpolated(recording, run, STEPS, noise_dn)
             s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
-            s, disturbed = beside_readouts(s, film.times_us, bunch(recording))
+            s, disturbed = without_readouts(s, film.times_us, bunch(recording))
             if films is not None and len(places) <= STRETCHES and film.dn[0].size <= LARGE:
                 films[of_place(recording, run)] = film
             yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s, disturbed
@@ -260,8 +288,8 @@ def receptor_sample(
 def find_photoreceptor(
     places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None
 ) -> Found | None:
-    """What the pixels of a camera see the frames by, from runs of intervals; None where too little
-    happens. films: as of `receptor_sample`."""
+    """The photoreceptor of a camera and the offset and delay of its frames; None with too few
+    events. Arguments as of `receptor_sample`."""
     data = receptor_sample(places, noise_dn, films)
     return find(data) if data is not None else None
 

@@ -1,11 +1,11 @@
-"""Each pixel's thresholds, from the path at the pixel's own events and from those it did not send.
+"""Each pixel's thresholds, from the path at its events and from changes without events.
 
-At the instant of an event the memory equals the brightness, so over the events i of a pixel the
-path at t_i is theta_on a_i - theta_off b_i plus a constant, a and b counting its events: a linear
-regression without quantisation noise, whose only error is the path's; the contrast that the path
-lacks is measured where most pixels tell. Its normal equations add over chunks; the camera's
-summary and mismatch are the prior, bounds.py adds what no event answered and start.py what the
-memory was at the beginning.
+At an event the memory equals the brightness, so at the events i of a pixel the path is
+theta_on a_i - theta_off b_i plus a constant, with a and b counting its events. This is a linear
+regression without quantisation noise; its only error is the path's. The gain (contrast that the
+interpolated path keeps) is measured from the pixels whose events determine it. The normal equations
+add over chunks. The camera's summary and mismatch are the prior; bounds.py adds bounds from changes
+without events, start.py the memory at the beginning.
 """
 
 from __future__ import annotations
@@ -16,19 +16,31 @@ import numpy as np
 
 from evflow.camera import THETA_MIN, Summary
 from evflow.estimation.refine.bounds import NOTHING, bounded, unanswered
-from evflow.estimation.refine.sightings import PATH_ERROR, Sightings, counted, sight, trusted
-from evflow.estimation.refine.start import Belief, anchored, remembered, running_on, since_start
+from evflow.estimation.refine.sightings import (
+    PATH_ERROR,
+    Sightings,
+    counts_so_far,
+    path_weights,
+    sight,
+)
+from evflow.estimation.refine.start import (
+    Belief,
+    fresh_probability,
+    since_start,
+    with_fresh_start,
+    with_running_start,
+)
 from evflow.types import Events
 
 Array = np.ndarray
 
-PRIOR_COUNT = 5.0  # events' worth of belief in PATH_ERROR, against the residuals seen
-SHARED_ERROR = 2.2  # errors of neighbouring events go together: variance is this much larger
+PRIOR_COUNT = 5.0  # weight of PATH_ERROR as a prior of the error variance, in events
+SHARED_ERROR = 2.2  # variance factor, as errors of consecutive events are correlated
 LEAST_VARIANCE = 0.022**2  # log units squared: a path that misses all motion leaves no residuals
 PASSES = 3
-KNOWN = 0.15  # share of the prior's variance that is left
-FEW_TO_MOST = (0.5, 0.9)  # share of pixels: from where their gain is used, and fully
-GAINS = (0.7, 1.1)  # beyond, the path shows something else
+KNOWN = 0.15  # share of the prior's variance left, below which a pixel is used for the gain
+FEW_TO_MOST = (0.5, 0.9)  # shares of such pixels at which the gain is used not at all, and fully
+GAINS = (0.7, 1.1)  # a gain outside of these is not one of contrast, and is ignored
 GAIN_SPREAD = 0.06  # of the gain from pixel to pixel: measured on simulated recordings of 8 s
 LEAST_SIGMA = 0.01  # log units
 START_ERROR = 0.05  # log units, of the path from the first frame to another
@@ -36,9 +48,10 @@ START_ERROR = 0.05  # log units, of the path from the first frame to another
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PixelEvidence:
-    """equations: (7, H, W) sums of weighted aa, ab, bb, ay, by, yy about their means, and the
-    number of events. bounds: (3, H, W), see `unanswered`. start: (6, H, W), see `since_start`.
-    Evidence of several chunks adds."""
+    """Per-pixel statistics; those of several chunks add.
+
+    equations: (7, H, W) sums of weighted aa, ab, bb, ay, by, yy about their means, and the number
+    of events; bounds: (3, H, W), see `unanswered`; start: (6, H, W), see `since_start`."""
 
     equations: Array
     bounds: Array
@@ -57,7 +70,7 @@ class PixelEvidence:
 
 
 def _no_start(shape: tuple[int, int]) -> Array:
-    """What says nothing of a start, of no memory: to be read only."""
+    """`since_start` of no events, a read-only view."""
     values = np.array([0.0, 0.0, 0.0, 0.0, NOTHING, NOTHING])
     return np.broadcast_to(values[:, None, None], (6, *shape))
 
@@ -66,16 +79,23 @@ def pixel_evidence(
     events: Events, times_us: Array, path: Array, steps: int, seen: Array | None = None, *,
     first: bool = False,
 ) -> PixelEvidence:
-    """What the events between frames at times_us (K + 1,) say about each pixel, given the path
-    (K*steps + 1, H, W) of its log brightness. seen: (K + 1, H, W) bool, frames that show what
-    the pixel saw; events of intervals that are not shown are not used. first: whether the
-    recording begins with these frames."""
+    """Evidence of a chunk's events about each pixel.
+
+    Args:
+        events: of the recording.
+        times_us: (K + 1,) of the frames.
+        path: (K*steps + 1, H, W) log brightness.
+        steps: fine steps per interval.
+        seen: (K + 1, H, W) bool, frames that are neither saturated nor black; events beside
+            others are not used.
+        first: whether the recording begins with these frames.
+    """
     return evidence_of(sight(events, times_us, path, steps, seen), first=first)
 
 
 def evidence_of(s: Sightings, *, first: bool = False) -> PixelEvidence:
-    """The same of events that are placed beside the path already."""
-    weight = trusted(s)
+    """`pixel_evidence` of sightings."""
+    weight = path_weights(s)
     return PixelEvidence(_equations(s, weight), unanswered(s),
                          since_start(s, weight) if first else _no_start(s.shape))
 
@@ -84,7 +104,7 @@ def _equations(s: Sightings, weight: Array) -> Array:
     out = np.zeros((7, s.frames.shape[1]))
     if len(s.pixel) == 0:
         return out.reshape(7, *s.shape)
-    group, a, b = counted(s)
+    group, a, b = counts_so_far(s)
 
     def total(v: Array) -> Array:
         return np.bincount(group, v)
@@ -99,21 +119,31 @@ def _equations(s: Sightings, weight: Array) -> Array:
 
 
 def pixel_posterior(evidence: PixelEvidence, summary: Summary) -> tuple[Array, Array]:
-    """theta (2, H, W) and its std, given the camera: N(median, sigma²) per pixel times the
-    regression, whose error variance each pixel learns from its own residuals, within the bounds;
-    the mean over what the memory may have been at the start. What the path lacks of the
-    brightness' contrast is alike in all pixels, but for GAIN_SPREAD."""
+    """Posterior of each pixel's thresholds.
+
+    The prior is N(median, sigma²) of the camera. The regression's error variance is estimated per
+    pixel from its residuals; bounds from changes without events truncate the result. It is a
+    mixture over the two cases of the memory at the start (start.py). The path's gain is common to
+    all pixels, up to GAIN_SPREAD.
+
+    Args:
+        evidence: summed over chunks.
+        summary: of the camera.
+
+    Returns:
+        theta (2, H, W), ON and OFF, and its std, float32.
+    """
     median = np.array([float(summary.theta_on), float(summary.theta_off)])
     sigma = np.maximum([float(summary.sigma_on), float(summary.sigma_off)], LEAST_SIGMA)
     precision, unanswered = sigma**-2.0, evidence.bounds[:2]
     running = _regression(evidence.equations, median, precision)
     belief = bounded(running.theta, running.covariance, unanswered)
-    belief = running_on(*belief, evidence.bounds[2], evidence.equations[6] > 0)
+    belief = with_running_start(*belief, evidence.bounds[2], evidence.equations[6] > 0)
     mean, variance = _with_gain_error(*belief, precision)
-    error, chance = remembered(evidence.start, running, median)
+    error, chance = fresh_probability(evidence.start, running, median)
     if chance.any():
         known = _regression(
-            anchored(evidence.equations, evidence.start, error), median, precision)
+            with_fresh_start(evidence.equations, evidence.start, error), median, precision)
         belief = bounded(known.theta, known.covariance, unanswered)
         belief = bounded(*belief, evidence.start[4:], float(np.hypot(START_ERROR, error)))
         mean, variance = _either(chance, _with_gain_error(*belief, precision), (mean, variance))
@@ -123,23 +153,23 @@ def pixel_posterior(evidence: PixelEvidence, summary: Summary) -> tuple[Array, A
 def _either(
     chance: Array, one: tuple[Array, Array], other: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Mean and variance of what is `one` with a chance (H, W), else the `other`."""
+    """Mean and variance of a mixture: `one` with probability `chance` (H, W), else `other`."""
     mean = chance * one[0] + (1 - chance) * other[0]
     variance = [v + (m - mean) ** 2 for m, v in (one, other)]
     return mean, chance * variance[0] + (1 - chance) * variance[1]
 
 
 def _with_gain_error(mean: Array, covariance: Array, precision: Array) -> tuple[Array, Array]:
-    """Mean and variance (2, H, W), with the error that gains leave in what was learned."""
+    """Mean and variance (2, H, W), including the spread of the gain from pixel to pixel."""
     variance = np.stack([covariance[0, 0], covariance[1, 1]])
     learned = 1.0 - variance * precision[:, None, None]
     return mean, variance + (GAIN_SPREAD * mean * learned) ** 2
 
 
 def _regression(equations: Array, median: Array, precision: Array) -> Belief:
-    """What the events say, before bounds, given N(median, 1 / precision)."""
+    """The belief from prior N(median, 1 / precision) and events, without bounds."""
     aa, ab, bb, ay, by, yy, count = equations
-    gain, theta = 1.0, median  # from the regression a path without motion could be explained
+    gain, theta = 1.0, median  # a start at the regression's theta would fit a path without motion
     for _ in range(PASSES):
         on, off = gain * theta  # on the path's scale
         residual = (yy - 2 * on * ay - 2 * off * by + on**2 * aa + off**2 * bb
@@ -160,10 +190,9 @@ def _inverse(a: Array, b: Array, c: Array) -> Array:
 
 
 def _gain(equations: Array, covariance: Array, median: Array, precision: Array) -> float:
-    """How much of the brightness' contrast the path keeps, as frames filled in by optical flow are
-    blurred: what the regression of a pixel gives over the camera's median, the median over
-    pixels that know their thresholds. Where those are few they have low thresholds, and do not
-    tell."""
+    """Share of the contrast that the path keeps, as interpolated frames are blurred: a pixel's
+    regression relative to the camera's median, the median over pixels whose events determine their
+    thresholds. If such pixels are few they are a biased sample with low thresholds; then 1."""
     aa, ab, bb, ay, by = equations[:5]
     u, v = np.einsum("i,ij...->j...", median * precision, covariance)
     known = np.maximum(covariance[0, 0] * precision[0], covariance[1, 1] * precision[1]) < KNOWN

@@ -1,9 +1,10 @@
-"""Where noise could have been: a chunk's events, random instants, and what surrounds each.
+"""Features of a chunk's events and of random points, for separating noise from signal.
 
-Noise is a Poisson process whatever the signal does, so what surrounds an event of it (itself left
-out) is what surrounds a random pixel at a random instant (Mecke's formula). Signal comes in
-company of its polarity, while the path moves its way, a threshold's worth of change after the
-pixel's last event. `surroundings` puts this in numbers, for events and random points alike.
+Noise is a Poisson process independent of the signal, so the surroundings of a noise event (without
+the event itself) are distributed as those of a random pixel at a random time (Mecke's formula).
+Signal events have neighbours of their polarity, come while the path moves in their direction, and
+about one threshold of change after the pixel's last event. `surroundings` computes such features
+for events and random points alike.
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ Array = np.ndarray
 
 # Neighbourhoods: side in pixels and number of fine steps, both odd.
 BOXES = ((3, 1), (5, 3), (9, 9), (9, 33), (17, 17), (1, 3), (1, 9), (1, 33))
-NEAR, MOST_NEAR = BOXES[1], 1.0  # where more events of a polarity are near, nothing is told of
-# its noise: held-out recordings lose a fifth of their accuracy if such points are kept
-SPANS = (1, 4, 8)  # fine steps before and after, over which the path climbs
-MOST_CLIMB, MOST_AROUND = 3.0, 5.0  # thresholds: of a pixel's climb, of the widest of 3x3
+# Points with more events of their polarity nearby are not used: with them, accuracy on held-out
+# recordings falls by a fifth.
+NEAR, MOST_NEAR = BOXES[1], 1.0
+SPANS = (1, 4, 8)  # fine steps before and after, for the path's climb
+MOST_CLIMB, MOST_AROUND = 3.0, 5.0  # in thresholds: limits of a pixel's climb, and of that in 3x3
 RANDOM_POINTS = 4096  # per chunk and polarity
 MOST_EVENTS = 8192  # per chunk and polarity; more are thinned
 STILL = 0.02  # log units: added to the path's range before its logarithm
@@ -33,9 +35,9 @@ FEATURES = 2 * len(BOXES) + len(SPANS) + 8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Points:
-    """Of one polarity. features: (N, FEATURES) float32; event: (N,) the event's number among the
-    sightings, -1 of a random point; density: (N,) random points per pixel second, divided by the
-    share of events that were kept."""
+    """Points of one polarity. features: (N, FEATURES) float32; event: (N,) number of the event
+    among the sightings, -1 for a random point; density: (N,) random points per pixel second,
+    divided by the share of events that were kept."""
 
     features: Array
     event: Array
@@ -44,8 +46,8 @@ class Points:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Places:
-    """Of N points of one polarity: pixel; position in fine steps; event, the event's number
-    among the sightings, -1 of a random point."""
+    """Places of N points of one polarity. pixel: flat index; position: in fine steps; event: number
+    of the event among the sightings, -1 for a random point."""
 
     pixel: Array
     position: Array
@@ -64,7 +66,14 @@ class _Places:
 
 
 def chunk_points(chunk: Chunk, theta: Array, steps: int, seed: int) -> list[Points]:
-    """ON and OFF points of the pixels in use; theta (2,): the camera's thresholds."""
+    """ON and OFF points of a chunk's bright pixels.
+
+    Args:
+        chunk: with sightings.
+        theta: (2,) thresholds of the camera.
+        steps: fine steps per interval.
+        seed: of the random points, and of the choice of events where there are too many.
+    """
     s, (k, rng) = chunk.sightings, (len(chunk.dt_s), np.random.default_rng(seed))
     table = _cumulated(s, k * steps, steps)
     wide = np.stack([cv2.dilate(np.ascontiguousarray(i.reshape(s.shape)), np.ones((5, 5), np.uint8))
@@ -72,7 +81,7 @@ def chunk_points(chunk: Chunk, theta: Array, steps: int, seed: int) -> list[Poin
     found = []
     for side, on in enumerate((True, False)):
         events, random = _candidates(s, k * steps, steps, on, rng)
-        events, random = (p[_undecided(p, chunk.bright, table[side])] for p in (events, random))
+        events, random = (p[_isolated(p, chunk.bright, table[side])] for p in (events, random))
         kept = min(1.0, MOST_EVENTS / max(len(events.pixel), 1))
         events = events[rng.random(len(events.pixel)) < kept]
         pixel, position, event = (np.concatenate([getattr(p, name) for p in (events, random)])
@@ -96,8 +105,8 @@ def _candidates(
                     rng.uniform(0, last, RANDOM_POINTS), np.full(RANDOM_POINTS, -1), on, width))
 
 
-def _undecided(p: _Places, bright: Array, table: Array) -> Array:
-    """(N,) bool: pixels in use with little company of the same polarity near."""
+def _isolated(p: _Places, bright: Array, table: Array) -> Array:
+    """(N,) bool: points of bright pixels with at most MOST_NEAR events of their polarity nearby."""
     return bright.ravel()[p.pixel] & (_company(table, p, NEAR) - (p.event >= 0) <= MOST_NEAR)
 
 
@@ -108,7 +117,7 @@ def _cumulated(s: Sightings, length: int, steps: int) -> Array:
     order = np.argsort(key, kind="stable")
     pixel, ends = s.pixel[order], np.searchsorted(key[order], np.arange(2 * length + 1))
     out = np.zeros((2, length + 1, s.shape[0] + 1, s.shape[1] + 1), np.int32)
-    # Image by image, which stays in the cache: a fifth of the time of sums over the whole table.
+    # Image by image, which stays in the cache: five times as fast as sums over the whole table.
     for k, (first, last) in enumerate(itertools.pairwise(ends)):
         side, at = divmod(k, length)
         counts = np.bincount(pixel[first:last], minlength=s.shape[0] * s.shape[1])
@@ -134,7 +143,7 @@ def _company(table: Array, p: _Places, box: tuple[int, int]) -> Array:
                      np.minimum(at + half + 1, most - 1) * stride))
     total, flat = np.zeros(len(p.pixel), np.int32), table.reshape(-1)
     for (i, t), (j, y) in itertools.product(enumerate(ends[0]), enumerate(ends[1])):
-        row = t + y  # one gather a corner from the flat table: three times as fast as by 3 indices
+        row = t + y  # a flat gather per corner is three times as fast as three indices
         difference = flat.take(row + ends[2][1]) - flat.take(row + ends[2][0])
         total += difference if i == j else -difference
     return total.astype(np.float32)
@@ -143,9 +152,20 @@ def _company(table: Array, p: _Places, box: tuple[int, int]) -> Array:
 def surroundings(
     chunk: Chunk, p: _Places, table: Array, wide: Array, unit: float, steps: int
 ) -> Array:
-    """Features (N, FEATURES) of points: company of the same and of the other polarity; how far
-    the path climbs the polarity's way, here and in 3x3 pixels, in thresholds `unit`; its range
-    within the interval, here and in 5x5 pixels (wide, (K, H, W)); the pixel's own events."""
+    """Features (N, FEATURES) of points.
+
+    Counts of neighbouring events of the same and of the other polarity; the path's climb in the
+    polarity's direction in units of the threshold, at the pixel and the largest in 3x3 pixels; its
+    range within the interval, at the pixel and in 5x5 pixels; the pixel's previous and next event.
+
+    Args:
+        chunk: with sightings.
+        p: the points.
+        table: of `_cumulated`.
+        wide: (K, H, W) range of the path in 5x5 pixels.
+        unit: threshold, log units.
+        steps: fine steps per interval.
+    """
     path, side, sign = chunk.path, 0 if p.on else 1, 1.0 if p.on else -1.0
     step, y, x = p.at
     columns = []

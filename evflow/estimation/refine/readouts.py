@@ -1,7 +1,7 @@
-"""Events of a frame's readout among those of a pixel: they part what came before from what follows.
+"""Remove events caused by a frame's readout (recordings/bunches.py) from a pixel's events.
 
-Such an event (recordings/bunches.py) is no change of light, and says neither how far brightness
-moved nor where it was; yet the pixel stores something at it, so that its constant is another after.
+Such an event is no change of light and carries no brightness. Yet the pixel resets its memory at
+it, so the regression's constant of a pixel differs before and after.
 """
 
 from __future__ import annotations
@@ -16,11 +16,16 @@ from evflow.recordings.bunches import Bunch
 Array = np.ndarray
 
 
-def beside_readouts(
+def without_readouts(
     s: Sightings, times_us: Array, found: Bunch | None
 ) -> tuple[Sightings, Array]:
-    """The sightings that do not come with a readout, and (N,) how many of their pixel's events
-    that do came before each. times_us: (K + 1,) of the frames."""
+    """Sightings without readout events, and (N,) the number of readout events before each.
+
+    Args:
+        s: all sightings of a stretch.
+        times_us: (K + 1,) of the frames.
+        found: when readout events come, relative to a frame; None: there are none.
+    """
     if found is None:
         return s, np.zeros(len(s.pixel), int)
     length = np.diff(times_us)[s.interval]

@@ -1,4 +1,4 @@
-"""What the search for a photoreceptor looks at: some pixels of some stretches, and their events."""
+"""Data of the search for a photoreceptor: some pixels of some stretches, and their events."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import numpy as np
 
 from evflow.estimation.refine.net_changes import Changes, changes, joined, offset_by_changes
 from evflow.estimation.refine.receptor_noise import noise_rates
-from evflow.estimation.refine.sightings import Sightings, counted, trusted
+from evflow.estimation.refine.sightings import Sightings, counts_so_far, path_weights
 from evflow.estimation.refine.smear import smeared
 
 Array = jax.Array
 
-PIXELS, EVENTS = 2048, 1 << 14  # of a stretch that are looked at
-SETTLE_S = 0.03  # of a stretch: before, what the pixel saw earlier still counts
+PIXELS, EVENTS = 2048, 1 << 14  # used of a stretch
+SETTLE_S = 0.03  # initial part of a stretch, where the low-pass still remembers earlier light
 TILES = (6, 8)  # blocks of the image whose errors are independent
-ENOUGH = 200  # events of either polarity to look at
-LEAST = 20  # of these, that are used: frames may hide what most of the pixels saw
+ENOUGH = 200  # events of each polarity
+LEAST = 20  # usable ones of these: most may lie beside saturated or black frames
 
 
 class Sample(NamedTuple):
-    """Stretches of one length, stacked: dn (C, T + 1, P) path in DN, dt_s (C, T); events (C, N) by
-    pixel and time: pixel (0..P-1), at (in fine steps), on, off (counts so far), weight, and group,
-    with whose events one shares a constant: those of its pixel, unless a readout (readouts.py) or
-    noise (receptor_noise.py) came between; block (C, P); noise_hz (C, 2): of `noise_rates`; told
-    (C, 2): the offset and its std by net_changes.py, of all stretches; watched (C,): pixel seconds
-    of the stretch, whichever pixels are looked at."""
+    """C stretches of one length, stacked.
+
+    dn: (C, T + 1, P) path in DN; dt_s: (C, T). Events (C, N) by pixel and time: pixel (0..P-1); at,
+    in fine steps; on, off, counts so far; weight; group, of events that share a regression
+    constant: those of a pixel, divided at readouts (readouts.py) and noise (receptor_noise.py).
+    block: (C, P); noise_hz: (C, 2), of `noise_rates`; watched: (C,) pixel seconds of all pixels;
+    net_offset: (C, 2) offset of the frames and its std by net_changes.py, of all stretches."""
 
     dn: Array
     dt_s: Array
@@ -41,16 +42,24 @@ class Sample(NamedTuple):
     block: Array
     noise_hz: Array
     watched: Array
-    told: Array | None = None
+    net_offset: Array | None = None
 
 
 def sample(
     parts: Iterable[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]], seed: int = 0
 ) -> Sample | None:
-    """What the search looks at. parts: of each stretch the path (T + 1, H, W) in DN, dt_s (T,) of
-    its fine steps, its sightings, and how often readouts disturbed the pixel before each, all of
-    one length; None where too little happens. One is looked at at a time."""
-    rng, count, told = np.random.default_rng(seed), np.zeros(2, int), np.zeros(2, int)
+    """Choose pixels and events of each stretch.
+
+    Args:
+        parts: per stretch, all of one length: path (T + 1, H, W) in DN, dt_s (T,) of its fine
+            steps, its sightings, and the number of readouts before each in its pixel. Read one at
+            a time.
+        seed: of the random choice.
+
+    Returns:
+        The sample; None with too few events.
+    """
+    rng, count, usable = np.random.default_rng(seed), np.zeros(2, int), np.zeros(2, int)
     rows: list[tuple[np.ndarray, ...]] = []
     nets: list[tuple[Changes, ...]] = []
     seen = 0
@@ -61,38 +70,38 @@ def sample(
             nets.append(_changes(dn, s, rng, len(nets)))
             seen += s.inner.size
             count += _of_both(s.on)
-            told += _of_both(used)
-        del dn, s  # before the next is made
-    if count.min() < ENOUGH or told.min() < LEAST:
+            usable += _of_both(used)
+        del dn, s  # free the memory before the next is made
+    if count.min() < ENOUGH or usable.min() < LEAST:
         return None
-    told = np.tile(offset_by_changes(joined(nets), seen), (len(rows), 1)).astype(np.float32)
+    offset = np.tile(offset_by_changes(joined(nets), seen), (len(rows), 1)).astype(np.float32)
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
-    return Sample(*map(jax.device_put, [*columns, told]))
+    return Sample(*map(jax.device_put, [*columns, offset]))
 
 
 def _changes(
     dn: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
 ) -> tuple[Changes, ...]:
-    """Of a stretch, those between its frames."""
+    """`net_changes.changes` of a stretch."""
     steps = (len(dn) - 1) // (len(s.frames) - 1)
     block = _block(np.arange(dn[0].size), s.shape, number)
     return changes(dn[::steps], s, block, rng)
 
 
 def _block(where: np.ndarray, shape: tuple[int, int], number: int) -> np.ndarray:
-    """In which of TILES pixels lie, of the stretch of that number."""
+    """Index of the tile of each pixel, distinct for each stretch."""
     (height, width), tiles = shape, TILES[0] * TILES[1]
     y, x = where // width * TILES[0] // height, where % width * TILES[1] // width
     return np.asarray(y * TILES[1] + x + number * tiles)
 
 
 def _of_both(on: np.ndarray) -> np.ndarray:
-    """How many ON and how many OFF events."""
+    """Number of ON and of OFF events."""
     return np.array([on.sum(), (~on).sum()])
 
 
 def smeared_sample(data: Sample, seconds: float) -> Sample:
-    """The sample with each count replaced by its mean over that time (smear.py)."""
+    """The sample with counts averaged over so many seconds (smear.py)."""
     on, off = np.array(data.on), np.array(data.off)
     weight, pixel, at = (np.asarray(a) for a in (data.weight, data.pixel, data.at))
     for c, dt_s in enumerate(np.asarray(data.dt_s)):
@@ -107,11 +116,11 @@ def _row(
     dn: np.ndarray, dt_s: np.ndarray, s: Sightings, disturbed: np.ndarray,
     rng: np.random.Generator, number: int,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """The fields of a Sample, of one stretch, and which of the events in it are ON."""
+    """Fields of `Sample` for one stretch, and (N,) bool: which of its events are ON."""
     steps = len(dt_s) // (len(s.frames) - 1)
     at = (s.interval + s.fraction) * steps
-    group, on, off = counted(s)
-    weight = trusted(s) * (at > SETTLE_S / dt_s.mean())
+    group, on, off = counts_so_far(s)
+    weight = path_weights(s) * (at > SETTLE_S / dt_s.mean())
     pixels = s.pixel[s.first]
     chosen = np.flatnonzero(np.bincount(group, weight > 0, len(pixels)) >= 2)
     if len(chosen) > PIXELS:

@@ -1,9 +1,9 @@
-"""Noise among the events of the pooled regression: from each on, a pixel has another constant.
+"""Noise in the pooled regression: a pixel's constant changes at each noise event.
 
-An event of noise stores what the pixel sees, as every event does, but counts as a whole threshold
-whatever has changed: after a few of them a pixel's counts say little of its brightness. How much
-noise a camera sends is counted where the path gives no cause for an event. An event is taken for
-noise where the path moves so slowly that noise is the likelier cause.
+A noise event resets the memory to the brightness, like any event, but adds a whole threshold to the
+counts whatever the change was. After a few of them a pixel's counts are unrelated to its
+brightness. The noise rates are measured where the path gives no cause for events. An event counts
+as noise where the path changes so slowly that noise is its likely cause.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-LEAST_RISE = 0.03  # log units in two frame intervals: less gives no cause for an event
-TILES = (6, 8)  # of the image, whose median is taken: where the path misses motion, events are none
+LEAST_RISE = 0.03  # log units in two frame intervals: smaller changes cause no event
+TILES = (6, 8)  # of the image; their median is robust where the path misses motion
 ENOUGH_S = 2.0  # pixel seconds of a tile
-MISSED_HZ = 1.0  # events of a pixel for which the path shows no cause, and yet there is one
-LIKELY = 0.15  # probability of noise from which an event is taken for noise
-REACH = 2  # fine steps before and after that of an event, whose change is looked at
+MISSED_HZ = 1.0  # signal events per pixel whose cause the path misses
+LIKELY = 0.15  # probability of noise above which an event counts as noise
+REACH = 2  # fine steps before and after an event over which the path's slope is taken
 
 
 def noise_rates(s: Sightings, dt_s: Array) -> Array:
-    """(2,) float32, ON and OFF events in Hz per pixel for which the path gives no cause, 0 where
-    there is no such place. dt_s: (K,) of the intervals."""
+    """(2,) float32: rates of ON and OFF events in Hz per pixel where the path is still; 0 where it
+    is nowhere still for long enough. dt_s: (K,) of the intervals."""
     intervals, pixels = s.inner.shape
     change = np.diff(s.frames, axis=0)
     shown = s.seen[1:] & s.seen[:-1]
@@ -45,8 +45,8 @@ def noise_rates(s: Sightings, dt_s: Array) -> Array:
         sent = np.bincount(place, minlength=intervals * pixels).reshape(intervals, pixels)[1:]
         seconds = _tiled((still * dt_s[1:, None]).sum(0), s.shape)
         events = _tiled((still * sent).sum(0), s.shape)
-        told = seconds >= ENOUGH_S
-        rates.append(float(np.median(events[told] / seconds[told])) if told.any() else 0.0)
+        used = seconds >= ENOUGH_S
+        rates.append(float(np.median(events[used] / seconds[used])) if used.any() else 0.0)
     return np.array(rates, np.float32)
 
 
@@ -62,10 +62,15 @@ def _tiled(values: Array, shape: tuple[int, int]) -> Array:
     return np.bincount(tile.ravel(), values, TILES[0] * TILES[1])
 
 
-def parted(data: Sample, seen_by: Photoreceptor, theta: Array | None = None) -> Sample:
-    """The sample with groups that part where an event is likely to be noise, which is the first of
-    the next. theta (2,): by which what a photoreceptor sees turns into events, else a typical one;
-    at least TYPICAL_THETA, as noise makes the thresholds of a regression small."""
+def split_at_noise(data: Sample, seen_by: Photoreceptor, theta: Array | None = None) -> Sample:
+    """Divide the sample's groups at events that are likely noise; such an event begins a group.
+
+    Args:
+        data: the sample.
+        seen_by: the photoreceptor by which the path is seen.
+        theta: (2,) thresholds, to convert the path's slope into an event rate; at least
+            TYPICAL_THETA is used, as noise lowers the thresholds of a regression.
+    """
     noise_hz = np.asarray(data.noise_hz).mean(0)
     if noise_hz.max() * (1.0 - LIKELY) <= LIKELY * MISSED_HZ:
         return data
@@ -74,11 +79,11 @@ def parted(data: Sample, seen_by: Photoreceptor, theta: Array | None = None) -> 
     def stretch(c: int) -> Sample:
         return jax.tree.map(lambda v: np.asarray(v[c]), data)
 
-    groups = [_parted(stretch(c), seen_by, noise_hz, scale) for c in range(len(data.dn))]
+    groups = [_groups(stretch(c), seen_by, noise_hz, scale) for c in range(len(data.dn))]
     return data._replace(group=jnp.asarray(np.stack(groups)))
 
 
-def _parted(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) -> Array:
+def _groups(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) -> Array:
     """(N,) int32 groups of one stretch."""
     step_s = float(np.mean(d.dt_s))
     path = np.asarray(_seen(d.dn, d.dt_s, np.float32(seen_by.offset_dn),

@@ -1,9 +1,9 @@
-"""How far the constants may be off where the likelihood is no parabola.
+"""Errors of the photoreceptor's constants where the likelihood is not a parabola.
 
-Along the offset, with tau and delay at their best everywhere: at the knee of the lin-log the
-likelihood bends, and is far flatter to the side of more light than its curvature at the top says;
-and a threshold goes with the offset's logarithm, not in proportion. Between the two laws of the
-low-pass, of which the less probable may be the true one.
+Two sources. Along the offset (with the best tau and delay at each): the lin-log's knee bends the
+likelihood, which is far flatter towards more light than its curvature at the maximum says, and a
+threshold depends on the offset's logarithm. Between the two laws of the low-pass: the less probable
+may be the true one.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from evflow.estimation.refine.receptor_regression import Regression
 
 Array = np.ndarray
 
-WALK = (1.0, 1.0, 1.0, 2.0, 2.0, 4.0)  # lengths of the steps to either side, in std of the offset
-SHORTEST, LONGEST = 1.5, 6.0  # DN, of that std
-FAR = 5.0  # below the best log-likelihood, where a walk ends
+WALK = (1.0, 1.0, 1.0, 2.0, 2.0, 4.0)  # steps to each side, in std of the offset
+SHORTEST, LONGEST = 1.5, 6.0  # DN, limits of that std
+FAR = 5.0  # drop of the log-likelihood at which a walk ends
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Other:
-    """The less probable law of a low-pass: its probability, and tau (s) and theta (2,) by it."""
+    """The less probable law of the low-pass: its probability, and tau (s) and theta (2,) by it."""
 
     chance: float
     tau_s: float
@@ -33,8 +33,16 @@ class Other:
     def beside(
         self, tau_s: float, theta: Array, covariance: Array, theta_error: Array
     ) -> tuple[Array, Array]:
-        """Covariance (3, 3) of the constants and relative errors (2,) of theta, of the more
-        probable law with tau_s and theta, widened by how far this one lies from it."""
+        """Errors of the more probable law, widened by its difference from this one.
+
+        Args:
+            tau_s, theta: by the more probable law.
+            covariance: (3, 3) of its constants.
+            theta_error: (2,) relative errors of its theta.
+
+        Returns:
+            Covariance (3, 3) and relative errors (2,).
+        """
         wider = np.zeros((3, 3))
         wider[1, 1] = self.chance * (self.tau_s - tau_s) ** 2
         apart = np.log(np.abs(self.theta) / np.abs(theta))
@@ -45,10 +53,17 @@ def along_offset(
     phi: Array, model: Regression, covariance: Array, minus_log: Callable[[Array], float],
     step: Callable[[Array], Array],
 ) -> tuple[float, Array]:
-    """Mean squares of how far the offset lies from phi's, and of how far the logs of theta (2,) do.
+    """Second moments of the posterior along the offset, about phi.
 
-    covariance: of phi (3,) near the best; minus_log: of the posterior; step: from a place to where
-    tau and delay are about the best for its offset.
+    Args:
+        phi: (3,) the most probable constants.
+        model: the regression.
+        covariance: (3, 3) of phi, from the curvature.
+        minus_log: of the posterior.
+        step: maps a place to about the best tau and delay for its offset.
+
+    Returns:
+        Mean square deviation of the offset, and (2,) of log theta.
     """
     lead = covariance[:, 0] / covariance[0, 0]
     length = float(np.clip(np.sqrt(covariance[0, 0]), SHORTEST, LONGEST))

@@ -1,8 +1,8 @@
-"""The pooled regression behind a photoreceptor: how much of what the pixels see it explains.
+"""Regression of the light behind a photoreceptor on the event counts, pooled over pixels.
 
-At an event the memory equals what the pixel sees, s of simulator/photoreceptor.py, so that s at a
-pixel's events is theta_on a - theta_off b plus a constant, a and b counting its events (b
-negatively). The squares of all pixels, about each one's means, are summed over blocks of the image.
+At an event the memory equals the pixel's signal s (simulator/photoreceptor.py), so s at a pixel's
+events is theta_on a - theta_off b plus a constant, with a and b counting its events (b negatively).
+The squares of all pixels, about each one's means, are summed over blocks of the image.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from evflow.simulator.photoreceptor import seen_path
 
 Array = jax.Array
 
-SCALE = np.array([2.0, 2e-4, 2e-4])  # of offset (DN), tau and delay (s): what is little of each
-LEAST_BENT = 1e-9  # of the curvature in units of SCALE
+SCALE = np.array([2.0, 2e-4, 2e-4])  # small changes of offset (DN), tau and delay (s)
+LEAST_BENT = 1e-9  # minimal eigenvalue of the curvature in units of SCALE
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Slopes:
-    """Of the log of the share that is left, at one photoreceptor. by_block: (blocks, 3) its
-    gradient, a sum over blocks; bent: (3, 3), positive definite, nearly its curvature; of_theta:
+    """Derivatives of the log unexplained share by (offset, tau, delay). by_block: (blocks, 3)
+    gradient, as a sum over blocks; bent: (3, 3) approximate curvature, positive definite; of_theta:
     (2, 3) gradient of log theta_on and log theta_off."""
 
     by_block: np.ndarray
@@ -41,7 +41,8 @@ class Slopes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Regression:
-    """A sample, and whether the low-pass goes with light; phi (3,) are offset, tau and delay."""
+    """The regression of a sample. by_light: whether the low-pass's cutoff is proportional to light.
+    phi (3,) of its methods: offset (DN), tau and delay (s)."""
 
     data: Sample
     by_light: bool = True
@@ -51,24 +52,25 @@ class Regression:
         return Prior.of(self.data)
 
     def solved(self, phi: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """theta_on, theta_off of the regression, what it leaves and what there is."""
+        """theta (2,) ON and OFF of the regression, residual and total sum of squares."""
         products = self._total(phi)
         theta = np.linalg.solve(products[:2, :2], products[:2, 2])
         return theta, left_over(products, theta), float(products[2, 2])
 
     def unexplained(self, phi: np.ndarray) -> float:
-        """Log of the share of variance that the regression leaves."""
+        """Log of the share of variance that the regression does not explain."""
         _, left, all_ = self.solved(phi)
         return float(np.log(max(left, 1e-12) / all_))
 
     def explained_by(self, phi: np.ndarray, theta: np.ndarray) -> float:
-        """Share of the variance that thresholds (2,) explain."""
+        """Share of the variance explained by given thresholds (2,)."""
         products = self._total(phi)
         return 1.0 - left_over(products, theta) / float(products[2, 2])
 
     def slopes(self, phi: np.ndarray) -> Slopes:
-        """By Gauss and Newton: what is left is |My|^2 of the unit vector y, M taking off the
-        counts; of its second derivative only the part along y, which keeps its length, is known."""
+        """Gauss-Newton derivatives. The unexplained share is |My|² of the unit vector y, where M
+        projects out the counts; second derivatives of y itself are neglected, except along y, as
+        its length is constant."""
         blocks = self._by_block(phi, slopes=True)
         total = blocks.sum(0)
         counts, seen, all_ = total[:2, :2], total[:2, 2], float(total[2, 2])
@@ -85,8 +87,8 @@ class Regression:
             np.linalg.solve(counts, total[:2, 3:]) / theta[:, None])
 
     def curvature(self, phi: np.ndarray) -> np.ndarray:
-        """(3, 3), positive definite, by differences: the lin-log bends y itself, of which Gauss
-        and Newton know nothing."""
+        """(3, 3), positive definite, by finite differences: the lin-log has second derivatives,
+        which Gauss-Newton neglects."""
         steps = np.diag(0.5 * SCALE)
         rows = np.array([self.slopes(phi + step).gradient - self.slopes(phi - step).gradient
                          for step in steps]) / SCALE[:, None]
@@ -101,14 +103,14 @@ class Regression:
 
 
 def left_over(products: np.ndarray, theta: np.ndarray) -> float:
-    """Squares that thresholds (2,) leave of y, from the products (>= 3, >= 3) of (a, b, y)."""
+    """Residual sum of squares of y at thresholds (2,), from products (>= 3, >= 3) of (a, b, y)."""
     rest = np.array([*-theta, 1.0])
     return float(rest @ products[:3, :3] @ rest)
 
 
 def _products(phi: Array, by_light: Array, data: Sample, *, slopes: bool) -> Array:
-    """(blocks, M, M): weighted products of a, b, y and, if asked for, the slopes of y, about each
-    group's means."""
+    """(blocks, M, M): weighted products of a, b, y and, with `slopes`, the derivatives of y, about
+    each group's means."""
     blocks = data.dn.shape[0] * TILES[0] * TILES[1]
 
     def one(d: Sample) -> Array:
@@ -147,7 +149,7 @@ _sums, _slopes = (jax.jit(partial(_products, slopes=slopes)) for slopes in (Fals
 
 
 def _positive(curvature: np.ndarray) -> np.ndarray:
-    """The curvature (3, 3) with no direction in which it is bent downward."""
+    """The curvature (3, 3) with eigenvalues raised to at least LEAST_BENT."""
     units = np.outer(SCALE, SCALE)
     values, vectors = np.linalg.eigh(curvature * units)
     return np.asarray(vectors @ np.diag(np.maximum(values, LEAST_BENT)) @ vectors.T / units)

@@ -1,8 +1,8 @@
-"""The photoreceptor of a camera, from its recording: which one explains the events best.
+"""The photoreceptor of a camera, from its recording: the one that explains the events best.
 
-The pooled regression (receptor_regression.py) explains the more of what the pixels see the truer
-(offset, tau, delay) are, and whether the low-pass goes with light; tau is linear where the pixel
-is fast. What cannot be told apart, as an offset from a threshold, is in the covariance.
+The share of variance that the pooled regression (receptor_regression.py) explains is maximal at the
+true offset, tau, delay and law of the low-pass. Constants that cannot be distinguished, such as an
+offset and a threshold, show in the covariance.
 """
 
 from __future__ import annotations
@@ -14,34 +14,35 @@ import numpy as np
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.refine.receptor_data import Sample, smeared_sample
-from evflow.estimation.refine.receptor_noise import parted
-from evflow.estimation.refine.receptor_prior import DOUBT, Prior, few
+from evflow.estimation.refine.receptor_noise import split_at_noise
+from evflow.estimation.refine.receptor_prior import DOUBT, Prior, small_sample_odds
 from evflow.estimation.refine.receptor_profile import Other, along_offset
 from evflow.estimation.refine.receptor_regression import SCALE, Regression, Slopes
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor
 
-OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, where the search begins
+OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, starting grid of the search
 TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
-STEP = np.array([12.0, 3e-3, 1e-3])  # most that one step changes
+STEP = np.array([12.0, 3e-3, 1e-3])  # largest change in one step
 LOW, HIGH = np.array([-25.0, FAST, -4e-3]), np.array([90.0, 3e-2, 4e-3])
-PATTERN = (4.0, 1.0, 0.25)  # SCALEs that are tried, one coordinate at a time
+PATTERN = (4.0, 1.0, 0.25)  # multiples of SCALE tried, one coordinate at a time
 MOST_STEPS, CONVERGED = 12, 0.02  # of log-likelihood
-MOST_SIZE = 400.0  # events' worth of a recording, as errors of the path are alike everywhere
+MOST_SIZE = 400.0  # cap of a recording's effective number of events, as path errors are shared
 ALL, OFFSET = np.full(3, True), np.arange(3) == 0
 PLAIN = np.array([0.0, FAST, 0.0])  # an ideal pixel, frames that show light
-# The path is wrong in its own way everywhere. What it explains better by less than a few per cent
-# of what is left says nothing of the pixel, and so much is left open of what is found:
-BELIEVED = 400.0  # events' worth, in the odds against an ideal pixel
-FLOOR = np.array([0.5, 1e-4, 5e-4])
-ALONE = 2.0  # log odds, beside those of the changes from frame to frame, that it takes to say that
-# the frames of an ideal pixel lack light
-BY_OFFSET = 5.0  # log odds that it takes to say that a slow pixel's frames lack light
-BY_LIGHT = 1.0  # log odds, a priori, that a low-pass goes with light
-TYPICAL = 0.4  # pace of such a low-pass, of its pace at 255 DN
+# The path has systematic errors. A gain of less than a few per cent of the unexplained variance is
+# no evidence about the pixel, which limits the odds and adds a floor to the errors:
+BELIEVED = 400.0  # cap of the effective number of events in the odds against an ideal pixel
+FLOOR = np.array([0.5, 1e-4, 5e-4])  # std of offset, tau and delay
+# Log odds required, beside the evidence of net changes, for an offset in the frames of an ideal
+# pixel:
+ALONE = 2.0
+BY_OFFSET = 5.0  # log odds required for an offset in the frames of a slow pixel
+BY_LIGHT = 1.0  # prior log odds of a low-pass whose cutoff is proportional to light
+TYPICAL = 0.4  # its typical cutoff relative to that at 255 DN
 
-# The less of the contrast a path keeps, the less of the events it explains. On simulated recordings
-# with .8 to .98 explained, the regression's thresholds over the true ones are 1 - LACKING times the
-# rest, but for a few per cent and a part of what is lacking.
+# A path that loses contrast also explains less of the events. On simulated recordings with .8 to
+# .98 explained, the ratio of the regression's thresholds to the true ones is 1 - LACKING times the
+# unexplained share, with an error of KEPT_ERROR: a constant, and a share of the loss.
 LACKING, LEAST_KEPT = 1.5, 0.5
 KEPT_ERROR = (0.04, 0.8)
 SMEARS = (0.01, 0.02)  # s
@@ -50,15 +51,16 @@ CUTOFFS = (np.inf, 1000.0, 500.0, 300.0, 200.0, 140.0, 100.0, 70.0, 50.0, 30.0, 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Found:
-    """seen: the most probable photoreceptor; theta, ideal_theta (2,): of the pooled regression,
-    with it and with an ideal pixel; covariance (3, 3) of (offset, tau, delay); theta_error (2,):
-    relative errors of theta that not knowing the three leaves; explained: shares of the variance
-    that the regression explains, with an ideal pixel and as found; chance: probability that the
-    ideal pixel is not enough; few: by how much its log odds were lowered, as little was watched;
-    size: how many independent events the sample is worth; smear (2, 3): for each of SMEARS, by how
-    much the memory's mean over it is explained better (log of what is left), and how the logs of
-    theta_on and theta_off change with it; curve (K, 2): the share that is explained with each of
-    CUTOFFS, Hz, offset and delay as found."""
+    """Result of the search.
+
+    seen: the most probable photoreceptor; theta, ideal_theta: (2,) of the pooled regression, with
+    it and with an ideal pixel; covariance: (3, 3) of (offset, tau, delay); theta_error: (2,)
+    relative errors of theta due to their uncertainty; explained: shares of the variance that the
+    regression explains, with an ideal pixel and as found; chance: probability that the pixel is not
+    ideal; few: log odds subtracted for a small sample; size: effective number of independent
+    events; smear: (2, 3) for each of SMEARS, gain of log unexplained share when counts are averaged
+    over it, and changes of log theta_on and log theta_off; curve: (K, 2) CUTOFFS in Hz, and the
+    share explained with each, offset and delay as found."""
 
     seen: Photoreceptor
     theta: np.ndarray
@@ -79,8 +81,8 @@ class Found:
 
     @property
     def sensor(self) -> tuple[SensorModel, dict[str, float]]:
-        """The pixel circuit that was measured, and its standard deviations; a cutoff that lies
-        within two of them of none is none."""
+        """The measured pixel circuit and its standard deviations; the cutoff is 0 (none) where tau
+        is less than two standard deviations."""
         tau, error = self.seen.tau_s, float(self.std[1])
         seen = self.needed and tau > 2.0 * error
         cutoff = self.seen.cutoff_hz if seen else 0.0
@@ -90,38 +92,38 @@ class Found:
 
     @property
     def least_cutoff_hz(self) -> float:
-        """What the cutoff is above, by two standard deviations of tau."""
+        """Lower bound of the cutoff: tau two standard deviations above its value."""
         slow = (self.seen.tau_s if self.needed else 0.0) + 2.0 * float(self.std[1])
         return float(1.0 / (2.0 * np.pi * slow))
 
     @property
     def optics(self) -> Optics:
-        """What the frames show beside what the pixels saw."""
+        """Offset and delay of the frames, and their standard deviations."""
         offset, delay = (self.seen.offset_dn, self.seen.delay_s) if self.needed else (0.0, 0.0)
         return Optics(offset, delay, float(self.std[0]), float(self.std[2]))
 
     @property
     def needed(self) -> bool:
-        """Whether an ideal pixel is the less probable."""
+        """Whether an ideal pixel is less probable than the photoreceptor found."""
         return self.chance > 0.5
 
     def thresholds(self) -> tuple[np.ndarray, float]:
-        """theta (2,) of the pooled regression, less what the path lacks of the contrast, and its
-        relative error."""
+        """theta (2,) of the pooled regression, corrected for the contrast that the path loses, and
+        its relative error."""
         kept = float(np.clip(1 - LACKING * (1 - self.explained[1]), LEAST_KEPT, 1.0))
         return self.theta / kept, float(np.hypot(KEPT_ERROR[0], KEPT_ERROR[1] * (1 - kept)))
 
 
 def find(data: Sample) -> Found:
-    """The photoreceptor that is most probable, and how well it is known: the curvature, and the
-    scatter of the gradient from block to block."""
-    by_light = Regression(parted(data, IDEAL))
+    """Search for the most probable photoreceptor; errors follow from the curvature and from the
+    scatter of the gradient over blocks."""
+    by_light = Regression(split_at_noise(data, IDEAL))
     phi = _start(by_light)
     for _ in range(2):
         size = _size(phi, by_light)
         phi = _descend(phi, by_light, size)
         theta = np.abs(by_light.solved(phi)[0])
-        by_light = Regression(parted(data, _receptor(phi), theta))
+        by_light = Regression(split_at_noise(data, _receptor(phi), theta))
     plain = by_light.unexplained(PLAIN)
     believed = min(size, BELIEVED)
     model, phi, other = _with_law(phi, by_light, believed)
@@ -138,12 +140,13 @@ def find(data: Sample) -> Found:
     fits, ideal_fits = (model.solved(at)[0] for at in (phi, PLAIN))
     if other is not None and phi[1] > 2 * FAST:
         covariance, open_ = other.beside(phi[1], fits, covariance, open_)
-    if fits.min() <= 0:  # brightness that falls with ON events: there is no path
+    if fits.min() <= 0:  # brightness falls at ON events: the path is wrong
         odds = -np.inf
     return Found(_receptor(phi, by_light=model.by_light), np.abs(fits), np.abs(ideal_fits),
                  covariance, open_,
                  (float(1 - np.exp(plain)), float(1 - np.exp(value))),
-                 float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))), few(data), size,
+                 float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))),
+                 small_sample_odds(data), size,
                  _smear(phi if odds > 0 else PLAIN, model), _curve(phi, model))
 
 
@@ -153,17 +156,17 @@ def _receptor(phi: np.ndarray, *, by_light: bool = True) -> Photoreceptor:
 
 
 def explained(data: Sample, seen_by: Photoreceptor, theta: np.ndarray) -> float:
-    """Share of the variance that thresholds (2,) explain behind a photoreceptor, both of another
-    part of the recording."""
+    """Share of a sample's variance explained by a photoreceptor and thresholds (2,) that were
+    measured on another part of the recording."""
     at = np.array([seen_by.offset_dn, max(seen_by.tau_s, FAST), seen_by.delay_s])
-    return Regression(parted(data, seen_by, theta), seen_by.by_light).explained_by(at, theta)
+    parted = split_at_noise(data, seen_by, theta)
+    return Regression(parted, seen_by.by_light).explained_by(at, theta)
 
 
 def _with_law(
     phi: np.ndarray, by_light: Regression, size: float
 ) -> tuple[Regression, np.ndarray, Other | None]:
-    """The law of the low-pass that explains more, the most probable constants with it, and what
-    the other law would say."""
+    """The more probable law of the low-pass, its most probable constants, and the other law."""
     if phi[1] <= 2 * FAST:
         return by_light, phi, None
     even = dataclasses.replace(by_light, by_light=False)
@@ -176,14 +179,14 @@ def _with_law(
 
 
 def _odds(phi: np.ndarray, model: Regression, size: float, plain: float) -> float:
-    """Log odds of the constants against an ideal pixel, which leaves `plain`."""
-    gain = 0.5 * size * (plain - model.unexplained(phi)) - DOUBT - few(model.data)
-    return gain - Prior().unlikely(phi) + model.prior.likelier(float(phi[0]))
+    """Log odds of the constants against an ideal pixel, whose log unexplained share is `plain`."""
+    gain = 0.5 * size * (plain - model.unexplained(phi)) - DOUBT - small_sample_odds(model.data)
+    return gain - Prior().minus_log(phi) + model.prior.log_odds(float(phi[0]))
 
 
 def _offset_alone(model: Regression, size: float, plain: float) -> tuple[np.ndarray, float]:
-    """The constants of an ideal pixel whose frames lack light as the changes from one to the next
-    tell, and their log odds. plain: what an ideal pixel leaves."""
+    """The constants of an ideal pixel whose frames have the offset measured from net changes, and
+    their log odds. plain: log unexplained share of an ideal pixel."""
     evidence = model.prior.evidence()
     if evidence <= 0.0:
         return PLAIN, -np.inf
@@ -192,7 +195,7 @@ def _offset_alone(model: Regression, size: float, plain: float) -> tuple[np.ndar
 
 
 def _without_offset(phi: np.ndarray, model: Regression, size: float) -> np.ndarray:
-    """The constants without an offset, if with it the events are not much more probable."""
+    """The constants with offset 0, unless an offset makes the events much more probable."""
     none = _descend(np.where(np.arange(3) == 0, 0.0, phi), model, size, free=np.arange(3) > 0)
     gain = _value(none, model, size) - _value(phi, model, size)
     return phi if gain > BY_OFFSET else none
@@ -200,12 +203,12 @@ def _without_offset(phi: np.ndarray, model: Regression, size: float) -> np.ndarr
 
 def _value(phi: np.ndarray, model: Regression, size: float) -> float:
     """Minus the log of the posterior of phi."""
-    return 0.5 * size * model.unexplained(phi) + model.prior.unlikely(phi)
+    return 0.5 * size * model.unexplained(phi) + model.prior.minus_log(phi)
 
 
 def _errors(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance (3, 3) of (offset, tau, delay), and relative errors (2,) of theta: by the slopes
-    at phi, and along the offset by the likelihood where that goes farther."""
+    """Covariance (3, 3) of (offset, tau, delay), and relative errors (2,) of theta: from the
+    derivatives at phi, or along the offset from the likelihood if that is wider."""
     slopes = model.slopes(phi)
     near = _covariance(slopes, model.curvature(phi), model.prior)
     lead = near[:, 0] / near[0, 0]
@@ -217,14 +220,14 @@ def _errors(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray
 
     offset, theta = along_offset(phi, model, near, lambda at: _value(at, model, size), step)
     farther = max(offset - near[0, 0], 0.0)
-    others = near - near[0, 0] * np.outer(lead, lead)  # were the offset known
+    others = near - near[0, 0] * np.outer(lead, lead)  # given the offset
     linear, rest = (np.einsum("ij,jk,ik->i", slopes.of_theta, c, slopes.of_theta)
                     for c in (near, others))
     return near + farther * np.outer(lead, lead), np.sqrt(np.maximum(linear, rest + theta))
 
 
 def _newton(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient and curvature of `_value`, by Gauss and Newton."""
+    """Gradient and Gauss-Newton curvature of `_value`."""
     slopes, prior = model.slopes(phi), model.prior
     return (0.5 * size * slopes.gradient + (phi - prior.centre) / prior.std**2,
             0.5 * size * slopes.bent + np.diag(prior.std**-2.0))
@@ -258,8 +261,8 @@ def _smear(phi: np.ndarray, model: Regression) -> np.ndarray:
 
 
 def _size(phi: np.ndarray, model: Regression) -> float:
-    """How many independent events the sample is worth: with L the log of the unexplained share,
-    the likelihood is exp(-size L / 2), whose gradient scatters as much as it is curved."""
+    """Effective number of independent events. With L the log unexplained share, the likelihood is
+    exp(-size L / 2); size is such that its gradient's scatter over blocks equals its curvature."""
     slopes = model.slopes(phi)
     scatter = ((slopes.by_block - slopes.by_block.mean(0)) ** 2).sum(0)
     worth = 2.0 * np.median(np.diag(model.curvature(phi)) / np.maximum(scatter, 1e-30))
@@ -267,7 +270,7 @@ def _size(phi: np.ndarray, model: Regression) -> float:
 
 
 def _start(model: Regression) -> np.ndarray:
-    """The best of a coarse grid, coordinate by coordinate."""
+    """The best point of a coarse grid, coordinate by coordinate."""
     phi = PLAIN.copy()
     for k, values in ((1, TAUS), (0, OFFSETS), (1, TAUS), (0, OFFSETS)):
         tried = [np.where(np.arange(3) == k, v, phi) for v in values]
@@ -278,8 +281,8 @@ def _start(model: Regression) -> np.ndarray:
 def _descend(
     phi: np.ndarray, model: Regression, size: float, free: np.ndarray = ALL
 ) -> np.ndarray:
-    """Newton's steps of the constants that are free, damped until they lead down, and single
-    constants where none does: the lin-log's bend at 20 DN bends the likelihood too."""
+    """Minimise `_value` over the free constants by damped Newton steps, and by steps of single
+    constants where none of these descends (the lin-log's knee at 20 DN bends the likelihood)."""
     phi = np.clip(phi, LOW, HIGH)
     best = _value(phi, model, size)
     for _ in range(MOST_STEPS):

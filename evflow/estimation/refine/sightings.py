@@ -1,8 +1,7 @@
 """A pixel's events beside the path of its brightness.
 
-Events are ordered by pixel, then time; each is placed in its frame interval and given the path's
-value at its instant. pixels.py, start.py and bounds.py read what the two tell of the pixel's
-thresholds.
+Events are ordered by pixel, then time; each has its frame interval and the path's value at its
+time. pixels.py, start.py and bounds.py derive the pixel's thresholds from these.
 """
 
 from __future__ import annotations
@@ -15,21 +14,22 @@ from evflow.types import Events
 
 Array = np.ndarray
 
-# This and the constants of pixels.py and bounds.py: chosen on 115 simulated recordings of .2 s.
+# These and the constants of pixels.py and bounds.py: chosen on 115 simulated recordings of .2 s.
 PATH_ERROR = 0.03  # log units: error of the path at a frame, from the frame's noise
-RANGE_ERROR = 0.2  # of the path's range in an interval: its error half-way between two frames
-TYPICAL_THETA = 0.25  # log units: turns events into a range, where the path may have missed it
-HIDDEN = 1e-9  # weight of an event whose brightness no frame shows: nothing, yet no 0 / 0
+RANGE_ERROR = 0.2  # error half-way between two frames, relative to the path's range there
+TYPICAL_THETA = 0.25  # log units: converts events into a range, where the path may have missed it
+HIDDEN = 1e-9  # weight of events beside saturated or black frames; not 0, to avoid 0 / 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sightings:
-    """Events, arrays (N,): number among the recording's events, pixel (flat index), interval,
-    fraction of it, on (bool), and path, the path's value at the event.
+    """N events beside the path, by pixel and time.
 
-    first: index of each pixel's first event; frames: (K + 1, H*W) path at the frames; inner: (K,
-    H*W) range of the path within each interval; seen: (K + 1, H*W) bool, frames that show what
-    their pixel saw; shape: (H, W).
+    number: (N,) index among the recording's events; pixel: (N,) flat index; interval: (N,);
+    fraction: (N,) of the interval; on: (N,) bool; path: (N,) the path's value at the event;
+    first: index of each pixel's first event; frames: (K + 1, H*W) path at the frames;
+    inner: (K, H*W) range of the path within each interval; seen: (K + 1, H*W) bool, frames that
+    are neither saturated nor black; shape: (H, W).
     """
 
     number: Array
@@ -46,7 +46,7 @@ class Sightings:
 
     @property
     def shown(self) -> Array:
-        """(N,) bool: events between two frames that show what the pixel saw."""
+        """(N,) bool: events whose frames before and after are neither saturated nor black."""
         at = self.interval, self.pixel
         return np.asarray(self.seen[at] & self.seen[self.interval + 1, self.pixel])
 
@@ -54,8 +54,15 @@ class Sightings:
 def sight(
     events: Events, times_us: Array, path: Array, steps: int, seen: Array | None = None
 ) -> Sightings:
-    """The events between frames at times_us (K + 1,) beside the path (K*steps + 1, H, W) in log
-    units. seen: (K + 1, H, W) bool, everything if left out."""
+    """Place events beside the path.
+
+    Args:
+        events: those outside of the frames' times are left out.
+        times_us: (K + 1,) of the frames.
+        path: (K*steps + 1, H, W) log units.
+        steps: fine steps per interval.
+        seen: (K + 1, H, W) bool, as of `Sightings`; by default all True.
+    """
     width, height = events.size
     used = events.slice(int(times_us[0]) + 1, int(times_us[-1]) + 1)
     k, flat = len(times_us) - 1, path.reshape(len(path), -1)
@@ -76,15 +83,15 @@ def sight(
 
 
 def no_sightings(seen: Array) -> Sightings:
-    """Those of no events, beside no path. seen: (K + 1, H, W) bool."""
+    """Sightings without events and path. seen: (K + 1, H, W) bool."""
     none, shape = np.zeros(0, np.int64), seen.shape[1:]
     path = np.zeros((0, seen[0].size), np.float32)
     return Sightings(none, none, none, none.astype(float), none > 0, none.astype(float), none,
                      path, path, seen.reshape(len(seen), -1), shape)
 
 
-def trusted(s: Sightings) -> Array:
-    """(N,) weights of the path at the events, 1 at a frame: PATH_ERROR² over its variance."""
+def path_weights(s: Sightings) -> Array:
+    """(N,) weights of the path at the events: PATH_ERROR² over its variance, 1 at a frame."""
     span = np.maximum(s.inner[s.interval, s.pixel], TYPICAL_THETA * _net_range(s))
     between = 4 * s.fraction * (1 - s.fraction)
     weight = 1.0 / (1.0 + (RANGE_ERROR / PATH_ERROR * span) ** 2 * between)
@@ -92,8 +99,8 @@ def trusted(s: Sightings) -> Array:
 
 
 def _net_range(s: Sightings) -> Array:
-    """(N,): how many net events the pixel went up and down in the interval of each event. What
-    moves there and back between two frames is seen by the events alone."""
+    """(N,): range of the pixel's net event count within each event's interval. It detects changes
+    there and back between two frames, which the path misses."""
     sign = np.where(s.on, 1, -1)
     net = np.cumsum(sign)
     new = (np.diff(s.pixel, prepend=-1) != 0) | (np.diff(s.interval, prepend=-1) != 0)
@@ -104,9 +111,9 @@ def _net_range(s: Sightings) -> Array:
     return (high - low)[np.cumsum(new) - 1]
 
 
-def counted(s: Sightings) -> tuple[Array, Array, Array]:
-    """(N,) each: which of the pixels that fired an event is of, and its pixel's ON events and
-    minus its OFF events so far, itself included."""
+def counts_so_far(s: Sightings) -> tuple[Array, Array, Array]:
+    """For each event, (N,): index of its pixel among those with events; the pixel's ON events so
+    far, itself included; minus its OFF events so far."""
     group = np.cumsum(np.diff(s.pixel, prepend=-1) != 0) - 1
     on, off = np.cumsum(s.on.astype(np.float64)), np.cumsum(1.0 - s.on)
     before_on, before_off = (on - s.on)[s.first], (off - 1.0 + s.on)[s.first]

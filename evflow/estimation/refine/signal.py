@@ -1,11 +1,10 @@
-"""Noise told from signal, event by event: the noise rates where nothing stands still.
+"""Noise rates in moving scenes: noise separated from signal, event by event.
 
-A small network, trained on simulated recordings, gives the rate of signal events at any point from
-what surrounds it (points.py). Events are then a Poisson process of the rate signal + eta, and eta
-the value that makes the recording the likeliest, together with a scale and an exponent by which
-the recording's signal departs from the network's: what the network does not know of a scene,
-the scene's own events say. Compared with random points the likelihood is a logistic regression
-(Baddeley et al. 2014), without any integral.
+A small network, trained on simulated recordings, predicts the rate of signal events at any point
+from its surroundings (points.py). Events are a Poisson process of rate signal + eta. eta is its
+maximum a posteriori value, fitted together with a scale and an exponent of the signal's rate, by
+which a scene may depart from the network's training. With random points for comparison the
+likelihood is a logistic regression (Baddeley et al. 2014), without any integral.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from evflow.estimation.refine.points import Points, chunk_points
 Array = np.ndarray
 Params = dict[str, Any]
 
-PIVOT = np.log(0.3)  # log Hz: where scale and exponent are independent, among the noise rates
-DEPARTURE = (0.7, 0.1)  # std of log scale and of the exponent; .5-.8 and .1-.2 of held-out scenes
-# What the network gets wrong about a scene it gets wrong everywhere, and no length of a recording
-# takes that away. Measured on simulated recordings of .4 to 8 s:
-ALIKE = 300.0  # noise events, from where that error outweighs the events' own
-USUAL = 180.0  # noise events of the recordings that "widen" was fitted to: it holds their share
+PIVOT = np.log(0.3)  # log Hz, near typical noise rates: scale and exponent are independent there
+DEPARTURE = (0.7, 0.1)  # prior std of log scale and exponent; .5-.8 and .1-.2 on held-out scenes
+# The network's error about a scene is the same everywhere in it and does not shrink with the
+# recording's length. Measured on simulated recordings of .4 to 8 s:
+ALIKE = 300.0  # noise events at which that error equals the counts' own
+USUAL = 180.0  # noise events of the recordings that "widen" was fitted to: it includes their share
 MOST_LOG = 20.0
 LONGEST_STEP, CONVERGED, MOST_PASSES = 0.7, 1e-3, 50
 
@@ -43,12 +42,22 @@ def log_intensity(net: Params, features: Any) -> Any:
     return (x @ layers[-1]["kernel"])[:, 0] + layers[-1]["bias"][0]
 
 
-def told_apart(
+def separated_noise_rates(
     chunks: Sequence[Chunk], theta: Array, log_eta: Array, log_std: Array, signal: Params,
     seed: int = 0,
 ) -> tuple[Array, Array]:
-    """Log noise rates (2,) and their std, given the thresholds (2,) and what was known of the
-    rates before. signal: the network, and "widen" (), the calibration of the std."""
+    """Log noise rates of a recording, with noise separated from signal.
+
+    Args:
+        chunks: of the recording.
+        theta: (2,) thresholds.
+        log_eta, log_std: (2,) prior of the log rates.
+        signal: the network, and "widen" (), the calibration of the std.
+        seed: of the random points.
+
+    Returns:
+        Log rates (2,) and their std.
+    """
     net = jax.tree.map(np.asarray, signal)
     parts = [chunk_points(c, theta, STEPS, seed + i) for i, c in enumerate(chunks)]
     sides = map(joined, zip(*parts, strict=True))
@@ -58,7 +67,7 @@ def told_apart(
 
 
 def rate_at(net: Params, points: Points, log_eta: float, log_std: float) -> tuple[float, float]:
-    """Log noise rate of one polarity and its std, before "widen", with the network's own error."""
+    """Log noise rate of one polarity and its std, with the network's error, before "widen"."""
     log_signal = log_intensity(net, points.features)
     rate, error = noise_rate(log_signal, points, log_eta, log_std)
     odds = np.minimum(log_signal[points.event >= 0] - rate, MOST_LOG)  # of signal
@@ -75,8 +84,8 @@ def joined(parts: Sequence[Points]) -> Points:
 def noise_rate(
     log_signal: Array, points: Points, log_eta: float, log_std: float
 ) -> tuple[float, float]:
-    """The most probable log noise rate and its std, given log rates (N,) of signal at points and
-    N(log_eta, log_std^2) before: Fisher scoring of (log eta, log scale, exponent - 1)."""
+    """Most probable log noise rate and its std, by Fisher scoring of (log eta, log scale,
+    exponent - 1). log_signal: (N,) log rates of signal; prior: N(log_eta, log_std²)."""
     event = points.event >= 0
     mean, precision = np.array([log_eta, 0.0, 0.0]), np.array([log_std, *DEPARTURE]) ** -2.0
     away = log_signal.astype(np.float64) - PIVOT
@@ -95,7 +104,7 @@ def noise_rate(
         gradient = slopes @ (event - chance) - precision * (v - mean)
         curvature = (slopes * (chance * (1 - chance))) @ slopes.T + np.diag(precision)
         step = np.linalg.solve(curvature, gradient)
-        # Shortened as a whole: cut component by component it need not lead uphill.
+        # Scaled as a whole: clipped per component it need not lead uphill.
         step *= min(1.0, LONGEST_STEP / max(np.abs(step).max(), CONVERGED))
         while (new := objective(v + step))[0] < value - 1e-9 and np.abs(step).max() > CONVERGED:
             step = 0.5 * step

@@ -1,9 +1,8 @@
-"""How much slower the frames' path moves than what the events saw: the mark of an exposure, and of
-frames too far apart.
+"""Temporal smearing of the path, by exposure or by frames far apart.
 
-The path between blurred or distant frames is the mean of the light over some time. What a pixel
-remembered moves from event to event; the mean of that over the same time is explained better by
-the path than the memory itself, and the thresholds that explain it are the higher.
+The path between blurred or distant frames is a mean of the light over some time. A pixel's memory
+changes from event to event. If the path is smeared, it explains the memory's mean over that time
+better than the memory itself, and the regression gives higher thresholds.
 """
 
 from __future__ import annotations
@@ -14,11 +13,19 @@ Array = np.ndarray
 
 
 def smeared(pixel: Array, at: Array, counts: Array, length: float) -> Array:
-    """Mean of a pixel's counts over `length` around each of its events, with straight lines between
-    events, and constant before the first and after the last.
+    """Mean of a pixel's counts over `length` around each of its events.
 
-    pixel: (N,) int; at: (N,) instants, in the unit of length; counts: (N,) at the instants.
-    Events of any order; the result is in theirs.
+    The counts are interpolated linearly between events, and constant before the first and after
+    the last.
+
+    Args:
+        pixel: (N,) int, events in any order.
+        at: (N,) times, in the unit of length.
+        counts: (N,) at these times.
+        length: of the window.
+
+    Returns:
+        (N,) in the order of the events.
     """
     order = np.lexsort((at, pixel))
     pixel, t, v = pixel[order], at[order].astype(np.float64), counts[order].astype(np.float64)
@@ -26,7 +33,7 @@ def smeared(pixel: Array, at: Array, counts: Array, length: float) -> Array:
     same = np.diff(pixel) == 0
     area = np.concatenate([[0.0], np.cumsum(np.where(
         same, 0.5 * (v[1:] + v[:-1]) * np.diff(t), 0.0))])
-    # One ascending axis for all pixels: time, and each pixel's own span of it.
+    # One ascending time axis, on which every pixel has a span of its own.
     span = (t.max() - t.min() if len(t) else 0.0) + 2.0 * length + 1.0
     axis = pixel * span + t
 

@@ -1,11 +1,10 @@
-"""What a pixel remembers when the recording begins, and what its first event then tells.
+"""A pixel's memory when the recording begins, and the information in its first event.
 
-Where the memory is the brightness of the first frame, as in a simulation or after a rest, the
-first event tells as much as any other, and what rises or falls before it bounds the thresholds.
-Where a camera has been running the memory lies anywhere between its thresholds: the wider they
-are apart, the less likely an event, and the likelier none in a given range of brightness. Which
-of the two holds is a matter of the pixel; how many there are of each makes the first events
-likely.
+Two cases. Fresh: the memory is the brightness of the first frame, as in a simulation or after a
+rest; then the first event is as informative as any other, and changes before it bound the
+thresholds. Running: the memory lies anywhere between the thresholds; then a wide range of
+brightness without an event indicates high thresholds. Each pixel is a mixture of the two; the
+mixing weight is fitted by EM.
 """
 
 from __future__ import annotations
@@ -18,17 +17,17 @@ import numpy as np
 from jax.scipy import special
 
 from evflow.estimation.refine.bounds import NOTHING
-from evflow.estimation.refine.sightings import PATH_ERROR, Sightings, counted
+from evflow.estimation.refine.sightings import PATH_ERROR, Sightings, counts_so_far
 
 Array = np.ndarray
 
-MEMORY_ERRORS = (0.02, 0.04, 0.07, 0.1)  # log units, of the memory where it is the first frame's
-EXPECTATIONS = 30  # steps of expectation and maximisation for the share of such pixels
+MEMORY_ERRORS = (0.02, 0.04, 0.07, 0.1)  # candidates, log units: std of a fresh memory
+EM_STEPS = 30
 FIRST_SIGNAL = 0.8  # share of signal among pixels' first events
 SPAN_ERROR = 0.1  # log units, of the range before the first event
-NODES, REACH = 21, 3.0  # of the integral over theta_on + theta_off (Gauss-Hermite); its reach in
-# standard deviations: a wider span is the path's error
-LEAST_SHARE = 0.05  # of the variance, that the nodes resolve
+NODES = 21  # of the Gauss-Hermite integral over theta_on + theta_off
+REACH = 3.0  # standard deviations; a wider span is attributed to the path's error
+LEAST_SHARE = 0.05  # of the variance: what the nodes resolve
 LEAST_SUM = 0.02  # log units
 DENSITY = float(1 / np.sqrt(2 * np.pi))  # of N(0, 1) at 0; a NumPy scalar would make all float64
 
@@ -42,12 +41,15 @@ class Belief(NamedTuple):
 
 
 def since_start(s: Sightings, weight: Array) -> Array:
-    """(6, H, W): sums over a pixel's events of weight (N,), and of it times ON events, minus OFF
-    events and change of the path since the first frame; the rise and the fall since then before
-    the first event, `NOTHING` where the first frame does not show the pixel."""
+    """Statistics of the time since the first frame, (6, H, W).
+
+    Sums over a pixel's events of the weight (N,), and of the weight times ON count, minus OFF count
+    and change of the path since the first frame; largest rise and largest fall before the first
+    event. No events and `NOTHING` where the first frame is saturated or black.
+    """
     out = np.zeros((6, s.frames.shape[1]))
     if len(s.pixel):
-        group, on, off = counted(s)
+        group, on, off = counts_so_far(s)
         change = s.path - s.frames[0, s.pixel]
         out[:4, s.pixel[s.first]] = [
             np.bincount(group, weight * v) for v in (np.ones_like(on), on, off, change)]
@@ -60,9 +62,15 @@ def since_start(s: Sightings, weight: Array) -> Array:
     return out.reshape(6, *s.shape)
 
 
-def anchored(equations: Array, start: Array, error: float) -> Array:
-    """The regression's sums (7, H, W) about the means, with one observation more: the memory at
-    the first frame is its brightness, but for an error."""
+def with_fresh_start(equations: Array, start: Array, error: float) -> Array:
+    """The regression's sums with one more observation, of a fresh memory: at the first frame it is
+    the brightness.
+
+    Args:
+        equations: (7, H, W) sums about the means.
+        start: of `since_start`.
+        error: std of the memory, log units.
+    """
     total, on, off, change = start[:4]
     weight = PATH_ERROR**2 / (error**2 + PATH_ERROR**2)
     share = np.divide(weight, total * (total + weight), where=total > 0, out=np.zeros_like(total))
@@ -71,15 +79,23 @@ def anchored(equations: Array, start: Array, error: float) -> Array:
                            equations[6:]])
 
 
-def remembered(start: Array, running: Belief, median: Array) -> tuple[float, Array]:
-    """The error of the memory where it is the first frame's brightness, and the probability
-    (H, W) that it is, given what the other events say of each pixel."""
+def fresh_probability(start: Array, running: Belief, median: Array) -> tuple[float, Array]:
+    """Fit the mixture of fresh and running pixels to the first events.
+
+    Args:
+        start: (6, H, W) of `since_start`.
+        running: the belief from all other events.
+        median: (2,) thresholds of the camera.
+
+    Returns:
+        Std of a fresh memory, the best of MEMORY_ERRORS; probability (H, W) that a pixel is fresh.
+    """
     fired = start[0] > 0
     likely = _first_events(start[:4, fired], Belief(*(a[..., fired] for a in running)), median)
     best, error, share, chance = -np.inf, MEMORY_ERRORS[0], 0.0, np.zeros(fired.sum())
     for candidate, near in zip(MEMORY_ERRORS, likely[:-1], strict=True):
         part, odds = 0.5, np.exp(near - likely[-1])
-        for _ in range(EXPECTATIONS if fired.any() else 0):
+        for _ in range(EM_STEPS if fired.any() else 0):
             belief = part * odds / (part * odds + 1 - part)
             part = float(belief.mean())
         total = (np.log(part * odds + 1 - part) + likely[-1]).sum()
@@ -91,8 +107,8 @@ def remembered(start: Array, running: Belief, median: Array) -> tuple[float, Arr
 
 
 def _first_events(start: Array, running: Belief, median: Array) -> Array:
-    """(errors + 1, N) log-likelihood of the brightness at the first frame for each of
-    MEMORY_ERRORS, and for a memory anywhere between the thresholds."""
+    """(errors + 1, N) log-likelihood of the brightness at the first frame, for a fresh memory with
+    each of MEMORY_ERRORS, and for a running one."""
     total, on, off, change = start
     a, b, y = on / total, off / total, change / total
     (aa, ab), (_, bb) = running.covariance
@@ -104,10 +120,19 @@ def _first_events(start: Array, running: Belief, median: Array) -> Array:
                      for v, mean in cases])
 
 
-def running_on(mean: Array, covariance: Array, span: Array, fired: Array) -> tuple[Array, Array]:
-    """The belief mean (2, H, W), covariance (2, 2, H, W) of a pixel whose memory at the start may
-    lie anywhere between its thresholds, given the range (H, W) of its brightness up to its first
-    event, and whether there is one (H, W)."""
+def with_running_start(
+    mean: Array, covariance: Array, span: Array, fired: Array
+) -> tuple[Array, Array]:
+    """Condition the belief of running pixels on their first event.
+
+    Args:
+        mean, covariance: (2, H, W), (2, 2, H, W).
+        span: (H, W) range of the brightness up to the first event.
+        fired: (H, W) bool, whether there is one.
+
+    Returns:
+        Mean and covariance.
+    """
     along = covariance.sum(1)
     variance, centre = along.sum(0), mean.sum(0)
     moments = _moments(*(v.astype(np.float32)
@@ -121,7 +146,7 @@ def running_on(mean: Array, covariance: Array, span: Array, fired: Array) -> tup
 def _moments(
     centre: jax.Array, scale: jax.Array, span: jax.Array, fired: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Mean and variance of (theta_on + theta_off - centre) / scale, before N(0, 1)."""
+    """Posterior mean and variance of (theta_on + theta_off - centre) / scale, a priori N(0, 1)."""
     span = jnp.minimum(span, centre + REACH * scale)
 
     def node(sums: jax.Array, at: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:

@@ -1,5 +1,5 @@
-"""Stretches: some frame intervals in a row and the windows in them, which is what an estimate reads
-of a recording at a time.
+"""Stretches: a few consecutive frame intervals and the windows in them. An estimate reads a
+recording one stretch at a time.
 """
 
 from __future__ import annotations
@@ -14,18 +14,20 @@ from evflow.recordings.windows import WindowPlan
 from evflow.simulator.interpolate import MIN_SIDE
 from evflow.types import Recording
 
-INTERVALS, FEW_INTERVALS = 8, 4  # frame intervals per stretch: 200 ms at 40 Hz; of large sensors
-PART = (260, 346)  # rows and columns that are simulated of a large sensor
-CHUNK_PIXELS = 8 * 346 * 260  # pixels of all stretches simulated, of a long recording
-LARGE = CHUNK_PIXELS // 2  # pixels of a sensor of which two stretches cannot be simulated whole
-BAND = PART[0] * PART[1]  # pixels of it that are gone through at once
+INTERVALS, FEW_INTERVALS = 8, 4  # frame intervals per stretch: 200 ms at 40 Hz; large sensors
+PART = (260, 346)  # rows and columns of a large sensor that are simulated
+CHUNK_PIXELS = 8 * 346 * 260  # pixels of all simulated stretches of a long recording
+LARGE = CHUNK_PIXELS // 2  # pixels of a sensor above which PART is simulated
+BAND = PART[0] * PART[1]  # pixels of a large sensor processed at once
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stretch:
-    """run: frame intervals i (frame i to i + 1) of the recording, ascending, none where there is
-    no path between its frames; windows: (number, (first, last) frame) of those that begin in it;
-    first: whether the camera's recording begins with it."""
+    """One stretch of a recording.
+
+    run: frame intervals i (frame i to i + 1), ascending; empty without a path between the frames;
+    windows: (number, (first, last) frame) of those that begin in it; first: whether the camera's
+    recording begins with it."""
 
     recording: Recording
     run: tuple[int, ...]
@@ -44,8 +46,14 @@ class Stretch:
 def cut(
     recording: Recording, plan: WindowPlan, *, path: bool = True, first: bool = True
 ) -> tuple[Stretch, ...]:
-    """The stretches of a recording in time order. path: whether to look at what is between the
-    frames; first: False for a later piece of what a camera records."""
+    """Cut a recording into stretches, in time order.
+
+    Args:
+        recording: with frames.
+        plan: its windows.
+        path: whether stretches have frame intervals, for a path between the frames.
+        first: False where the camera's recording began before this one.
+    """
     runs = plan_runs(recording, plan.pairs) if path else []
     numbered = list(enumerate(plan.pairs))
     if not runs:
@@ -60,9 +68,15 @@ def cut(
 
 
 def plan_runs(recording: Recording, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
-    """Runs of up to INTERVALS consecutive frame intervals i (frame i to i + 1) in the windows
-    between the pairs of frames (first, last), ascending; none where frames are too small for
-    optical flow."""
+    """Runs of up to INTERVALS consecutive frame intervals i (frame i to i + 1), ascending.
+
+    Args:
+        recording: with frames.
+        pairs: (first, last) frames of the windows to cover.
+
+    Returns:
+        The runs; empty where frames are too small for optical flow.
+    """
     height, width = recording.frames.shape[1:]
     if max(height, width) < MIN_SIDE:
         return []
@@ -77,22 +91,22 @@ def plan_runs(recording: Recording, pairs: Iterable[tuple[int, int]]) -> list[li
 
 
 def spread(lengths: Sequence[int], most: int) -> list[int]:
-    """Indices of the longest, evenly thinned to `most`."""
+    """Indices of the largest of `lengths`, evenly thinned to `most`."""
     longest = [i for i, n in enumerate(lengths) if n == max(lengths)]
     if len(longest) > most:
-        middles = (np.arange(most) + 0.5) * len(longest) / most  # of as many equal parts
+        middles = (np.arange(most) + 0.5) * len(longest) / most
         longest = [longest[int(k)] for k in middles]
     return longest
 
 
 def plan_chunks(recording: Recording, runs: list[list[int]]) -> list[list[int]]:
-    """The runs that are simulated, again and again: the longest, evenly thinned to the budget.
-    The camera's parameters are alike everywhere, so some of a long recording tell them."""
+    """The runs to simulate: the longest, evenly thinned to the budget. The camera's parameters are
+    the same everywhere, so a part of a long recording suffices."""
     most = most_simulated(recording.events.size)
     return [runs[i] for i in spread([len(run) for run in runs], most)]
 
 
 def most_simulated(size: tuple[int, int]) -> int:
-    """How many stretches of a long recording are simulated, of large sensors a part of each."""
+    """Number of stretches of a long recording that are simulated, for a sensor of this size."""
     pixels = size[0] * size[1]
     return max(1, CHUNK_PIXELS // (pixels if pixels <= LARGE else PART[0] * PART[1]))

@@ -1,7 +1,7 @@
-"""What a pixel did in a chunk, recorded or simulated alike: its first event and all counts.
+"""A pixel's first event and event counts in a chunk, recorded or simulated.
 
-After its first event a pixel's memory is the brightness at that instant, so everything that
-follows is determined by the path and the threshold; what came before is not compared.
+After its first event a pixel's memory is the brightness at that time, so all later events follow
+from path and thresholds. What came before is not compared.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def trace_of_events(events: Events, times_us: np.ndarray, steps: int) -> Trace:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Draws:
-    """What is random of cameras on a chunk. pixels: (2, N) normal, of the thresholds; phase: (N,)
-    uniform, where brightness lies about the memory; noise: (K, 2, N) uniform, compared with the
-    odds of a noise event; when: (K, 2, N) int8, the fine step at which it would come."""
+    """Random numbers of simulated cameras on a chunk. pixels: (2, N) normal, for the thresholds;
+    phase: (N,) uniform, brightness relative to the memory at the start; noise: (K, 2, N) uniform,
+    compared with the probability of a noise event; when: (K, 2, N) int8, its fine step."""
 
     pixels: Array
     phase: Array
@@ -81,8 +81,14 @@ class Draws:
 def draw(
     key: jax.Array, number: int, shape: tuple[int, int], intervals: int, steps: int
 ) -> Draws:
-    """Draws for chunk `number`, (H, W): cameras that share them differ by their parameters
-    alone."""
+    """Draws for a chunk, by its number: cameras that share them differ only by their parameters.
+
+    Args:
+        key: of the recording.
+        number: of the chunk.
+        shape: (H, W).
+        intervals, steps: frame intervals, and fine steps in each.
+    """
     return Draws(*(
         np.asarray(a) for a in _drawn(key, np.uint32(number), shape, intervals, steps)))
 
@@ -103,15 +109,23 @@ def _drawn(
 def trace_of_camera(
     draws: Draws, path: Array, dt_s: Array, theta: Array, eta: Array, start: Array, steps: int
 ) -> Trace:
-    """The Trace of a camera that sees path (K*steps + 1, H, W), all float32.
+    """The Trace of a simulated camera, all float32.
 
-    theta: (2, N) of its pixels; eta: (2,) Hz. start: (2,), shares of theta_off and theta_on between
-    which brightness lies about the memory: FRESH as in a simulation, RUNNING after motion, (0, 1)
-    after a rise. At most one noise event per pixel, polarity and interval is drawn (rates are ~.1
-    Hz, intervals ~25 ms); it stores the brightness of its instant.
+    At most one noise event per pixel, polarity and interval is drawn (rates are ~.1 Hz, intervals
+    ~25 ms); it sets the memory to the brightness.
+
+    Args:
+        draws: of the chunk.
+        path: (K*steps + 1, H, W) log intensity.
+        dt_s: (K,) interval lengths.
+        theta: (2, N) of its pixels.
+        eta: (2,) Hz.
+        start: (2,) shares of theta_off and theta_on that bound the brightness about the memory:
+            FRESH as in a simulation, RUNNING after motion, (0, 1) after a rise.
+        steps: fine steps per interval.
     """
-    # On the host, and a pixel of its own, without low-pass, leak or dead time: few pixels have
-    # events in a step, and a comparison finds them. XLA works all of them out, in 10 times as long.
+    # A simple pixel in NumPy (no low-pass, leak or dead time): few pixels have events in a step,
+    # and a comparison finds them. XLA would compute all pixels, in ten times as long.
     flat, shape, (on, off) = path.reshape(len(path), -1), path.shape[1:], theta
     below, above = start[0] * off, start[1] * on
     base = flat[0] - (draws.phase * (above + below) - below)
@@ -125,7 +139,7 @@ def trace_of_camera(
 
 
 def _strikes(draws: Draws, eta: Array, dt_s: Array, steps: int) -> Iterator[tuple[Array, Array]]:
-    """The pixels that noise strikes in each fine step, ON and OFF."""
+    """Pixels with a noise event in each fine step, ON and OFF."""
     for noise, when, dt in zip(draws.noise, draws.when, dt_s, strict=True):
         struck = [np.flatnonzero(u < -np.expm1(-rate * dt)) for u, rate in
                   zip(noise, eta, strict=True)]
@@ -135,8 +149,8 @@ def _strikes(draws: Draws, eta: Array, dt_s: Array, steps: int) -> Iterator[tupl
 
 
 class _Pixels:
-    """N pixels (float32) and what they have sent: first (N,) step of the first event, fraction of
-    that step, first_on; counts (K, 2, N)."""
+    """State of N simulated pixels (float32): first (N,) step of the first event, fraction of that
+    step, first_on; counts (K, 2, N)."""
 
     def __init__(self, on: Array, off: Array, base: Array, intervals: int) -> None:
         self.on, self.off, self.base = on, off, base
@@ -147,7 +161,7 @@ class _Pixels:
         self._fires, self._falls = np.empty((2, *base.shape), bool)
 
     def step(self, index: int, interval: int, before: Array, now: Array) -> None:
-        """The events of brightness that goes from before (N,) to now."""
+        """Add the events of brightness changing from before (N,) to now (N,)."""
         np.subtract(now, self.base, out=self._rise)
         np.greater_equal(self._rise, self.on, out=self._fires)
         np.less_equal(self._rise, self._fall, out=self._falls)
@@ -171,7 +185,7 @@ class _Pixels:
     def strike(
         self, index: int, interval: int, before: Array, now: Array, polarity: int, at: Array
     ) -> None:
-        """A noise event of the pixels at, whose memory is the brightness then."""
+        """Add a noise event of pixels `at`, which sets their memory to the brightness."""
         self.base[at] = np.float32(0.5) * (before[at] + now[at])
         self.counts[interval, polarity, at] += 1
         at = at[self.first[at] == NEVER]

@@ -76,24 +76,24 @@ def test_changes_are_those_of_shown_pixels_with_their_events() -> None:
     assert twice[0].on.tolist() == [2, 1, 0] * 2
 
 
-def test_what_is_told_and_the_spread_of_cameras_make_the_prior() -> None:
-    told = Prior(16.0, 2.0)
-    weights = np.array([PRIOR[0] ** -2, told.told**-2])
-    assert told.centre[0] == pytest.approx(weights[1] * 16.0 / weights.sum())
-    assert told.std[0] == pytest.approx(weights.sum() ** -0.5)
+def test_the_measured_offset_and_the_spread_of_cameras_make_the_prior() -> None:
+    prior = Prior(16.0, 2.0)
+    weights = np.array([PRIOR[0] ** -2, prior.offset_std**-2])
+    assert prior.centre[0] == pytest.approx(weights[1] * 16.0 / weights.sum())
+    assert prior.std[0] == pytest.approx(weights.sum() ** -0.5)
     assert Prior().centre.tolist() == [0.0, 0.0, 0.0]
     np.testing.assert_allclose(Prior().std, PRIOR)
-    assert told.unlikely(told.centre) == 0.0
+    assert prior.minus_log(prior.centre) == 0.0
 
 
-@pytest.mark.parametrize(("told", "for_some"), [
+@pytest.mark.parametrize(("prior", "for_some"), [
     (Prior(16.0, 2.0), True), (Prior(-9.0, 3.0), True), (Prior(1.0, 2.0), False),
     (Prior(11.0, 14.0), False)])
-def test_odds_of_an_offset(told: Prior, for_some: bool) -> None:
-    assert (told.evidence() > 0.0) == for_some
-    assert told.evidence() < 5.0  # changes mislead now and then
-    assert told.likelier(told.offset_dn) > told.likelier(3.0 * told.offset_dn)
+def test_odds_of_an_offset(prior: Prior, for_some: bool) -> None:
+    assert (prior.evidence() > 0.0) == for_some
+    assert prior.evidence() < 5.0  # changes mislead now and then
+    assert prior.log_odds(prior.offset_dn) > prior.log_odds(3.0 * prior.offset_dn)
 
 
-def test_without_changes_nothing_is_likelier() -> None:
-    assert Prior().evidence() == Prior().likelier(20.0) == 0.0
+def test_without_changes_the_odds_are_even() -> None:
+    assert Prior().evidence() == Prior().log_odds(20.0) == 0.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine import receptor_data
-from evflow.estimation.refine.readouts import beside_readouts
+from evflow.estimation.refine.readouts import without_readouts
 from evflow.estimation.refine.sightings import Sightings, sight
 from evflow.recordings.bunches import Bunch
 from evflow.types import Events
@@ -32,7 +32,7 @@ def seen(t: list[int], pixel: list[int], steps: int = 4) -> Sightings:
 def test_what_comes_with_a_readout(
     t: list[int], pixel: list[int], kept: list[int], disturbed: list[int]
 ) -> None:
-    left, before = beside_readouts(seen(t, pixel), TIMES, READOUT)
+    left, before = without_readouts(seen(t, pixel), TIMES, READOUT)
     found = TIMES[left.interval] + left.fraction * 40_000
     np.testing.assert_allclose(found, kept)
     assert before.tolist() == disturbed
@@ -41,7 +41,7 @@ def test_what_comes_with_a_readout(
 
 def test_without_readouts_all_is_as_it_was() -> None:
     s = seen([10_000, 39_600], [0, 0])
-    left, before = beside_readouts(s, TIMES, None)
+    left, before = without_readouts(s, TIMES, None)
     assert left is s
     assert before.tolist() == [0, 0]
 
@@ -51,7 +51,7 @@ def test_a_readout_begins_another_group(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(receptor_data, "LEAST", 0)
     t = [35_000, 38_000, 40_200, 45_000, 60_000, 75_000, 79_800, 90_000]
     parts = [(np.full((13, 1, 2), 100.0), np.full(12, 0.01),
-              *beside_readouts(seen(t, [0] * 8), TIMES, found)) for found in (None, READOUT)]
+              *without_readouts(seen(t, [0] * 8), TIMES, found)) for found in (None, READOUT)]
     groups, counts = [], []
     for part in parts:
         data = receptor_data.sample([part])

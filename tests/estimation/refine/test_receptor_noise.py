@@ -7,7 +7,7 @@ import pytest
 
 from evflow.estimation.refine import receptor_noise
 from evflow.estimation.refine.receptor_data import Sample
-from evflow.estimation.refine.receptor_noise import noise_rates, parted
+from evflow.estimation.refine.receptor_noise import noise_rates, split_at_noise
 from evflow.estimation.refine.receptor_profile import along_offset
 from evflow.estimation.refine.sightings import sight
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
@@ -72,7 +72,7 @@ def test_groups_part_where_noise_is_likely(
     noise_hz: float, tau_s: float, groups: list[int]
 ) -> None:
     seen_by = Photoreceptor(tau_s=tau_s, by_light=False) if tau_s else IDEAL
-    assert np.asarray(parted(one_pixel(noise_hz), seen_by).group)[0].tolist() == groups
+    assert np.asarray(split_at_noise(one_pixel(noise_hz), seen_by).group)[0].tolist() == groups
 
 
 def test_thresholds_that_noise_makes_small_do_not_explain_it(
@@ -80,8 +80,8 @@ def test_thresholds_that_noise_makes_small_do_not_explain_it(
 ) -> None:
     monkeypatch.setattr(receptor_noise, "MISSED_HZ", 0.0)
     data = one_pixel(2.0)
-    small = parted(data, IDEAL, np.full(2, 1e-3)).group
-    np.testing.assert_array_equal(small, parted(data, IDEAL).group)
+    small = split_at_noise(data, IDEAL, np.full(2, 1e-3)).group
+    np.testing.assert_array_equal(small, split_at_noise(data, IDEAL).group)
 
 
 class Bent:

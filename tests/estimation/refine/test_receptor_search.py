@@ -9,7 +9,7 @@ import pytest
 from evflow.estimation.refine import receptor_search
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
-from evflow.estimation.refine.receptor_prior import FEW, FEWER, few
+from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
 from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_search import find
@@ -202,7 +202,7 @@ def test_the_less_was_watched_the_more_it_takes() -> None:
     """To take a pixel for slow, or frames for lacking light."""
     data = looked_at(0.0, 0.0)
     assert data.watched == pytest.approx(INTERVALS * FRAME_S * SHAPE[0] * SHAPE[1], rel=1e-5)
-    much, less, least = (few(data._replace(watched=np.array([seconds])))
+    much, less, least = (small_sample_odds(data._replace(watched=np.array([seconds])))
                          for seconds in (2 * FEW, FEW / np.e, FEW / np.e**2))
     assert (much, less, least) == pytest.approx((0.0, FEWER, 2 * FEWER))
 

@@ -21,7 +21,7 @@ from evflow.estimation.refine.points import (
     chunk_points,
 )
 from evflow.estimation.refine.sightings import sight
-from evflow.estimation.refine.signal import joined, log_intensity, noise_rate, told_apart
+from evflow.estimation.refine.signal import joined, log_intensity, noise_rate, separated_noise_rates
 from evflow.estimation.refine.trace import trace_of_events
 from evflow.types import Events
 
@@ -95,7 +95,7 @@ def test_pure_noise_comes_back(monkeypatch: pytest.MonkeyPatch, most: int) -> No
     monkeypatch.setattr(points_module, "MOST_EVENTS", most)
     bright = np.broadcast_to(np.arange(SHAPE[1]) < SHAPE[1] // 2, SHAPE)
     chunks = [chunk(noise(s), bright) for s in range(10)]
-    found, std = told_apart(chunks, THETA, np.log([0.1, 0.1]), np.array([2.0, 2.0]),
+    found, std = separated_noise_rates(chunks, THETA, np.log([0.1, 0.1]), np.array([2.0, 2.0]),
                             network(SILENT))
     assert (std < 0.12).all()
     assert (np.abs(found - np.log(ETA)) < 3 * std).all()
@@ -147,7 +147,8 @@ def test_without_points_nothing_is_learnt() -> None:
     assert std == pytest.approx(0.5)
     none = np.zeros(0, int)
     empty = Events(none, none, none, none > 0, SHAPE[::-1])
-    rate, _ = told_apart([chunk(empty)], THETA, np.log([0.1, 0.1]), np.ones(2), network(SILENT))
+    rate, _ = separated_noise_rates(
+        [chunk(empty)], THETA, np.log([0.1, 0.1]), np.ones(2), network(SILENT))
     assert (rate < np.log(0.02)).all()  # 384 pixel seconds without an event
 
 
@@ -156,7 +157,7 @@ def test_an_error_is_left_however_much_noise_there_is(monkeypatch: pytest.Monkey
     monkeypatch.setattr(points_module, "RANDOM_POINTS", 256)
     start, wide = np.log([0.1, 0.1]), np.array([2.0, 2.0])
     parts = [chunk(noise(s)) for s in range(2)]
-    found = [told_apart(parts * many, THETA, start, wide, network(SILENT))[1]
+    found = [separated_noise_rates(parts * many, THETA, start, wide, network(SILENT))[1]
              for many in (1, 16, 256)]
     assert (found[1] > 0.3 * found[0]).all()
     assert (found[2] > 0.8 * found[1]).all()

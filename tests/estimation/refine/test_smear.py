@@ -1,4 +1,4 @@
-"""The mean of what a pixel remembered, against a dense integral."""
+"""The mean of what a pixel fresh_probability, against a dense integral."""
 
 from __future__ import annotations
 

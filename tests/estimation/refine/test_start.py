@@ -13,7 +13,12 @@ from evflow.camera import Camera, Summary
 from evflow.estimation.refine import PixelEvidence, pixel_posterior
 from evflow.estimation.refine.bounds import NOTHING
 from evflow.estimation.refine.pixels import pixel_evidence
-from evflow.estimation.refine.start import MEMORY_ERRORS, Belief, remembered, running_on
+from evflow.estimation.refine.start import (
+    MEMORY_ERRORS,
+    Belief,
+    fresh_probability,
+    with_running_start,
+)
 from evflow.light.log_maps import lin_log
 from evflow.types import Events
 
@@ -46,7 +51,7 @@ def chance_of_start(evidence: PixelEvidence) -> np.ndarray:
     """(H, W), with nothing but the prior known beside the first event."""
     prior = Belief(np.full((2, *SHAPE), MEDIAN), np.einsum(
         "ij,yx->ijyx", SIGMA**2 * np.eye(2), np.ones(SHAPE)), np.full(SHAPE, 0.002))
-    return remembered(evidence.start, prior, np.full(2, MEDIAN))[1]
+    return fresh_probability(evidence.start, prior, np.full(2, MEDIAN))[1]
 
 
 def test_a_single_event_tells_the_threshold_of_a_fresh_start() -> None:
@@ -86,7 +91,7 @@ def test_thresholds_between_which_memory_may_lie_anywhere(fired: bool, span: flo
     their sum; silence is likelier of wide ones; without any change it tells nothing."""
     covariance = np.array([[0.01, 0.002], [0.002, 0.02]])
     mean = np.array([0.3, 0.25])
-    (on, off), after = running_on(
+    (on, off), after = with_running_start(
         mean[:, None, None], covariance[..., None, None], np.full((1, 1), span),
         np.full((1, 1), fired))
     rng = np.random.default_rng(0)
@@ -108,7 +113,7 @@ def test_thresholds_between_which_memory_may_lie_anywhere(fired: bool, span: flo
 
 
 def test_the_memorys_error_is_found() -> None:
-    """First events around the brightness that remembered thresholds foretell, .07 off."""
+    """First events around the brightness that fresh_probability thresholds foretell, .07 off."""
     rng = np.random.default_rng(0)
     n = 3000
     theta = MEDIAN + SIGMA * rng.standard_normal(n)
@@ -117,6 +122,6 @@ def test_the_memorys_error_is_found() -> None:
     known = Belief(np.stack([theta, np.full(n, MEDIAN)])[..., None],
                    1e-6 * np.einsum("ij,nk->ijnk", np.eye(2), np.ones((n, 1))),
                    np.full((n, 1), 1e-6))
-    error, chance = remembered(start, known, np.full(2, MEDIAN))
+    error, chance = fresh_probability(start, known, np.full(2, MEDIAN))
     assert error == MEMORY_ERRORS[2]
     assert chance.mean() > 0.9
