@@ -1,9 +1,9 @@
-"""A camera measured on a bench: thresholds from steps of light, noise from a scene at rest.
+"""Calibration on a bench: thresholds from steps of light, noise from a scene at rest.
 
 The paper's ground truth (Section III-B): a screen that fills the view brightens or darkens by a
-known dlogI, and a pixel's threshold is dlogI over its events; what a scene at rest sends is noise.
-Here recordings become counts at rests of the light and results become a `CameraEstimate`; how
-counts become thresholds is in steps.py. The noise alone: evflow/estimation/static.py.
+known dlogI, and a pixel's threshold is dlogI divided by its events; events of a scene at rest are
+noise. This module counts events per step and rest, and returns a `CameraEstimate`; steps.py
+computes thresholds from counts. Noise alone: evflow/estimation/static.py.
 """
 
 from __future__ import annotations
@@ -37,16 +37,18 @@ from evflow.types import Events, Recording
 Span = tuple[int, int]
 
 SETTLE_US = 20_000  # events of a step come until this long after the light rests again
-FEW_EVENTS = 2  # of a polarity, over all steps
-MOST = 0.5  # of the pixels: with fewer measured, the result warns
+FEW_EVENTS = 2  # of a polarity, over all steps: the least for a measurement
+MOST = 0.5  # share of pixels measured, below which a note is added
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Steps:
-    """levels: (K+1, H, W) log intensity at each rest; counts: (K, 2, H, W) ON and OFF events of
-    each step; seconds: (K,) over which they were counted; rests: (K+1, 2, H, W) events while
-    nothing changed; spans: the rests, and quiet their parts in which those were counted; light:
-    (K+1,) of each, in unit; notes: what is odd about these."""
+    """K steps of light between K+1 rests.
+
+    levels: (K+1, H, W) log intensity at each rest; counts: (K, 2, H, W) ON and OFF events of each
+    step; seconds: (K,) counting time of each; rests: (K+1, 2, H, W) events at each rest; spans: the
+    rests; quiet: the parts of them in which events were counted; light: (K+1,) in unit;
+    notes: on the light."""
 
     levels: np.ndarray
     counts: np.ndarray
@@ -65,7 +67,7 @@ class Steps:
 
     @property
     def rest_s(self) -> float:
-        """How long they were, in seconds."""
+        """Total seconds of counting at rest."""
         return sum(b - a for a, b in self.quiet) * 1e-6
 
     @property
@@ -80,17 +82,26 @@ def calibrate_step(
     triggers_us: Sequence[int] | np.ndarray | None = None, fresh: bool = False,
     literal: bool = False,
 ) -> CameraEstimate:
-    """Thresholds, and the noise of the rests, from a screen whose light steps between rests.
+    """Thresholds, and noise at rest, from a screen whose light steps between rests.
 
-    rests_us: (begin, end) of each rest in us; found in the frames if left out. light: its light
-    (any linear unit: lux, cd/m2) at each rest; the mean of the frames there if left out. lux:
-    instead, that of each level which the frames rest at, darkest first. triggers_us: instants of
-    the light's edges, for the latency of the pixels. fresh: the memory is at the light of the first
-    rest, as in a simulation; a running camera's may be anywhere. literal: theta = dlogI / events,
-    the paper's own words; the std then counts a whole event. A polarity's map is measured where a
-    pixel has 2 of its events; else it is the camera's median. Raises EV001 (no events), EV011 (no
-    frames and no light), EV012 (no trigger at a step), EV017 (frames that show no two rests, or no
-    screen that steps), EV020.
+    A polarity's map is measured at pixels with at least 2 of its events; elsewhere it is the
+    camera's median.
+
+    Args:
+        recording: of the screen.
+        rests_us: (begin, end) of each rest in us; by default detected in the frames.
+        light: of the screen at each rest, in any linear unit (lux, cd/m²); by default the mean of
+            the frames.
+        lux: instead of light, that of each distinct level, darkest first.
+        triggers_us: times of the light's edges, for the latency of the pixels.
+        fresh: whether the memory is at the light of the first rest, as in a simulation; that of a
+            running camera may be anywhere.
+        literal: theta = dlogI / events, as the paper says; the std is then that of one event.
+
+    Raises:
+        EvflowDataError: EV001 (no events), EV011 (no frames and no light), EV012 (no trigger at a
+            step), EV017 (fewer than two rests in the frames, or no screen that steps), EV020, EV021
+            (polarities swapped).
     """
     steps = _steps(recording, rests_us, light, tuple(lux or ()))
     _check_polarity(steps)
@@ -103,11 +114,11 @@ def calibrate_step(
     events = steps.counts.sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
-    maps, stds, medians, spreads, untold = [], [], [], [], list[str]()
+    maps, stds, medians, spreads, undetermined = [], [], [], [], list[str]()
     for i, name in enumerate(THRESHOLDS):
         good = sound[i] & kept
         if not good.any():
-            untold.append(name)
+            undetermined.append(name)
         median, spread, own = camera_wide(theta[i][good], error[i][good])
         medians.append((median, own))
         spreads.append(spread)
@@ -117,8 +128,8 @@ def calibrate_step(
     n_events = steps.counts.sum((0, 1)).astype(np.uint32)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
     found = _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
-                      n_events, ~kept, len(steps.counts), _notes(steps, untold, valid, ~kept),
-                      tuple(untold))
+                      n_events, ~kept, len(steps.counts), _notes(steps, undetermined, valid, ~kept),
+                      tuple(undetermined))
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.quiet, steps.light,
         np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan))
@@ -132,11 +143,11 @@ def calibrate_step(
 
 
 def _notes(
-    steps: Steps, untold: Sequence[str], valid: np.ndarray, hot: np.ndarray
+    steps: Steps, undetermined: Sequence[str], valid: np.ndarray, hot: np.ndarray
 ) -> tuple[Note, ...]:
     notes = [*steps.notes, *few_sizes(steps.changes), *(Note(
         f"{name}.undetermined", f"no step sends {side} events: {name} is the prior's.")
-        for name, side in zip(THRESHOLDS, ("ON", "OFF"), strict=True) if name in untold)]
+        for name, side in zip(THRESHOLDS, ("ON", "OFF"), strict=True) if name in undetermined)]
     if valid.mean() < MOST:
         notes.append(Note("pixels.unsure", f"{valid.mean():.0%} of the pixels sent enough events "
                           "to be measured: take more steps, or larger ones."))
@@ -193,7 +204,7 @@ def _steps(
 
 
 def _restless(rest: Events) -> list[Note]:
-    """What says that the light moved during a rest, if anything does."""
+    """A note if the events of a rest are not noise alone."""
     if len(rest) < LEAST_EVENTS or company(rest, hot_at_rest(rest.count_map().sum(0))) <= MOVING:
         return []
     return [Note(

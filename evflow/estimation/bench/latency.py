@@ -1,5 +1,5 @@
-"""Latency on a bench: from the instant of a step, which a trigger tells, to the events of its
-direction. A pixel's first event is its answer; pixels differ, and so do repetitions.
+"""Latency on a bench: from a step, timed by a trigger, to each pixel's first event of the step's
+direction.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ ALIKE = 0.05  # log units: steps to one level whose sizes differ by less are rep
 
 @dataclasses.dataclass(frozen=True)
 class Latency:
-    """Of all steps of one size to one level.
+    """Latency of all steps of one size to one level.
 
-    change: log units, negative down; light: what they lead to, in the bench's unit; steps: how
-    many had a trigger; seconds: median over pixels and steps from the trigger to the first event of
-    the step's direction, and std_s its standard deviation, from how much the steps' own medians
-    differ (None of a single step); jitter_s: half of what the middle 68 % of these times span;
+    change: log units, negative down; light: the level they lead to, in the bench's unit; steps:
+    number with a trigger; seconds: median over pixels and steps from the trigger to the first event
+    of the step's direction; std_s: its standard deviation, from the scatter of the steps' medians
+    (None for a single step); jitter_s: half the width of the central 68 % of these times;
     responded: share of the pixels that sent such an event."""
 
     change: float
@@ -40,15 +40,24 @@ def measured_latency(
     events: Events, triggers_us: Sequence[int] | np.ndarray, spans: Sequence[Span],
     ends: Sequence[int], light: np.ndarray, logs: np.ndarray, kept: np.ndarray,
 ) -> tuple[Latency, ...]:
-    """By size and level, dark to light. triggers_us: instants (N,) of steps; spans: the R rests;
-    ends: (R,) until when events belong to the step that leads there; light, logs: (R,) of the
-    rests, and its log intensity; kept (H, W): pixels that are not hot. Of several triggers within a
-    step the first counts. EV012 where no trigger lies at a step."""
+    """Latencies by size of the step and level, dark to light.
+
+    Args:
+        events: of the recording.
+        triggers_us: (N,) times of steps; the first counts where several lie within a step.
+        spans: the R rests.
+        ends: (R,) time until which events belong to the step that leads to a rest.
+        light, logs: (R,) light of the rests in the bench's unit, and its log intensity.
+        kept: (H, W) bool, pixels that are not hot.
+
+    Raises:
+        EvflowDataError: EV012 where no trigger lies at a step.
+    """
     instants = np.sort(np.asarray(triggers_us, np.int64))
     answers: dict[tuple[float, int], list[np.ndarray]] = {}
     changes = np.diff(logs)
     for k, change in enumerate(changes):
-        lead = (spans[k][1] - spans[k][0]) // 10  # a frame stands for some time around its own
+        lead = (spans[k][1] - spans[k][0]) // 10  # the rest's end is known to a frame only
         at = instants[(instants >= spans[k][1] - lead) & (instants <= spans[k + 1][0])]
         if len(at):
             key = next((kind for kind in answers if abs(kind[0] - change) < ALIKE
@@ -66,7 +75,7 @@ def measured_latency(
 
 
 def _answers(events: Events, instant_us: int, rises: bool, kept: np.ndarray) -> np.ndarray:
-    """(N,) us from the instant to the first event of a direction, of each pixel that has one."""
+    """(N,) us from a time to the first event of a direction, for each pixel that has one."""
     of_side = (events.p == rises) & kept[events.y, events.x]
     pixel = events.y[of_side].astype(np.int64) * events.size[0] + events.x[of_side]
     return events.t[of_side][np.unique(pixel, return_index=True)[1]] - instant_us

@@ -1,7 +1,7 @@
-"""What a bench shows level by level: noise where the light rests, and how long steps to it last.
+"""Measurements of a bench by level of light: noise at rest, and the duration of steps.
 
-A level is what the screen rests at, once or several times. Steps between them are told apart by
-their size: where all are alike, the counts of a pixel can take a few values only.
+The screen rests at a level once or several times. Steps are grouped by size; if all have one size,
+the counts of a pixel take few values only.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ UNSEEN = DeadTime()
 Unit = Literal["DN", "lux", "light"]
 Span = tuple[int, int]
 
-SAME = 0.05  # log units: rests closer than that are of one level, steps of one size
-WAY = (0.5, 0.9)  # of a step's rise or fall in log units: between them its duration is measured
-BANDWIDTH = float(np.log(5.0)) / (2.0 * np.pi)  # cutoff of a first-order low-pass times that
-LARGE = 3.0  # thresholds that a step takes at least, or its events do not tell how long it lasts
-APART, EVEN = 0.87, 0.08  # sizes that are told apart; of a ratio, what is the same
-SHORT = 0.05  # of a pixel's intervals are shorter
-FEW_EVENTS = 100  # of a step, from all pixels: neither do these
+SAME = 0.05  # log units: tolerance of one level, and of one size of steps
+WAY = (0.5, 0.9)  # shares of a step in log units between which its duration is measured
+BANDWIDTH = float(np.log(5.0)) / (2.0 * np.pi)  # of a first-order low-pass: cutoff times duration
+LARGE = 3.0  # thresholds: the duration of smaller steps is not measured
+APART, EVEN = 0.87, 0.08  # ratio of distinct sizes at most; tolerance of a ratio
+SHORT = 0.05  # quantile of a pixel's intervals
+FEW_EVENTS = 100  # of a step, from all pixels: with fewer its duration is not measured
 
 
 @dataclasses.dataclass(frozen=True)
 class Level:
     """One level of light.
 
-    light: in the bench's unit; rests: how many times it was seen, for how many seconds in all;
+    light: in the bench's unit; rests, seconds: number of rests at it, and their total duration;
     eta_on, eta_off: noise in Hz per pixel, means over pixels that are not hot, with their standard
-    deviations; up_s, down_s: how long large steps up or down to it take from half to nine tenths of
-    the way (median step), None where there are none."""
+    deviations; up_s, down_s: median duration of large steps up or down to it, from half to nine
+    tenths of the way; None without such steps."""
 
     light: float
     rests: int
@@ -53,9 +53,9 @@ class Level:
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """change: log units, of the median pixel; events: of its direction per pixel, the mean over
-    pixels that are not hot, less the noise; seconds: from half to nine tenths of the way, None
-    where they do not tell."""
+    """One step of light. change: log units, of the median pixel; events: of its direction per
+    pixel, mean over pixels that are not hot, minus the noise; seconds: duration from half to nine
+    tenths of the way, None where not measured."""
 
     change: float
     events: float
@@ -64,10 +64,9 @@ class Step:
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """What `CameraEstimate.bench` holds. unit: of the light, "light" where it was given without
-    one; levels: darkest first; steps: in order of time, none of a static scene; dead: time of the
-    pixels, where their events show one; latency: by kind of step, where triggers tell its
-    instants."""
+    """Measurements of a bench (`CameraEstimate.bench`). unit: of the light, "light" if unknown;
+    levels: darkest first; steps: in order of time, none for a static scene; dead: dead time of the
+    pixels, if detected; latency: by size and level of steps, if triggers were given."""
 
     unit: Unit
     levels: tuple[Level, ...]
@@ -85,12 +84,12 @@ class Bench:
 
 
 def cutoff_hz(duration_s: float) -> float:
-    """Of a first-order low-pass that takes so long from half to nine tenths of a step."""
+    """Cutoff of a first-order low-pass whose step takes so long from half to nine tenths."""
     return BANDWIDTH / duration_s
 
 
 def level_of(logs: np.ndarray) -> np.ndarray:
-    """Which level, 0 the darkest, each rest (R,) of log intensity is at."""
+    """Index of the level, 0 the darkest, of each rest (R,) of log intensity."""
     order = np.argsort(logs, kind="stable")
     found = np.empty(len(logs), int)
     found[order] = np.concatenate([[0], np.cumsum(np.diff(logs[order]) > SAME)])
@@ -98,8 +97,8 @@ def level_of(logs: np.ndarray) -> np.ndarray:
 
 
 def light_of_rests(logs: np.ndarray, lux: tuple[float, ...]) -> list[float]:
-    """The lux of each rest (R,), given that of each level, darkest first; EV020 where they are not
-    as many, or do not rise."""
+    """Lux of each rest (R,), given that of each level, darkest first. Raises EV020 where the
+    number of levels differs, or lux does not increase."""
     which = level_of(logs)
     levels = int(which.max()) + 1
     if len(lux) != levels or lux[0] <= 0 or any(b <= a for a, b in itertools.pairwise(lux)):
@@ -113,10 +112,15 @@ def measured_levels(
     quiet: list[Span], light: np.ndarray, logs: np.ndarray, rests: np.ndarray, kept: np.ndarray,
     steps: tuple[Step, ...],
 ) -> tuple[Level, ...]:
-    """Levels of R rests, the spans `quiet`, and the R - 1 steps between them.
+    """Levels of R rests and the R - 1 steps between them.
 
-    light, logs: (R,) of each and its log intensity; rests (R, 2, H, W) events there; kept (H, W)
-    pixels that are not hot."""
+    Args:
+        quiet: the R spans in which events were counted.
+        light, logs: (R,) in the bench's unit, and log intensity.
+        rests: (R, 2, H, W) events.
+        kept: (H, W) bool, pixels that are not hot.
+        steps: between the rests.
+    """
     which = level_of(logs)
     found = []
     for level in range(int(which.max()) + 1):
@@ -135,9 +139,12 @@ def measured_levels(
 
 
 def _duration(t: np.ndarray, way: float, pixels: int) -> float | None:
-    """Seconds from half to nine tenths of the way, `way` thresholds long, that the events of a
-    step's direction, at times t (N,) of so many pixels, go: fewer than it is long, where the light
-    turned, as those that are missing are missing in the beginning."""
+    """Seconds from half to nine tenths of a step.
+
+    t: (N,) times of the events of its direction; way: its size in thresholds; pixels: that sent
+    them. Where the direction of the light reversed, events at the beginning of a step are missing,
+    so the shares are counted back from the end.
+    """
     if len(t) < FEW_EVENTS or way < LARGE:
         return None
     behind = [(1.0 - part) * way * pixels / len(t) for part in WAY]
@@ -153,23 +160,29 @@ def _median(values: list[float | None]) -> float | None:
 
 
 def few_sizes(changes: np.ndarray) -> list[Note]:
-    """What is to be known where all steps (K,) are of one size, whatever their direction."""
+    """A note if all steps (K,) have one size, whatever their direction."""
     sizes = np.sort(np.abs(changes))
     if not len(sizes) or np.any(np.diff(sizes) > SAME):
         return []
     return [Note("levels.few", "all steps of light are of one size (a ratio of "
                  f"{np.exp(sizes.mean()):.2f}), so that a pixel's count takes few values only: "
                  "spikes in the histogram of the thresholds are counts, not kinds of pixels. Three "
-                 "or more unequally spaced levels tell the pixels apart.")]
+                 "or more unequally spaced levels distinguish the pixels.")]
 
 
 def measured_bench(
     unit: Unit, events: Events, spans: list[Span], quiet: list[Span], light: np.ndarray,
     logs: np.ndarray, rests: np.ndarray, clean: np.ndarray, kept: np.ndarray, theta: np.ndarray,
 ) -> Bench:
-    """All of it. spans: the rests, of which `quiet` count; clean (K, 2, H, W): events of the steps,
-    less the noise; theta (2, H, W): thresholds, NaN where they are unknown; the rest as in
-    `measured_levels`."""
+    """All measurements of a bench.
+
+    Args:
+        unit: of light.
+        events: of the recording.
+        spans: the rests; other arguments as of `measured_levels`.
+        clean: (K, 2, H, W) events of the steps minus the noise.
+        theta: (2, H, W) thresholds, NaN where unknown.
+    """
     inverse = [float(np.mean(1.0 / known)) if (known := t[kept & np.isfinite(t)]).size else 0.0
                for t in theta]
     steps = []
@@ -186,10 +199,11 @@ def measured_bench(
 
 
 def _dead_time(events: Events, changes: np.ndarray, during: list[Events]) -> DeadTime:
-    """Of all events; none where it is the light's own edge, which sends events of even pixels at
-    even intervals too: those of smaller steps are longer then, as much as the steps are smaller.
+    """Dead time from all events; none where the intervals come from the edge of the light.
 
-    changes (K,) and `during` (K) are sizes and events of the steps."""
+    An edge also sends a pixel's events at equal intervals, which are longer for smaller steps in
+    proportion; a dead time is the same for all. changes (K,), during (K): sizes and events of the
+    steps."""
     found, sizes = dead_time(events), np.abs(changes)
     smaller = sizes[sizes < APART * sizes.max()] if len(sizes) else sizes
     if not found.measured or not len(smaller):

@@ -1,7 +1,7 @@
-"""Where the light of a bench rests, told from frames; and whether they show a bench at all.
+"""Detection of a bench in frames: whether its light steps, and when it rests.
 
-Their level alone would do for a screen, but also for much that is none: frames of a slow pan hardly
-differ in it. So most pixels must rest where it rests, and step as it steps.
+The mean level alone would find a screen's rests, but also accept other scenes, such as a slow pan.
+So most pixels must rest when the level rests, and step when it steps.
 """
 
 from __future__ import annotations
@@ -17,18 +17,23 @@ from evflow.types import Recording
 
 STILL = 0.01  # log units between two frames: the screen rests
 LEAST_STEP = 0.1  # log units between two rests
-MOVING, MOST_MOVING = 0.1, 0.1  # log units, beside the others; of the pixels, within a rest
-LEAST_TOGETHER = 0.5  # of the pixels: those that step by half to twice what the median pixel does
-LOOKED, ROWS = 400, 32  # frames, and rows of them, that tell a bench at a glance
-LEAST_RESTS, LEAST_RESTING = 3, 0.7  # of a bench: rests, and the share of its frames in them
+MOVING, MOST_MOVING = 0.1, 0.1  # log units against the median pixel; share of pixels in a rest
+LEAST_TOGETHER = 0.5  # share of pixels that step by half to twice the median pixel's change
+LOOKED, ROWS = 400, 32  # frames, and rows of them, that are checked
+LEAST_RESTS, LEAST_RESTING = 3, 0.7  # rests of a bench, and share of its frames in them
 FILL_THE_VIEW = ("Steps of light need a screen, or a card, that fills the view, all of it at one "
                  "level and then at another. For a scene that moves leave --protocol out.")
 
 
 def find_rests(recording: Recording) -> list[tuple[int, int]]:
-    """(first, last) frame of each stretch in which the pixels rest, those of one light joined.
+    """Rests of the light; consecutive rests at one level are joined.
 
-    EV011 without frames; EV017 where there are not two, or the scene moves in one.
+    Returns:
+        (first, last) frame of each.
+
+    Raises:
+        EvflowDataError: EV011 without frames; EV017 with fewer than two rests, or where the scene
+            moves within one.
     """
     if len(recording.frames) < 4:
         raise EvflowDataError("EV011", f"the recording has {len(recording.frames)} frames.",
@@ -44,8 +49,8 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
 
 
 def steps_of_light(recording: Recording) -> int:
-    """How many times the light of the whole view steps in the first LOOKED frames, as on a bench;
-    0 in an ordinary scene. Looks at few pixels."""
+    """Number of steps of light in the first LOOKED frames of a bench; 0 for an ordinary scene.
+    Reads every few rows and columns only."""
     scale, stride = np.float32(255 / recording.full_scale), max(1, recording.events.size[1] // ROWS)
     some = [frame.astype(np.float32) * scale
             for frame in recording.frames[:LOOKED, ::stride, ::stride]]
@@ -66,8 +71,7 @@ def steps_of_light(recording: Recording) -> int:
 
 
 def _rests(level: np.ndarray) -> list[tuple[int, int]]:
-    """(first, last) frame of each stretch in which the levels (T,) rest, those of one light
-    joined."""
+    """(first, last) frame of each rest of the levels (T,); consecutive ones at one level joined."""
     still = np.abs(np.diff(level)) < STILL
     found: list[tuple[int, int]] = []
     for resting, group in itertools.groupby(range(len(still)), key=lambda i: bool(still[i])):
@@ -84,8 +88,8 @@ def _rests(level: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _level(dn: np.ndarray) -> float:
-    """Log intensity of a frame (H, W): the mean of its middle half, which half of the pixels may
-    disturb, and which moves less than the median where grey levels are few."""
+    """Log intensity of a frame (H, W): the mean between its quartiles, robust against half of the
+    pixels and, unlike the median, smooth where grey levels are few."""
     log = np.sort(np.asarray(lin_log(dn)), axis=None)
     return float(log[len(log) // 4:len(log) - len(log) // 4].mean())
 
@@ -100,14 +104,15 @@ def _check_rest(recording: Recording, first: int, last: int) -> None:
 
 
 def _moving(begin: np.ndarray, dn: np.ndarray) -> float:
-    """The share of the pixels that change from a smoothed frame to one in DN, (H, W) both, beside
-    the others: a lamp may settle."""
+    """Share of the pixels that change, relative to the median pixel (a lamp may settle), from a
+    smoothed frame to one in DN, both (H, W)."""
     off = smooth(dn) - begin
     return float((np.abs(off - np.median(off)) > MOVING).mean())
 
 
 def check_steps(levels: np.ndarray) -> None:
-    """EV017 where most pixels do not step together; levels (K+1, H, W) log intensity at rests."""
+    """Raise EV017 where most pixels do not step together. levels: (K+1, H, W) log intensity at
+    rests."""
     for k, step in enumerate(np.diff(levels, axis=0)):
         median = float(np.median(step))
         together = float((np.abs(step - 1.25 * median) <= 0.75 * abs(median)).mean())

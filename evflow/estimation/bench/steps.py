@@ -1,16 +1,16 @@
-"""From counts at rests of the light to thresholds, and from counts at rest to noise rates.
+"""Thresholds from event counts between rests of the light, and noise rates from counts at rest.
 
-dlogI over the events is too large a threshold: half an event is missing at the end, and more where
-the light turned before, as a pixel that came down has up to theta_OFF to go back before it moves at
-all. At a rest k, with a_k and b_k the ON and OFF events until then,
+dlogI divided by the events is biased high: half an event is missing at the end, and more after the
+light reversed, as a pixel after OFF events is up to theta_OFF below its memory. At a rest k, with
+a_k and b_k the ON and OFF events until then,
 
     L_k - L_0 = theta_ON a_k - theta_OFF b_k + r_k - r_0,
 
-where the remainder r_k is uniform in [0, theta_ON) if light came up, in (-theta_OFF, 0] if it came
-down: mean half a threshold, variance theta²/12. Each pixel is a linear regression with these means
-and variances, its unknown r_0 among the unknowns. An event of noise at a rest stores the light, in
-most sensors: from there on the pixel starts anew, with a remainder of 0. Whether it does is what
-the steps after rests with events say (`storing`). NumPy, float64: 3x3 systems of sums of squares.
+where the remainder r_k is uniform in [0, theta_ON) after a rise, in (-theta_OFF, 0] after a fall:
+mean half a threshold, variance theta²/12. Each pixel is a linear regression with these means and
+variances; r_0 is a third unknown. In most sensors a noise event at a rest resets the memory to the
+light, and the pixel starts anew with remainder 0. `storing` decides this from the steps after rests
+with events. NumPy, float64: 3x3 normal equations.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ import numpy as np
 from evflow.camera import THETA_MIN
 from evflow.recordings.faulty_pixels import hot_at_rest
 
-THETA_PRIOR, THETA_PRIOR_STD = 0.3, 0.115  # of U(.1, .5), where nothing was measured
+THETA_PRIOR, THETA_PRIOR_STD = 0.3, 0.115  # mean and std of U(.1, .5), without measurements
 THETA_TOP = 2.0
 PASSES = 4
 GOLDEN = 0.6180339887498949
-BIAS = 0.015  # of the threshold: medians of eight simulated benches came out 1.4 % low
+BIAS = 0.015  # relative error of the median threshold: 1.4 % low on eight simulated benches
 
 
 def ratio(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """dlogI / events (2, H, W) over the steps of each direction; std of one event more or less.
-    Takes what `regression` takes."""
+    """theta = dlogI / events (2, H, W) over the steps of each direction, and the std of one event.
+    Arguments as of `regression`."""
     change = np.diff(levels, axis=0)
     sums = [((s * change > 0) * s * change).sum(0) for s in (1.0, -1.0)]
     counts = [((s * change > 0) * n[:, i]).sum(0) for i, s in enumerate((1.0, -1.0))]
@@ -42,25 +42,34 @@ def ratio(
 def regression(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """theta and std (2, H, W): weighted least squares for (theta_ON, theta_OFF, r_0), the weights
-    from the thresholds of the pass before. levels (K+1, H, W) at the rests; n (K, 2, H, W) events
-    of the steps, less the noise; strays (K, 2) how much that was; fresh: r_0 is 0; noisy (K+1, H,
-    W) bool: rests with events."""
+    """Thresholds by iterated weighted least squares for (theta_ON, theta_OFF, r_0).
+
+    Args:
+        levels: (K+1, H, W) log intensity at the rests.
+        n: (K, 2, H, W) events of the steps, minus the noise.
+        strays: (K, 2) expected noise events of each step.
+        fresh: whether r_0 is 0.
+        noisy: (K+1, H, W) bool, rests with events.
+
+    Returns:
+        theta and its std, (2, H, W).
+    """
     theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy))
     up = np.median(np.diff(levels, axis=0), (1, 2)) > 0
     if storing(n, up, noisy, np.median(theta, (1, 2))) > 0.5:
-        # An event of noise amid a step takes what half an event of the step would have gone on to.
+        # A noise event amid a step discards half a threshold of change on average.
         lost = 0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1)
         return _regression(levels, n + lost[..., None, None], strays, fresh, noisy)
     return theta, std
 
 
 def storing(n: np.ndarray, up: np.ndarray, noisy: np.ndarray, theta: np.ndarray) -> float:
-    """1 where noise at a rest stores the light, 0 where it does not, and a little about it.
+    """About 1 where noise at a rest resets the memory to the light, about 0 where it does not.
 
-    Of a step (up (K,) or down) pixels that start from the light itself send half an event less than
-    those that may have gone up to a threshold ahead in its direction already, or as many more as
-    half of theta (2,) of the other side is, which the others have to go back first."""
+    Compares the events of a step between pixels with and without noise at the rest before. If noise
+    resets the memory, pixels with noise send half an event less than the others after a step in the
+    same direction, and theta_other / (2 theta) events more after one in the opposite direction.
+    n: (K, 2, H, W); up: (K,); noisy: (K+1, H, W); theta: (2,)."""
     excess, expected, weight = [], [], []
     for k in range(1, len(n)):
         side = 0 if up[k] else 1
@@ -78,7 +87,7 @@ def storing(n: np.ndarray, up: np.ndarray, noisy: np.ndarray, theta: np.ndarray)
 def _regression(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, stored: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same, of pixels whose memory is the light at rests (K+1, H, W) in which it was stored."""
+    """`regression` for given rests at which the memory was reset, stored: (K+1, H, W) bool."""
     number = np.arange(len(n))[:, None, None]
     last = np.maximum.accumulate(np.where(stored[:-1], number, -1), 0)  # rest, of each step
     known, base = last >= 0, np.maximum(last, 0)
@@ -106,7 +115,7 @@ def _regression(
         centre = 0.0 if fresh else 0.5 * (theta[0] - theta[1])
         normal[..., 2, 2] += 1.0 / spread
         right[..., 2] += centre / spread
-        # A polarity that no step moves: its prior alone, which says nothing.
+        # A negligible prior, for polarities without steps.
         normal[..., [0, 1], [0, 1]] += 1e-6
         right[..., :2] += 1e-6 * THETA_PRIOR
         covariance = np.linalg.inv(normal)
@@ -121,8 +130,9 @@ def _regression(
 
 
 def _walked(pulled: np.ndarray, variance: np.ndarray, stored: np.ndarray) -> np.ndarray:
-    """(H, W, 3, 3) scatter of what noise of a variance (K, H, W) in each step does to all later
-    rests, pulled (K, H, W, 3) by each, until one of the rests (K+1, H, W) stores the light."""
+    """(H, W, 3, 3) scatter due to noise events, whose error persists over all later rests until the
+    memory is reset. pulled: (K, H, W, 3) weighted design; variance: (K, H, W) of each step; stored:
+    (K+1, H, W) bool, rests with a reset."""
     scatter, after = np.zeros((*pulled.shape[1:], 3)), np.zeros(pulled.shape[1:])
     for k in reversed(range(len(pulled))):
         after = pulled[k] + np.where(stored[k + 1][..., None], 0.0, after)
@@ -134,8 +144,8 @@ def camera_wide(theta: np.ndarray, error: np.ndarray) -> tuple[float, float, flo
     """Median, mismatch (spread beyond the pixels' own errors) and the median's std."""
     if not len(theta):
         return THETA_PRIOR, 0.0, THETA_PRIOR_STD
-    # Counts are few and whole, thresholds are not: each pixel is spread evenly over its own error
-    # (the golden ratio's multiples fill (0, 1) evenly), or the median is that of a staircase.
+    # Counts are small integers, which quantises the thresholds. Each is spread evenly over its
+    # error (multiples of the golden ratio fill (0, 1) evenly) for a continuous median.
     phase = np.arange(len(theta)) * GOLDEN % 1.0 - 0.5
     low, median, high = np.quantile(theta + np.sqrt(12.0) * error * phase, (0.1587, 0.5, 0.8413))
     wide = 0.5 * (high - low)
@@ -145,7 +155,7 @@ def camera_wide(theta: np.ndarray, error: np.ndarray) -> tuple[float, float, flo
 
 
 def camera_rate(counts: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean rates (2,) in Hz of counts (2, H, W) without hot pixels, and which are kept."""
+    """Mean rates (2,) in Hz of counts (2, H, W) without hot pixels, and (H, W) bool, the others."""
     kept = ~hot_at_rest(counts.sum(0))
     return counts[:, kept].mean(1) / seconds if seconds > 0 else np.zeros(2), kept
 
@@ -153,8 +163,16 @@ def camera_rate(counts: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndar
 def shrunk_rates(
     counts: np.ndarray, seconds: float
 ) -> tuple[np.ndarray, tuple[np.ndarray, list[tuple[float, float]]]]:
-    """Rates (2, H, W), a gamma posterior whose prior has the mean and the spread of the camera;
-    their std, and per polarity the mean rate over pixels that are not hot and its std."""
+    """Noise rates by a gamma posterior whose prior has the camera's mean and spread.
+
+    Args:
+        counts: (2, H, W) events at rest.
+        seconds: counting time.
+
+    Returns:
+        Rates (2, H, W) in Hz; their std, and per polarity the mean rate over pixels that are not
+        hot and its std.
+    """
     hz, kept = camera_rate(counts, seconds)
     if seconds <= 0:
         flat = np.zeros(counts.shape)
