@@ -173,6 +173,8 @@ class Hints:
 
     def _microseconds(self, t: np.ndarray, native: str) -> np.ndarray:
         unit = native if self.time_unit == "auto" else self.time_unit
+        if t.dtype.kind in "mM" and not np.isnat(t).any():  # they know their unit
+            t, unit = t.astype(f"{t.dtype.kind}8[us]").astype(np.int64), "us"
         if t.dtype.kind == "f":
             if self.time_unit == "auto" and native != "s":
                 raise EvflowDataError(

@@ -193,7 +193,7 @@ def test_npz_reads_the_conventions_of_others(tmp_path: Path) -> None:
     ({"t": np.arange(100)[::-1]}, "EV004", "at event 1"),
     ({"x": np.full(100, 64)}, "EV005", "64x48"),
     ({"p": np.full(100, 3)}, "EV006", "3"),
-    ({"p": np.full((100, 1), 1)}, "EV002", "(100, 1)"),
+    ({"p": np.full((100, 2), 1)}, "EV002", "(100, 2)"),
     ({"x": np.arange(100) / 2}, "EV003", "undistorted"),
     ({"y": None}, "EV008", "['y']"),
     ({"size": None}, "EV015", "--size WxH"),

@@ -58,7 +58,7 @@ def named(name: str, columns_of: dict[str, Any], n: int, unit: str = "auto") -> 
 def structured(name: str, data: Any) -> Table | None:
     """The table of an array (N,) with fields; None if they do not name all four."""
     fields = data.dtype.fields or {}
-    simple = [f for f, (kind, *_) in fields.items() if kind.kind in "biuf" and kind.shape == ()]
+    simple = [f for f, (kind, *_) in fields.items() if kind.kind in "biufmM" and kind.shape == ()]
     chosen = columns.by_name(simple)
     if len(data.shape) != 1 or not chosen:
         return None

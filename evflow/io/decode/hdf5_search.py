@@ -17,7 +17,12 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import arrays, columns, tables
 from evflow.io.decode.hdf5 import DAMAGE
+from evflow.io.decode.images_beside import beside
+from evflow.io.decode.stream import Gathered
 from evflow.io.decode.units import written_unit
+from evflow.io.hints import Hints
+from evflow.notes import Note
+from evflow.types import Recording
 
 MOST = 2000  # groups and data sets examined
 SCALES_MS = {1e3: "s", 1.0: "ms", 1e-3: "us", 1e-6: "ns"}  # eventcv's attribute, in ms
@@ -68,10 +73,10 @@ def _in_group(
     path: Path, f: Any, group: Any, found: dict[str, Any]
 ) -> Iterator[tuple[int, arrays.Table]]:
     flat = [name for name, data in found.items()
-            if len(data.shape) == 1 and data.dtype.kind in "biuf"]
+            if (len(data.shape) == 1 or tables.line(data.shape)) and data.dtype.kind in "biuf"]
     if chosen := columns.by_name(flat):
         of = {c: found[name] for c, name in chosen.items()}
-        if len({len(data) for data in of.values()}) == 1:
+        if len({max(data.shape) for data in of.values()}) == 1:
             of = {c: tables.dataset(path, group, name, (None,)) for c, name in chosen.items()}
             yield 0, arrays.named(group.name, of, len(of["t"]), _unit(
                 f, chosen["t"], of["t"]))
@@ -101,15 +106,41 @@ def told_unit(f: Any) -> str:
     return next((unit for ms, unit in SCALES_MS.items() if abs(stated[0] / ms - 1) < 1e-6), "auto")
 
 
+def told_offset(hints: Hints, *places: Any) -> int:
+    """What to add to all times, in us: the first t_offset among the data sets and attributes of
+    these groups; 0 if there is none."""
+    for place in places:
+        stored = place["t_offset"] if "t_offset" in place else place.attrs.get("t_offset")
+        if getattr(stored, "size", None) == 1:
+            return hints.instant(stored[()] if hasattr(stored, "chunks") else stored, "us")
+    return 0
+
+
 def told_size(f: Any, group: Any) -> Size | None:
-    """(width, height) from attributes or data sets of the group, its `calib`, or the root."""
+    """(width, height) from attributes or data sets of the group, its `calib`, or the groups it lies
+    in."""
     calib = group.get("calib")
-    places = [group, *([calib] if hasattr(calib, "keys") else []), f]
+    parts = group.name.strip("/").split("/")
+    around = [f["/".join(parts[:n])] for n in range(len(parts) - 1, 0, -1)]
+    places = [group, *([calib] if hasattr(calib, "keys") else []), *around, f]
     for place in places:
         for get in (place.attrs.get, lambda name, at=place: _small(at, name)):
             if size := columns.stated_size(get):
                 return size
     return None
+
+
+def images_beside(
+    path: Path, f: Any, found: Gathered, hints: Hints, events: str, notes: tuple[Note, ...] = ()
+) -> Recording:
+    """The recording of these events and of images anywhere in the file (`images_beside`)."""
+    of = {data.name.strip("/"): data for _, members in walk(f) for data in members.values()}
+
+    def checked(name: str) -> Any:
+        return tables.dataset(path, f, name, (None,) * len(of[name].shape))
+
+    return beside(path, of, lambda name: checked(name)[:], lambda name, part:
+                  tables.stored_frames(checked(name), part), found, hints, events.strip("/"), notes)
 
 
 def _small(group: Any, name: str) -> Any:

@@ -18,6 +18,8 @@ from evflow.io.decode.chunk import Chunk, joined
 from evflow.notes import Note
 
 LOOK = 1 << 16  # events examined after the first that goes back
+WRAPS = 1 << 32, 1 << 31  # us: where times of 32 bits, or 31 and a sign, begin anew
+NEAR_WRAP = 1 / 64  # of it: a step back that is smaller by no more than this is a wrap
 FEW = 16  # at most this many events ahead of all later ones count as wrong
 
 
@@ -44,10 +46,18 @@ def advice(t: np.ndarray, i: int, before: int) -> str:
         return (f"The {ahead} events before it are ahead of all later ones: damaged times? Leave "
                 "them out: --late drop (late='drop')")
     if before - int(t[i]) > RESET_US and not (t[i : i + LOOK] >= before).any():
+        if turn := _turn(before - int(t[i])):
+            return (f"Times of {turn.bit_length() - 1} bits that begin anew? Write them as 64-bit "
+                    "integers, or continue them, without frames: --late join (late='join')")
         return ("A camera reset, or two recordings joined? Read one after the other: --late join "
                 "(late='join')")
     return ("Packets that were overtaken? Leave late events out: --late drop (late='drop'), or "
             "sort them in: --late sort")
+
+
+def _turn(step: int) -> int:
+    """The wrap-around that explains a step back in us, 0 if none does."""
+    return next((turn for turn in WRAPS if 0 <= turn - step <= NEAR_WRAP * turn), 0)
 
 
 def begin(t: np.ndarray, start: int) -> int:
@@ -148,7 +158,7 @@ def _longest(values: list[float]) -> np.ndarray:
 
 class Joint:
     """Joins clocks: where time goes back further than a late packet would, everything after it is
-    shifted to continue the previous clock. count: how often."""
+    shifted to continue the previous clock; a wrap-around is undone exactly. count: how often."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -164,7 +174,10 @@ class Joint:
         reset = steps < -RESET_US
         if not reset.any():
             return t + self._shift
-        shift = self._shift + np.cumsum(np.where(reset, -steps, 0))
+        gone = np.where(reset, -steps, 0)
+        for i in np.flatnonzero(reset):
+            gone[i] = _turn(int(gone[i])) or gone[i]
+        shift = self._shift + np.cumsum(gone)
         self._shift, self.count = int(shift[-1]), self.count + int(reset.sum())
         return t + shift
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,6 +74,8 @@ def dataset(
             "Another layout? Convert it to a format listed in docs/formats.md.", where=path)
     data = group[name]
     found = getattr(data, "shape", None)
+    if shape == (None,) and line(found):
+        return Line(dataset(path, group, name, (None, None), own_filter))
     if found is None or len(found) != len(shape) or any(
             want is not None and want != got for want, got in zip(shape, found, strict=True)):
         raise EvflowDataError(
@@ -86,6 +88,29 @@ def dataset(
             "EV009", f"{path}: {name} claims blocks of {block:,} bytes in a file of "
             f"{os.path.getsize(path):,}.", "Copy or write the file again.", where=path)
     return data
+
+
+def line(shape: Any) -> bool:
+    """Whether an array of that shape is a row or column of numbers, as MATLAB writes them."""
+    return shape is not None and len(shape) == 2 and 1 in shape and max(shape) > 1
+
+
+class Line:
+    """A data set (N, 1) or (1, N) as if it were (N,)."""
+
+    def __init__(self, data: Any) -> None:
+        self._data, self._across = data, data.shape[0] == 1
+        self.shape = (max(data.shape),)
+        self.chunks = data.chunks and (data.chunks[self._across],)
+
+    def __len__(self) -> int:
+        return int(self.shape[0])
+
+    def __getitem__(self, part: Any) -> Any:
+        return self._data[0, part] if self._across else self._data[part, 0]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._data, name)
 
 
 def blocks(
@@ -131,31 +156,33 @@ class Images(NamedTuple):
 
 
 def with_frames(
-    path: Path, found: Gathered, hints: Hints, images: Images, native: str,
-    notes: tuple[Note, ...] = (), clock: tuple[Note, ...] = (),
+    path: Path, found: Gathered, hints: Hints, images: Images | Sequence[Images], native: str,
+    notes: tuple[Note, ...] = (), clock: tuple[Note, ...] = (), events: str = "",
 ) -> Recording:
     """The recording with the images that are its frames, at times within its span.
 
-    native: unit of their times in the format; notes: on the recording; clock: on frames. Faulty
-    images never prevent reading the events: see `streams.events_alone`.
+    images: of one stream, or of several; native: unit of their times in the format; notes: on the
+    recording; clock: on frames; events: their name, as in `choose`. Faulty images never prevent
+    reading the events: see `streams.events_alone`.
     """
-    events, span, told = found
+    stored, span, told = found
     notes = (*notes, *told)
-    chosen = choose((images.stream,), hints, events.size)
+    several = (images,) if isinstance(images, Images) else images
+    chosen = choose([image.stream for image in several], hints, stored.size, events)
     if chosen.stream is None:
-        return Recording.of_events(events, (*notes, *chosen.notes))
+        return Recording.of_events(stored, (*notes, *chosen.notes))
     with events_alone():
-        stamps, decode = images.load()
-        times, told = beside_events(stamps, path, native, hints, events)
+        stamps, decode = next(i for i in several if i.stream is chosen.stream).load()
+        times, told = beside_events(stamps, path, native, hints, stored)
         order, _ = in_order(times, hints)
         check_times(times if order is None else times[order], "frame times", strict=True)
         within = np.flatnonzero((times >= span[0]) & (times < span[1]))
         keep = slice(int(within[0]), int(within[-1]) + 1) if len(within) else slice(0)
-        stack = FrameStack(path, events.size, hints.colour)
+        stack = FrameStack(path, stored.size, hints.colour)
         for image, time in zip(decode(keep), times[keep], strict=True) if len(within) else ():
             if span[0] <= time < span[1]:
                 stack.append(image, time)
-        return stack.beside(events, hints, (*clock, *notes, *told, *chosen.notes))
+        return stack.beside(stored, hints, (*clock, *notes, *told, *chosen.notes))
 
 
 def stored_frames(data: Any, keep: slice) -> Iterator[np.ndarray]:

@@ -128,8 +128,11 @@ def _before_damage(
                 is_number(fields[i]) for i in read or range(len(fields))):
             widths = (len(fields),)
         elif fields:
+            header = not any(map(is_float, fields)) and len(fields) in widths
             return block[:at], Damage(byte + at, f"the line {content[:60]!r} is not `t x y p` "
-                                      f"({' or '.join(map(str, widths))} numbers)")
+                                      f"({' or '.join(map(str, widths))} numbers)" + (
+                                          ", but a header: were files joined? Remove that line"
+                                          if header else ""))
         at += len(content) + 1
     return block, Damage(byte + at, "what comes before this is not plain text")
 

@@ -22,7 +22,12 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import MAGIC, Hdf5Writer, plausible
-from evflow.io.decode.hdf5_search import told_size, told_unit
+from evflow.io.decode.hdf5_search import (
+    images_beside,
+    told_offset,
+    told_size,
+    told_unit,
+)
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
 from evflow.notes import Note
@@ -72,10 +77,11 @@ def read(path: Path, hints: Hints) -> Recording:
         size, assumed = _size(f)
         if assumed and hints.size is None:
             notes += (assumed,)
-        offset = hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else 0
+        offset = (hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else
+                  told_offset(hints, f["events"], f))
         found = gather(path, _chunks(columns, hints), hints, size, "us", offset)
-        if "frames" not in f:
-            return Recording.of_events(found.events, (*notes, *found.notes))
+        if not ("frame_times" in f and hasattr(f.get("frames"), "shape")):
+            return images_beside(path, f, found, hints, "events/t", notes)
         images = tables.dataset_images(path, f, "frames", "frame_times")
         return tables.with_frames(path, found, hints, images, "us", notes)
 

@@ -20,8 +20,10 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import Hdf5Writer
 from evflow.io.decode.hdf5_columns import FILTERS
+from evflow.io.decode.hdf5_search import images_beside
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
+from evflow.io.images.folder import natural
 from evflow.io.images.streams import ImageStream
 from evflow.io.writer import FLUSH, SECONDS_US
 from evflow.notes import Note
@@ -50,7 +52,7 @@ def read(path: Path, hints: Hints) -> Recording:
                                max(tables.stored_rows(column) for column in columns.values()))
         found = gather(path, chunks, hints, size, native)
         if not _names(f):
-            return Recording.of_events(found.events, (*notes, *found.notes))
+            return images_beside(path, f, found, hints, "events/ts", notes)
 
         def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
             images = [_image(path, f["images"], name) for name in _names(f)]
@@ -62,7 +64,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
 
 def _names(f: Any) -> list[str]:
-    return sorted(f["images"]) if hasattr(f.get("images"), "keys") else []
+    return sorted(f["images"], key=natural) if hasattr(f.get("images"), "keys") else []
 
 
 def _image_size(f: Any) -> Size | None:

@@ -2,13 +2,13 @@
 p}, calib/resolution), e2calib and other flat files, compound data sets. See `hdf5_search`.
 
 Times are us if they are integers and seconds if they have fractions, unless a name or an attribute
-gives the unit; a data set t_offset is added. Images are not read: every layout has its own clock.
+gives the unit; a t_offset is added. Images beside the events are its frames where names tell their
+times.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from evflow.errors import EvflowDataError
 from evflow.io.decode import hdf5_search, tables
@@ -39,12 +39,5 @@ def read(path: Path, hints: Hints) -> Recording:
         name, notes = hints.camera([table.name for _, table in found])
         group, table = next(pair for pair in found if pair[1].name == name)
         size = hdf5_search.told_size(f, group)
-        gathered = table.gather(path, hints, size, _offset(hints, group))
-        return Recording.of_events(gathered.events, (*notes, *gathered.notes))
-
-
-def _offset(hints: Hints, group: Any) -> int:
-    if "t_offset" not in group or getattr(group["t_offset"], "size", None) != 1:
-        return 0
-    return hints.instant(group["t_offset"][()], "us")
-
+        gathered = table.gather(path, hints, size, hdf5_search.told_offset(hints, group))
+        return hdf5_search.images_beside(path, f, gathered, hints, name, notes)

@@ -24,6 +24,7 @@ from evflow.files.atomic import aside
 from evflow.files.moves import remove
 from evflow.files.whole import need_members
 from evflow.io.decode import arrays, columns, tables
+from evflow.io.decode.images_beside import beside, times_of
 from evflow.io.decode.stream import Gathered, gather
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
@@ -61,9 +62,21 @@ def read(path: Path, hints: Hints) -> Recording:
                              written_unit(chosen["t"]) if chosen["t"] != "t" else "us")
         else:
             events = _table(path, found).gather(path, hints, size)
-        if "frames" not in found:
-            return Recording.of_events(events.events, events.notes)
-        return _with_frames(path, found, events, hints)
+        if _own_frames(found):
+            return _with_frames(path, found, events, hints)
+        if "frames" in found and not (hints.no_frames or times_of("frames", found)):
+            with events_alone():
+                raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.",
+                                      where=path)
+        return beside(path, found, lambda name: found[name].whole(),
+                      lambda name, part: found[name].spooled()[part], events, hints)
+
+
+def _own_frames(found: dict[str, Member]) -> bool:
+    """Whether frames and frame_times are as `NpzWriter` writes them."""
+    return {"frames", "frame_times"} <= set(found) and len(found["frames"].shape) == 3 and (
+        found["frames"].dtype in (np.uint8, np.uint16, np.float32)) and (
+        len(found["frame_times"].shape) == 1)
 
 
 def _size(found: dict[str, Member]) -> Any:
@@ -115,8 +128,6 @@ def _with_frames(
     if chosen.stream is None:
         return Recording.of_events(events, notes)
     with events_alone():
-        if "frame_times" not in found:
-            raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.", where=path)
         times, told = beside_events(found["frame_times"].whole(), path, "us", hints, events)
         frames = found["frames"].spooled()
         order, late = in_order(times, hints)
@@ -130,12 +141,13 @@ def _events(
 ) -> Gathered:
     """`gather` on the columns; damage is reported before errors in their values."""
     members = [found[name] for name in COLUMNS]
-    check_columns(*(np.broadcast_to(np.int8(0), member.shape) for member in members))
+    lines = [(max(m.shape),) if tables.line(m.shape) else m.shape for m in members]
+    check_columns(*(np.broadcast_to(np.int8(0), shape) for shape in lines))
 
     def rows(part: slice) -> Any:
         return tuple(member.take(part.stop - part.start) for member in members)
 
-    chunks, native = tables.blocks(members[0].shape[0], rows), "us"
+    chunks, native = tables.blocks(lines[0][0], rows), "us"
     try:
         if unit != "us":
             chunks, native = arrays.in_unit(path, chunks, unit, hints)

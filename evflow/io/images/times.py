@@ -17,6 +17,7 @@ import numpy as np
 
 from evflow.checks import check_times
 from evflow.errors import EvflowDataError, naming
+from evflow.files.archives import npy_header
 from evflow.files.arrays import mapped
 from evflow.files.limits import read_whole
 from evflow.io.decode.text import is_float
@@ -48,12 +49,34 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> T
     EV004 (not increasing), EV007 (NaN), EV016 (not found).
     """
     if existing(path).suffix == ".npy":
-        us, notes = to_us(np.array(mapped(path, (None,))), path, unit)
+        us, notes = to_us(_stored(path), path, unit)
         return us, [], notes
     rows, written = _rows(path)
     times, labels = _columns(path, rows, names)
     us, notes = to_us(times, path, unit if unit != "auto" else written)
     return us, labels, notes
+
+
+def _stored(path: Path) -> np.ndarray:
+    """Times (T,) of an .npy of them, or of begin and end of the exposures (T, 2)."""
+    try:
+        with open(path, "rb") as f:
+            pairs = npy_header(f)[0][1:] == (2,)
+    except (OSError, EOFError, ValueError):  # `mapped` explains
+        pairs = False
+    return mid_exposure(np.array(mapped(path, (None, 2) if pairs else (None,))), path)
+
+
+def mid_exposure(times: np.ndarray, where: object) -> np.ndarray:
+    """Times (T,) of exposures whose begin and end are (T, 2), EV008 if they cannot be that; others
+    as they are, without axes of length 1."""
+    if times.ndim != 2 or times.shape[1] != 2:
+        return times.ravel() if times.size == max(times.shape, default=0) else times
+    if (found := middle(*times.T)) is None:
+        raise EvflowDataError(
+            "EV008", f"{where} holds two columns, which are not begin and end of exposures: "
+            f"{times[0].tolist()}, ...", "Keep one time per frame.", where=where)
+    return found
 
 
 def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndarray, Notes]:
@@ -164,7 +187,8 @@ def _columns(
         label = [not all(map(is_float, column)) or _counts(column) for column in columns]
     clock = [i for i, named in enumerate(label) if not named]
     times = (_numbers(path, rows, clock[0]) if len(clock) == 1 else
-             _middle(path, rows, clock) if len(clock) == 2 else None)
+             middle(*(_numbers(path, rows, column) for column in clock)) if len(clock) == 2
+             else None)
     if times is None or sum(label) > 1:
         raise EvflowDataError(
             "EV008", f"{path} has lines like {' '.join(rows[0])[:60]!r}; which column is the time?",
@@ -176,9 +200,8 @@ def _columns(
     return times, [known.get(tail, tail) for tail in tails]
 
 
-def _middle(path: Path, rows: list[list[str]], clock: list[int]) -> np.ndarray | None:
-    """Mid-exposure (T,) from columns of begin and end; None if they are something else."""
-    begin, end = (_numbers(path, rows, column) for column in clock)
+def middle(begin: np.ndarray, end: np.ndarray) -> np.ndarray | None:
+    """Mid-exposure (T,) from its begin and end; None if they are something else."""
     if (end < begin).any() or (end[:-1] > begin[1:]).any():
         return None
     return begin + (end - begin) // 2 if begin.dtype == end.dtype == np.int64 else (

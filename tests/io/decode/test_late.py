@@ -159,6 +159,14 @@ def test_clocks_are_put_one_behind_the_other(tmp_path: Path, kind: str) -> None:
     equal(read_events(path, late="join", start_s=2.0), want.slice(7_000_000, 2**60))
 
 
+@pytest.mark.parametrize("dtype", [np.uint32, np.int32])
+def test_times_of_32_bits_go_on_where_they_begin_anew(tmp_path: Path, dtype: Any) -> None:
+    whole = T + 2 ** (32 if dtype == np.uint32 else 31) - int(T[-1]) // 2
+    path = npz(tmp_path, table(whole.astype(np.uint32).view(dtype)))
+    assert "32 bits that begin anew" in refused(path).fix
+    np.testing.assert_array_equal(read_events(path, late="join").t, whole)
+
+
 @pytest.mark.parametrize("kind", ENCODERS)
 def test_streams_of_cameras_drop_and_sort(tmp_path: Path, kind: str) -> None:
     """An early burst between two parts of a recording, as a packet that was overtaken."""

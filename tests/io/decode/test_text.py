@@ -243,6 +243,10 @@ def test_other_numbers_are_no_events(tmp_path: Path, kind: str) -> None:
     ("t x y p\n0.1 3 -4 1\n0.2 7 4 0\n", "EV005", "No pixel is below 0"),
     ("0.1 64 48 1\n0.2 1 1 0\n", "EV005", "start at 1"),
     ("0.1 40 60 1\n0.2 7 4 0\n", "EV005", "--size 48x64"),
+    ("0.1 64 48 1\n0.2 0 0 0\n", "EV005", "Wrong size?"),
+    ("t,x,y,p\n0.1,3,4,1\nt,x,y,p\n0.2,3,4,0\n", "EV009", "were files joined?"),
+    ("t,x,y,p\n0.1,3,4,255\n0.2,3,4,0\n", "EV006", "Is 255 ON?"),
+    ("t,x,y,p\n0.1,3,4,1\n0.2,3,4,2\n", "EV006", "count from 1"),
 ])
 def test_unclear_text_is_told(tmp_path: Path, content: str, code: str, seen: str) -> None:
     path = tmp_path / "a.csv"

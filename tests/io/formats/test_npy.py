@@ -39,7 +39,9 @@ RECORDS = {
     "seconds": records([("x", "u2"), ("y", "u2"), ("ts", "f8"), ("p", "i1")], ZERO,
                        t=ZERO.t / 1e6, p=SIGNED),
     "nanoseconds": records([("x", "u2"), ("y", "u2"), ("t_ns", "i8"), ("p", "u1")],
-                           t=EVENTS.t * 1000)}
+                           t=EVENTS.t * 1000),
+    "pandas": records([("t", "M8[ns]"), ("x", "i8"), ("y", "i8"), ("p", "?")],
+                      t=EVENTS.t.astype("M8[us]"))}
 
 
 @pytest.mark.parametrize("kind", RECORDS)

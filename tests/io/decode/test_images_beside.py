@@ -1,0 +1,125 @@
+"""Images under other names beside the events of HDF5 and npz, and columns in odd shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from helpers.recordings import SIZE, T0, equal, make, refused
+from helpers.tables import based
+
+from evflow.io import read_recording
+from evflow.io.decode.images_beside import times_of
+
+SOUND = based(make(500), T0)
+E, FRAMES, TIMES = SOUND.events, SOUND.frames, SOUND.frame_times
+COLUMNS = {"x": E.x, "y": E.y, "t": E.t, "p": E.p}
+EXPOSED = np.stack([TIMES - 3000, TIMES + 3000], 1)
+RGB = np.stack([FRAMES] * 3, -1)
+
+BESIDE: dict[str, dict[str, Any]] = {
+    "usual names": {"images": FRAMES, "image_ts": TIMES},
+    "in a group": {"frames/data": FRAMES, "frames/t": TIMES},
+    "times one above": {"cam/left/data": FRAMES, "cam/ts": TIMES},
+    "the nearer name": {"images": FRAMES, "image_times": TIMES, "pose_times": TIMES + 7},
+    "seconds": {"images": FRAMES, "image_timestamps": TIMES / 1e6},
+    "nanoseconds": {"images": FRAMES, "stamps_ns": TIMES * 1000},
+    "begin and end": {"images": FRAMES, "exposure_timestamps": EXPOSED},
+    "one channel": {"images": FRAMES[..., None], "image_ts": TIMES[:, None]},
+    "colour": {"images": RGB, "image_ts": TIMES},
+    "wide integers": {"images": FRAMES.astype(np.int64), "image_ts": TIMES},
+    "float64": {"images": FRAMES.astype(float), "image_ts": TIMES},
+    "big-endian": {"images": FRAMES.astype(">u2"), "image_ts": TIMES.astype(">i8")}}
+
+
+def h5(events: str) -> Callable[[Path, dict[str, Any]], Path]:
+    """Writes arrays and the events, in columns x, y, t, p of those names."""
+    def write(folder: Path, arrays: dict[str, Any]) -> Path:
+        with h5py.File(folder / "a.h5", "w") as f:
+            for name, old in zip(events.split(), "xytp", strict=True):
+                f[name] = COLUMNS[old]
+            for name, array in arrays.items():
+                f[name] = array
+            f.attrs["resolution" if "xs" not in events else "sensor_resolution"] = (
+                SIZE if "xs" not in events else SIZE[::-1])
+        return folder / "a.h5"
+    return write
+
+
+def npz(folder: Path, arrays: dict[str, Any]) -> Path:
+    np.savez(folder / "a.npz", size=SIZE, **({**COLUMNS} | arrays))
+    return folder / "a.npz"
+
+
+@pytest.mark.parametrize("write", [
+    h5("x y t p"), h5("events/x events/y events/t events/p"),
+    h5("events/xs events/ys events/ts events/ps"), npz])
+@pytest.mark.parametrize("kind", BESIDE)
+def test_images_of_other_names_are_the_frames(
+    tmp_path: Path, write: Callable[[Path, dict[str, Any]], Path], kind: str
+) -> None:
+    found = read_recording(write(tmp_path, BESIDE[kind]))
+    equal(found.events, E)
+    np.testing.assert_array_equal(found.frames, FRAMES)
+    np.testing.assert_array_equal(found.frame_times, TIMES)
+    assert "frames are from" in found.notes[0].text
+
+
+@pytest.mark.parametrize(("arrays", "said"), [
+    ({"images": FRAMES}, "without an array of 6 times"),
+    ({"images": FRAMES, "a_ts": TIMES, "b_ts": TIMES}, "without an array of 6 times"),
+    ({"depth": FRAMES, "depth_ts": TIMES}, "not brightness"),
+    ({"images": FRAMES[:, :40], "image_ts": TIMES}, "64x40"),
+    ({"images": FRAMES, "image_ts": TIMES[::-1]}, "Frame times must increase"),
+    ({"images": FRAMES / 255.0, "image_ts": TIMES}, "Multiply by 255"),
+    ({"images": FRAMES - 300.0, "image_ts": TIMES}, "expected DN")])
+def test_what_cannot_be_frames_leaves_the_events_and_is_told(
+    tmp_path: Path, arrays: dict[str, Any], said: str
+) -> None:
+    for write in (npz, h5("x y t p")):
+        found = read_recording(write(tmp_path, arrays))
+        equal(found.events, E)
+        assert not found.has_frames
+        assert said in found.notes[0].text
+        assert not read_recording(write(tmp_path, arrays), no_frames=True).notes
+
+
+def test_a_stream_that_is_named_is_read_or_refused(tmp_path: Path) -> None:
+    path = h5("x y t p")(tmp_path, {"blurred": FRAMES, "blurred_ts": TIMES, "raw": FRAMES // 2,
+                                    "raw_ts": TIMES})
+    assert read_recording(path).frames.max() <= 127
+    np.testing.assert_array_equal(read_recording(path, frames_topic="blurred").frames, FRAMES)
+    assert refused(path, frames_topic="other").code == "EV020"
+
+
+def test_times_are_told_by_their_names() -> None:
+    times, other = np.zeros(6), np.zeros((6, 9, 9))
+    for name in ("t", "timestamps_us", "frameTimes", "image_ts"):
+        assert times_of("images", {"images": other, name: times}) == name
+    for name in ("events", "counts", "gain", "ts_map"):
+        assert times_of("images", {"images": other, name: times}) == ""
+
+
+@pytest.mark.parametrize("turn", [lambda a: a[:, None], lambda a: a[None]])
+@pytest.mark.parametrize("write", [
+    h5("x y t p"), h5("events/x events/y events/t events/p"), npz])
+def test_columns_as_matlab_writes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Any, turn: Callable[[Any], Any]
+) -> None:
+    for name in "xytp":
+        monkeypatch.setitem(COLUMNS, name, turn(getattr(E, name)))
+    equal(read_recording(write(tmp_path, {})).events, E)
+
+
+def test_size_and_offset_in_attributes_around(tmp_path: Path) -> None:
+    path = h5("a/b/events/x a/b/events/y a/b/events/t a/b/events/p")(tmp_path, {})
+    with h5py.File(path, "a") as f:
+        del f.attrs["resolution"]
+        f["a"].attrs["resolution"] = SIZE
+        f["a/b/events"].attrs["t_offset"] = 5000
+    found = read_recording(path).events
+    assert (found.size, int(found.t[0])) == (SIZE, int(E.t[0]) + 5000)
