@@ -33,7 +33,7 @@ def instead(f: Any, name: str, what: str) -> None:
     data = {
         "strings": lambda: np.full(shape, b"abc"), "scalar": lambda: np.float64(3),
         "compound": lambda: np.zeros(shape, COMPOUND), "complex": lambda: np.zeros(shape, "c8"),
-        "deep": lambda: np.zeros((*shape, 1)), "empty": lambda: h5py.Empty("f4"),
+        "deep": lambda: np.zeros((*shape, 2)), "empty": lambda: h5py.Empty("f4"),
         "nan": lambda: np.full(shape, np.nan), "huge": lambda: np.full(shape, 2**64 - 1, "u8"),
         "references": lambda: np.full(shape, f.ref, h5py.ref_dtype),
         "dates": lambda: np.zeros(shape, "i8").astype("V8")}

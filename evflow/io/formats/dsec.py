@@ -80,7 +80,7 @@ def read(path: Path, hints: Hints) -> Recording:
         offset = (hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else
                   told_offset(hints, f["events"], f))
         found = gather(path, _chunks(columns, hints), hints, size, "us", offset)
-        if not ("frame_times" in f and hasattr(f.get("frames"), "shape")):
+        if not {"frames", "frame_times"} <= set(f) or len(getattr(f["frames"], "keys", list)()):
             return images_beside(path, f, found, hints, "events/t", notes)
         images = tables.dataset_images(path, f, "frames", "frame_times")
         return tables.with_frames(path, found, hints, images, "us", notes)
