@@ -1,10 +1,10 @@
 """The simulator: frames and a camera in; events, voxels or counts out.
 
-constants.py the circuit as programs take it · pixel.py one interval of one pixel (second_order.py:
+constants.py the circuit as a pytree · pixel.py one interval of one pixel (second_order.py:
 with a photoreceptor of second order) · noise.py Poisson noise and leak · sensor.py all pixels,
 vmapped · to events: frames.py what comes in, active.py the pixels that may fire, pack.py sorted
 lists, circuits.py block by block, events.py the stream · to voxels: bins.py, grids.py, voxels.py ·
-to counts: counts.py · voltmeter.py a Brownian pixel · interpolate.py slow videos to fast
+to counts: counts.py · voltmeter.py a Brownian pixel · interpolate.py frames in between
 (motion.py optical flow, between.py the pictures along its paths).
 """
 

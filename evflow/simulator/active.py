@@ -1,11 +1,12 @@
 """One block of frames on the device: find the pixels that may fire, and step only those.
 
-Few pixels fire in a few milliseconds. Those that may are gathered, taken through the block interval
-by interval, and their memory is put back, so that cost follows the active pixels. Where the memory
-moves by itself (low-pass, leak), `look` takes all pixels through the light of the block to find
-them, and `step` steps them. Where it stays as it is between events, `limits` of brightness tell
-which frames can matter to a pixel, and `step_still` steps those that saw one. What the steps are
-made into is their `Exit`: events (`sent`), or voxels (`grids.Touched`).
+Few pixels fire within a few milliseconds. Those that may fire are gathered, stepped through the
+block interval by interval, and their memory is written back, so the cost is proportional to the
+number of active pixels. If the memory changes without events (low-pass, leak), `look` passes all
+pixels through the block to find candidates, and `step` steps them. If it does not, brightness
+`limits` give for each pixel which frames can trigger an event, and `step_still` steps the pixels
+that saw such a frame. An `Exit` turns steps into output: events (`sent`) or voxels
+(`grids.Touched`).
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from evflow.simulator.sensor import Sensor
 Array = jax.Array
 T = TypeVar("T")
 
-BLOCK = 8  # frames; more of them have more active pixels, fewer pass more often over all pixels
-TICKS = 1 << 30  # microseconds in a block that leave room for two flags in 32 bits
-SLACK = 1e-4  # of a threshold, or log units: beyond what rounding may differ by
+BLOCK = 8  # frames; larger blocks have more active pixels, smaller ones need more passes over all
+TICKS = 1 << 30  # limit of a block's microseconds, for two flags beside them in 32 bits
+SLACK = 1e-4  # of a threshold, or log units: more than rounding errors
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """T intervals, of which `first` is the index of the first. frames: (T + 1, N) DN, uint8 or
-    float32, the frame before and those at which they end. dt: (T,) seconds. dt_us: (T,) uint32.
-    clock: (T + 1, 2) times of the frames, see `SimState.time`. salts: (T, 2) of `noise.salts`.
-    bits: uint32, of a pixel's number in `Sent.first`."""
+    """T frame intervals. first: global index of interval 0; frames: (T + 1, N) DN, uint8 or
+    float32, the frame before the block and those at which its intervals end; dt: (T,) seconds;
+    dt_us: (T,) uint32; clock: (T + 1, 2) times of the frames, see `SimState.time`; salts: (T, 2) of
+    `noise.salts`; bits: uint32, bits of a pixel's number in `Sent.first`."""
 
     first: Any
     frames: Any
@@ -51,19 +52,20 @@ class Block:
     bits: Any
 
 
-# Takes K pixels through a block: (model, their sensor, their state, the block as they see it, their
-# numbers (K,), -1 for padding) -> (state, what they send). Hashable: `jit` compiles for each.
+# Steps K pixels through a block: (model, sensor, state and block of these pixels, their numbers
+# (K,), -1 for padding) -> (state, output). Hashable, as `jit` compiles for each.
 Exit = Callable[[Constants, Sensor, PixelState, Block, Array], tuple[PixelState, Any]]
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """What K pixels send in T intervals, each array (T, K). first: uint32, 0 where there is no
-    signal event, else of the first of them the microseconds from the begin of the block, times 4,
-    + 2 where ON, + 1 where it is not the only one (nonsense, but not 0, in blocks of `TICKS` us
-    and more); and below these, in `Block.bits` bits if any, the pixel. struck: whether there are
-    noise events, None without noise."""
+    """Events of K pixels in T intervals, arrays (T, K).
+
+    first: uint32, 0 without a signal event; else that of the first: microseconds since the block's
+    begin, times 4, + 2 if ON, + 1 if more follow (in blocks of `TICKS` us and more only nonzero);
+    shifted left by `Block.bits`, with the pixel in these bits. spikes: all signal events. struck:
+    whether there are noise events, None without noise."""
 
     first: Array
     spikes: Spikes
@@ -72,12 +74,12 @@ class Sent:
 
 @functools.partial(jax.jit, static_argnames="dtype")
 def limits(model: Constants, camera: Camera, base: Array, dtype: np.dtype) -> Array:
-    """(2, N) DN: only frames brighter than the first or darker than the second can make pixels
-    with this memory fire. dtype: that of the frames."""
+    """(2, N) DN: a pixel with this memory can fire only at frames brighter than the first or darker
+    than the second. dtype: of the frames."""
     inverse = LOG_MAPS[model.log_map][1]
     bright = inverse(base + (camera.theta_on - SLACK))
     dark = inverse(base - (camera.theta_off - SLACK))
-    if dtype == np.uint8:  # the last values that cannot
+    if dtype == np.uint8:  # the extreme values that do not fire
         bright = jnp.clip(jnp.ceil(bright) - 1.0, 0.0, 255.0)
         dark = jnp.clip(jnp.floor(dark) + 1.0, 0.0, 255.0)
     return jnp.stack([bright, dark]).astype(dtype)
@@ -87,7 +89,7 @@ def limits(model: Constants, camera: Camera, base: Array, dtype: np.dtype) -> Ar
 def look(
     model: Constants, whole: Sensor, pixels: PixelState, block: Block
 ) -> tuple[PixelState, Array]:
-    """The pixels after the block where none of them fires, and (N,) which may."""
+    """State after the block if no pixel fires, and (N,) bool: pixels that may fire."""
     def body(
         carry: tuple[PixelState, Array], inputs: tuple[Array, Array, Array]
     ) -> tuple[tuple[PixelState, Array], None]:
@@ -107,7 +109,7 @@ def look(
 
     active = jnp.zeros(pixels.lp.shape, bool)
     if model.photoreceptor is not None and model.refractory_s is not None:
-        active = pixels.last < model.refractory_s  # whose reset ends within the block
+        active = pixels.last < model.refractory_s  # dead time ends within the block
     (after, active), _ = jax.lax.scan(
         body, (pixels, active), (block.frames[1:], block.dt, block.salts))
     last = pixels.last + jnp.sum(block.dt) if model.is_dead_between else pixels.last
@@ -117,15 +119,15 @@ def look(
 
 
 def _beyond(camera: Camera, contrast: Array) -> Array:
-    """Whether contrast may cross a threshold; `step` may round otherwise."""
+    """Whether contrast may cross a threshold, up to rounding in `step`."""
     near = 1.0 - SLACK
     return (contrast >= near * camera.theta_on) | (-contrast >= near * camera.theta_off)
 
 
 @jax.jit
 def look_for_noise(sensor: Sensor, block: Block) -> Array:
-    """(N,) whether noise may strike in the block: the least a pixel draws against the highest
-    odds."""
+    """(N,) bool: pixels that may have a noise event in the block, by their smallest draw against
+    the highest probability."""
     assert sensor.rates is not None
     least = functools.reduce(jnp.minimum, [noise.draw(sensor.words, salt) for salt in block.salts])
     highest = -jnp.expm1(-noise.peak(sensor.rates) * jnp.max(block.dt))
@@ -142,11 +144,18 @@ def step(
     model: Constants, whole: Sensor, before: PixelState, after: PixelState, block: Block,
     at: Array, exit: Exit,
 ) -> tuple[PixelState, Any]:
-    """Take the pixels `at` (K,) int32 through the block, whose frames (T + 1, K) are theirs alone,
-    from `before` it.
+    """Step some pixels through a block.
 
-    Returns `after` (see `look`) with their memory put back, and what they send. Entries of `at`
-    beyond the last pixel are padding, all different: they repeat it and are not put back.
+    Args:
+        model, whole: the circuit and all pixels.
+        before: state of all pixels before the block.
+        after: state after it if none fires, of `look`.
+        block: with frames (T + 1, K) of these pixels only.
+        at: (K,) int32 pixels; numbers beyond the last pixel, all different, are padding.
+        exit: what to compute of the steps.
+
+    Returns:
+        `after` with the stepped pixels written into it, and their output.
     """
     few, own = _gathered((whole, before), at)
     own, sent = exit(model, few, own, block, _numbers(whole, at))
@@ -158,8 +167,9 @@ def step_still(
     model: Constants, whole: Sensor, pixels: PixelState, block: Block, at: Array,
     rested: Array | None, exit: Exit,
 ) -> tuple[PixelState, Any, Array]:
-    """The same for sensors that are still. rested: (K,) seconds before the block in which the
-    pixels were not stepped, where they wait. Returns their new `limits` (2, K) as well."""
+    """`step` for sensors whose memory changes at events only; also returns new `limits` (2, K).
+    rested: (K,) seconds before the block in which the pixels were not stepped, for models with a
+    dead time."""
     few, own = _gathered((whole, pixels), at)
     last = own.last if rested is None else own.last + rested
     own = PixelState(to_log(block.frames[0], model.log_map), own.base, last)
@@ -195,7 +205,7 @@ def sent(
     logs, i01 = to_log(block.frames, model.log_map), _i01(block.frames[1:])
     number = number[None]
     real = number >= 0
-    # All that does not depend on the memory is worked out for the block at once.
+    # Everything independent of the memory is computed for the block at once.
     dist = jax.vmap(functools.partial(sensor.disturb, model, few))(i01, block.salts, block.dt)
     inputs = (logs[1:], i01, dist, block.dt, (block.clock[:-1], block.clock[1:]))
     pixels, spikes = _spikes(model, few.camera, pixels, inputs)
@@ -208,15 +218,15 @@ def sent(
 def _spikes(
     model: Constants, camera: Camera, pixels: PixelState, inputs: tuple[Any, ...]
 ) -> tuple[PixelState, Spikes]:
-    """The pixels after T intervals, and what they send in each. inputs: of `sensor.advance`, log
-    intensities first."""
+    """State after T intervals, and the spikes of each. inputs: of `sensor.advance`, log intensities
+    first."""
     def advance(pixels: PixelState, inputs: tuple[Any, ...]) -> tuple[PixelState, Spikes]:
         return sensor.advance(model, camera, pixels, *inputs)
 
-    if model.timestamps == "v2e":  # whose slots are visited one by one
+    if model.timestamps == "v2e":  # slots are visited one by one
         return jax.lax.scan(advance, pixels, inputs)
 
-    # A loop that also writes times takes twice as long: these are made for all intervals at once.
+    # Times are computed for all intervals at once: a loop that writes them takes twice as long.
     def body(
         pixels: PixelState, inputs: tuple[Any, ...]
     ) -> tuple[PixelState, tuple[PixelState, Array]]:
@@ -230,7 +240,7 @@ def _spikes(
 
 
 def _ticks(spikes: Spikes, dt_us: Array) -> Array:
-    """`Sent.first` where there are events, but for the pixels. Times are rounded up to a
+    """`Sent.first` of intervals with events, without pixel numbers. Times are rounded up to a
     microsecond, within (begin, end] of their interval."""
     at = spikes.first if spikes.earliest is None else jnp.maximum(spikes.first, spikes.earliest)
     length = dt_us.astype(at.dtype)[:, None]
@@ -242,8 +252,8 @@ def _ticks(spikes: Spikes, dt_us: Array) -> Array:
 
 @jax.jit
 def strike(model: Constants, whole: Sensor, block: Block) -> Array | None:
-    """Where there is noise in a block, bool (T, N), for sensors whose signal comes from
-    elsewhere; None without noise."""
+    """(T, N) bool: intervals with noise events, for sensors whose signal is computed elsewhere;
+    None without noise."""
     one = functools.partial(sensor.disturb, model, whole)
     struck = jax.vmap(one)(_i01(block.frames[1:]), block.salts, block.dt).struck
     return None if struck is None else struck.some

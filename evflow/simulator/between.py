@@ -1,12 +1,11 @@
-"""What lies between the frames of a video: pictures warped along smooth paths.
+"""Frames interpolated between those of a video: pictures warped along smooth paths.
 
-What a pixel shows moves along a cubic in time, so that neither place nor velocity jumps at a frame.
-Its velocity there is that of the polynomial through five frames: the mean of those before and after
-it alone (Catmull-Rom) would be a fifth too small in what swings at a sixth of the frame rate. The
-picture at a time is
-warped from both frames, by cubic interpolation at double resolution. Bilinear interpolation blurs
-all but the given frames, so that events come at the frame rate, and OpenCV's cubic one alone moves
-by fits and starts.
+Each point moves along a cubic in time, with continuous position and velocity at the frames. Its
+velocity there is that of the polynomial through five frames; the mean of the velocities before and
+after (Catmull-Rom) would be a fifth too small for oscillations at a sixth of the frame rate. The
+picture is warped from both frames, by cubic interpolation at double resolution. Bilinear
+interpolation blurs all but the given frames, which modulates the event rate at the frame rate;
+OpenCV's cubic interpolation at single resolution moves unevenly.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ from evflow.simulator.motion import (
     speed,
 )
 
-UNEVEN = 2.0  # ratio of neighbouring intervals; beyond it the velocity of one tells little of both
-REACH = 33  # halved pixels: from how far away acceleration is taken where flow is not trusted
-COVERED = 5  # halved pixels around flow that is not trusted: parts of DIS' patches
+UNEVEN = 2.0  # ratio of neighbouring intervals above which no acceleration is estimated
+REACH = 33  # halved pixels: neighbourhood for the acceleration where flow is not trusted
+COVERED = 5  # halved pixels around untrusted flow that share DIS' patches with it
 MIDDLE = np.array([9, -50, 225, 225, -50, 9], np.float32) / 368  # Lanczos' kernel of 3 pixels half
 # way between two
 BAND, TOGETHER = 1 << 15, 1 << 24  # pixels filled by a thread of OpenCV's at a time, so that caches
@@ -55,7 +54,7 @@ class Frame:
 
     @functools.cached_property
     def doubled(self) -> np.ndarray:
-        """(2H, 2W): the frame, and between its pixels what lies there (Lanczos)."""
+        """(2H, 2W): the frame at twice the resolution (Lanczos)."""
         height, width = self.dn.shape
         wide = np.empty((height, 2 * width), np.float32)
         wide[:, ::2], wide[:, 1::2] = self.dn, _between_pixels(self.dn, 1)
@@ -72,11 +71,11 @@ def _between_pixels(image: np.ndarray, axis: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interval:
-    """Two frames and what moves between them.
+    """Two frames and the motion between them.
 
     bends: half the acceleration at a and at b, (H, W, 2) in pixels per squared interval; None
-    where nothing accelerates. speed_px: how far the fast pixels of trusted flow would move at their
-    greatest velocity, 0 where motion is lost. grid: of `motion.grid`.
+    without acceleration. speed_px: motion of the fast pixels of trusted flow at their greatest
+    velocity, 0 where the flow is lost. grid: of `motion.grid`.
     """
 
     a: Frame
@@ -87,8 +86,8 @@ class Interval:
     grid: np.ndarray
 
     def at(self, fractions: Iterable[float], *, sharp: bool = True) -> Iterator[np.ndarray]:
-        """The pictures (H, W) in DN, float32, at fractions of the interval; not sharp: warped
-        bilinearly from the frames as they are. Where motion is lost, mixtures of both."""
+        """The pictures (H, W) in DN, float32, at fractions of the interval. sharp: cubic at double
+        resolution, else bilinear. Cross-fades where the flow is lost."""
         if self.motion.lost:
             for s in fractions:
                 yield cv2.addWeighted(self.a.dn, 1 - s, self.b.dn, s, 0)
@@ -141,7 +140,7 @@ class Interval:
             np.clip(picture, min(least_a, least_b), max(most_a, most_b), out=picture)
 
     def _reach(self) -> int:
-        """Pixels beyond which nothing is looked up, from any fraction of the interval."""
+        """Largest displacement in pixels at any fraction of the interval."""
         bent = sum(cv2.norm(bend, cv2.NORM_INF) for bend in self.bends or ())
         flows = (cv2.norm(flow, cv2.NORM_INF) for flow in (self.motion.there, self.motion.back))
         return math.ceil(max(flows) + bent) + 1
@@ -156,8 +155,8 @@ def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
 
 
 def _edges(rows: slice, shape: tuple[int, ...], reach: int) -> Iterator[tuple[slice, slice]]:
-    """Parts of some rows of a frame (H, W), from the first of them on, that hold all that lies
-    within `reach` of its edge; none twice."""
+    """Disjoint parts of some rows of a frame (H, W) that cover its border of width `reach`;
+    indices count from the first of these rows."""
     (height, width), count = shape, rows.stop - rows.start
     top = min(max(reach - rows.start, 0), count)
     bottom = min(max(height - reach - rows.start, top), count)
@@ -170,9 +169,15 @@ def _edges(rows: slice, shape: tuple[int, ...], reach: int) -> Iterator[tuple[sl
 def intervals(
     pairs: Iterable[tuple[np.ndarray, int]], *, jerk: bool = True
 ) -> Iterator[Interval]:
-    """The intervals of frames (H, W) in DN, float32, of one size, at rising times in us; none of
-    less than two. jerk: that acceleration changes counts too, so that an interval comes when two
-    frames after it were read, not one, or there are none."""
+    """The intervals of a stream of frames.
+
+    Args:
+        pairs: (frame (H, W) in DN, float32, all of one size; time in us, increasing).
+        jerk: use the change of acceleration; an interval is then yielded two frames later, not one.
+
+    Yields:
+        One interval per pair of neighbouring frames; none of a single frame.
+    """
     held = outer = places = None
     for found in _bent(pairs):
         places = grid(found[0].a.dn.shape) if places is None else places
@@ -218,10 +223,9 @@ class _Pair:
 
 
 def _acceleration(first: _Pair, second: _Pair) -> np.ndarray | None:
-    """Half the acceleration at the frame that two intervals share, (h, w, 2) in pixels per us^2 at
-    half the resolution; None where one interval is much the longer, or its motion lost. Where flow
-    is not trusted, as at the edges of what moves and of the picture, it is that of what lies
-    around."""
+    """Half the acceleration at the frame shared by two intervals, (h, w, 2) in pixels per us² at
+    half resolution; None where the intervals' lengths differ too much or the flow is lost. Where
+    flow is not trusted, as at edges of objects and of the picture, it is averaged from around."""
     before, after = first.length, second.length
     lost = first.motion.lost or second.motion.lost
     if lost or max(before, after) > UNEVEN * min(before, after):
@@ -240,8 +244,8 @@ def _interval(
     pair: _Pair, before: np.ndarray | None, after: np.ndarray | None, places: np.ndarray,
     earlier: np.ndarray | None = None, later: np.ndarray | None = None,
 ) -> Interval:
-    """before, after: `_acceleration` at its frames; of one alone, it is constant. earlier, later:
-    at the frames next to them, which tell how it changes."""
+    """The interval of a pair. before, after: `_acceleration` at its frames; if only one is known
+    it is constant. earlier, later: at the neighbouring frames, for its change."""
     if pair.motion.lost:
         return Interval(pair.a, pair.b, pair.motion, None, 0.0, places)
     (there, back), (on_a, on_b) = pair.motion.halves, pair.motion.trusted
@@ -267,6 +271,6 @@ def _speed(flow: np.ndarray, trusted: np.ndarray) -> float:
 
 
 def _limited(bend: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """No longer than the flow: what goes somewhere never turns back, and what rests stays."""
+    """The bend, at most as long as the flow: no point reverses, and resting points stay."""
     most, found = length(flow), length(bend)
     return bend * (np.minimum(found, most) / np.maximum(found, np.float32(1e-9)))[..., None]

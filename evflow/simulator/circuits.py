@@ -29,9 +29,9 @@ from evflow.simulator.sensor import Sensor, SimState
 from evflow.simulator.sizes import ACTIVE, aligned, picked, sizes
 
 Array = jax.Array
-Packed = tuple[Keys, list[np.ndarray]]  # events in no order, and how they are integers
+Packed = tuple[Keys, list[np.ndarray]]  # unsorted events as integers, and their encoding
 Fetch = Callable[[], Packed]
-Piece = tuple[np.ndarray, np.ndarray, Any]  # pixels, the frames they see, what they send
+Piece = tuple[np.ndarray, np.ndarray, Any]  # pixels, the frames they see, their output
 Stepped = tuple[list[Piece], Block, np.ndarray]  # a block, and the ticks of its intervals
 Spiked = tuple[np.ndarray, np.ndarray, np.ndarray]  # pixel, fraction of the interval, whether ON
 
@@ -57,7 +57,7 @@ def thresholds(
     key: Array, frame: np.ndarray, start: int, camera: Camera, model: Constants, *,
     exit: Exit, tick_s: float = 1e-6,
 ) -> Still | Drifting:
-    """The same for all but DVS-Voltmeter, with any exit. tick_s: unit of the frames' times."""
+    """`circuit` for all kinds but DVS-Voltmeter, with any exit. tick_s: unit of frame times."""
     kind = Still if model.is_still else Drifting
     return kind(exit, key, frame, start, camera, model, tick_s)
 
@@ -75,7 +75,7 @@ def _salts(key: Array, first: int) -> Array:
 
 
 class _Blocks:
-    """What all kinds share: noise rates, and blocks padded to BLOCK frames."""
+    """Common to all kinds: noise rates, and blocks padded to BLOCK frames."""
 
     def __init__(
         self, key: Array, frame: np.ndarray, start: int, camera: Camera, model: Constants,
@@ -86,21 +86,20 @@ class _Blocks:
         if noise.is_noisy(model, camera):
             nominal = noise.nominal_thresholds(model, camera)
             self.most_hz = noise.most_rate(model, camera, nominal)
-        self.law = model.on_device()  # as programs take it
+        self.law = model.on_device()  # argument of compiled programs
         self.whole, state = _start(key, frame, camera, nominal, self.law)
-        self.here = jax.tree.map(np.asarray, self.whole)  # the same, for the host
+        self.here = jax.tree.map(np.asarray, self.whole)  # copy on the host
         self.pixels, self.key = state.pixels, state.key
         self.interval, self.salts = 0, np.empty((0, 2), np.uint32)
         self.no_clock = np.zeros((BLOCK + 1, 2), np.float32)
         self.before = frame.ravel()
 
     def keys(self, ticks: np.ndarray) -> Keys:
-        """How the events of these intervals are sorted."""
+        """Encoding of the events of these intervals as sortable integers."""
         return Keys.of(self.before.size, int(ticks.sum()))
 
     def block(self, frames: list[np.ndarray], edges: np.ndarray) -> Block:
-        """The block, whose frames are a list. Raises EV014 where the noise is more than an
-        interval can hold."""
+        """The block of these frames. Raises EV014 where an interval has too much noise."""
         ticks = np.diff(edges)
         noise.check_rate(self.most_hz, float(ticks.max()) * self.tick_s)
         if missing := BLOCK - len(frames):
@@ -108,7 +107,7 @@ class _Blocks:
             ticks = np.append(ticks, np.zeros(missing, np.int64))
         frames = [self.before, *frames]
         self.before = frames[-1]
-        # Only the frames are always read; jit passes over what a model has no use for.
+        # jit drops inputs that a model does not use.
         block = Block(np.int32(self.interval), frames, (ticks * self.tick_s).astype(np.float32),
                       ticks.astype(np.uint32), self._clock(edges[0], ticks), self._next_salts(),
                       np.uint32(self.keys(ticks).bits_below))
@@ -139,7 +138,7 @@ class _Thresholds(_Blocks):
         self.sizes = sizes(self.before.size, jax.tree.structure(self.law), exit, self.before.dtype)
 
     def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
-        """What comes of each block; the device may still be at it."""
+        """Steps of each block, dispatched; the device may still compute them."""
         raise NotImplementedError
 
     def run(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Fetch]:
@@ -148,16 +147,16 @@ class _Thresholds(_Blocks):
     def pieces(
         self, at: np.ndarray, block: Block
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Block]]:
-        """The pixels `at` some at a time, the same padded with numbers beyond the last pixel, and
-        the block as these see it."""
+        """The pixels `at` in parts. Yields the pixels, the same padded with numbers beyond the last
+        pixel, and the block with the frames of these pixels."""
         count, most = self.here.words.size, ACTIVE[-1]
-        if slots := self.model.timestamps == "v2e":  # which depend on all pixels
+        if slots := self.model.timestamps == "v2e":  # slots depend on all pixels
             at, most = np.arange(count), count
         for first in range(0, len(at), most):
             some = at[first : first + most]
             size = count if slots else self.sizes.of(len(some))
             padded = np.append(some, np.arange(count, count + size - len(some)))
-            # NumPy takes a quarter of the time that XLA does; "clip" takes half as long again.
+            # NumPy gathers four times as fast as XLA; mode "clip" would take half as long again.
             seen = np.empty((BLOCK + 1, size), self.before.dtype)
             for frame, row in zip(block.frames, seen, strict=True):
                 frame.take(padded, mode="wrap", out=row)
@@ -176,11 +175,12 @@ class _Thresholds(_Blocks):
 
 
 class Drifting(_Thresholds):
-    """Memory moves by itself: the device looks at every pixel."""
+    """Pixels whose memory changes without events: the device checks every pixel."""
 
     def __init__(self, *exit_and_sensor: Any) -> None:
         super().__init__(*exit_and_sensor)
-        # Fresh memory is dear. The device may read one block while another is filled.
+        # Buffers are reused, as new memory is slow; two, as the device may still read one block
+        # while the next is filled.
         shape = (BLOCK + 1, self.before.size)
         self.buffers = itertools.cycle([aligned(shape, self.before.dtype) for _ in range(2)])
 
@@ -191,7 +191,7 @@ class Drifting(_Thresholds):
             block = dataclasses.replace(
                 block, frames=np.stack(block.frames, out=next(self.buffers)))
             stepped = self._step(*looked) if looked else None
-            # In line behind the step before, which it continues; nothing is waited for here.
+            # Queued on the device behind the previous step; does not block here.
             after, may_send = active.look(self.law, self.whole, self.pixels, block)
             looked = block, np.diff(edges), after, may_send
             if stepped:
@@ -211,16 +211,16 @@ class Drifting(_Thresholds):
 
 
 class Still(_Thresholds):
-    """Memory stays as it is between events: the host compares the brightest and the darkest
-    frame of a block with each pixel's limits, which is fast for bytes."""
+    """Pixels whose memory changes at events only: the host compares the brightest and the darkest
+    value in a block with each pixel's limits, which is fast for bytes."""
 
     def __init__(self, *exit_and_sensor: Any) -> None:
         super().__init__(*exit_and_sensor)
         found = active.limits(
             self.law, self.whole.camera, self.pixels.base, self.before.dtype)
         self.bright, self.dark = np.array(found)
-        self.seen = np.full(self.before.size, self.begin)  # when each was stepped last
-        self.stepped: list[tuple[np.ndarray, Array]] = []  # pixels, their limits from then on
+        self.seen = np.full(self.before.size, self.begin)  # time of each pixel's last step
+        self.stepped: list[tuple[np.ndarray, Array]] = []  # pixels and their new limits
         self.lapse = Lapse(self.model)
 
     def steps(self, video: Iterable[tuple[list[np.ndarray], np.ndarray]]) -> Iterator[Stepped]:
@@ -254,7 +254,7 @@ class Still(_Thresholds):
         return super()._signal(keys, pieces, dt_us) if exact is None else exact
 
     def _rested(self, some: np.ndarray, padded: np.ndarray, edges: np.ndarray) -> np.ndarray:
-        """Seconds since the last block of these pixels, for which this one is the last now."""
+        """Seconds since these pixels were last stepped; records this block as their last."""
         since = edges[0] - self.seen.take(padded, mode="clip")
         self.seen[some] = edges[-1]
         return (since * self.tick_s).astype(np.float32)

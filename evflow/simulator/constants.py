@@ -1,7 +1,8 @@
-"""The pixel circuit as programs take it: choices and what is off are structure, numbers are leaves.
+"""The pixel circuit as an argument of compiled programs: a pytree whose leaves are its numbers.
 
-What is derived of a number is worked out here, on the host and in double precision where the number
-is known, so that a program computes with the same float32 as if it were written into it.
+Choices and switched-off parts are static structure. Derived constants are computed here, on the
+host and in double precision for known numbers, so that programs use the same float32 as if the
+number were a literal in them.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ Number = Any  # a float, what is traced, or None where it is off
 CHOICES = ("kind", "timestamps", "log_map", "cutoff_by_light", "eta_is_all", "eta_intensity",
            "noise_resets_memory")
 
-AT_ONCE = 1e30  # per second: the corner of a low-pass that follows at once
-NO_TIME = 1e-12  # seconds: a dead time that delays nothing
+AT_ONCE = 1e30  # per second: corner of a low-pass without effect
+NO_TIME = 1e-12  # seconds: dead time without effect
 
 
 @partial(
@@ -52,9 +53,9 @@ class Constants:
 
     @staticmethod
     def of(model: SensorModel) -> Constants:
-        """Of known numbers floats, of traced ones what is traced. Raises EV020 for numbers that a
-        model cannot have, as a step along a gradient may lead to."""
-        model = dataclasses.replace(model)  # checked anew: what comes out of jit or tree.map is not
+        """The constants of a model, of floats or traced numbers. Raises EV020 for invalid numbers,
+        to which a gradient step may lead."""
+        model = dataclasses.replace(model)  # validates; jit and tree.map do not
         on: dict[str, Any] = {
             name: None if is_off(value := getattr(model, name)) else value for name in NUMBERS}
         on |= {name: getattr(model, name) for name in CHOICES}
@@ -65,7 +66,7 @@ class Constants:
 
     @property
     def is_still(self) -> bool:
-        """Whether a pixel's memory stays as it is between events."""
+        """Whether a pixel's memory changes at events only."""
         return self.corner is None is self.leak_hz and self.photoreceptor is None
 
     @property
@@ -75,11 +76,11 @@ class Constants:
 
     @property
     def waits(self) -> bool:
-        """Whether an event that comes within the refractory period of another fires later."""
+        """Whether an event within the refractory period of another is delayed, not lost."""
         return self.is_dead_between and self.kind == "v2e" and self.photoreceptor is None
 
     def on_device(self) -> Constants:
-        """The same for calls of many programs."""
+        """A copy on the device, for calls of many programs."""
         return jax.tree.map(jnp.asarray, self)
 
 

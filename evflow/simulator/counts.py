@@ -1,8 +1,9 @@
 """Event counts per pixel and polarity: exact, or smooth with gradients.
 
-Counts are steps in theta. The smooth mode replaces each step by a ramp of some width around it:
-as wide as a threshold, the count is what one expects of a pixel whose memory may lie anywhere; as
-narrow as nothing, it is the count. Its gradients in theta, eta and light are those of the ramp.
+Counts are step functions of theta. The smooth mode replaces each step by a ramp around it. At the
+width of a threshold the count is the expectation for a pixel whose memory is uniformly distributed
+between thresholds; at width 0 it is the exact count. Gradients in theta, eta and light are those of
+the ramp.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def _counts(
     camera, marks = sensor.possible(camera)
     whole, state = sensor.start(key, log_frames[0], camera, model, nominal)
     frames = log_frames[1:].reshape(steps - 1, math.prod(shape))
-    if smooth:  # of the thresholds themselves: rounded ones have no gradient
+    if smooth:  # unrounded thresholds, as rounded ones have no gradient
         whole = dataclasses.replace(whole, camera=jax.tree.map(jnp.ravel, camera))
     scan = partial(_scan_smooth, smooth) if smooth else partial(_scan, times)
     counts = jnp.stack(scan(model, whole, state, frames, dt), -1)
@@ -132,7 +133,7 @@ def _scan(
 
 
 def _struck(model: Constants, words: Array, struck: sensor.Struck) -> tuple[Array, Array]:
-    """(ON, OFF) noise events of an interval, the ones of `simulate`."""
+    """(ON, OFF) noise events of an interval, the same as of `simulate`."""
     u, mean = noise.uniform(struck.drawn), struck.odds.mean
 
     def step(carry: tuple[noise.Tail, Array, Array]) -> tuple[noise.Tail, Array, Array]:
@@ -159,7 +160,7 @@ def soft_floor(x: Array, width: float) -> Array:
 def _scan_smooth(
     smooth: float, model: Constants, whole: Sensor, state: SimState, frames: Array, dt: Array
 ) -> tuple[Array, Array]:
-    """(ON, OFF) smooth counts (N,); the memory moves by as much as they say."""
+    """(ON, OFF) smooth counts (N,); the memory moves by these counts times theta."""
     camera = whole.camera
 
     def body(

@@ -48,23 +48,23 @@ def simulate(
 ) -> Events | Labelled:
     """Events of a video seen by a camera.
 
-    Not for jit, vmap or grad: how many events there will be is not known beforehand. There take
-    `simulate_voxels` or `simulate_counts`.
+    Not for jit, vmap or grad, as the number of events is not known beforehand; use
+    `simulate_voxels` or `simulate_counts` there.
 
     Args:
-        key: of jax.random; noise, leak pattern and crossings of the Brownian pixel come of it.
+        key: of jax.random; determines noise, leak pattern and the crossings of a Brownian pixel.
         frames: (T, H, W), T >= 2: uint8, float DN on 0..255, or uint16 on 0..65535 (convert 10-
             and 12-bit data with `evflow.light.log_maps.to_dn`). Between frames log intensity is
             interpolated linearly.
         times_us: (T,) integer microseconds, strictly increasing; the first may be anything.
         camera: maps (H, W).
         model: the pixel circuit; None is `SensorModel()`.
-        labels: also tell which events are noise.
+        labels: also return which events are noise.
 
     Returns:
         Sorted `Events`, integer microseconds in (times_us[0], times_us[-1]]. With `labels`, also
-        bool (N,): which are noise (eta and shot noise; what leaks crosses the threshold as light
-        does, and counts as signal).
+        bool (N,): which are noise (eta and shot noise; leak crosses the threshold as light does,
+        and counts as signal).
 
     Raises:
         EvflowDataError: EV001 (fewer than two frames), EV002 (shapes), EV003 (dtype or range),
@@ -108,7 +108,7 @@ def simulate_stream(
     key: Array, frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     camera: Camera, *, model: SensorModel | None = None, labels: bool = False,
 ) -> Iterator[Events] | Iterator[Labelled]:
-    """Events of a video that arrives piece by piece, in bounded memory.
+    """Events of a streamed video, in bounded memory.
 
     Args:
         key: of jax.random.
@@ -117,12 +117,12 @@ def simulate_stream(
         times_iter: yields the matching times, scalars or (T,), integer microseconds.
         camera: maps (H, W).
         model: the pixel circuit; None is `SensorModel()`.
-        labels: also tell which events are noise.
+        labels: also return which events are noise.
 
     Returns:
-        An iterator over `Events` of eight frames at a time, each later than the one before, after
-        reading 8 or 16 frames more; together they are the same bytes as of `simulate`, for any cut
-        of the input. With `labels`, pairs of them and bool (N,) as in `simulate`.
+        An iterator over `Events` of eight frames each, in order of time, 8 or 16 frames behind the
+        input. Together they are the same bytes as of `simulate`, for any chunking of the input.
+        With `labels`, pairs of them and bool (N,) as in `simulate`.
 
     Raises:
         EvflowDataError: EV001, EV002, EV003, EV004, EV007, EV014, EV015 as in `simulate`, while
@@ -142,12 +142,12 @@ def _packed(
     key: Array, video: Iterator[tuple[list[np.ndarray], np.ndarray]], camera: Camera,
     model: Constants,
 ) -> Iterator[Labelled]:
-    """While the device works on a block, one that is done is packed."""
+    """Pack a finished block while the device computes the next."""
     camera = _checked_camera(camera)
     shape = (camera.shape[0], camera.shape[1])
     (first,), last = next(video)
     pixels = circuit(key, first.reshape(shape), int(last[0]), camera, model)
-    edges: deque[np.ndarray] = deque()  # of the blocks under way
+    edges: deque[np.ndarray] = deque()  # of the blocks in flight
 
     def watched() -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
         before = last

@@ -17,10 +17,19 @@ def blocks(
     frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     shape: tuple[int, ...], length: int, *, copy: bool,
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-    """Flat frames, bytes or float32 DN, and their int64 times, however the input is cut: first
-    the first frame alone, then `length` frames at a time. copy: frames as they are when they
-    arrive, for sources that write the next one into the same memory. Raises EV001 for less than
-    two frames, EV002, EV003, EV004, EV007 and EV015 for bad ones."""
+    """Validated flat frames (bytes or float32 DN) and int64 times, in blocks independent of the
+    input's chunks: first the first frame alone, then `length` frames at a time.
+
+    Args:
+        frames_iter, times_iter: single frames or blocks, and matching times.
+        shape: (H, W).
+        length: frames of a block.
+        copy: copy frames on arrival, for sources that reuse one buffer.
+
+    Raises:
+        EvflowDataError: EV001 for less than two frames; EV002, EV003, EV004, EV007 and EV015 for
+            bad ones.
+    """
     pairs = ((_flat(frame, copy), t)
              for frame, t in _single_frames(frames_iter, times_iter, shape))
     taken = list(itertools.islice(pairs, 1))
@@ -47,7 +56,7 @@ def _single_frames(
     frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     shape: tuple[int, ...],
 ) -> Iterator[tuple[np.ndarray, int]]:
-    """Validated (frame, time) pairs, whatever the blocks they came in."""
+    """Validated (frame, time) pairs, from single frames or blocks."""
     dtype, last, index, doubt, bright = None, None, 0, None, False
     for block, times in itertools.zip_longest(frames_iter, times_iter):
         if block is None or times is None:

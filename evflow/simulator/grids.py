@@ -1,7 +1,7 @@
 """Contributions of frame intervals to a voxel grid, without making events.
 
-The frames are scanned, `sensor.advance` says when events fall, `bins` what they weigh, and each
-interval's few touched bins are added to the grid in place.
+The frames are scanned; `sensor.advance` gives the times of events, `bins` their weights, and the
+few bins that an interval touches are added to the grid in place.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def scan(
     model: Constants, whole: Sensor, pixels: PixelState, frames: Array, dt: Array, salts: Array,
     clock: Array, plan: Schedule, bins: int,
 ) -> tuple[PixelState, Array]:
-    """Pixels (N,) after T intervals, and what those add to `bins` bins, (2 * bins, N).
+    """State of pixels (N,) after T intervals, and their voxels (2 * bins, N).
 
     frames: (T, N), log intensity or bytes, at the ends of the intervals. dt: (T,) seconds. salts:
     (T, 2). clock: (T + 1, 2), as in `SimState.time`. plan: of these intervals and bins.
@@ -58,21 +58,21 @@ def scan(
 
 
 def as_log(model: Constants, frames: Array) -> Array:
-    """Log intensity of frames, which they hold unless they are bytes."""
+    """Log intensity of frames: bytes are converted, others are logarithms already."""
     return to_log(frames, model.log_map) if frames.dtype == jnp.uint8 else frames
 
 
 @dataclasses.dataclass(frozen=True)
 class Touched:
     """The `active.Exit` to voxels of a window of `steps` intervals and `bins` bins: K pixels in a
-    block of it add (K, 2, span) to the bins from `low` on, of ON and OFF."""
+    block contribute (K, 2, span), ON and OFF, to the bins from `low` on."""
 
     steps: int
     bins: int
 
     @functools.cached_property
     def plan(self) -> Schedule:
-        """Of whole blocks: intervals beyond the last repeat it, and add nothing."""
+        """Schedule of whole blocks; padding intervals repeat the last one and add nothing."""
         plan, more = Schedule.of(self.steps, self.bins), (0, -self.steps % BLOCK)
         low, offset, wide = (np.pad(row, more, "edge")
                              for row in (plan.low, plan.offset, plan.wide))
@@ -80,7 +80,7 @@ class Touched:
 
     @functools.cached_property
     def span(self) -> int:
-        """Bins that a block touches at most."""
+        """Largest number of bins that a block touches."""
         low = self.plan.low.reshape(-1, BLOCK)
         return min(self.bins, int(np.max(low[:, -1] - low[:, 0])) + self.plan.width)
 
@@ -157,8 +157,8 @@ def _weights(
         spare = [jnp.zeros_like(spikes.first)] * (plan.width - width)
         return weigh.signal_bins(width, spikes, offset, plan.length, dead) + spare
 
-    # The branch saves the third bin where it is not touched; it also is where XLA writes the
-    # spikes down once, instead of computing them again for every bin and polarity.
+    # The branch skips the third bin where it is not touched. It also makes XLA materialise the
+    # spikes once, instead of recomputing them for every bin and polarity.
     return weigh.by_polarity(
         jax.lax.cond(
         wide, functools.partial(signed, plan.width), functools.partial(signed, 2), spikes))
@@ -171,7 +171,7 @@ def _noise_weights(
     u, mean = noise.uniform(struck.drawn), struck.odds.mean
 
     def placed(k: Array, sent: Array) -> Array:
-        """Where each pixel's k-th event falls, negative for OFF, 0 where none is sent."""
+        """Fraction of the interval of each pixel's k-th event, negative for OFF, 0 without one."""
         at, on = noise.event(model, words, struck.drawn, k, struck.odds.share)
         return jnp.where(sent, jnp.where(on, at, -at), 0.0)
 
@@ -187,7 +187,7 @@ def _noise_weights(
         more = weights(placed(jnp.asarray(tail[2], jnp.uint32), u < tail[0]))
         return noise.next_tail(mean, tail), jax.tree.map(jnp.add, total, more)
 
-    # Behind a branch XLA writes the places down once, not again for every bin and polarity.
+    # The branch makes XLA materialise the places once, not for every bin and polarity.
     first = jax.lax.cond(jnp.any(struck.some), lambda: placed(jnp.zeros((), jnp.uint32),
                          struck.some), lambda: jnp.zeros_like(u))
     tail = jax.tree.map(jnp.asarray, noise.next_tail(mean, struck.odds.tail()))

@@ -21,23 +21,31 @@ from evflow.simulator.between import intervals
 
 MIN_SIDE = 12  # pixels on the longer side: smaller frames show no motion
 STEP_PX = 0.5  # of motion: at one pixel a step, fine textures lose 5 to 15 % of their events
-MAX_STEPS = 128  # frames per pair; beyond it the motion is too fast to trust the flow anyway
+MAX_STEPS = 128  # frames per pair; faster motion gives no reliable flow
 GOLDEN, NEAREST = 0.6180339887, 0.3
-AHEAD = 1  # interval that is found while another is filled
-FAILED = 0.3  # of the pixels that change: flow fails in so many where much is covered, and more
+AHEAD = 1  # intervals whose motion is computed while another is filled
+FAILED = 0.3  # share of changing pixels with wrong flow: strong occlusion alone causes that much
 
 
 def upsample(
     pairs: Iterable[tuple[np.ndarray, int]], *, max_motion_px: float = STEP_PX,
     warn: Callable[[Note], None] | None = None, tell: Callable[[Seen], None] = lambda _: None,
 ) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield (frame, time) with at most ~max_motion_px of motion between neighbours.
+    """Insert frames so that motion between neighbours is at most about max_motion_px.
 
-    pairs: (frame (H, W) in DN 0..255, time in us). Yields float32 frames; the given ones come
-    out unchanged, those between lie evenly in time. What lies between two comes after the two
-    frames that follow them were read. `warn` is told, at the end, where motion needs more than
-    MAX_STEPS steps, where optical flow fails and where the scene is cut; `tell` what was seen of
-    each interval. Raises EV002 (frames too small or of changing size), EV020.
+    Args:
+        pairs: (frame (H, W) in DN 0..255, time in us).
+        max_motion_px: motion between neighbouring frames of the output.
+        warn: receives notes at the end: motion that needs more than MAX_STEPS steps, failed
+            optical flow, cuts.
+        tell: receives measurements of each interval.
+
+    Yields:
+        (float32 frame, time): the given frames unchanged, and frames at even times between them,
+        delayed by two input frames.
+
+    Raises:
+        EvflowDataError: EV002 (frames too small or of changing size), EV020.
     """
     if not max_motion_px > 0:
         raise EvflowDataError("EV020", f"max_motion_px={max_motion_px}.", "It must be > 0.")
@@ -68,9 +76,9 @@ def upsample(
 
 
 def _times(t0: int, t1: int, steps: int, number: int) -> list[int]:
-    """The times in us that divide interval `number` into about `steps`, none nearer to a frame than
-    NEAREST steps. They begin at another fraction of a step in each interval, evenly spread (by the
-    golden ratio): what a step does to the rate of events would add up over the frames otherwise."""
+    """Times in us that divide interval `number` into about `steps`, none closer to a frame than
+    NEAREST steps. Each interval starts at another fraction of a step (multiples of the golden
+    ratio), so that a step's effect on the event rate does not add up over the frames."""
     step = (t1 - t0) / max(1, min(steps, t1 - t0))
     first = (1 - number * GOLDEN % 1) * step
     times = t0 + np.unique(np.rint(np.arange(first, t1 - t0, step)).astype(np.int64))
@@ -80,8 +88,8 @@ def _times(t0: int, t1: int, steps: int, number: int) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """Of an interval from t0 to t1 us: motion, the steps that it wants, share of wrong flow,
-    whether its motion is lost."""
+    """Measurements of the interval from t0 to t1 us: motion, steps that it needs, share of wrong
+    flow, whether the flow is lost."""
 
     t0: int
     t1: int
@@ -92,7 +100,7 @@ class Seen:
 
 
 def notes_on(seen: list[Seen]) -> Iterator[Note]:
-    """What interpolation could not do well, of the worst interval of each kind."""
+    """Notes on intervals that could not be interpolated well, naming the worst of each kind."""
     fast = [s for s in seen if s.wanted > MAX_STEPS]
     if fast:
         worst = max(fast, key=lambda s: s.motion_px)
@@ -101,10 +109,10 @@ def notes_on(seen: list[Seen]) -> Iterator[Note]:
                    f"steps were used{_many(fast, seen)}.")
     lost = [s for s in seen if s.lost]
     if lost:
-        yield Note("frames.cut", f"next to nothing of the frame at {lost[0].t0} us is found again "
-                   f"in that at {lost[0].t1} us{_many(lost, seen)}: a cut, or motion too fast to "
-                   "follow. The one fades into the other, which pixels see as a flash of all that "
-                   "differs; --start and --stop take a single shot.")
+        yield Note("frames.cut", f"hardly anything of the frame at {lost[0].t0} us is found in "
+                   f"that at {lost[0].t1} us{_many(lost, seen)}: a cut, or motion too fast to "
+                   "follow. The frames are cross-faded, which gives a burst of false events; "
+                   "--start and --stop select a single shot.")
     failed = [s for s in seen if s.failed > FAILED and not s.lost]
     if failed:
         worst = max(failed, key=lambda s: s.failed)
@@ -119,7 +127,7 @@ def _many(some: list[Seen], seen: list[Seen]) -> str:
 
 
 def _checked(pairs: Iterable[tuple[np.ndarray, int]]) -> Iterator[tuple[np.ndarray, int]]:
-    """Frames as float32; EV002 where they are no pictures of one size that shows motion."""
+    """Frames as float32; EV002 where sizes differ or are too small for optical flow."""
     shape = None
     for given, time in pairs:
         frame = np.asarray(given, np.float32)
@@ -132,15 +140,15 @@ def _checked(pairs: Iterable[tuple[np.ndarray, int]]) -> Iterator[tuple[np.ndarr
             raise EvflowDataError(
                 "EV002", f"frames of {shape[1]}x{shape[0]} pixels are too small to see motion in: "
                 f"their longer side has less than {MIN_SIDE}.",
-                "Take the frames as they are: --no-interpolate, or no upsample.")
+                "Use the frames without interpolation: --no-interpolate, or no upsample.")
         yield frame, int(time)
 
 
 def unzip(
     pairs: Iterable[tuple[np.ndarray, int]]
 ) -> tuple[Iterator[np.ndarray], Iterator[int]]:
-    """Lazy (frames, times) of a stream of pairs, for `simulate_stream`, which reads a frame and
-    then its time: nothing waits longer than that (itertools.tee would hold 57 pairs)."""
+    """Lazy (frames, times) of a stream of pairs, for `simulate_stream`, which alternates between
+    the two. Buffers one pair (itertools.tee would hold 57)."""
     source, times = iter(pairs), collections.deque[int]()
 
     def frames() -> Iterator[np.ndarray]:

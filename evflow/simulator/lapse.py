@@ -1,8 +1,8 @@
 """Event times of frames far apart: in double precision, on the host.
 
-A crossing is a fraction of its interval. In float32 it tells the microsecond of tenths of a second,
-but not of a minute or an hour, as the frames of a time lapse are apart. There the memory of the
-pixels is followed in float64, beside the device, which decides how many events there are.
+A crossing is a fraction of its interval. float32 resolves microseconds in tenths of a second, but
+not in the minutes or hours between frames of a time lapse. For these the pixels' memory is also
+tracked in float64 on the host; the number of events is still the device's.
 """
 
 from __future__ import annotations
@@ -22,31 +22,29 @@ from evflow.simulator.pack import Keys
 
 Array = np.ndarray
 
-FAR_US = 1 << 18  # of an interval: there float32 log intensities are half a microsecond
+FAR_US = 1 << 18  # length of an interval at which float32 log intensities resolve .5 us
 
 
 class Lapse:
-    """Of pixels that stand still between events: the events of blocks with intervals that are far
-    longer than others'; the other blocks are no matter of this."""
+    """Event times of blocks with long intervals, for pixels whose memory changes at events only."""
 
     def __init__(self, model: Constants) -> None:
         self.model = model
-        self.before: deque[Array] = deque()  # what is remembered before blocks under way
-        self.memory: Array | None = None  # log intensity (N,) float64, followed from block to block
+        self.before: deque[Array] = deque()  # memory before each block in flight
+        self.memory: Array | None = None  # log intensity (N,) float64
 
     def begin(self, block: Block, dt_us: Array, base: Any) -> None:
-        """A block is about to be stepped; base (N,) float32: what the device remembers."""
+        """Record the memory before a block; base: (N,) float32, the device's memory."""
         if self._is_far(dt_us):
-            first = block.first == 0  # what is remembered is the first frame
+            first = block.first == 0  # the memory is the first frame
             self.before.append(log64(block.frames[0], self.model.log_map) if first else
                                np.array(base, np.float64))
 
     def signal(
         self, keys: Keys, camera: Camera, pieces: Sequence[tuple[Array, Array, Sent]], dt_us: Array
     ) -> Iterator[Array] | None:
-        """Keys of the signal events of the next block; None where it is as short as others.
-        camera: flat maps in NumPy. pieces: some pixels, the frames (T + 1, K) in DN that they see,
-        and what they send."""
+        """Keys of the signal events of the next block; None if its intervals are short. camera:
+        flat NumPy maps; pieces: pixels, their frames (T + 1, K) in DN, their output."""
         if not self._is_far(dt_us):
             self.memory = None
             return None
@@ -81,8 +79,8 @@ class Lapse:
 def _crossings(
     keys: Keys, i: int, pixels: Array, count: Array, step: Array, contrast: Array, dt_us: Array
 ) -> Array:
-    """Keys of the events of interval i. count (K,); step (K,): thresholds, negative for OFF;
-    contrast (2, K): when it begins and ends."""
+    """Keys of the events of interval i. count: (K,); step: (K,) thresholds, negative for OFF;
+    contrast: (2, K) at its begin and end."""
     pack.need_few(count, 1)
     at = np.flatnonzero(count)
     row, k = pack.repeated(np.abs(count[at]))

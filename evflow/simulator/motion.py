@@ -1,7 +1,7 @@
 """Motion between two frames: optical flow (OpenCV DIS) both ways, and where it can be trusted.
 
-DIS finds motion of up to a few patches of its coarsest picture, about 20 pixels in fine or
-repetitive textures, so it starts from the shift of the whole picture where that explains more.
+DIS finds motion of up to a few patches of its coarsest scale, about 20 pixels in fine or repetitive
+textures. So it starts from a shift of the whole picture where that explains most of the change.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from evflow.process.threads import behind
 
 PATCHES = 16  # pixels: two of DIS' patches
 SMOOTHING = 2  # iterations of DIS' variational refinement: more are slower and no better
-MOTION_QUANTILE = 99.5  # per cent of pixels that are slower than a `speed`
-LEAST_SIDE, SHIFTED_SIDE = 8, 160  # on the shorter side: of halved frames that show a shift; at
-# which it is found
-BETTER = 0.9  # of the difference without a shift: what a shift must reach to be believed
-APART_PX, APART = 1.0, 0.05  # forward and backward flow may differ by so much, and of the motion
-CHANGED, MISFITS = 5.0, 3.0  # codes: differences of frames that are more than their noise
-MISFIT = 0.5  # of the local contrast: what a right flow leaves far below, and a wrong one exceeds
-LOST, MUCH = 0.9, 0.4  # of the pixels that change, and these of the picture: so many are wrong
-# where another scene begins, and else where things turn by 30 degrees
+MOTION_QUANTILE = 99.5  # per cent: `speed` is this quantile of the pixels' motion
+LEAST_SIDE = 8  # pixels of halved frames, shorter side: below, no shift is searched
+SHIFTED_SIDE = 160  # to which halved frames are reduced for the search
+BETTER = 0.9  # a shift is used if the difference falls below this share of that without
+APART_PX, APART = 1.0, 0.05  # tolerance of forward against backward flow: pixels, share of motion
+CHANGED, MISFITS = 5.0, 3.0  # codes: differences between frames above their noise
+MISFIT = 0.5  # of the local contrast: residuals of correct flow are far below, of wrong flow above
+# Flow is lost if LOST of the changing pixels, and these are MUCH of the picture, have wrong flow:
+# so in a new scene, and where things turn by 30 degrees.
+LOST, MUCH = 0.9, 0.4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Motion:
-    """Of frame a (H, W) to frame b. there: (H, W, 2) float32 pixels (x, y) that carry a into b;
-    back: those that carry b into a; halves: both at half the resolution, (h, w, 2); trusted: where
-    these undo each other, (h, w) bool on a and on b; failed: share of the pixels that change, and
-    stay in view, whose flow is wrong; lost: whether next to nothing of a is found in b, as where a
-    film is cut."""
+    """Optical flow between frames a and b (H, W). there: (H, W, 2) float32 pixels (x, y) from a to
+    b; back: from b to a; halves: both at half resolution, (h, w, 2); trusted: (h, w) bool on a and
+    on b, where the two are consistent; failed: share of changing pixels, which stay in view, with
+    wrong flow; lost: whether hardly anything of a is found in b, as at a cut."""
 
     there: np.ndarray
     back: np.ndarray
@@ -56,7 +56,8 @@ def motion_between(a: np.ndarray, b: np.ndarray) -> Motion:
 
 
 def _flows(a: np.ndarray, b: np.ndarray, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of a to b, and back, from a shift; at the same time where OpenCV has but one thread."""
+    """Flow from a to b and from b to a, starting from a shift; in parallel where OpenCV has one
+    thread."""
     if cv2.getNumThreads() > 1:
         return _flow(a, b, x, y), _flow(b, a, -x, -y)
     back: list[np.ndarray] = []
@@ -67,8 +68,8 @@ def _flows(a: np.ndarray, b: np.ndarray, x: float, y: float) -> tuple[np.ndarray
 
 
 def _flow(a: np.ndarray, b: np.ndarray, x: float, y: float) -> np.ndarray:
-    """Of a to b, from a shift. Of a new object of OpenCV's: one that began from a shift before
-    finds another flow without."""
+    """Flow from a to b, starting from a shift. Uses a new OpenCV object, as one that was once given
+    a shift returns different results without."""
     dis: Any = cv2.DISOpticalFlow_create(  # type: ignore[attr-defined]
         cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setVariationalRefinementIterations(SMOOTHING)
@@ -77,19 +78,20 @@ def _flow(a: np.ndarray, b: np.ndarray, x: float, y: float) -> np.ndarray:
 
 
 def halved(values: np.ndarray) -> np.ndarray:
-    """At half the resolution, the means of 2x2 pixels."""
+    """Half the resolution, means of 2x2 pixels."""
     height, width = values.shape[:2]
     return cv2.resize(values, ((width + 1) // 2, (height + 1) // 2), interpolation=cv2.INTER_AREA)
 
 
 def grid(shape: tuple[int, ...]) -> np.ndarray:
-    """(H, W, 2) float32: where each pixel is (x, y)."""
+    """(H, W, 2) float32: position (x, y) of each pixel."""
     x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[1::-1]))
     return np.stack([x, y], -1)
 
 
 def inside(at: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """(H, W) uint8, 255 or 0: positions (H, W, 2) within a frame of `shape`, to half a pixel."""
+    """(H, W) uint8, 255 where positions (H, W, 2) lie within a frame of `shape`, to half a pixel,
+    else 0."""
     height, width = shape[:2]
     return cv2.inRange(at, (-0.5, -0.5, 0, 0), (width - 0.5, height - 0.5, 0, 0))
 
@@ -104,7 +106,8 @@ def looked_up(
 
 
 def length(flow: np.ndarray) -> np.ndarray:
-    """Of each vector of a flow (H, W, 2), (H, W). OpenCV's rounds by where its result lies."""
+    """(H, W): length of each vector of a flow (H, W, 2). Not cv2.magnitude, whose rounding depends
+    on the memory address of its result."""
     return np.sqrt(np.square(flow[..., 0]) + np.square(flow[..., 1]))
 
 
@@ -123,7 +126,7 @@ def speed(flow: np.ndarray) -> float:
 
 
 def _coded(frame: np.ndarray) -> np.ndarray:
-    """DN of light as 8-bit codes, by the square root: textures in the dark count too."""
+    """DN as 8-bit codes by the square root, so that dark textures count too."""
     return cv2.sqrt(np.maximum(frame, 0) * np.float32(255))
 
 
@@ -132,25 +135,25 @@ def _gray8(frame: np.ndarray) -> np.ndarray:
 
 
 def _padded(image: np.ndarray) -> np.ndarray:
-    """At least PATCHES pixels on each side: DIS ends the process at some narrower frames."""
+    """Padded to at least PATCHES pixels per side: DIS crashes on some narrower frames."""
     return np.pad(image, [(0, max(0, PATCHES - n)) for n in image.shape], mode="edge")
 
 
 def _even(shape: tuple[int, ...], x: float, y: float) -> np.ndarray:
-    """(H, W, 2) float32: the same flow everywhere; as pairs, a tenth of the time."""
+    """(H, W, 2) float32: constant flow; filled as pairs, which is ten times as fast."""
     return np.full(shape, complex(x, y), np.complex64).view(np.float32).reshape(*shape, 2)
 
 
 def _shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """Pixels (x, y) that carry all of one frame into the other, of the halved frames by phase
-    correlation; 0 unless they explain much of the difference."""
+    """Shift (x, y) in pixels from one halved frame to the other, by phase correlation; 0 unless it
+    explains much of the difference."""
     pixel = 2
     if min(a.shape) < LEAST_SIDE:
         return 0.0, 0.0
     while min(a.shape) > SHIFTED_SIDE:
         a, b, pixel = halved(a), halved(b), 2 * pixel
     window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(a.copy(), b.copy(), window)  # writes into what it is given
+    (x, y), _ = cv2.phaseCorrelate(a.copy(), b.copy(), window)  # modifies its arguments
     height, width = a.shape
     i, j = round(x), round(y)
     if i == j == 0 or max(abs(2 * i) - width, abs(2 * j) - height) > 0:
@@ -162,7 +165,7 @@ def _shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def _overlap(image: np.ndarray, x: int, y: int) -> np.ndarray:
-    """The part of an image that another, shifted by (x, y), covers."""
+    """The part of an image that overlaps with one shifted by (x, y)."""
     height, width = image.shape
     return image[max(0, y):height + min(0, y), max(0, x):width + min(0, x)]
 
@@ -170,9 +173,9 @@ def _overlap(image: np.ndarray, x: int, y: int) -> np.ndarray:
 def _verdict(
     a: np.ndarray, b: np.ndarray, there: np.ndarray, back: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], float, bool]:
-    """(trusted, failed, lost) of Motion, of halved frames and flows. A flow is wrong where the
-    other does not undo it, or where the frame that it warps differs from the real one by half the
-    contrast around; a change of light alone is neither."""
+    """(trusted, failed, lost) of `Motion`, from halved frames and flows. Flow is wrong where the
+    backward flow is inconsistent, or where the warped frame differs from the real one by half the
+    local contrast; a change of light alone is neither."""
     at, seen_in_b = _ends(there)
     trusted_there = _undone(there, back, at)
     trusted = trusted_there, _undone(back, there, _ends(back)[0])
@@ -186,13 +189,13 @@ def _verdict(
 
 
 def _ends(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a halved flow, in whole pixels, leads on the halved frame; whether inside it."""
+    """Target of a halved flow in whole pixels, and whether it is inside the frame."""
     at = cv2.scaleAdd(flow, 0.5, grid(flow.shape))
     return at, inside(at, flow.shape) > 0
 
 
 def _undone(flow: np.ndarray, other: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Whether `other`, where a flow leads, leads back."""
+    """Whether `other`, at the targets `at` of a flow, leads back."""
     rest = flow + looked_up(other, at)
     return (length(rest) < APART_PX + APART * length(flow)) & (inside(at, flow.shape) > 0)
 

@@ -1,10 +1,10 @@
 """Noise events: a Poisson process per pixel and polarity, and the leak of the memory.
 
-Rates follow the camera's eta maps and, where asked for, v2e's shot noise. What a pixel draws in
-an interval is a hash of (key, pixel, interval): nothing is stored, a few pixels can be asked for
-alone, and every program finds the same events; the functions from `scramble` to `next_tail` take
-NumPy arrays as well, so that the host can place the few events there are. Counts are exact at any
-interval length; the events of an interval are independent of each other and uniform in it.
+Rates follow the camera's eta maps and, optionally, v2e's shot noise. A pixel's draw in an interval
+is a hash of (key, pixel, interval): nothing is stored, any subset of pixels can be evaluated, and
+all programs give the same events. The functions from `scramble` to `next_tail` also take NumPy
+arrays, for the host to place the few events. Counts are exact at any interval length; the events of
+an interval are independent and uniform in it.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from evflow.simulator.constants import Constants
 Array = jax.Array
 
 MAX_MEAN = 70.0  # noise events per pixel and interval; beyond ~85 exp(-mean) underflows
-LEAK_THETA = 10.0  # natural log; all of an image sensor's range is 5.5
+LEAK_THETA = 10.0  # natural log; the range of an image sensor is 5.5
 GOLDEN = np.uint32(0x9E3779B9)  # 2^32 / golden ratio: distinct numbers far apart
 # sin(2 pi y) / y in powers of y^2, |y| <= 1/4: the fit of least relative error, 5e-9.
 SINE = (6.28318548, -41.3416786, 81.6022339, -76.5749893, 39.7109184)
-JITTER = 1 << 30  # what the leak's draws are numbered from; those of events count from 0
+JITTER = 1 << 30  # first number of the leak's draws; those of events count from 0
 
 
 def scramble(x: Values) -> Values:
-    """A bijection of uint32 under which neighbours become unrelated: xor-shift and multiply,
-    twice, with the constants of C. Wellons' hash prospector."""
+    """Hash: a bijection of uint32 by xor-shift and multiply, twice, with the constants of C.
+    Wellons' hash prospector."""
     x = (x ^ (x >> 16)) * np.uint32(0x21F0AAAD)
     x = (x ^ (x >> 15)) * np.uint32(0xD35A2D97)
     return x ^ (x >> 15)
 
 
 def pixel_words(key: Array, count: int) -> Array:
-    """uint32 (count,): each pixel's own word."""
+    """uint32 (count,): a random word for each pixel."""
     return jax.random.bits(key, (count,), jnp.uint32)
 
 
 def salts(key: Array, intervals: Array) -> Array:
-    """uint32 (T, 2): a multiplier and an offset for each frame interval, from its index alone."""
+    """uint32 (T, 2): a multiplier and an offset for each frame interval, by key and index."""
     def salt(interval: Array) -> Array:
         bits = jax.random.bits(jax.random.fold_in(key, interval), (2,), jnp.uint32)
         return bits | jnp.array([1, 0], jnp.uint32)  # an odd multiplier loses no bit
@@ -54,13 +54,13 @@ def salts(key: Array, intervals: Array) -> Array:
 
 
 def draw(words: Array, salt: Array) -> Array:
-    """uint32 per pixel: what it draws in the interval of this salt (2,). The multiply-add alone
-    makes any two pixels independent; the hash breaks up what is left of its structure."""
+    """uint32 per pixel: its draw in the interval of this salt (2,). The multiply-add makes any two
+    pixels independent; the hash removes the remaining structure."""
     return scramble(words * salt[0] + salt[1])
 
 
 def further(words: Values, drawn: Values, number: Values) -> Values:
-    """Uniforms in (0, 1], the interval's draw of this number (uint32) beside `drawn`."""
+    """Uniforms in (0, 1]: further draws of the interval, by number (uint32)."""
     return uniform(scramble(drawn + words + (number + np.uint32(1)) * GOLDEN))
 
 
@@ -73,8 +73,8 @@ def uniform(bits: Values) -> Values:
 def event(
     model: Constants, words: Values, drawn: Values, k: Values, share: Values
 ) -> tuple[Values, Values]:
-    """The k-th (uint32) noise event of an interval: where it falls, a fraction (v2e puts it at
-    the frame), and whether it is ON, as `share` of them are."""
+    """The k-th (uint32) noise event of an interval: its fraction of the interval (v2e: 1, at the
+    frame), and whether it is ON. share: probability of ON."""
     at, mark = (further(words, drawn, np.uint32(2) * k + np.uint32(i)) for i in (0, 1))
     return at if model.timestamps == "crossing" else at * 0 + 1, mark <= share
 
@@ -92,8 +92,8 @@ def some(mean: Values) -> Values:
 def next_tail(mean: Values, current: Tail) -> Tail:
     """From P(N > k) and P(N = k) to those of k + 1.
 
-    A pixel sends its event k (0, 1, ...) where the interval's uniform lies below P(N > k). What
-    remains of it where P(N = k) < 1e-12 is rounding, and is cut: that ends any loop.
+    A pixel sends its event k (0, 1, ...) if the interval's uniform is below P(N > k). Where
+    P(N = k) < 1e-12 the remainder is rounding and set to 0, which ends any loop.
     """
     more, equal, k = current
     k = k + np.float32(1.0)
@@ -135,8 +135,8 @@ class Rates:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Odds:
-    """Of an interval, per pixel: the mean number of noise events, the probabilities of any and of
-    none, and the share of ON among them."""
+    """Noise of an interval, per pixel: mean number of events, probabilities of any and of none,
+    share of ON among them."""
 
     mean: Values
     some: Values
@@ -160,8 +160,9 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
     """The camera's noise rates.
 
     reference: the I01 at which eta is given (the mean of the first frame). nominal: the median
-    thresholds (ON, OFF); v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta. Where eta is
-    all noise, leak is taken off, and `nominal` makes the mean of the rest 1, which is shot noise.
+    thresholds (ON, OFF); v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta. If eta includes
+    all noise (`eta_is_all`), leak is subtracted, and the rest, normalised to mean 1 by `nominal`,
+    is the pattern of shot noise.
     """
     eta = _but_leak(model, camera)
     if not model.eta_intensity and model.shot_hz is None:
@@ -182,7 +183,7 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
 
 
 def _but_leak(model: Constants, camera: Camera) -> tuple[Array, Array]:
-    """Noise rates ON and OFF, without the leak that is among them where eta is all noise."""
+    """Noise rates ON and OFF, minus the leak if eta includes it."""
     on, off = camera.eta_on, camera.eta_off
     if not model.eta_is_all or model.leak_hz is None:
         return on, off
@@ -190,11 +191,11 @@ def _but_leak(model: Constants, camera: Camera) -> tuple[Array, Array]:
 
 
 def nominal_thresholds(model: Constants, camera: Camera) -> Array:
-    """Median thresholds (ON, OFF) that shot noise refers to, (2, ...) for maps (..., H, W); where
-    eta is all noise, one over the mean of what is not leak.
+    """Median thresholds (ON, OFF) to which shot noise refers, (2, ...) for maps (..., H, W); if eta
+    includes all noise, one over the mean of the part that is not leak.
 
-    A median is a sort, 17 ms on the device for a sensor of 346x260 and 1 ms on the host: call
-    it outside jit where the camera is known. Models without shot noise do not look.
+    A median is a sort: 17 ms on the device for a sensor of 346x260, 1 ms on the host. Call it
+    outside jit where the camera is known. Skipped for models without shot noise.
     """
     theta = (camera.theta_on, camera.theta_off)
     lead = camera.shape[:-2]
@@ -208,7 +209,7 @@ def nominal_thresholds(model: Constants, camera: Camera) -> Array:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in theta):
         return jnp.median(jnp.stack(theta).reshape(2, *lead, -1), axis=-1)
     maps = np.stack([np.asarray(t) for t in theta])
-    with jax.ensure_compile_time_eval():  # known within jit too, for `most_rate`
+    with jax.ensure_compile_time_eval():  # concrete within jit too, for `most_rate`
         return jnp.asarray(np.median(maps.reshape(2, *lead, -1), axis=-1))
 
 
@@ -232,8 +233,8 @@ def peak(rates: Rates) -> Array:
 
 
 def most_rate(model: Constants, camera: Camera, nominal: Array) -> float:
-    """Bound on the rate of any pixel at any intensity and reference, Hz (host side; 0 for traced
-    cameras and models, of which nothing is known)."""
+    """Bound on the rate of any pixel at any intensity and reference, Hz (host side; 0, no bound,
+    for traced cameras and models)."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((camera, model))):
         return 0.0
     with jax.ensure_compile_time_eval():
@@ -252,8 +253,8 @@ def check_rate(rate_hz: float, dt_s: float) -> None:
 
 
 def leak_rates(model: Constants, theta_on: Array, pattern: Array) -> Array:
-    """Contrast that leaks into ON per second: rate x fixed pattern x theta_on (v2e). Thresholds
-    beyond what light can reach are those of dead pixels, which leak does not wake either."""
+    """Contrast that leaks into ON per second: rate x fixed pattern x theta_on (v2e). Pixels with
+    thresholds out of reach of light are dead, and do not leak either."""
     return model.leak_hz * pattern * jnp.minimum(theta_on, LEAK_THETA)
 
 
@@ -267,8 +268,8 @@ def leak(model: Constants, leaking: Array, words: Array, drawn: Array, dt: Array
 
 
 def cosine(turns: Array) -> Array:
-    """cos(2 pi turns) of float32 turns in [0, 1], 2e-7 off. On a CPU XLA asks the C library, number
-    by number: 10 ns each, where this takes .3 ns."""
+    """cos(2 pi turns) of float32 turns in [0, 1], to 2e-7. On a CPU XLA calls the C library for
+    each number, which takes 10 ns against .3 ns here."""
     y = 0.25 - jnp.minimum(turns, 1.0 - turns)
     square, sine = y * y, jnp.full_like(y, SINE[-1])
     for coefficient in SINE[-2::-1]:

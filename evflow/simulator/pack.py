@@ -28,9 +28,9 @@ MOST_EVENTS = 1 << 27  # of a block of frames: 8 GB while they are sorted
 
 @dataclasses.dataclass(frozen=True)
 class Keys:
-    """Events as integers that sort as they do: a rank, the microseconds from the begin of the
-    block, times 4, + 2 where ON, + 1 where noise; and in the `bits` below it the pixel. Equal
-    integers are equal events, 0 is none. dtype: of 32 bits where these do."""
+    """Encoding of a block's events as integers in sort order: microseconds since the block's begin,
+    times 4, + 2 if ON, + 1 if noise (the rank), shifted left by `bits`, with the pixel in these.
+    Equal integers are equal events; 0 is none. dtype: 32 bits if sufficient, else 64."""
 
     bits: int
     dtype: type
@@ -42,7 +42,7 @@ class Keys:
 
     @property
     def bits_below(self) -> int:
-        """`Block.bits`: the device makes keys of 32 bits, else ranks alone."""
+        """`Block.bits`: the device makes whole keys of 32 bits, but only ranks of wider ones."""
         return self.bits if self.dtype is np.uint32 else 0
 
     def __call__(self, rank: Array, pixel: Array) -> Array:
@@ -68,19 +68,19 @@ def from_fractions(
 def signal(
     model: Constants, keys: Keys, sent: Sequence[tuple[Array, Sent]], dt_us: Array
 ) -> Iterator[Array]:
-    """Keys of the signal events of a block. sent: what some pixels send, and which they are."""
-    # Ranks have room for nearly half an hour; time-lapse goes by fractions altogether.
+    """Keys of the signal events of a block. sent: pixels and their output."""
+    # Ranks hold nearly half an hour; longer blocks (time lapse) use fractions only.
     timed = int(dt_us.sum()) < TICKS
     flag = np.uint32(1 << keys.bits_below)
     further = []
     for pixels, out in sent:
         first = np.asarray(out.first)[: len(dt_us)]
-        at = np.flatnonzero(first != 0)  # of bools: six times as fast
+        at = np.flatnonzero(first != 0)  # six times as fast on bools
         if timed:
             found = first.ravel().take(at)
             yield (found & ~flag if keys.bits_below else
                    keys(found & ~flag, _pixels(at, first, pixels)))
-            at = at.take(np.flatnonzero((found & flag) != 0))  # there are few of more than one
+            at = at.take(np.flatnonzero((found & flag) != 0))  # few pixels have more than one
         further.append((out, at, _pixels(at, first, pixels)))
     if any(len(at) for _, at, _ in further):
         yield _progressions(model, keys, further, dt_us, skip=int(timed))
@@ -89,8 +89,8 @@ def signal(
 def _progressions(
     model: Constants, keys: Keys, sent: list[tuple[Sent, Array, Array]], dt_us: Array, skip: int
 ) -> Array:
-    """All events but the first `skip` of each pixel and interval. sent: with what is sent, where
-    in its arrays, and the pixels there."""
+    """All events but the first `skip` of each pixel and interval. sent: outputs, flat indices into
+    their arrays, and the pixels there."""
     def spikes(name: str) -> Array:
         return np.concatenate([_of(getattr(out.spikes, name), at) for out, at, _ in sent])
 
@@ -111,11 +111,16 @@ def noises(
     model: Constants, keys: Keys, whole: Sensor, struck: Sequence[tuple[Array, Array, Any]],
     block: Block, dt_us: Array,
 ) -> Iterator[Array]:
-    """Keys of the noise events of a block. whole: the sensor in NumPy. struck: some pixels, the
-    frames (T + 1, K) that they see, and where they are struck, None without noise.
+    """Keys of the noise events of a block.
 
-    What a pixel drew and its odds are worked out again here, for the few that are struck: as
-    maps of all that may be, they cost more to write than all else that a block does.
+    Draws and probabilities are recomputed here for the few pixels with noise events: writing them
+    as maps on the device would cost more than the rest of the block.
+
+    Args:
+        model, keys: the circuit, and the encoding.
+        whole: the sensor in NumPy.
+        struck: pixels, their frames (T + 1, K), and flags of noise events (None without noise).
+        block, dt_us: the block and its intervals in us.
     """
     found = [_struck(pixels, frames, np.asarray(flags)[: len(dt_us)])
              for pixels, frames, flags in struck if flags is not None]
@@ -132,14 +137,14 @@ def noises(
 
 
 def _struck(pixels: Array, frames: Array, flags: Array) -> tuple[Array, Array, Array]:
-    """Interval, pixel and DN, where noise strikes."""
+    """Interval, pixel and DN of noise events."""
     at = np.flatnonzero(flags)
     return at // flags.shape[1], _pixels(at, flags, pixels), frames[1:].ravel().take(at)
 
 
 def _number(odds: noise.Odds, u: Array) -> Array:
-    """How many noise events each pixel sends that is struck and drew u: at least one, however
-    the device that found it rounds."""
+    """Number of noise events of pixels that drew u: at least one, whatever the rounding of the
+    device that flagged them."""
     tail, number = noise.next_tail(odds.mean, odds.tail()), np.ones(len(u), np.int64)
     while (more := u < tail[0]).any():
         number += more
@@ -148,7 +153,7 @@ def _number(odds: noise.Odds, u: Array) -> Array:
 
 
 def _pixels(at: Array, values: Array, pixels: Array) -> Array:
-    """The pixels (K,) that indices into an array (T, K) are of."""
+    """The pixels of flat indices into an array (T, K); pixels: (K,)."""
     row = at // values.shape[1]
     return pixels.take(at - row * values.shape[1])  # % takes three times as long
 
@@ -158,7 +163,8 @@ def _of(values: jax.Array, at: Array) -> Array:
 
 
 def need_few(count: Array, intervals: int) -> None:
-    """EV014 for more events, signed counts of pixels, than a video of sound thresholds has."""
+    """Raise EV014 for more events than a video gives at plausible thresholds. count: signed, per
+    pixel."""
     if (total := float(np.abs(count).sum(dtype=np.float64))) > MOST_EVENTS:
         most = float(np.abs(count).max())
         raise EvflowDataError(
@@ -169,7 +175,7 @@ def need_few(count: Array, intervals: int) -> None:
 
 
 def repeated(number: Array) -> tuple[Array, Array]:
-    """Rows 0, 1, ... each `number` times, and which time it is: 0, 1, ..."""
+    """Indices 0, 1, ... each repeated `number` times, and the number of the repetition, from 0."""
     number = number.astype(np.int64)
     row = np.repeat(np.arange(len(number)), number)
     return row, np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
@@ -178,8 +184,7 @@ def repeated(number: Array) -> tuple[Array, Array]:
 def sort(
     keys: Keys, parts: list[Array], begin_us: int, shape: tuple[int, int]
 ) -> tuple[Events, Array]:
-    """The sorted `Events` of a block that begins at `begin_us`, and (N,) bool: which of them are
-    noise."""
+    """The sorted `Events` of a block that begins at `begin_us`, and (N,) bool: which are noise."""
     height, width = shape
     bits, merged = keys.bits, np.concatenate([np.empty(0, keys.dtype), *parts])
     merged, above = _in_order(merged, bits)
@@ -195,8 +200,8 @@ def sort(
 
 
 def _in_order(keys: Array, bits: int) -> tuple[Array, Array]:
-    """Sorted integers, and what to add to them: of 64 bits, where there are few upper halves, the
-    lower ones, sorted by 32 bits in two thirds of the time."""
+    """Sorted integers, and an offset to add to them. Of 64 bits with few distinct upper halves, the
+    lower halves are sorted by 32 bits, in two thirds of the time."""
     few = keys.dtype == np.uint64 and bits <= 30 and int(keys.max(initial=0)) >> 40 == 0
     if not few:
         keys.sort()

@@ -1,15 +1,14 @@
-"""What a pixel sees of what frames show: added light, a low-pass, and another clock.
+"""The signal of a pixel, given frames: added light, a low-pass and a delay.
 
-A pixel sees log(light + its dark current) through a photoreceptor that follows with a delay; a
-frame subtracts its black level, and its time stamp is off by a little. With light L in DN of the
-frames, what the pixel sees is s in
+A pixel sees log(light + dark current) through a low-pass. A frame has its black level subtracted,
+and a small error of its time stamp. With light L in DN of the frames, the pixel's signal s follows
 
     ds/dt = r(t) (u(t) - s),    u = lin-log(L + offset),    r = (L + offset + 20) / 275 / tau
 
-(first order, its rate proportional to light as in v2e, or r = 1 / tau whatever the light, where
-not the photoreceptor but what follows it is slow), `delay` after the frames' clock. Between
-instants u moves linearly, which is solved exactly, however long the step: `SensorModel.cutoff_hz`
-is v2e's own form of it, true for steps far below tau. tau = 1 / (2 pi cutoff).
+(first order, with a rate proportional to light as in v2e; or r = 1 / tau at any light, where a
+later stage is slower than the photoreceptor), `delay` after the frames' clock. u is linear between
+the given times, which is solved exactly for steps of any length. `SensorModel.cutoff_hz` is v2e's
+discretisation, valid for steps far below tau. tau = 1 / (2 pi cutoff).
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ from evflow.light.log_maps import lin_log_inverse
 
 Array = jax.Array
 
-FAST = 1e-5  # s: a photoreceptor too fast to be seen between two fine frames
+FAST = 1e-5  # s: a photoreceptor without visible effect between two fine frames
 LEAST_DN = 0.1  # of light, before the log
 LEAST_LIGHT = 0.02  # of v2e's full rate
 
 
 @dataclasses.dataclass(frozen=True)
 class Photoreceptor:
-    """offset_dn: light added to the frames' DN before the log; tau_s: time constant of the
-    low-pass at 255 DN, 0 where it is too fast to be seen; delay_s: of the events after the
-    frames; by_light: whether the low-pass is the slower the darker it is."""
+    """offset_dn: light added to the frames' DN before the log; tau_s: time constant of the low-pass
+    at 255 DN, 0 without one; delay_s: of the events after the frames; by_light: whether the
+    low-pass's cutoff is proportional to light."""
 
     offset_dn: float = 0.0
     tau_s: float = 0.0
@@ -55,7 +54,7 @@ class Photoreceptor:
 
     @property
     def cutoff_hz(self) -> float:
-        """Corner of the low-pass at 255 DN; 0 where there is none."""
+        """Cutoff of the low-pass at 255 DN; 0 without one."""
         return 1.0 / (2.0 * np.pi * self.tau_s) if self.tau_s > FAST else 0.0
 
 
@@ -63,8 +62,8 @@ IDEAL = Photoreceptor()
 
 
 def as_measured(sensor: SensorModel, optics: Optics) -> tuple[Photoreceptor, SensorModel]:
-    """How a measured camera is simulated: what its frames are put through by `seen_frames`, and the
-    circuit behind it, with its dead time and its noise."""
+    """The two stages of simulating a measured camera: the photoreceptor for `seen_frames`, and the
+    circuit behind it, with dead time and noise."""
     behind = dataclasses.replace(sensor, cutoff_hz=0.0, cutoff_by_light=True)
     return Photoreceptor.of(sensor, optics), behind
 
@@ -78,7 +77,7 @@ def lin_log_dn(dn: ArrayLike) -> Array:
 def seen_path(
     dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike, by_light: ArrayLike = True
 ) -> Array:
-    """s (T + 1, ...) of light (T + 1, ...) in DN at instants dt_s (T,) apart, begun at rest."""
+    """s (T + 1, ...) of light dn (T + 1, ...) in DN at times dt_s (T,) apart, starting at rest."""
     u, rate = _light(dn, offset, tau_s, by_light)
 
     def step(s: Array, x: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
@@ -93,9 +92,16 @@ def seen_path(
 def seen_frames(
     pairs: Iterable[tuple[np.ndarray, int]], seen_by: Photoreceptor
 ) -> Iterator[tuple[np.ndarray, int]]:
-    """Frames (H, W) in DN at their times in us -> the frames that an ideal pixel would have to be
-    shown to see the same, float32 on 0..255, at the times of the events. All are darker by one
-    factor where light is added: a pixel sees changes of the log alone."""
+    """Convert frames so that an ideal pixel gives the events of one behind a photoreceptor.
+
+    Args:
+        pairs: (frame (H, W) in DN, time in us).
+        seen_by: the photoreceptor.
+
+    Yields:
+        (frame, time on the events' clock): float32 DN on 0..255. With added light all are scaled
+        by one factor to fit, as pixels respond to changes of the log only.
+    """
     if seen_by.ideal:
         yield from pairs
         return
@@ -123,14 +129,14 @@ def _light(
 
 
 def _followed(s: Array, before: Array, now: Array, rate: Array, dt_s: Array) -> Array:
-    """s at the end of a step in which u moves from `before` to `now`."""
+    """s at the end of a step in which u changes linearly from `before` to `now`."""
     lag = (now - before) / (rate * dt_s)
     return now - lag + (s - before + lag) * jnp.exp(-rate * dt_s)
 
 
 @jax.jit
 def _shown(s: Array, darker: ArrayLike) -> Array:
-    """The frame in DN of 0..255 that shows s, darker by so many log units."""
+    """The frame in DN (0..255) whose log is s minus `darker` log units."""
     return jnp.minimum(lin_log_inverse(s - darker), 255.0)
 
 

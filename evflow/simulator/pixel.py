@@ -1,10 +1,10 @@
 """One pixel over one frame interval: pure functions of scalars, vmapped over pixels.
 
-The low-passed log intensity `lp` moves linearly from its old to its new value during the
-interval; the memory `base` holds the value at the last event. An event fires each time
-lp - base passes theta; base then moves by theta, so the remainder is kept. Inside an interval
-a pixel fires one polarity only, at times that form an arithmetic progression: `Spikes` holds
-it as (count, first, spacing) in fractions of the interval, and nothing is ever looped.
+The low-passed log intensity `lp` moves linearly from its old to its new value during the interval;
+the memory `base` is the value at the last event. An event fires each time lp - base passes theta;
+base then moves by theta, so the remainder is kept. Within an interval a pixel fires one polarity
+only, at times in arithmetic progression: `Spikes` holds it as (count, first, spacing) in fractions
+of the interval, so that no loop is needed.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Array = jax.Array
 @dataclasses.dataclass(frozen=True)
 class PixelState:
     """lp, base: log intensities. last: with crossing times, seconds since the last signal
-    event (positive); with v2e's slots, its time stamp in float32 seconds as v2e keeps it. inner:
-    None but with a photoreceptor of second order."""
+    event (positive); with v2e's slots, its time stamp in float32 seconds as in v2e. inner: state of
+    a second-order photoreceptor, else None."""
 
     lp: Array
     base: Array
@@ -40,8 +40,8 @@ class Spikes:
     """Signal events of one interval. count: float32, positive ON, negative OFF.
 
     The k-th event (k = 0, 1, ...) falls at max(first + k spacing, earliest + k dead), in
-    fractions of the interval, where dead = refractory / dt; earliest is None where pixels never
-    wait, and the first term alone counts.
+    fractions of the interval, where dead = refractory / dt. earliest is None for models without
+    waiting, and only the first term applies.
     """
 
     count: Array
@@ -61,8 +61,9 @@ def exact(camera: Camera) -> Camera:
     """Thresholds rounded to 16 significant bits, a change below 8e-6 of their value.
 
     Sums of log intensity and thresholds are then exact in float32, and a contrast of k theta
-    crosses k times. 8-bit video is full of such ties, wherever a pixel returns to a value it had.
-    ESIM adds thresholds to its reference until it passes; v2e rounds, and loses one in 600.
+    crosses exactly k times. Such ties are common in 8-bit video, where pixels return to earlier
+    values. ESIM adds thresholds to its reference until it passes; v2e rounds, and loses one event
+    in 600.
     """
     def rounded(theta: Array) -> Array:
         if theta.dtype != jnp.float32:
@@ -79,7 +80,7 @@ def exact(camera: Camera) -> Camera:
 def floor_divide(a: Array, theta: Array) -> Array:
     """floor(a / theta) for a >= 0, corrected by the remainder.
 
-    8-bit video makes exact ties common; a rounded quotient would shift whole edges.
+    Exact ties are common in 8-bit video; a rounded quotient would shift whole edges.
     """
     quotient = jnp.floor(a / theta)
     remainder = a - quotient * theta
@@ -87,8 +88,8 @@ def floor_divide(a: Array, theta: Array) -> Array:
 
 
 def low_pass(model: Constants, lp: Array, log_i: Array, i01: Array, dt: Array) -> Array:
-    """First-order low-pass, eps = dt 2 pi fc, whose corner scales with intensity i01 (v2e) if the
-    model's does."""
+    """First-order low-pass, eps = dt 2 pi fc, with fc proportional to intensity i01 (v2e) or
+    constant, by the model."""
     eps = dt * model.corner
     eps = jnp.minimum(i01 * eps if model.cutoff_by_light else eps, 1.0)
     return lp + eps * (log_i - lp)
@@ -97,8 +98,8 @@ def low_pass(model: Constants, lp: Array, log_i: Array, i01: Array, dt: Array) -
 def crossings(
     model: Constants, theta: Array, start: Array, end: Array, last: Array, dt: Array
 ) -> tuple[Spikes, Array]:
-    """Events at the true crossing of the interpolated contrast, and by how many thresholds the
-    memory moves.
+    """Events at the crossings of the interpolated contrast, and the number of thresholds by which
+    the memory moves.
 
     start, end: contrast in the direction of the event (end >= 0).
     """
@@ -119,11 +120,11 @@ def crossings(
 
 
 def delayed(spikes: Spikes, ready: Array, dead: Array) -> Spikes:
-    """v2e's refractory period: an event that comes too early waits.
+    """v2e's refractory period: an event within it is delayed.
 
-    t_k = max(s_k, max(s_0, ready) + k dead) is the max-plus form of "no sooner than the
-    crossing, no sooner than `dead` after the one before"; what does not fit into the interval
-    keeps its contrast. ready: when the pixel may fire again.
+    t_k = max(s_k, max(s_0, ready) + k dead): not before the crossing, and not within `dead` of the
+    event before. Contrast of events that do not fit into the interval is kept. ready: time from
+    which the pixel may fire.
     """
     earliest = jnp.maximum(jnp.maximum(spikes.first, 0.0), ready)
     fits = jnp.where(earliest <= 1.0, jnp.floor((1.0 - earliest) / dead) + 1.0, 0.0)
@@ -131,9 +132,8 @@ def delayed(spikes: Spikes, ready: Array, dead: Array) -> Spikes:
 
 
 def thinned(spikes: Spikes, ready: Array, dead: Array) -> Spikes:
-    """ESIM's refractory period: an event that comes too early is lost. What is left of an
-    arithmetic progression is one: from the first event after `ready`, each first one `dead`
-    later."""
+    """ESIM's refractory period: an event within it is lost. The rest of an arithmetic progression
+    is one again: the first event after `ready`, then each first one at least `dead` later."""
     spacing = jnp.maximum(spikes.spacing, 1e-9)
     skipped = jnp.clip(jnp.ceil((ready - spikes.first) / spacing), 0.0, spikes.count)
     stride = jnp.maximum(jnp.ceil(dead / spacing), 1.0)
@@ -165,10 +165,10 @@ def slots(
 ) -> tuple[Spikes, Array]:
     """v2e's timestamps: the k-th event of every pixel sits in slot k of the frame's M slots.
 
-    slots_used: M, the largest count of any pixel in this interval. A refractory pixel skips
-    slots (only where the period exceeds a slot) and keeps the contrast. The slots are visited
-    one by one with v2e's float32 times, because frame-locked slots tie with the period and
-    rounding alone decides. Returns the spikes and the new `last`.
+    slots_used: M, the largest count of any pixel in this interval. A refractory pixel skips slots
+    (if the period exceeds a slot) and keeps the contrast. The slots are visited one by one with
+    v2e's float32 times, as slots locked to frames tie with the period, and rounding decides.
+    Returns the spikes and the new `last`.
     """
     count = floor_divide(jnp.maximum(end, 0.0), theta)
     total = jnp.maximum(slots_used, 1.0)
@@ -211,9 +211,9 @@ def contrast(
 ) -> tuple[PixelState, Array, Array, Array]:
     """Advance to the end of an interval of dt seconds, before any event is sent.
 
-    i01: normalised intensity, read by the low-pass only. leaked: contrast that leaks into ON
-    during the interval. Returns the state with its memory leaked; the threshold it moves
-    towards, negative for OFF; the contrast towards it when the interval begins and ends.
+    i01: normalised intensity, for the low-pass only. leaked: contrast that leaks into ON during the
+    interval. Returns the state after leak; the threshold in the direction of motion, negative for
+    OFF; the contrast in that direction at the begin and the end of the interval.
     """
     lp = log_i if model.corner is None else low_pass(model, state.lp, log_i, i01, dt)
     base = state.base if leaked is None else state.base - leaked
@@ -227,8 +227,8 @@ def send(
     model: Constants, state: PixelState, theta: Array, start: Array, end: Array, dt: Array,
     begin: Array, stop: Array, slots_used: Array,
 ) -> tuple[PixelState, Spikes]:
-    """The events of the interval that `contrast` led through, and the state after them. begin,
-    stop, slots_used: see `slots`."""
+    """State and events after an interval, from the results of `contrast`. begin, stop, slots_used:
+    see `slots`."""
     threshold = jnp.abs(theta)
     if model.timestamps == "v2e":
         spikes, last = slots(model, threshold, end, state.last, dt, begin, stop, slots_used)
@@ -246,8 +246,8 @@ def advance_second_order(
     model: Constants, theta_on: Array, theta_off: Array, state: PixelState, log_i: Array,
     i01: Array, leaked: Array | None, dt: Array,
 ) -> tuple[PixelState, Spikes]:
-    """An interval of dt seconds of a pixel whose photoreceptor is of second order. i01: normalised
-    light in its middle."""
+    """An interval of dt seconds of a pixel with a second-order photoreceptor. i01: normalised light
+    in its middle."""
     assert state.inner is not None
     lp, inner = second_order.follow(model.photoreceptor, state.lp, state.inner, log_i, i01, dt)
     base = state.base - (0.0 if leaked is None else leaked)

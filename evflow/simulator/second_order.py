@@ -1,14 +1,14 @@
-"""A pixel whose photoreceptor is of second order: `SecondOrder` of camera/sensors.py.
+"""A pixel with a second-order photoreceptor: `SecondOrder` of camera/sensors.py.
 
     photoreceptor    v'' + 2 a v' + w^2 v = w^2 u        u: log light; a, w grow with the light
     source follower  lp' = (v - lp) / tau_f
     amplifier        y' = (lp - y) / tau_d               an event comes where |y - base| = theta
 
-An event resets the amplifier: until the dead time is over y follows lp, where both then begin anew,
-base = y = lp. So what light does in a dead time is lost. Within an interval u moves linearly and
-the rates are those of its middle; photoreceptor and follower are then solved exactly, however long
-it is. lp is taken to move linearly too, with which the amplifier is solved exactly: from the first
-reset on, events are as far apart as dead time and rise together.
+An event resets the amplifier: during the dead time y follows lp, then starts with base = y = lp. So
+changes of light in a dead time are lost. Within an interval u is linear and the rates are those of
+its middle; photoreceptor and follower are solved exactly for any length. For the amplifier lp is
+taken as linear, which is solved exactly too: after the first reset, the distance of events is dead
+time plus rise time.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from evflow.simulator.constants import Constants
 
 Array = jax.Array
 
-NEVER = 1e9  # in intervals: beyond any
+NEVER = 1e9  # intervals
 NO_TIME = 1e-9  # seconds
-TINY = 1e-9  # a rise that reaches no threshold; its square is no 0, by which gradients divide
-APART = 1e-3  # (1 - follower's time x pole) of both poles, multiplied; nearer ones are moved apart
+TINY = 1e-9  # a rise that reaches no threshold, with a nonzero square for gradients
+APART = 1e-3  # least |(1 - tau_f p1)(1 - tau_f p2)| of the poles p; closer ones are moved apart
 LEAST_DELAY = 1e-3  # of the amplifier, in intervals
 SEARCH, RISE = 4, 4  # steps of Newton's method
 
@@ -34,8 +34,8 @@ SEARCH, RISE = 4, 4  # steps of Newton's method
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Inner:
-    """Of a pixel beside `PixelState`: log light u and its voltage v at the photoreceptor, v per
-    second, and y behind the amplifier; log units."""
+    """State beside `PixelState`: log light u, photoreceptor voltage v, its derivative per second,
+    and y behind the amplifier; log units."""
 
     light: Array
     voltage: Array
@@ -58,7 +58,7 @@ def constants(receptor: SecondOrder, i01: Array) -> tuple[Array, Array]:
 def decay(a: Array, w: Array, dt: Array) -> tuple[Array, Array]:
     """exp(-a dt) (cosh, sinh / d)(d dt), d^2 = a^2 - w^2 of either sign."""
     square = a * a - w * w
-    d = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-6 * w * w))  # nearer to 0 is not to be told
+    d = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-6 * w * w))  # closer to 0 makes no difference
     slow, fast = jnp.exp(-dt * (w * w) / (a + d)), jnp.exp(-dt * (a + d))
     still = jnp.exp(-a * dt)
     over = square > 0
@@ -70,8 +70,8 @@ def decay(a: Array, w: Array, dt: Array) -> tuple[Array, Array]:
 def follow(
     receptor: SecondOrder, lp: Array, inner: Inner, log_i: Array, i01: Array, dt: Array
 ) -> tuple[Array, Inner]:
-    """lp after an interval of dt seconds in which log light moves to log_i, and photoreceptor. i01:
-    in its middle."""
+    """lp and the photoreceptor's state after an interval of dt seconds in which log light moves to
+    log_i. i01: light in its middle."""
     a, w = constants(receptor, i01)
     tau = jnp.maximum(receptor.follower_s, NO_TIME)
     near = jnp.abs(1.0 - 2.0 * a * tau + (w * tau) ** 2) < APART
@@ -81,7 +81,7 @@ def follow(
     rise = (log_i - inner.light) / jnp.maximum(dt, NO_TIME)
     lag = rise * (2.0 * a / (w * w))
     even, odd = decay(a, w, dt)
-    # z: v about a line that lags behind the light; q of it is what the follower makes of it.
+    # z: v relative to a line that lags behind the light; q: the follower's response to it.
     z = inner.voltage - inner.light + lag
     slope = inner.slope - rise
     later = even * z + odd * (slope + a * z)
@@ -97,14 +97,14 @@ def follow(
 
 
 def amplified(y: Array, start: Array, rise: Array, delay: Array, elapsed: Array) -> Array:
-    """y after `elapsed` of which lp moves from start by `rise` per interval. delay: tau_d, in
-    intervals."""
+    """y after `elapsed` intervals, with lp moving from `start` by `rise` per interval. delay: tau_d
+    in intervals."""
     lag = rise * delay
     return start + rise * elapsed - lag + (y - start + lag) * jnp.exp(-elapsed / delay)
 
 
 def _delay(model: Constants, dt: Array) -> Array:
-    """Of the amplifier, in intervals."""
+    """tau_d of the amplifier in intervals."""
     delay = model.photoreceptor.amplifier_s / jnp.maximum(dt, NO_TIME)
     return jnp.maximum(delay, LEAST_DELAY)
 
@@ -119,8 +119,8 @@ def rest(
 
 
 def rise_time(theta: Array, rise: Array, delay: Array) -> Array:
-    """How long after a reset y has risen by theta, in intervals, where lp rises all the time:
-    x - 1 + exp(-x) = theta / (rise delay), x in delays."""
+    """Intervals from a reset until y has risen by theta, with lp rising steadily: x - 1 + exp(-x) =
+    theta / (rise delay), x in units of delay."""
     wanted = theta / jnp.maximum(rise * delay, TINY)
     x = jnp.minimum(jnp.sqrt(2.0 * wanted) + 0.5 * wanted, wanted + 1.0)
     for _ in range(RISE):
@@ -131,8 +131,8 @@ def rise_time(theta: Array, rise: Array, delay: Array) -> Array:
 def first_time(
     y: Array, start: Array, rise: Array, delay: Array, level: Array, left: Array
 ) -> Array:
-    """When y, beyond `level` after `left`, first meets it: from the straight line on, by Newton's
-    method."""
+    """First time at which y meets `level`, given that it is beyond after `left`: Newton's method,
+    starting from a straight line."""
     end = amplified(y, start, rise, delay, left)
     low = jnp.where(jnp.abs(end - y) > 1e-12, (level - y) / jnp.where(end == y, 1.0, end - y), 1.0)
     at = jnp.clip(low, 0.0, 1.0) * left
@@ -147,8 +147,8 @@ def first_time(
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Fired:
-    """What an interval ends with: the memory, y, seconds since the last event; and its events,
-    signed count, the first and their distance in intervals."""
+    """Result of an interval: memory, y, seconds since the last event; events as signed count, time
+    of the first and their distance, in intervals."""
 
     base: Array
     amplified: Array
@@ -166,7 +166,7 @@ def fire(
     long, delay = jnp.maximum(dt, NO_TIME), _delay(model, dt)
     dead = jnp.zeros_like(last) if model.refractory_s is None else model.refractory_s / long
     rise = end - start
-    waits = jnp.clip(dead - last / long, 0.0, 1.0)  # of a dead time before the interval
+    waits = jnp.clip(dead - last / long, 0.0, 1.0)  # rest of a dead time from before
     begin = start + rise * waits
     base, y = (jnp.where(waits > 0, begin, value) for value in (base, y))
     left = 1.0 - waits

@@ -28,8 +28,8 @@ Clock = tuple[Array, Array]  # begin and end of an interval, see `SimState.time`
 
 
 def simulable(camera: Camera) -> Camera:
-    """The camera, unless it is none or its thresholds are within the rounding of brightness, where
-    events stand for nothing; EV002, EV014, EV015. Traced maps pass unchecked."""
+    """The validated camera. Raises EV002, EV014, EV015, also for thresholds as small as rounding
+    errors of brightness. Traced maps pass unchecked."""
     camera.validate()
     if any(isinstance(m, jax.core.Tracer) for m in jax.tree.leaves(camera)):
         return camera
@@ -47,7 +47,7 @@ def simulable(camera: Camera) -> Camera:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """What stays the same, maps (N,). words: see `noise.draw`. rates: None for a silent sensor.
+    """Constants of the pixels, maps (N,). words: see `noise.draw`. rates: None without noise.
     leaking: log units per second, None without leak."""
 
     camera: Camera
@@ -70,8 +70,8 @@ class SimState:
 
 
 def frame_times(dt: Array | float, steps: int) -> Array:
-    """(steps + 1, 2) seconds since the first of frames dt apart, pairs as in `SimState.time`:
-    exact where dt is a number; where it is traced, rounded to float32."""
+    """(steps + 1, 2) seconds since the first of frames dt apart, pairs as in `SimState.time`; exact
+    for a number dt, rounded to float32 if traced."""
     if isinstance(dt, jax.core.Tracer):
         high = dt * jnp.arange(steps + 1)
         return jnp.stack([high, jnp.zeros_like(high)], -1)
@@ -81,8 +81,8 @@ def frame_times(dt: Array | float, steps: int) -> Array:
 
 
 def later(time: Array, by: Array) -> Array:
-    """time (2,) plus each of by (T, 2), pairs as in `SimState.time`: what the sum of the high
-    parts loses to rounding joins the low ones."""
+    """time (2,) plus each of by (T, 2), pairs as in `SimState.time`. Rounding errors of the high
+    parts' sum are added to the low parts."""
     high = time[0] + by[:, 0]
     added = high - time[0]
     lost = (time[0] - (high - added)) + (by[:, 0] - added)
@@ -92,8 +92,8 @@ def later(time: Array, by: Array) -> Array:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Struck:
-    """Noise of an interval, maps (N,). some: whether a pixel sends any event; drawn (`noise.draw`)
-    and odds say how many, when, and of which polarity."""
+    """Noise of an interval, maps (N,). some: whether a pixel sends any event; drawn (of
+    `noise.draw`) and odds determine number, times and polarities."""
 
     some: Array
     drawn: Array
@@ -103,18 +103,23 @@ class Struck:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Disturbance:
-    """What happens to pixels in an interval whatever their memory. leaked: log units (N,), None
-    without leak. struck: None without noise."""
+    """Effects on pixels in an interval that do not depend on their memory. leaked: log units (N,),
+    None without leak. struck: None without noise."""
 
     leaked: Array | None
     struck: Struck | None
 
 
 def possible(camera: Camera) -> tuple[Camera, Array]:
-    """A traced camera with parameters that a pixel can have, and (..., H, W) what its pixels'
-    output is to be multiplied by: 1, or NaN where the parameters were impossible (theta <= 0,
-    eta < 0, not finite). Within jit nothing can be refused, and a pixel of negative threshold would
-    send numbers that look like events."""
+    """Replace impossible parameters of a traced camera (theta <= 0, eta < 0, not finite).
+
+    Within jit nothing can raise, and a pixel with a negative threshold would return numbers that
+    look like events.
+
+    Returns:
+        The camera with valid parameters, and a factor (..., H, W) for its output: 1, or NaN where
+        parameters were impossible.
+    """
     least = {"theta_on": 1e-30, "theta_off": 1e-30, "eta_on": 0.0, "eta_off": 0.0}
     maps = {name: jnp.asarray(getattr(camera, name)) for name in least}
     good = [jnp.isfinite(values) & (values >= least[name]) for name, values in maps.items()]
@@ -130,9 +135,8 @@ def start(
 ) -> tuple[Sensor, SimState]:
     """The sensor and its state after the first log frame; maps of any one shape, kept flat.
 
-    nominal: `noise.nominal_thresholds`; None leaves noise out. phase: contrast already on the
-    pixel (log units, a map or 0 as in v2e); a recording cut from a running camera has it uniform
-    in (-theta_off, theta_on).
+    nominal: `noise.nominal_thresholds`; None: no noise. phase: initial contrast of the pixels (log
+    units, a map; 0 as in v2e); that of a running camera is uniform in (-theta_off, theta_on).
     """
     k_leak, k_words, k_intervals = jax.random.split(key, 3)
     count = math.prod(log_frame.shape)

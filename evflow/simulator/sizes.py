@@ -1,10 +1,9 @@
-"""How many pixels a program steps at a time, and the memory that it takes.
+"""Sizes of the arrays of pixels that are stepped at a time.
 
 The pixels that may fire in a block are padded to one of a few sizes, as XLA compiles a program for
-each. A short video gains nothing by many: the first has room for twice as many pixels as fire in
-the first block, a larger one comes when it is needed, and a smaller one once the padding without it
-has taken a good part of the time to compile it. What the padding does is thrown away, so the events
-are the same.
+each. The first size has room for twice the pixels of the first block. A larger one is added when
+needed, a smaller one once padding has cost about as much time as compiling it. Results of padding
+are discarded, so the events do not depend on sizes.
 """
 
 from __future__ import annotations
@@ -16,18 +15,18 @@ from collections.abc import Hashable
 
 import numpy as np
 
-# A call hands work to another thread and back, which costs more than arrays that leave the cache.
+# Not smaller: a call hands work to another thread and back, which costs more than cache misses.
 ACTIVE: tuple[int, ...] = (4096, 8192, 12288, 16384, 20480)
-PATIENCE = 1 << 19  # pixels of padding: some .1 s on one core, where a program takes .3 and more
-ROOM = 2  # times the pixels for which a size is chosen
+PATIENCE = 1 << 19  # pixels of padding before a smaller size: some .1 s; compiling takes .3 s
+ROOM = 2  # first size relative to the pixels of the first block
 
 
 class Sizes:
-    """The sizes that have a program. pixels: of the sensor."""
+    """The sizes with a compiled program. pixels: of the sensor."""
 
     def __init__(self, pixels: int) -> None:
         self.pixels, self.ready = pixels, list[int]()
-        self.padding: Counter[int] = Counter()  # that each size would have saved
+        self.padding: Counter[int] = Counter()  # pixels that each size would have saved
 
     def of(self, count: int) -> int:
         """The size for `count` pixels, up to the largest."""
@@ -45,12 +44,13 @@ class Sizes:
 
 @functools.lru_cache(maxsize=256)
 def sizes(pixels: int, *program: Hashable) -> Sizes:
-    """Those of a program, as long as the process runs. program: what else it is compiled for."""
+    """The sizes of a program, cached for the process. program: everything else it is compiled
+    for."""
     return Sizes(pixels)
 
 
 def aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
-    """An empty array that a CPU device takes over without a copy: at a multiple of 64 bytes."""
+    """An empty array, aligned to 64 bytes, which a CPU device takes over without a copy."""
     size = math.prod(shape) * dtype.itemsize
     memory = np.empty(size + 64, np.uint8)
     first = -memory.ctypes.data % 64
@@ -58,7 +58,8 @@ def aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
 
 
 def picked(pick: np.ufunc, frames: list[np.ndarray]) -> np.ndarray:
-    """The greatest or least of all frames, in place: fresh memory is dear."""
+    """The greatest or least value of each pixel over the frames, in reused memory, as new memory is
+    slow."""
     out = frames[0].copy()
     for frame in frames[1:]:
         pick(out, frame, out=out)

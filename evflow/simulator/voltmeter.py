@@ -98,7 +98,7 @@ def passage(c: Circuit, residual: Array, u: Array, z: Array) -> tuple[Array, Arr
     distance = jnp.where(contrary, behind, ahead)
     g = 0.5 * z * z * c.variance / distance
     fast = jnp.maximum(speed + g + jnp.sqrt(g * (2.0 * speed + g)), TINY)
-    # Given the polarity, u is uniform in what remains, and may choose between the roots.
+    # Given the polarity, u is uniform in its remaining range, and may choose between the roots.
     u, whole = jnp.where(contrary, u, u - against), jnp.where(contrary, against, 1.0 - against)
     pace = jnp.where(u * (fast + speed) < whole * fast, fast, speed * (speed / fast))
     pace = jnp.maximum(pace, TINY)
@@ -106,7 +106,7 @@ def passage(c: Circuit, residual: Array, u: Array, z: Array) -> tuple[Array, Arr
 
 
 def settle(c: Circuit, distance: Array, pace: Array, rest: Array, u: Array, z: Array) -> Array:
-    """Voltage after the `rest` of an interval, in which a passage drawn does not come. Scalars.
+    """Voltage after the `rest` of an interval that ends before the passage drawn. Scalars.
 
     Seen from the level, a path that first meets it at time t is a three-dimensional Bessel
     bridge: after s, about d (1 - s/t) on one axis, with variance sigma^2 s (1 - s/t) on each.
@@ -129,7 +129,7 @@ def advance(c: Circuit, elapsed: Array, residual: Array, *draws: Array) -> tuple
 
 def _draws(key: Array, pixel: Array, dtype: jnp.dtype) -> tuple[Array, Array]:
     """A uniform in (0, 1], in steps of 2^-32 near zero where rare exits are decided, and a normal,
-    |z| < 5.4, for each pixel, whichever others are drawn beside it."""
+    |z| < 5.4, for each pixel, independent of the other pixels drawn."""
     words = jax.vmap(lambda p: jax.random.key_data(jax.random.fold_in(key, p)))(pixel)
     odd = ((words[:, 1] >> 9).astype(dtype) + 0.5) * 2.0**-22 - 1.0
     return (words[:, 0].astype(dtype) + 0.5) * 2.0**-32, 2.0**0.5 * jax.lax.erf_inv(odd)

@@ -1,8 +1,8 @@
 """Frames -> voxel grid, without making events.
 
-`simulate_window` is pure; jit, vmap and scan it. Large frames are taken in tiles of pixels, whose
-state, light and grid stay in the cache from the first frame to the last. Where `simulate_voxels`
-is called with bytes on a CPU, untraced, only pixels that may fire are stepped, block by block.
+`simulate_window` is pure; jit, vmap and scan it. Large frames are processed in tiles of pixels,
+whose state, light and grid stay in the cache from the first frame to the last. If `simulate_voxels`
+is called with bytes on a CPU, outside of jit, only pixels that may fire are stepped, in blocks.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from evflow.voxel import BINS
 
 Array = jax.Array
 
-TILE = 8192  # pixels; their maps and grid, some 1.5 MB, are worked on at a time
+TILE = 8192  # pixels, whose maps and grid take some 1.5 MB
 
 
 def simulate_window(
@@ -41,7 +41,7 @@ def simulate_window(
     frame_dt_s: Array | float, bins: int, times: Array | None = None,
 ) -> tuple[SimState, Array]:
     """Advance through log_frames (T, H, W), T frames after the state's own, equally spaced: log
-    intensity, or bytes. times: `sensor.frame_times`, where they are known better than by a traced
+    intensity, or bytes. times: `sensor.frame_times`, if known more exactly than from a traced
     frame_dt_s.
 
     Returns the state and the voxel grid (H, W, 2*bins) of the window of T intervals.
@@ -62,7 +62,7 @@ def simulate_window(
         return pixels, grid.T
 
     maps = (whole, state.pixels, log_frames.reshape(steps, count))
-    whole_at_once = count <= TILE or model.timestamps == "v2e"  # whose slots depend on all pixels
+    whole_at_once = count <= TILE or model.timestamps == "v2e"  # slots depend on all pixels
     pixels, grid = scanned(maps) if whole_at_once else _tiled(scanned, maps, count)
     end = SimState(pixels, intervals[-1] + 1, clock[-1], state.key)
     return end, grid.reshape(*shape, 2 * bins)
@@ -161,8 +161,8 @@ def simulate_voxels(
 
 
 def _by_blocks(key: Array, model: Constants, frames: Array, camera: Camera) -> bool:
-    """Whether the host can tell which pixels may fire, and a CPU gains by it."""
-    new = jnp.zeros(())  # traced within jit, even where all that is given is not
+    """Whether the host can determine the pixels that may fire, and a CPU gains by it."""
+    new = jnp.zeros(())  # traced within jit, even if all arguments are concrete
     given = jax.tree.leaves((key, model, frames, camera, new))
     traced = any(isinstance(value, jax.core.Tracer) for value in given)
     return (not traced and frames.ndim == 3 and frames.dtype == jnp.uint8
@@ -174,7 +174,7 @@ def _in_blocks(
     key: Array, frames: np.ndarray, camera: Camera, frame_dt_s: float, model: Constants,
     bins: int,
 ) -> Array:
-    """Voxels (H, W, 2 * bins) of bytes (T, H, W), whose active pixels are stepped."""
+    """Voxels (H, W, 2 * bins) of bytes (T, H, W), stepping only active pixels."""
     count, *shape = frames.shape
     touched = Touched(count - 1, bins)
     pixels = circuits.thresholds(
