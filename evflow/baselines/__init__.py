@@ -4,9 +4,9 @@
 
 ecc.py least squares on frame differences · jaer.py gains that learn · s2r.py event rates ·
 match.py simulation of the same scene (resimulate.py) · lgan.py adversarial, per recording ·
-noise_forms.py noise rates in closed form · calibration.py and steps.py the paper's own ground truth
-(Section III-B). Written from the equations of the papers they name; where a published rule and the
-strongest fair reading differ, both are here.
+noise_forms.py noise rates in closed form. Written from the equations of the papers that they name;
+where a published rule and the strongest fair reading differ, both are implemented. The paper's own
+ground truth (Section III-B) is in evflow/estimation/bench.
 """
 
 from evflow.baselines.akf import Akf

@@ -3,11 +3,11 @@
 Wang, Ng, Scheerlinck, Mahony, "An Asynchronous Kalman Filter for Hybrid Event Cameras" (ICCV
 2021). Between updates, dt apart, with reference brightness y and its precision 1/R, exactly:
 x <- y + (x - y) / (1 + P dt/R) and P <- P / (1 + P dt/R); then P += sigma_p dt, and an event adds
-+-theta to x and Q to P. A frame is an update of every pixel without an event. The reference is the
-frame carried on by events: "between" blends it with the next frame carried back, as published,
-and so knows the future; "latest" does not. There y moves with the events, x - y does not, and the
-filter is direct integration from the latest frame plus what it has not yet forgotten.
-Exposure deblurring is left out: recordings seldom tell the exposure.
++-theta to x and Q to P. A frame updates every pixel without an event. The reference is the latest
+frame plus the events since: "between" blends it with the next frame minus the events until then, as
+published, which uses the future; "latest" does not. With "latest" events change y and x alike, so
+the filter is direct integration from the latest frame plus a decaying remainder.
+Exposure deblurring is left out, as recordings seldom state the exposure.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ LEAST_CERTAINTY = 0.09  # of a black or saturated pixel
 # which was measured on one camera.
 SHARPNESS = 6
 BORDER_VARIANCE = 10.0  # Q of a pixel without eight neighbours
-SCALE_RANGE = (0.6, 100.0)  # of the contrast of an interval's events over its frame difference:
-# beyond, the two have little to do with each other, and events are taken as they are
-LANES, GROWTH = 4096, 4  # pixels at a time; their events padded to powers of 4: few programs
+SCALE_RANGE = (0.6, 100.0)  # of the contrast of an interval's events over its frame difference;
+# outside of it the two are unrelated, and events are not rescaled
+LANES, GROWTH = 4096, 4  # pixels at a time; events padded to powers of 4, for few programs
 
 
 @jax.tree_util.register_dataclass
@@ -61,9 +61,10 @@ class Pixel:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """What the frames say of pixels (...): log intensity of the frames around and their
-    precision 1/R per second; total: signed contrast of the events between them; gain: what
-    makes that contrast the frames' difference; blend: 1 where the next frame is known, else 0."""
+    """Frames around the present of pixels (...). before, after: their log intensity; trust_before,
+    trust_after: precision 1/R per second; total: signed contrast of the events between them; gain:
+    factor from that contrast to the frames' difference; blend: 1 where the next frame is known,
+    else 0."""
 
     before: Values
     after: Values
@@ -77,8 +78,8 @@ class Reference:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """An event: dt_s since the pixel's last update, share of the frame interval gone by, the
-    contrast it adds and the variance. All 0 is no event."""
+    """An event. dt_s: since the pixel's last update; share: elapsed share of the frame interval;
+    contrast, variance: that it adds. All 0 is no event."""
 
     dt_s: Values
     share: Values
@@ -123,11 +124,11 @@ _relax = jax.jit(relax, static_argnames=("process", "offset_dn"))
 
 @dataclasses.dataclass(frozen=True)
 class Akf(Reconstructor):
-    """Asynchronous Kalman filter; published values of all but the log map, which is theirs with
-    offset_dn=255 (their variances are of its steps, a third of ours in mid-grey), and of the trust
-    between two frames: the mean of both precisions, where they blend variances.
+    """Asynchronous Kalman filter, with published parameters but for the log map (theirs is
+    offset_dn=255, in which steps are a third of ours in mid-grey) and the trust between two frames:
+    the mean of both precisions instead of blended variances.
 
-    reference: "between" (published) or "latest", which knows no frame that is yet to come.
+    reference: "between" (published) or "latest", which uses no later frame.
     process, isolated, refractory: variance per second since a pixel's last update, since the last
     event in its 3x3 pixels, and since its own last event where that is at most refractory_us ago.
     variance: of the first frame. trust: factor on 1/R.
@@ -181,7 +182,7 @@ class Akf(Reconstructor):
         return np.where(inside, q, BORDER_VARIANCE).astype(np.float32)
 
     def _blind(self, start: np.ndarray) -> Reference:
-        """No frame yet: nothing draws x anywhere."""
+        """The reference before the first frame, of no precision."""
         zero = np.zeros_like(start)
         return Reference(start, start, zero, zero, zero, zero + 1, zero)
 
@@ -189,7 +190,7 @@ class Akf(Reconstructor):
         self, events: Events, frames: np.ndarray, frame_times: np.ndarray, theta: np.ndarray,
         frame: int,
     ) -> Reference:
-        """What is known from `frame` on."""
+        """The reference for the interval after `frame`."""
         before, trust = self._shown(frames[frame])
         zero = np.zeros_like(before)
         if self.reference == "latest" or frame + 1 == len(frames):
@@ -217,7 +218,7 @@ class Akf(Reconstructor):
         self, pixel: Pixel, reference: Reference, now_us: int, updated: np.ndarray,
         span: tuple[int, int],
     ) -> Pixel:
-        """All pixels at now_us; their state, not changed by looking."""
+        """State of all pixels at now_us; the filter itself is not advanced."""
         dt_s = ((now_us - updated) * 1e-6).astype(np.float32)
         share = np.full_like(dt_s, (now_us - span[0]) / (span[1] - span[0]))
         return jax.device_get(
@@ -236,7 +237,7 @@ class Akf(Reconstructor):
         dt_us = np.where(first, t - updated[where], np.diff(t, prepend=0))
         columns = Step((dt_us * 1e-6).astype(np.float32), share,
                        contrast[order].astype(np.float32), noise[part.events][order])
-        updated[where] = t  # of equal pixels the last one stays
+        updated[where] = t  # the last of equal pixels is kept
         state = jax.tree.map(np.array, pixel)
         for pixels, rows, inside in _batches(where):
             steps = jax.tree.map(
@@ -250,14 +251,14 @@ class Akf(Reconstructor):
 
 
 def _span(frame_times: np.ndarray, frame: int) -> tuple[int, int]:
-    """Begin and end of the interval after a frame; where there is none, any that is not empty."""
+    """Begin and end of the interval after a frame; after the last one, any nonempty interval."""
     inside = 0 <= frame < len(frame_times) - 1
     return (int(frame_times[frame]), int(frame_times[frame + 1])) if inside else (0, 1)
 
 
 def _batches(where: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Pixels with alike numbers of events, LANES at a time: pixels (LANES,), rows (LANES, L) of
-    their events among `where` (N,) sorted pixels, and which rows there are (LANES, L) bool."""
+    """Pixels with similar numbers of events, LANES at a time: pixels (LANES,), indices (LANES, L)
+    of their events in `where` (N,) sorted pixels, and (LANES, L) bool: which indices are valid."""
     pixels, start, count = np.unique(where, return_index=True, return_counts=True)
     length = 1
     while len(pixels):

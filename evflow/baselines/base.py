@@ -1,7 +1,7 @@
 """Shared by the compared systems: the protocol, its result, and the input data.
 
-A `System` is a frozen dataclass of its options; `fit` takes a recording and never fails for lack
-of data: what cannot be measured is marked invalid and holds a stated value, never NaN. Thresholds
+A `System` is a frozen dataclass of its options. `fit` takes a recording and never fails for lack of
+data: values that cannot be measured are marked invalid and set to a default, never NaN. Thresholds
 are in natural-log units of the lin-log map, as everywhere.
 """
 
@@ -24,18 +24,18 @@ from evflow.light.log_maps import lin_log
 from evflow.recordings import plan_windows
 from evflow.types import Recording
 
-UNKNOWN = 0.3  # log units: where nothing is known, the middle of the common range .1-.5
-THETA_MAX = 2.0  # log units: a factor of seven; beyond it a fit has run away
+UNKNOWN = 0.3  # log units: default, the middle of the common range .1-.5
+THETA_MAX = 2.0  # log units: a factor of seven; larger fits have diverged
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fitted:
-    """What a system says of a camera.
+    """Estimate of a camera by a system.
 
-    camera: maps (H, W), finite and positive everywhere; eta is 0 where a system measures none.
-    valid: (2, H, W) bool, ON and OFF: where the map was measured. theta: (2,) median thresholds
-    over the valid pixels, ON and OFF (of the whole map where there are none). seconds: it took.
-    notes: a sentence each.
+    camera: maps (H, W), finite and positive everywhere; eta is 0 if a system measures none;
+    valid: (2, H, W) bool, ON and OFF, where the map was measured; theta: (2,) median thresholds
+    over the valid pixels, ON and OFF (over the whole map if there are none); seconds: run time;
+    notes: sentences.
     """
 
     camera: Camera
@@ -52,7 +52,7 @@ class Fitted:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solution:
-    """A system's own answer: theta (2, H, W), not yet checked; valid (2, H, W); eta (2,) in Hz."""
+    """A system's unchecked result: theta (2, H, W); valid (2, H, W) bool; eta (2,) in Hz."""
 
     theta: np.ndarray
     valid: np.ndarray
@@ -61,18 +61,18 @@ class Solution:
 
 
 class System(abc.ABC):
-    """A way to tell a camera's thresholds from a recording; its options are its fields."""
+    """A method that estimates thresholds from a recording; its options are its fields."""
 
-    # A table takes this many recordings of it: fewer of one that learns for a minute from each.
+    # Most recordings in a table: few for systems that train for minutes on each.
     most_recordings: ClassVar[float] = math.inf
 
     @abc.abstractmethod
     def solve(self, recording: Recording) -> Solution:
-        """The system's own answer; raises EvflowDataError where the recording cannot tell."""
+        """The unchecked result; raises EvflowDataError where the recording is insufficient."""
 
     def fit(self, recording: Recording) -> Fitted:
-        """Thresholds of a recording. A recording that cannot tell, a fit that diverges or leaves
-        [.01, 2] give a defined map that is not valid there."""
+        """Thresholds of a recording. Insufficient recordings and fits that diverge or leave
+        [.01, 2] give default values that are marked invalid."""
         start = time.perf_counter()
         width, height = recording.events.size
         try:
@@ -91,7 +91,7 @@ class System(abc.ABC):
 
 
 def nothing(shape: tuple[int, int], note: str, theta: float = UNKNOWN) -> Solution:
-    """No answer: `theta` everywhere, valid nowhere."""
+    """No result: `theta` everywhere, valid nowhere."""
     return Solution(np.full((2, *shape), theta, np.float32), np.zeros((2, *shape), bool),
                     notes=(note,))
 
@@ -108,8 +108,8 @@ def constant(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interval:
-    """Between two neighbouring frames: counts (2, H, W) float32 of ON and OFF events, the log
-    frames (H, W) at its ends, and whether it begins where the one before ended."""
+    """The time between two neighbouring frames: counts (2, H, W) float32 of ON and OFF events, the
+    log frames (H, W) at its ends, and whether it begins at the end of the one before."""
 
     counts: np.ndarray
     before: np.ndarray
@@ -118,8 +118,8 @@ class Interval:
 
 
 def usable(recording: Recording) -> list[int]:
-    """The intervals i (frame i to i + 1) that events cover and no fault spoils; raises EV001,
-    EV011, EV012 and EV017 where there are none."""
+    """The intervals i (frame i to i + 1) with events and without glitches. Raises EV001, EV011,
+    EV012 and EV017 if there are none."""
     plan = plan_windows(recording, 1)
     found = [i for first, last in plan.pairs for i in range(first, last)]
     if not found:

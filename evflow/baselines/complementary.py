@@ -22,9 +22,9 @@ class Complementary(Reconstructor):
     """Complementary filter.
 
     cutoff_rad_s: alpha, above which events lead (published 2 pi). trust, margin: alpha falls to
-    `trust` of itself where the frame is black or white, from `margin` of 0..255 DN on (published
-    .1 and .05): clipped pixels say little. Before the first frame, or without frames, the
-    brightness of `start_dn` takes its place.
+    `trust` of itself where the frame is within `margin` of black or white (published .1 and .05;
+    clipped pixels carry little information). Before the first frame, or without frames, the
+    brightness `start_dn` takes its place.
     """
 
     cutoff_rad_s: float = 2.0 * np.pi
@@ -54,7 +54,7 @@ class Complementary(Reconstructor):
         return images
 
     def _alpha(self, frame: np.ndarray) -> np.ndarray:
-        """alpha (H*W,) of each pixel: full amid the range of DN, less towards its ends."""
+        """alpha (H*W,) of each pixel: full within the range of DN, less near its ends."""
         dn = frame.ravel().astype(np.float64)
         inside = np.minimum(dn, 255.0 - dn)
         share = np.clip(inside / max(self.margin * 255.0, 1e-9), 0.0, 1.0)

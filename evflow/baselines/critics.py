@@ -52,9 +52,17 @@ class Critic(nn.Module):
 def sort_patches(
     frames: np.ndarray, usable: np.ndarray, size: int, stride: int, classes: tuple[int, int, int]
 ) -> Patches | None:
-    """The patches of `size` px, `stride` px apart, of log frames (N, H, W) that lie where usable
-    (N, H', W') bool says so of their upper left corners; None where there are none. classes:
-    how many angles, strengths (quantiles over the patches) and coherences."""
+    """Sort patches into classes by the structure tensor.
+
+    Args:
+        frames: (N, H, W) log frames.
+        usable: (N, H', W') bool, for the patches' upper left corners.
+        size, stride: of the patches, px.
+        classes: numbers of angles, strengths (quantiles over the patches) and coherences.
+
+    Returns:
+        The patches; None without usable ones.
+    """
     gy, gx = np.gradient(frames, axis=(1, 2))
     tensor = np.stack([window_sums(a, size)[:, ::stride, ::stride]
                        for a in (gx * gx, gx * gy, gy * gy)])
@@ -90,11 +98,11 @@ def window_sums(a: np.ndarray, size: int) -> np.ndarray:
 
 
 def features(counts: Array, saturating: bool) -> Array:
-    """What critics see of counts (N, 2, H, W) and of their spatial gradient, (N, H, W, CHANNELS).
+    """The critics' features (N, H, W, CHANNELS): of counts (N, 2, H, W) and their spatial gradient.
 
-    saturating: tanh, as published, of the counts and of |Sobel x| + |Sobel y|: pixels of three
-    events and more look alike, and the slope tells hardly more than whether there is one. Else
-    log(1 + x) of the counts and of the gradient's length.
+    saturating: tanh, as published, of the counts and of |Sobel x| + |Sobel y|, which hardly
+    distinguishes pixels of three and more events, or slopes. Else log(1 + x) of the counts and of
+    the gradient's length.
     """
     if saturating:
         seen = jnp.concatenate([counts, _sobel(counts)], 1)
@@ -143,8 +151,8 @@ def score(params: Params, patches: Array, hidden: tuple[int, ...]) -> Array:
 def losses(
     params: Params, key: Array, real: Array, made: Array, counted: Array, hidden: tuple[int, ...]
 ) -> Array:
-    """WGAN-GP loss (G,) of G critics; real, made (G, n, P, P, CHANNELS), counted (G, n): weights
-    of the patches that were made."""
+    """WGAN-GP loss (G,) of G critics. real, made: (G, n, P, P, CHANNELS) recorded and simulated
+    patches; counted: (G, n) weights of the simulated ones."""
     def one(params: Params, key: Array, real: Array, made: Array, counted: Array) -> Array:
         def scored(x: Array) -> Array:
             return jnp.asarray(Critic(hidden).apply({"params": params}, x))

@@ -3,8 +3,8 @@
 Wang, Ng, van Goor, Mahony, "Event Camera Calibration of Per-pixel Biased Contrast Threshold"
 (ACRA 2019). An event of sign s changes log intensity by s c + b, so theta_ON = c + b and
 theta_OFF = c - b, and a frame difference over `span` frames is c dP + b dE with P = n_ON - n_OFF
-and E = n_ON + n_OFF. The same equations read dL = theta_ON n_ON - theta_OFF n_OFF; they are solved
-in that form, where a pixel with events of one polarity still tells that one.
+and E = n_ON + n_OFF. The same equations read dL = theta_ON n_ON - theta_OFF n_OFF. They are solved
+in that form, in which events of one polarity suffice to determine its threshold.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from evflow.types import Recording
 Array = jax.Array
 
 SPAN = 40  # frames between the ends of a difference, as published
-DEFAULT = 0.1  # log units: the published value of a pixel that cannot be told
+DEFAULT = 0.1  # log units: the published value of an undetermined pixel
 THETA_TOP = 1.0  # log units: thresholds are clipped to [.01, 1]
-STILL = 0.93  # share of frame differences that are exactly 0 from which a pixel says nothing
-SINGULAR = 1e-6  # ratio of eigenvalues; float32 sums of products hold no less
+STILL = 0.93  # share of frame differences of exactly 0, from which a pixel is not used
+SINGULAR = 1e-6  # ratio of eigenvalues, the precision of float32 sums of products
 ENOUGH = 3.0  # events of a polarity over all differences, for the fair reading
 
 
@@ -38,12 +38,12 @@ ENOUGH = 3.0  # events of a polarity over all differences, for the fair reading
 class Ecc(System):
     """ECC of events and frames.
 
-    reading: "pixel": each pixel by itself with the published rules (a pixel that cannot be told
-        gets c = .1, b = 0); "median": the fair reading, for every pixel the median over those
-        that tell a polarity; "global": one system for all pixels.
+    reading: "pixel": each pixel by itself with the published rules (an undetermined one gets
+        c = .1, b = 0); "median": the fair reading, for all pixels the median over those that
+        determine a polarity; "global": one system of equations for all pixels.
     span: frames between the ends of a difference, at most half of the frames there are.
-    offset_dn: log(DN + offset) in place of the lin-log map; published 40 to 100, which makes the
-        thresholds those of a compressed brightness.
+    offset_dn: log(DN + offset) in place of the lin-log map; published 40 to 100, with thresholds
+        of a compressed brightness.
     """
 
     reading: Literal["pixel", "median", "global"] = "pixel"
@@ -59,28 +59,28 @@ class Ecc(System):
             theta, sound = _solve(sums.sum((1, 2), keepdims=True))
             return constant((height, width), np.asarray(theta)[:, 0, 0],
                             np.asarray(sound)[:, 0, 0], note)
-        theta, told = (np.asarray(a) for a in _solve(sums))
+        theta, determined = (np.asarray(a) for a in _solve(sums))
         if self.reading == "pixel":
             still = np.asarray(sums[5] >= STILL * sums[6])
-            both = (told.all(0) & ~still)[None]
+            both = (determined.all(0) & ~still)[None]
             clipped = np.clip(theta, THETA_MIN, THETA_TOP)
             return Solution(np.where(both, clipped, DEFAULT),
                             both & (clipped == theta), notes=(note,))
         enough = np.asarray(sums[7:9]) >= ENOUGH
-        valid = told & enough & (theta > THETA_MIN) & (theta < THETA_TOP)
+        valid = determined & enough & (theta > THETA_MIN) & (theta < THETA_TOP)
         found = np.asarray(valid.any((1, 2)))
         medians = [np.median(t[v]) if v.any() else UNKNOWN
                    for t, v in zip(theta, valid, strict=True)]
-        told_by = f"medians over {valid[0].sum()} and {valid[1].sum()} pixels"
-        return constant((height, width), np.array(medians), found, note, told_by)
+        medians_of = f"medians over {valid[0].sum()} and {valid[1].sum()} pixels"
+        return constant((height, width), np.array(medians), found, note, medians_of)
 
 
 @dataclasses.dataclass(frozen=True)
 class EccEvents(System):
-    """ECC of events alone: every pixel is taken to see the same contrast, so the random walk of
-    its net count is as wide as its threshold is small. Gives ratios; the median is .1.
+    """ECC of events alone: all pixels are assumed to see the same contrast, so that the width of a
+    pixel's random walk of net counts is inverse to its threshold. Gives ratios; the median is .1.
 
-    samples: instants at which counts are read where there are no frames.
+    samples: number of times at which counts are read without frames.
     """
 
     samples: int = 40
@@ -101,8 +101,8 @@ class EccEvents(System):
 
 def frame_sums(recording: Recording, span: int, offset_dn: float = 0.0) -> Array:
     """Normal equations (9, H, W): sums of aa, ab, bb, ad, bd over differences of `span` frames
-    (a, b: ON and OFF events, d: dL), how many d are exactly 0, how many there are, and the most
-    ON and OFF events in one."""
+    (a, b: ON and OFF events, d: dL), number of d that are exactly 0, number of all, and largest
+    numbers of ON and OFF events in one."""
     log = lin_log if offset_dn == 0 else lambda dn: np.log(dn + np.float32(offset_dn))
     width, height = recording.events.size
     sums = jnp.zeros((9, height, width))
@@ -130,8 +130,8 @@ def _add(sums: Array, n: Array, d: Array) -> Array:
 
 @jax.jit
 def _solve(sums: Array) -> tuple[Array, Array]:
-    """theta (2, ...) and whether it is told (2, ...): both where the system has full rank, the
-    one polarity that fired where the other never did."""
+    """theta (2, ...) and whether it is determined (2, ...): both polarities at full rank, one where
+    only that one fired."""
     aa, ab, bb, ad, bd = sums[:5]
     root = jnp.sqrt((aa - bb) ** 2 + 4.0 * ab**2)
     full = (aa + bb - root) > SINGULAR * (aa + bb + root)

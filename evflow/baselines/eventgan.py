@@ -2,14 +2,14 @@
 
 Zhu, Wang, Khant, Daniilidis, "EventGAN: Leveraging Large Scale Image Datasets for Event Cameras"
 (ICCP 2021). A U-Net turns two frames into a volume of counts; a patch critic (hinge loss) sees
-volume and frames; two networks that know true events alone tell what the volume says of the motion
-(optical flow, photometric) and of the second frame (reconstruction): the cycle losses. It knows no
-camera: what it makes is typical of the cameras it was trained on.
+volume and frames. For the cycle losses, two networks trained on true events predict the motion
+(optical flow, photometric) and the second frame (reconstruction) from the volume. There is no
+camera as an input: the events are typical of the cameras it was trained on.
 
 Voxels are (..., H, W, 2 * bins), raw counts in [ON..., OFF...], as everywhere here; published are 9
 bins and volumes scaled one by one, which loses the count. Published cycle networks are trained
-before and frozen; here they learn beside, on true volumes only, and count from `cycle_from` on.
-Left out of the published networks: spectral norm of residual blocks and decoders, and leaky ReLUs.
+before and frozen; here they are trained at the same time, on true volumes only, and their losses
+are used from `cycle_from` on. Left out: spectral norm of residual blocks and decoders, leaky ReLUs.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class GanConfig:
 
     data: the simulated windows (`evflow.training.batch`); bins follow its model. base, encoders:
     of the generator; critic: features of the critic's first layer; scales: predictions of the cycle
-    networks. paired: weight of the L1 distance to the simulated volume of the same frames, 0 as
-    published: the fair strongest reading has pairs, since a simulator makes them.
+    networks. paired: weight of the L1 distance to the simulated volume of the same frames; 0 as
+    published, more for the strongest fair reading, as a simulator gives pairs.
     """
 
     data: TrainConfig = DATA
@@ -126,8 +126,8 @@ def networks(config: GanConfig) -> dict[str, nn.Module]:
 
 
 def generate(params: Params, frame0: Array, frame1: Array) -> Array:
-    """Voxels (..., H, W, 2*bins), >= 0, of what happens between two frames (..., H, W) in DN
-    0..255 of any size; params: the generator's, whose shapes tell its structure. Raises EV002."""
+    """Voxels (..., H, W, 2*bins), >= 0, between two frames (..., H, W) in DN 0..255 of any size.
+    params: of the generator, whose structure follows from their shapes. Raises EV002."""
     if frame0.shape != frame1.shape or frame0.ndim < 2:
         raise EvflowDataError("EV002", f"the frames are {frame0.shape} and {frame1.shape}.",
                               "Expected two of one shape (..., H, W).")
@@ -153,7 +153,7 @@ def predictions(network: nn.Module, params: Params, x: Array) -> list[Array]:
 
 
 def make_pairs(batch: Batch) -> Pair:
-    """All windows of a batch by themselves; the frames are those that made its dlogI."""
+    """All windows of a batch separately, with the frames of its dlogI."""
     half = 0.5 * batch.dlogI
     frames = jnp.stack([batch.intensity - half, batch.intensity + half], -1)
     frames, voxels = (a.reshape(-1, *a.shape[2:]) for a in (frames, batch.voxels))
@@ -184,7 +184,7 @@ def init_state(config: GanConfig) -> GanState:
 def cycle_losses(
     config: GanConfig, params: dict[str, Params], pair: Pair, volume: Array
 ) -> Metrics:
-    """What a volume tells of motion and of the second frame, by the cycle networks."""
+    """Losses of the motion and the second frame that the cycle networks predict from a volume."""
     nets = networks(config)
     summed = jnp.stack([volume.sum(-1), pair.frames[..., 0]], -1)
     return {"flow": flow_loss(predictions(nets["flow"], params["flow"], volume), pair),
@@ -194,7 +194,7 @@ def cycle_losses(
 
 @partial(jax.jit, static_argnames="config")
 def train_step(state: GanState, pair: Pair, config: GanConfig) -> tuple[GanState, Metrics]:
-    """One step on one batch: the critic twice, each time on other halves of it, made and true;
+    """One step on one batch: the critic twice, on generated and true volumes of different halves;
     the generator once; the cycle networks once, on true volumes."""
     nets, txs, keys = networks(config), optimisers(config), jax.random.split(
         jax.random.fold_in(jax.random.fold_in(state.key, 0), state.step), 2)

@@ -1,8 +1,8 @@
 """Direct integration: L(t) = L(t0) + sum of p theta over the events since a frame at t0.
 
 Wang et al. (ACRA 2019) judge a calibration by these images, and so does the paper (Table X). The
-state is set to each frame that comes; without frames it starts at a constant. Nothing forgets, so
-an error of a threshold shows in full, times the number of events.
+state is set to each new frame; without frames it starts at a constant. There is no decay, so a
+threshold's error adds up over the events.
 """
 
 from __future__ import annotations

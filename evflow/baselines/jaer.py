@@ -2,14 +2,14 @@
 
 Brandli, Muller, Delbruck, "Real-time, high-speed video decompression using a frame- and
 event-based DAVIS sensor" (ISCAS 2014). Each event adds its gain to a log display buffer; at a new
-frame the error err = theta_ON n_ON - theta_OFF n_OFF - dL is blamed on the gains by their share of
-the events: theta_ON -= a err n_ON / n, theta_OFF += a err n_OFF / n. Averages over the pixels that
-fired, low-passed by m, are what the camera is said to have. Inter-event-time bins are left out:
-practically every event falls into the last.
+frame the error err = theta_ON n_ON - theta_OFF n_OFF - dL is distributed to the gains by their
+share of the events: theta_ON -= a err n_ON / n, theta_OFF += a err n_OFF / n. The camera's
+thresholds are averages over the pixels that fired, low-passed by m. Inter-event-time bins are left
+out, as practically every event falls into the last.
 
-The loop gain of a pixel is a n: by itself it diverges beyond 8 events per frame at a = .25. Tied
-gains are one pixel's worth for all, and their updates are sums over pixels: K numbers for a
-recording of K frames, whatever the number of passes.
+The loop gain of a pixel is a n, which diverges beyond 8 events per frame at a = .25. Tied gains are
+one value for all pixels, updated by means over pixels: K updates for a recording of K frames in
+each pass.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ RUNAWAY = 10.0  # log units: a gain of no sensor
 @dataclasses.dataclass(frozen=True)
 class Jaer(System):
     """passes: over the frames. tied: one gain per polarity for all pixels, the published default;
-    else each pixel learns its own. normalised: divide by n_ON² + n_OFF² (NLMS), which no number
-    of events makes diverge. start: of the gains, log units (published: .001 of the converter's own
-    scale). From above the threshold the step of a busy pixel ends below 0, which the rule discards:
-    then the gain is stuck, and not valid."""
+    else one per pixel. normalised: divide by n_ON² + n_OFF² (NLMS), which never diverges. start: of
+    the gains, log units (published: .001 of the converter's own scale). From a start above the
+    threshold a busy pixel's update is negative, and discarded by the rule; the gain is then stuck
+    and marked invalid."""
 
     passes: int = 3
     tied: bool = True
@@ -62,7 +62,7 @@ class Jaer(System):
         return Solution(np.where(sound, theta, self.start), sound, notes=diverged)
 
     def _tied(self, parts: Iterable[Interval]) -> tuple[np.ndarray, np.ndarray]:
-        """theta (2,), and whether it ever moved (2,); one interval in memory at a time."""
+        """theta (2,), and whether it was ever updated (2,); one interval in memory at a time."""
         rows = [_means(p.counts, p.after - p.before, self.normalised) for p in parts]
         matrix, vector, fired = (jnp.stack(column) for column in zip(*rows, strict=True))
         theta = jnp.full(2, self.start, matrix.dtype)
@@ -71,8 +71,8 @@ class Jaer(System):
         return np.asarray(theta), np.asarray(theta != jnp.full_like(theta, self.start))
 
     def _untied(self, n: Array, d: Array) -> tuple[Array, Array, Array]:
-        """theta (2, H, W), whether each pixel fired (2, H, W), and whether it ran away (H, W); a
-        pixel that does stays where it was. n: counts (K, 2, H, W); d: dL (K, H, W)."""
+        """theta (2, H, W), whether each pixel fired (2, H, W), and whether it diverged (H, W); such
+        a pixel keeps its last value. n: counts (K, 2, H, W); d: dL (K, H, W)."""
         theta = jnp.full(n.shape[1:], self.start, d.dtype)
         away = jnp.zeros(d.shape[1:], bool)
         for _ in range(self.passes):
@@ -81,15 +81,15 @@ class Jaer(System):
 
 
 def _blame(n: Array, normalised: bool) -> Array:
-    """Share of the error (..., 2, H, W) that each polarity takes."""
+    """Share of the error (..., 2, H, W) for each polarity."""
     size = (n * n if normalised else n).sum(-3, keepdims=True)
     return n / jnp.maximum(size, 1.0)
 
 
 @partial(jax.jit, static_argnames="normalised")
 def _means(n: Array, d: Array, normalised: bool) -> tuple[Array, Array, Array]:
-    """The mean blame of each polarity over the pixels where it fired is matrix (2, 2) theta -
-    vector (2,); and whether it fired (2,). n: counts (2, H, W); d: dL (H, W)."""
+    """Mean update of each polarity over the pixels where it fired, as matrix (2, 2) theta - vector
+    (2,), and whether it fired (2,). n: counts (2, H, W); d: dL (H, W)."""
     blame, touched = _blame(n, normalised), (n > 0).sum((1, 2))
     share = 1.0 / jnp.maximum(touched, 1).astype(d.dtype)
 

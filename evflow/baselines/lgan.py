@@ -1,14 +1,14 @@
 """LGAN: maps of the mean and spread of thresholds, trained against critics of event patches.
 
-Gu, Li, Zhang, Tian, "How to Learn a Domain-Adaptive Event Simulator?" (ACM MM 2021). A network sees
-a frame and says mean and spread of each pixel's thresholds; a simulator draws thresholds and makes
-the events that follow; critics compare patches of them with the recorded ones. It is trained anew
-for every recording.
+Gu, Li, Zhang, Tian, "How to Learn a Domain-Adaptive Event Simulator?" (ACM MM 2021). A network
+predicts mean and spread of each pixel's thresholds from a frame; a simulator draws thresholds and
+computes the events; critics compare patches of these with the recorded ones. It is trained anew for
+every recording.
 
-Two readings. "published": free maps that ON and OFF share, no noise, a memory up to .2 below the
-first frame, patches that have ten events, tanh of the counts. That cannot tell ON from OFF, and
-chooses real and made patches by what is compared. "fair": a mean and a spread for each polarity,
-the noise of what is at rest, a memory that has been running, patches chosen by the light alone,
+Two readings. "published": free maps common to ON and OFF, no noise, a memory up to .2 below the
+first frame, patches with at least ten events, tanh of the counts. It cannot distinguish ON from
+OFF, and selects patches by the quantity that is compared. "fair": mean and spread per polarity, the
+noise of pixels at rest, the memory of a running camera, patches selected by the light alone,
 log(1 + counts), the moving average of the generator.
 """
 
@@ -41,27 +41,27 @@ Array = jax.Array
 Params = Any
 
 PIXEL_MEAN, PIXEL_STD = 0.449, 0.226  # of frames / 255, as published
-START_STD, MEAN_UNIT = 0.05, 0.1  # log units: where the spread starts, and the free maps' scale
-DEPARTURE = 0.2  # of log mean and log spread, from one pixel to the next
-FEW_EVENTS = 10  # the published least of a patch
-MOVED = 0.05  # log units: mean path length in a patch that a fair comparison wants
-# Weight of the pull of N(mean, spread) to N(0, 1). The published code sums over clips of 12 x 160 x
-# 160 px, with the spread in the place of its log variance, and so pulls spreads to 0, away from
-# what is estimated; the mean, meant as written, is hardly felt.
+START_STD, MEAN_UNIT = 0.05, 0.1  # log units: initial spread, and scale of the free maps
+DEPARTURE = 0.2  # largest deviation of a pixel's log mean and log spread from the constant
+FEW_EVENTS = 10  # least events of a patch, as published
+MOVED = 0.05  # log units: least mean path length in a patch for the fair comparison
+# Weight of the divergence of N(mean, spread) from N(0, 1). The published code sums it over clips of
+# 12 x 160 x 160 px, with the spread in place of its log variance, which drives spreads to 0; as a
+# mean over pixels its effect is small.
 KL = 1e-5
 CHECK_EVERY = 10  # iterations between looks at the clock
-EXPLAINED = np.log(1.5)  # counts made and seen: further apart, the fit has not converged
+EXPLAINED = np.log(1.5)  # log ratio of simulated to recorded counts; larger: not converged
 
 
 @dataclasses.dataclass(frozen=True)
 class Lgan(System):
-    """reading: see above. iterations, seconds: the budget; a fit that runs out of seconds is what
-    it is by then, and says so; else the seed alone decides. clip: frame intervals per clip. patch,
-    classes: px, and how many angles, strengths and coherences (published: 40 px of 160,
-    24 x 3 x 3, for thousands of clips; a short recording has some hundred patches). hidden: layers
-    of a critic. groups, draws: critics per step and patches for each; critic_steps: per step of
-    the generator. rate, critic_rate: of the optimisers. average: decay of the generator's moving
-    average. shown: with a bar of the iterations."""
+    """reading: see above. iterations, seconds: the budget; a fit stopped by the clock has a note,
+    else it is determined by the seed. clip: frame intervals per clip. patch, classes: side in px,
+    and numbers of angles, strengths and coherences (published: 40 px of 160, 24 x 3 x 3, for
+    thousands of clips; a short recording has some hundred patches). hidden: layers of a critic.
+    groups, draws: critics per step and patches for each; critic_steps: per step of the generator.
+    rate, critic_rate: of the optimisers. average: decay of the generator's moving average. shown:
+    whether to show a progress bar."""
 
     reading: Literal["fair", "published"] = "fair"
     iterations: int = 200
@@ -88,7 +88,7 @@ class Lgan(System):
 
     @property
     def program(self) -> Lgan:
-        """These options without those that no compiled program depends on."""
+        """The options with those reset that do not change compiled programs."""
         return dataclasses.replace(self, seconds=0.0, shown=False, seed=0)
 
     def solve(self, recording: Recording) -> Solution:
@@ -122,8 +122,8 @@ PUBLISHED = Lgan("published", classes=(24, 3, 3), hidden=(256, 128), rate=4e-4, 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class LganState:
-    """Of the training: the generator, its moving average and optimiser; the stacked critics and
-    theirs."""
+    """State of the training: generator, its moving average and optimiser; stacked critics and
+    their optimisers."""
 
     generator: Params
     average: Params
@@ -134,8 +134,8 @@ class LganState:
 
 class Thresholds(nn.Module):
     """Mean and spread (N, 2, H, W) of the thresholds, from frames (N, H, W, 1). published: free
-    maps that ON and OFF share. Else each polarity has a constant, in logs, from which the map
-    departs by a fifth at most: free maps run away where nothing fires, since only events have a
+    maps common to ON and OFF. Else each polarity has a constant, in logs, from which the map
+    deviates by a fifth at most: free maps diverge where nothing fires, as only events have a
     gradient, and get stuck at the clamp."""
 
     published: bool
@@ -155,7 +155,7 @@ class Thresholds(nn.Module):
 
 
 def _log_constant(value: float) -> nn.initializers.Initializer:
-    # Of a type of its own: a weak one becomes another after a step, for which all compiles again.
+    # Explicit dtype: a weak type would change after a step, and everything would compile again.
     return nn.initializers.constant(np.log(np.float32(value)), jnp.float32)
 
 
@@ -168,7 +168,7 @@ def thresholds(generator: Params, runs: Runs, system: Lgan) -> tuple[Array, Arra
 
 
 def patches_of(runs: Runs, system: Lgan) -> Patches | None:
-    """Patches to compare: where the light moved, or as published where events were recorded."""
+    """Patches to compare: where light changed ("fair"), or where events were recorded."""
     size, skipped = system.patch, lead(runs)
     path = np.asarray(runs.path)[:, skipped:]
     if system.published:
@@ -182,8 +182,8 @@ def patches_of(runs: Runs, system: Lgan) -> Patches | None:
 
 
 def _made(generator: Params, key: Array, runs: Runs, system: Lgan) -> tuple[Array, Array]:
-    """Counts (M, 2, H, W) of the compared clips by the generator's thresholds, and the divergence
-    of N(mean, spread) from N(0, 1)."""
+    """Simulated counts (M, 2, H, W) of the compared clips, and the divergence of N(mean, spread)
+    from N(0, 1)."""
     k_theta, k_runs = jax.random.split(key)
     mean, spread = thresholds(generator, runs, system)
     theta = jnp.maximum(mean + spread * jax.random.normal(k_theta, mean.shape), THETA_MIN)
@@ -201,7 +201,7 @@ def _optimisers(system: Lgan) -> tuple[optax.GradientTransformation, ...]:
 
 @partial(jax.jit, static_argnames="system")
 def start(key: Array, runs: Runs, patches: Patches, system: Lgan) -> LganState:
-    """A fresh generator, whose thresholds are about .3, and critics."""
+    """Initial generator, with thresholds of about .3, and critics."""
     k_generator, k_critics = jax.random.split(key)
     tx, critics_tx = _optimisers(system)
     image = jnp.zeros((1, *runs.frames.shape[1:], 1))
@@ -215,8 +215,8 @@ def start(key: Array, runs: Runs, patches: Patches, system: Lgan) -> LganState:
 def step(
     state: LganState, key: Array, runs: Runs, patches: Patches, system: Lgan
 ) -> tuple[LganState, Array]:
-    """`critic_steps` of some of the critics, one of the generator. Also the log ratio (2,) of the
-    counts made and seen."""
+    """`critic_steps` steps of some critics and one of the generator; also returns the log ratio
+    (2,) of simulated to recorded counts."""
     k_made, k_chosen, k_critics, k_score = jax.random.split(key, 4)
     (counts, divergence), pull = jax.vjp(
         lambda g: _made(g, k_made, runs, system), state.generator)
@@ -260,7 +260,7 @@ def _draw(key: Array, places: Array, count: int) -> Array:
 
 
 def _features(counts: Array, places: Array, system: Lgan) -> tuple[Array, Array]:
-    """Features (G, n, P, P, CHANNELS) of counts at places (G, n, 3), and whether they count."""
+    """Features (G, n, P, P, CHANNELS) of counts at places (G, n, 3), and the patches' weights."""
     seen = critics.cut(critics.features(counts, system.published), places, system.patch)
     if not system.published:
         return seen, jnp.ones(places.shape[:-1])
@@ -269,8 +269,8 @@ def _features(counts: Array, places: Array, system: Lgan) -> tuple[Array, Array]
 
 
 def train(runs: Runs, patches: Patches, system: Lgan) -> tuple[LganState, np.ndarray, int]:
-    """The state within the budget, the mean log ratio (2,) of counts over the last tenth of the
-    iterations (not finite where they diverged), and how many there were."""
+    """The state after the budget, the mean log ratio (2,) of counts over the last tenth of the
+    iterations (not finite where they diverged), and the number of iterations."""
     k_start, k_steps = jax.random.split(jax.random.key(system.seed))
     program, begun = system.program, time.monotonic()
     state = start(k_start, runs, patches, program)

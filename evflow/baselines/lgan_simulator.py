@@ -1,10 +1,10 @@
-"""LGAN's simulator: stretches of a recording's own scene, simulated with straight-through
-gradients of the event counts in the thresholds.
+"""LGAN's simulator: stretches of a recording, simulated with straight-through gradients of the
+event counts by the thresholds.
 
-The forward pass is `evflow.simulator`, exactly; nothing is smoothed. A run is cut into clips, each
-with its own counts. The memory at a run's start is unknown: a fair comparison plays the first clip
-without comparing it (where the light goes back and forth, a memory that may lie anywhere between
-the thresholds sends up to five times the events of one that has been there for a while).
+The forward pass is `evflow.simulator`, exactly. A run is cut into clips, each with its own counts.
+The memory at a run's start is unknown, so the fair reading simulates the first clip without
+comparing it (where light oscillates, a memory drawn uniformly between the thresholds sends up to
+five times the events of one that has settled).
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from evflow.scenes import watch
 Array = jax.Array
 
 MODEL = SensorModel()
-BINS = 2  # the fewest; their sums are the counts
-BLIND_START = 0.2  # log units: the published range of the memory's start
+BINS = 2  # the minimum; their sums are the counts
+BLIND_START = 0.2  # log units: range of the initial memory, as published
 MOST_CLIPS = 16  # of a long recording, evenly thinned
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Runs:
-    """N runs of C clips of T steps: path (N, C, T + 1, H, W) log frames, a clip's last one being
-    the next one's first; seen (N, C, 2, H, W) recorded counts; bright (N, H, W) 1 where frames
-    are exposed, 0 elsewhere; dt_s (N,) per step; eta (2,) noise in Hz."""
+    """N runs of C clips of T steps. path: (N, C, T + 1, H, W) log frames, the last of a clip equal
+    to the first of the next; seen: (N, C, 2, H, W) recorded counts; bright: (N, H, W), 0 where
+    frames are black or saturated, else 1; dt_s: (N,) per step; eta: (2,) noise in Hz."""
 
     path: Array
     seen: Array
@@ -72,19 +72,19 @@ def runs_of(scene: Scene, clip: int, apart: bool) -> Runs:
 
 
 def lead(runs: Runs) -> int:
-    """Clips at the start of a run that are played, not compared."""
+    """Number of clips at the start of a run that are simulated, but not compared."""
     return min(1, runs.path.shape[1] - 1)
 
 
 def compared(runs: Runs, counts: Array) -> Array:
-    """The clips (M, 2, H, W) of counts (N, C, 2, H, W) that are compared, where light is known."""
+    """The compared clips (M, 2, H, W) of counts (N, C, 2, H, W), 0 where light is unknown."""
     counts = (counts * runs.bright[:, None, None])[:, lead(runs):]
     return counts.reshape(-1, *counts.shape[2:])
 
 
 def straight_through(counts: Array, theta: Array) -> Array:
-    """Counts or voxels as they are, with the gradient in theta (of a shape that broadcasts) of
-    floor(d / theta) theta / theta whose first two factors are held: -counts / theta."""
+    """Unchanged counts or voxels with the gradient -counts / theta: that of floor(d / theta) theta
+    / theta with the first two factors held constant. theta: of a shape that broadcasts."""
     held = jax.lax.stop_gradient
     return held(counts) * (1.0 - (jnp.log(theta) - held(jnp.log(theta))))
 
@@ -114,6 +114,6 @@ def simulate_run(
                  else watch.memory(k_phase, camera))
     frames = jnp.concatenate([path[0], *path[1:, 1:]])
     grids = watch.voxels(key, frames, camera, MODEL, len(path), dt_s, BINS, phase)
-    # An event's weights add up to one but for rounding.
+    # An event's weights sum to 1, up to rounding.
     counts = jnp.round(grids.reshape(*grids.shape[:-1], 2, BINS).sum(-1))
     return jnp.moveaxis(counts, -1, 1)

@@ -1,9 +1,9 @@
 """MATCH: the thresholds at which a simulation of the same scene has the recorded event counts.
 
-Nothing is learned. Per polarity, the mean over pixels of the square root of the count is matched:
-the root keeps the few pixels at the threshold's clamp, which send most events where the mismatch
-is wide, from deciding alone. The scene is the recording's own frames with motion-compensated ones
-between them (the limit: what the flow misses), or the true video where it is known.
+Nothing is learned. Per polarity, the mean over pixels of the square root of the count is matched.
+The root limits the influence of the few pixels at the threshold's clamp, which send most events at
+a wide mismatch. The scene is the recording's frames with motion-compensated ones in between (its
+accuracy is that of the flow), or the true video where known.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from evflow.baselines.base import Solution, System, constant
 from evflow.baselines.resimulate import Path, Scene, scene_of
 from evflow.types import Recording
 
-GRID = np.geomspace(0.03, 1.2, 10)  # log units: tied thresholds that the search begins with
-OFFSET = 0.08  # log theta: finite differences; below it the counts' own steps show
+GRID = np.geomspace(0.03, 1.2, 10)  # log units: equal ON and OFF thresholds to start from
+OFFSET = 0.08  # log theta: finite differences; smaller ones are dominated by steps of the counts
 OFFSETS = OFFSET * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 PASSES = 6
-CLOSE = 2e-3  # of both statistics together, log units: a tenth of what counts tell
-# Where next to nothing fires the statistic is flat: a tenth of its usual slope, d log root / d log
-# theta = -1, holds the step.
+CLOSE = 2e-3  # log units, both statistics together: a tenth of the counts' precision
+# With hardly any events the statistic is flat: a tenth of its usual slope, d log root / d log
+# theta = -1, regularises the step.
 HOLD = 0.1
 LONGEST_STEP = 0.5  # log theta per pass
 LOW, HIGH = 0.02, 2.0
-MATCHED = 0.05  # log units of the statistic, from which the scene cannot explain the events
+MATCHED = 0.05  # log units: larger residuals of the statistic mean that the fit has failed
 SIGMAS = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2)
-MODEL_ERROR = 0.05  # log units: what interpolation leaves in a statistic
+MODEL_ERROR = 0.05  # log units: error of a statistic by interpolation
 COUNTS, ROOTS, ACTIVE, PIXELS = range(4)
 
 
 @dataclasses.dataclass(frozen=True)
 class Match(System):
-    """path: "flow" interpolates the frames, "given" takes them for the video itself.
-    mismatch: standard deviation of the thresholds from pixel to pixel; None: the one at which the
-        mean count, which heavy tails move, agrees as well.
+    """path: "flow" interpolates the frames, "given" takes them as the video itself.
+    mismatch: standard deviation of the thresholds over pixels; None: the one at which the mean
+        count, which depends on heavy tails, agrees too.
     start: "fresh" as a simulation, with the memory at the first frame; "running" anywhere between
-        the thresholds; "auto" the likelier. Whatever is left open is chosen by the counts and the
-        active pixels, which the match itself leaves free.
+        the thresholds; "auto": the likelier. Options left open are chosen by the mean counts and
+        active pixels, which are not matched.
     """
 
     path: Path = "flow"
@@ -70,7 +70,7 @@ class Match(System):
 
 
 def unlikeliness(scene: Scene, excess: np.ndarray) -> float:
-    """How far off all statistics are, in variances: those of the counts and of the model."""
+    """Chi-square of all statistics, with variances of counts and model."""
     variance = MODEL_ERROR**2 + 1.0 / (scene.seen[[COUNTS, ROOTS, ACTIVE]] + 1.0)
     return float((excess**2 / variance).sum())
 
@@ -87,8 +87,8 @@ def log_statistics(statistics: np.ndarray) -> np.ndarray:
 
 
 def from_grid(scene: Scene, key: jax.Array, sigma: float, fresh: float) -> np.ndarray:
-    """theta (2,) at which cameras with equal thresholds ON and OFF send the roots that were seen,
-    by log-log interpolation on GRID, held at its ends."""
+    """theta (2,) at which cameras with equal ON and OFF thresholds give the recorded roots, by
+    log-log interpolation on GRID, clipped to its ends."""
     made = scene.simulate(key, camera_rows(scene, np.stack([GRID] * 2, 1), sigma), fresh)
     made, seen = (log_statistics(s)[..., ROOTS, :] for s in (made, scene.seen))
     falling, grid = np.minimum.accumulate(made)[::-1], np.log(GRID)[::-1]
@@ -98,15 +98,15 @@ def from_grid(scene: Scene, key: jax.Array, sigma: float, fresh: float) -> np.nd
 def newton(
     scene: Scene, key: jax.Array, theta: np.ndarray, sigma: float, fresh: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """theta (2,) that matches the roots of both polarities, and the excess (3, 2) of the log
-    statistics that were made over those seen."""
+    """theta (2,) that matches the roots of both polarities, and the log ratio (3, 2) of simulated
+    to recorded statistics."""
     seen, jacobian = log_statistics(scene.seen), np.eye(2)
     best = (np.inf, theta, np.zeros((3, 2)))
     for k in range(PASSES):
         rows = theta * np.exp(OFFSETS if k % 2 == 0 else OFFSETS[:1])
         excess = log_statistics(scene.simulate(key, camera_rows(scene, rows, sigma), fresh)) - seen
         roots = excess[:, ROOTS]
-        if len(rows) > 1:  # the slopes serve two passes
+        if len(rows) > 1:  # slopes are reused for two passes
             jacobian = (roots[1:] - roots[0]).T / OFFSET
         if (size := float(np.abs(roots[0]).sum())) < best[0]:
             best = (size, theta, excess[0])

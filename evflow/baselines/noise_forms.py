@@ -1,7 +1,7 @@
 """Closed-form noise rates of two simulators for a static scene (paper, Table IV).
 
 v2e's shot noise falls linearly with light and inversely with a pixel's threshold; the leak of
-DVS-Voltmeter is a Brownian motion with drift between two levels, whose exits are known. Arrays
+DVS-Voltmeter is a Brownian motion with drift between two levels, with known exit times. Arrays
 broadcast; rates are in Hz per pixel and polarity, light in DN on 0..255.
 """
 

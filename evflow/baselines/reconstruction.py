@@ -49,10 +49,9 @@ def slope_of(dn: ArrayLike, offset_dn: float) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Reconstructor(abc.ABC):
-    """A system that follows a pixel's brightness by events and frames.
+    """A system that tracks pixels' brightness by events and frames.
 
-    offset_dn: of the log map, see `log_of`. start_dn: brightness before the first frame; all
-    there is without frames.
+    offset_dn: of the log map, see `log_of`. start_dn: initial brightness before the first frame.
     """
 
     offset_dn: float = 0.0
@@ -63,8 +62,8 @@ class Reconstructor(abc.ABC):
         self, events: Events, frames: np.ndarray, frame_times: np.ndarray, camera: Camera,
         times: np.ndarray,
     ) -> np.ndarray:
-        """Log intensity (T, H, W) float32 at times (T,), as far as it goes: not clipped. Arguments
-        and errors as in `reconstruct`."""
+        """Log intensity (T, H, W) float32 at times (T,), not clipped. Arguments and errors as of
+        `reconstruct`."""
 
     def reconstruct(
         self, events: Events, frames: np.ndarray, frame_times: np.ndarray, camera: Camera,
@@ -82,10 +81,10 @@ class Reconstructor(abc.ABC):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Segment:
-    """The time (begin_us, end_us] in which nothing but events happens.
+    """The time (begin_us, end_us] between two neighbouring frames or images.
 
-    frame: number of the frame taken in at its begin, -1 for none; events: first and last + 1;
-    images: numbers of the images that are read at its end.
+    frame: number of the frame at its begin, -1 for none; events: first and last + 1; images:
+    numbers of the images at its end.
     """
 
     begin_us: int
@@ -96,7 +95,7 @@ class Segment:
 
 
 def segments(events: Events, frame_times: np.ndarray, times: np.ndarray) -> Iterator[Segment]:
-    """The stream cut at every frame and every image, in time order."""
+    """The stream, cut at every frame and every image, in time order."""
     knots = np.unique(np.concatenate([frame_times, times]))
     begin = int(min([*knots[:1], *(events.t[:1] - 1)], default=0))
     cuts = np.searchsorted(events.t, np.append(begin, knots), side="right")
@@ -113,8 +112,8 @@ def segments(events: Events, frame_times: np.ndarray, times: np.ndarray) -> Iter
 def checked(
     events: Events, frames: np.ndarray, frame_times: np.ndarray, camera: Camera, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """frames, frame_times, theta (2, H*W) float32 and times, as every system wants them; raises
-    what `Reconstructor.reconstruct` says."""
+    """Validated frames, frame_times, theta (2, H*W) float32 and times; raises as
+    `Reconstructor.reconstruct`."""
     width, height = events.size
     frames, frame_times, times = np.asarray(frames), np.asarray(frame_times), np.asarray(times)
     check_frames(frames, events.size)

@@ -1,8 +1,8 @@
 """A recording's own scene, simulated with given thresholds, for MATCH and S2R.
 
 The path between the frames is motion-compensated, or given where the frames are a fast video. A
-camera is one row (theta_ON, theta_OFF, eta_ON, eta_OFF, sigma_ON, sigma_OFF); all rows see the
-same random numbers, so that their differences are the cameras'.
+camera is one row (theta_ON, theta_OFF, eta_ON, eta_OFF, sigma_ON, sigma_OFF); all rows share random
+numbers, so that differences are due to the cameras.
 """
 
 from __future__ import annotations
@@ -26,15 +26,14 @@ from evflow.types import Recording
 Array = jax.Array
 
 Path = Literal["flow", "given"]
-BLOCK_US = 25_000  # of a given video: a typical frame interval, in which edges cross pixels
-TYPICAL_ETA, ETA_SPREAD = 0.1, 2.0  # Hz and relative std: held only where nothing is at rest
+BLOCK_US = 25_000  # of a given video, as a typical frame interval
+TYPICAL_ETA, ETA_SPREAD = 0.1, 2.0  # prior, Hz and relative std: matters without pixels at rest
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """Stretches of a recording and the number of fine steps per frame interval; seen: (4, 2)
-    statistics of the recorded events, see `statistics`; eta: (2,) noise rates in Hz of what is at
-    rest."""
+    """Stretches of a recording. steps: fine steps per frame interval; seen: (4, 2) `statistics` of
+    the recorded events; eta: (2,) noise rates in Hz of pixels at rest."""
 
     chunks: list[Chunk]
     steps: int
@@ -56,8 +55,8 @@ class Scene:
 
 
 def scene_of(recording: Recording, path: Path, quiet: bool = True) -> Scene:
-    """The scene of a recording. quiet: measure the noise of what is at rest. Raises EV001, EV011,
-    EV012, EV017 as `plan_windows` does, and EV017 where the frames are too small for flow."""
+    """The scene of a recording. quiet: measure the noise of pixels at rest. Raises EV001, EV011,
+    EV012, EV017 as `plan_windows`, and EV017 where the frames are too small for flow."""
     found = usable(recording)
     if path == "flow":
         steps, chunks = STEPS, refinement_chunks(recording, tuple((i, i + 1) for i in found))
@@ -92,14 +91,14 @@ def _given(recording: Recording, run: list[int], steps: int) -> Chunk:
 
 
 def _runs(found: list[int]) -> list[list[int]]:
-    """Consecutive intervals together."""
+    """Groups of consecutive intervals."""
     breaks = np.flatnonzero(np.diff(found) > 1) + 1
     return [part.tolist() for part in np.split(np.array(found), breaks)]
 
 
 def statistics(trace: Trace, bright: np.ndarray) -> np.ndarray:
-    """(4, 2): sums over pixels of the counts, of their square roots and of the pixels that fire
-    at all, ON and OFF; then the number of pixels there are, twice."""
+    """(4, 2), ON and OFF: sums over pixels of the counts and of their square roots, number of
+    pixels with events, number of pixels."""
     counts = trace.counts.sum(0, dtype=np.float64) * bright
     pixels = np.full(2, float(bright.sum()))
     return np.stack([counts.sum((1, 2)), np.sqrt(counts).sum((1, 2)), (counts > 0).sum((1, 2)),

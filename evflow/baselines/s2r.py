@@ -2,9 +2,9 @@
 
 Stoffregen, Scheerlinck et al., "Reducing the Sim-to-Real Gap for Event Cameras" (ECCV 2020): the
 events per pixel and second of a recording are compared with those of simulated sequences at a grid
-of contrast thresholds. What the sequences show is taken to average out: a generic set of scenes
-("generic"), or the recording's own ("same", the stronger reading). One threshold for both
-polarities, as published, or one for each.
+of contrast thresholds. The content of the sequences is assumed to average out: of a generic set of
+scenes ("generic"), or of the recording itself ("same", the stronger reading). One threshold for
+both polarities, as published, or one for each.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ SHAPE, FRAMES, FRAME_S = (64, 64), 200, 1e-3  # of a generic scene
 
 @dataclasses.dataclass(frozen=True)
 class S2r(System):
-    """scenes: "generic" or "same". per_polarity: a threshold each for ON and OFF.
-    count: generic scenes; their table is computed once a process."""
+    """scenes: "generic" or "same". per_polarity: separate thresholds for ON and OFF. count: of
+    generic scenes; their table is computed once per process."""
 
     scenes: Literal["generic", "same"] = "generic"
     per_polarity: bool = False
@@ -62,8 +62,8 @@ class S2r(System):
 
 
 def event_rate(recording: Recording) -> np.ndarray:
-    """Events per pixel and second, ON and OFF (2,), between the first and last usable frame, or
-    of all events where there are no frames; EV001 without events."""
+    """Events per pixel and second, ON and OFF (2,), between the first and last usable frame, or of
+    all events without frames. Raises EV001 without events."""
     events = recording.events
     if len(events) == 0:
         raise EvflowDataError("EV001", "the recording has no events.")
@@ -77,8 +77,8 @@ def event_rate(recording: Recording) -> np.ndarray:
 
 
 def invert(rate: float, rates: np.ndarray) -> tuple[float, bool]:
-    """The threshold of a rate on a table over GRID, log-log; held at the grid's ends, and whether
-    it lies inside."""
+    """The threshold of a rate by log-log interpolation of a table over GRID, clipped to the grid,
+    and whether it lies inside."""
     if not rate > 0:
         return float(GRID[-1]), False
     falling = np.log(np.maximum(np.minimum.accumulate(rates), 1e-9))[::-1]
@@ -88,8 +88,8 @@ def invert(rate: float, rates: np.ndarray) -> tuple[float, bool]:
 
 @functools.lru_cache(maxsize=4)
 def generic_rates(count: int, seed: int) -> np.ndarray:
-    """Events per pixel and second (len(GRID), 2) over generic scenes of textures and photographs
-    in slow to fast motion; the polarity that varies alternates from scene to scene."""
+    """Events per pixel and second (len(GRID), 2) over generic scenes of textures and photographs in
+    slow to fast motion. The polarity with the varied threshold alternates between scenes."""
     k_bank, k_scene, k_theta = jax.random.split(jax.random.key(seed), 3)
     bank = make_bank(k_bank, 48)
     times = (jnp.arange(FRAMES + 1) - FRAMES / 2) * FRAME_S

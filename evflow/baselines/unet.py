@@ -1,9 +1,9 @@
 """The U-Net of the adversarial systems: images (..., H, W, C) of any size -> maps.
 
-A head at full resolution, encoders that halve, residual blocks, decoders that double (nearest) and
-take in what the encoder of their size saw, and a linear 1x1 prediction at every scale. The channels
-of each pixel are normalised by themselves: batch statistics of the few small crops that two cores
-can take are noise, and those of an image would change with its size.
+A head at full resolution, encoders that halve, residual blocks, decoders that double (nearest) with
+skip connections, and a linear 1x1 prediction at every scale. Channels are normalised per pixel:
+batch statistics of the few small crops that two cores can process are noisy, and those of an image
+would depend on its size.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ Array = jax.Array
 
 BLOCKS = 2
 KERNEL = nn.initializers.he_uniform()
-# As of EventGAN's authors: its predictions begin near nothing (PyTorch's kaiming_normal_ with
-# a = 10), layers of its critic with PyTorch's own bound, 1 / sqrt(inputs).
+# As EventGAN's authors: predictions start near 0 (PyTorch's kaiming_normal_ with a = 10), layers of
+# the critic with PyTorch's default bound, 1 / sqrt(inputs).
 GAINS = {"prediction_": 0.1, "critic_": 6.0**-0.5}
 
 
@@ -74,7 +74,7 @@ class UNet(nn.Module):
             x = nn.relu(x + Layer(x.shape[-1], relu=False, name=f"block_{i}_b")(y))
         found = []
         for i, skip in enumerate(reversed(skips)):
-            left = self.encoders - 1 - i  # halvings that are still to be undone
+            left = self.encoders - 1 - i  # remaining doublings
             x = jnp.concatenate([jnp.repeat(jnp.repeat(x, 2, -3), 2, -2), skip], -1)
             x = Layer(self.base << left, name=f"decoder_{i}")(x)
             if left < self.scales:

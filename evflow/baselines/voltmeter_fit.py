@@ -1,7 +1,7 @@
-"""DVS-Voltmeter's constants from a recording, where it tells them (Lin et al., ECCV 2022).
+"""DVS-Voltmeter's constants from a recording, where it determines them (Lin et al., ECCV 2022).
 
-    k1, k2   what an event is worth in log(L + k2): regression of that brightness at the events on
-             their counts, all pixels together, one threshold for both polarities
+    k1, k2   threshold in log(L + k2): regression of that brightness at the events on their counts,
+             all pixels together, one threshold for both polarities
     k4, k5   drift at rest, k4 + k5 L, and
     k3, k6   diffusion, k3 sqrt(L) / (L + k2) + k6: of quiet pixels' noise over the light, as the
              first passage of a Brownian motion between -1 and 1 has the rates
@@ -22,36 +22,37 @@ from evflow.estimation.shot import LIGHTS
 Array = np.ndarray
 
 K2 = (1.0, 3.0, 6.0, 10.0, 15.0, 20.0, 26.0, 33.0, 42.0, 55.0, 75.0, 100.0)  # DN
-WORTH = 400.0  # events' worth of a recording's path, as its errors are alike everywhere
-WIDE = 8.0  # times from the least to the largest k2 that is probable: it is not told
-LEAST_EVENTS, LEAST_LIGHT = 200.0, 50.0  # of quiet pixels; in a step of light
-FEW_LIGHTS, CONTRAST = 3, 2.0  # steps of light, and how far apart, that tell what light does
-THETA = (0.02, 2.0)  # log units: where thresholds are looked for
+WORTH = 400.0  # cap of the effective number of events, as path errors are shared
+WIDE = 8.0  # ratio of the largest to the least probable k2, above which it is undetermined
+LEAST_EVENTS, LEAST_LIGHT = 200.0, 50.0  # of quiet pixels; in a bin of light
+FEW_LIGHTS, CONTRAST = 3, 2.0  # least number of bins of light, and their ratio, for its effect
+THETA = (0.02, 2.0)  # log units: range of thresholds
 
 
 @dataclasses.dataclass(frozen=True)
 class Constants:
-    """voltmeter: the constants; untold: names of those that the recording does not tell: 0, and k2
-    the most probable."""
+    """voltmeter: the constants; undetermined: names of those that the recording does not determine:
+    0, or for k2 the most probable."""
 
     voltmeter: Voltmeter
-    untold: tuple[str, ...]
+    undetermined: tuple[str, ...]
 
 
 def measured_constants(data: Sample, light: Array) -> Constants:
-    """k1 to k6 of a recording. data: of `receptor_sample`; light: events of quiet pixels,
-    of `by_light`."""
+    """k1 to k6 of a recording. data: of `receptor_sample`; light: of `by_light`, events of quiet
+    pixels."""
     fits = [regressed(data, k2, tied=True) for k2 in K2]
     likely = -0.5 * WORTH * np.log([left for _, left in fits])
     best = int(np.argmax(likely))
-    told = np.array(K2)[likely > likely[best] - 2.0]
-    untold = ("k2",) if told[-1] / told[0] > WIDE else ()
+    probable = np.array(K2)[likely > likely[best] - 2.0]
+    undetermined = ("k2",) if probable[-1] / probable[0] > WIDE else ()
     rest, more = _at_rest(light, K2[best])
-    return Constants(Voltmeter(1.0 / float(fits[best][0][0]), K2[best], *rest), (*untold, *more))
+    voltmeter = Voltmeter(1.0 / float(fits[best][0][0]), K2[best], *rest)
+    return Constants(voltmeter, (*undetermined, *more))
 
 
 def _at_rest(light: Array, k2: float) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """k3 to k6, and those that are not told."""
+    """k3 to k6, and the names of undetermined ones."""
     events, seconds = light[:, 0], light[:, 1]
     used = (events.sum(0) >= LEAST_LIGHT) & (seconds.min(0) > 0)
     dn = np.clip((np.arange(LIGHTS) + 0.5) / LIGHTS * 275.0 - 20.0, 1.0, 255.0)[used]
@@ -59,8 +60,8 @@ def _at_rest(light: Array, k2: float) -> tuple[tuple[float, ...], tuple[str, ...
     if few or used.sum() < FEW_LIGHTS or dn.max() < CONTRAST * dn.min():
         rates = (events.sum(1) + 0.5) / np.maximum(seconds.sum(1), 1e-9) * 1e-6  # per us
         drift, sigma = passage_rates(np.full((2, 1), rates.mean()) if few else rates[:, None])
-        untold = ("k3", "k4", "k5", "k6") if few else ("k3", "k5")
-        return (0.0, float(drift[0]), 0.0, float(sigma[0])), untold
+        undetermined = ("k3", "k4", "k5", "k6") if few else ("k3", "k5")
+        return (0.0, float(drift[0]), 0.0, float(sigma[0])), undetermined
     rates = (events[:, used] + 0.5) / seconds[:, used] * 1e-6
     drift, sigma = passage_rates(rates)
     root = np.sqrt(events.sum(0)[used])  # in units of the largest, as k's are 1e-4 and less
@@ -72,8 +73,8 @@ def _at_rest(light: Array, k2: float) -> tuple[tuple[float, ...], tuple[str, ...
 
 
 def passage_rates(rates: Array) -> tuple[Array, Array]:
-    """Drift and diffusion of a Brownian motion that leaves (-1, 1) upwards and downwards at the
-    rates (2, N), and begins at 0 each time."""
+    """Drift and diffusion of a Brownian motion that starts at 0 and leaves (-1, 1) upwards and
+    downwards at the rates (2, N)."""
     q = 0.5 * np.log(rates[0] / rates[1])
     total = rates.sum(0)
     drift = total * np.tanh(q)
@@ -81,8 +82,8 @@ def passage_rates(rates: Array) -> tuple[Array, Array]:
 
 
 def regressed(data: Sample, added: float, tied: bool) -> tuple[Array, float]:
-    """theta (2,), ON and OFF, or one for both, of the regression of log(L + added) at the events
-    on their counts, all pixels together; and the share that it leaves."""
+    """Regression of log(L + added) at the events on their counts, all pixels together: theta (2,),
+    ON and OFF (equal if tied), and the share of variance not explained."""
     sums = np.zeros((3, 3))
     for dn, pixel, at, on, off, weight in zip(
             *(np.asarray(getattr(data, n), np.float64) for n in

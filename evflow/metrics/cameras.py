@@ -1,4 +1,4 @@
-"""How alike two cameras are, parameter by parameter, in units of what is known of both."""
+"""Comparison of two cameras, parameter by parameter, in units of their errors."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from evflow.camera import PARAMETERS, Camera
 from evflow.errors import EvflowDataError
 
-APART = 3.0  # standard deviations by which values differ for sure
-FLOOR = 0.01  # of a value: errors below are not believed
+APART = 3.0  # standard deviations: larger differences are certain
+FLOOR = 0.01  # relative: least error of a value
 WHOLE = ("sigma_on", "sigma_off", "cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # no maps
 
 Known = Mapping[str, tuple[float, float]]
@@ -23,13 +23,20 @@ def compare_cameras(
 ) -> dict[str, dict[str, float | None]]:
     """JSON-ready numbers of two cameras of maps (H, W), by parameter.
 
-    Of each: a and b, the camera's value as it was measured (`read_known`: a_known, b_known), else
-    the median of its map; a_std and b_std, their standard deviations, else those of the median
-    pixel, as all pixels share most of it; their ratio b / a; error, standard deviation of the
-    difference, and apart, the difference in units of it; r, correlation over the pixels. None
-    where a value is not known, a map does not vary, or sizes differ.
+    Args:
+        a, b: the cameras.
+        a_std, b_std: standard deviations of their pixels.
+        a_known, b_known: camera-wide values and errors (`read_known`).
 
-    Raises EV002 where one holds several cameras.
+    Returns:
+        By parameter: a, b, the known value, else the median of the map; a_std, b_std, its standard
+        deviation, else that of the median pixel, as errors of pixels are mostly shared; their
+        ratio b / a; error, std of the difference; apart, the difference in units of it; r,
+        correlation over the pixels. None where a value is unknown, a map does not vary, or sizes
+        differ.
+
+    Raises:
+        EvflowDataError: EV002 for maps of several cameras.
     """
     for camera in (a, b):
         if len(camera.shape) != 2:
@@ -51,7 +58,7 @@ def compare_cameras(
 def _value(
     name: str, values: np.ndarray, std: Camera | None, known: Known | None
 ) -> tuple[float, float] | None:
-    """The camera's value and its error, NaN for none; None where it was not measured."""
+    """The camera's value and its error (NaN if unknown); None where it was not measured."""
     if known and set(PARAMETERS) & set(known):
         return known.get(name)
     error = np.nan if std is None else float(np.median(np.asarray(getattr(std, name))))
@@ -71,7 +78,7 @@ def _one(
 
 
 def verdict(numbers: dict[str, Any], labels: Mapping[str, str] | None = None) -> str:
-    """Which parameters differ for sure. labels: what these are called."""
+    """A sentence naming the parameters that differ significantly. labels: their names."""
     known = [name for name, row in numbers.items() if row["apart"] is not None]
     sure = [(labels or {}).get(name, name) for name in known
             if abs(numbers[name]["apart"]) > APART]

@@ -2,7 +2,7 @@
 
 Events are arrays of a fixed length N, weight 0 for padding; flow (2, H, W) = (x, y) in pixels per
 unit of the events' time. Pure, jit-able, batched by vmap. FWL of the same flow differs by window,
-splat and polarity (1.1 to 1.4 for the true flow over 50 ms), so these are always said.
+splat and polarity (1.1 to 1.4 for the true flow over 50 ms), so these are always reported.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def fwl(
 
     x, y, t: (N,), also between pixels, of any dtype and origin; p: (N,) bool or sign; weight: (N,)
     1, or 0 for padding; flow: (2, H, W) px per unit of t.
-    Raises EV002 (shapes), EV020 (a convention that is none), as `warped_image` and `rsat` do.
+    Raises EV002 (shapes), EV020 (not an FwlConvention), as do `warped_image` and `rsat`.
     """
     flow = _flow(flow)
     warped = warped_image(x, y, t, p, weight, flow, convention)
@@ -97,8 +97,8 @@ def warped_image(
 def rsat(x: Array, y: Array, t: Array, p: Array, weight: Array, flow: Array) -> Array:
     """Ratio of the squared average timestamps, warped to unwarped, of both polarities per active
     pixel, each event voting for the nearest one; below 1 where the flow is better than none
-    (Hagenaars et al., NeurIPS 2021). Arguments as of `fwl`; unlike it, it is not won by flow that
-    collapses all events."""
+    (Hagenaars et al., NeurIPS 2021). Unlike FWL, it does not reward flow that collapses all events.
+    Arguments as of `fwl`."""
     columns, flow = _columns(x, y, t, p, weight), _flow(flow)
     return _timestamps(*columns, flow) / _timestamps(*columns, jnp.zeros_like(flow))
 
@@ -130,7 +130,7 @@ def _columns(
 
 
 def _on_device(a: Any) -> Array:
-    """NumPy's doubles quietly become floats where JAX has no doubles."""
+    """As a JAX array; doubles become floats, without a warning, where JAX has no doubles."""
     return jnp.asarray(a, jnp.result_type(a))
 
 

@@ -1,7 +1,7 @@
 """Scores of optical flow over a recording: FWL and RSAT from its events, AEE from the true flow.
 
-A result holds the conventions that made it, the number of events a window, and, where the true
-flow is known, the FWL of that: the ceiling.
+A result holds its conventions, the number of events per window, and, where the true flow is known,
+its FWL as an upper bound.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def score_flow(
     """Scores of flows (T, 2, H, W), px over each of the windows between edges_us (T + 1,); JSON-
     ready means over the windows that have events (None where none has).
 
-    "windows" says how many those are, "window_ms" and "events_per_window" what they are like.
-    truth: the true flows, scored at pixels with events where valid (T, H, W) bool holds (default:
-    where they are finite). The FWL of the truth is that of events where it is known.
+    "windows" is their number, "window_ms" and "events_per_window" their mean length and events.
+    truth: the true flows, scored at pixels with events where valid (T, H, W) is True (default:
+    where they are finite). Its FWL uses the events at pixels where it is known.
     Raises EV002 (shapes), EV004 (edges that do not rise), EV007 (flows that are not finite).
     """
     edges, flows = np.asarray(edges_us, np.int64), np.asarray(flows)

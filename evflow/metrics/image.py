@@ -2,7 +2,7 @@
 
 Images are (..., H, W) on [0, 1], results (...): one number an image. Pure, jit-able; leading
 axes batch. SSIM is one name for several numbers (the same pair: .61 by `evreal`, .75 by `etnet`,
-.91 by `global`), so the preset is always said.
+.91 by `global`), so the preset is always reported.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def least_side(preset: str) -> int:
 
 
 def check_images(*images: Any) -> list[Array]:
-    """The images as arrays; EV003 for those of integers, EV002 for what is no image and for two of
-    different sizes, or of numbers that cannot be paired."""
+    """The images as arrays. Raises EV003 for integers, EV002 for other shapes than (..., H, W) and
+    for sizes or leading axes that differ."""
     arrays = [check_floats(image) for image in images]
     for image in arrays:
         if image.ndim < 2:
@@ -79,8 +79,8 @@ def check_floats(image: Any) -> Array:
 
 
 def as_array(values: Any) -> Array:
-    """Arrays of JAX and NumPy as they are, with their precision, but half precision, in which no
-    image's pixels can be counted, as float32; EV002 for what is none."""
+    """An array, with the precision of JAX and NumPy arrays; half precision, in which sums over an
+    image overflow, becomes float32. Raises EV002 for other objects."""
     if not hasattr(values, "dtype"):
         try:
             values = jnp.asarray(values)
@@ -101,8 +101,8 @@ def pair_up(*arrays: Array) -> bool:
 
 
 def mse(image: Array, reference: Array) -> Array:
-    """Mean squared error. Raises EV002 for images of two sizes and EV003 for images of integers,
-    as do all that build on it."""
+    """Mean squared error. Raises EV002 for different sizes and EV003 for integers, as do the
+    measures based on it."""
     image, reference = check_images(image, reference)
     return jnp.mean((image - reference) ** 2, (-2, -1))
 
@@ -137,7 +137,7 @@ def _ssim_windowed(x: Array, y: Array, how: SsimPreset) -> Array:
     """Mean of the local index where the window is wholly inside the image."""
     taps = len(how.window)
     unbiased = taps**2 / (taps**2 - 1) if how.sample else 1.0
-    # Moments about the image's own mean: less is cancelled than about 0.
+    # Moments about the image's mean, for less cancellation.
     around_x, around_y = (jnp.mean(a, (-2, -1), keepdims=True) for a in (x, y))
     x, y = x - around_x, y - around_y
     mean_x, mean_y = _blur(x, how.window), _blur(y, how.window)

@@ -1,4 +1,4 @@
-"""How alike two event streams are in space and time: correlation of small cubes' signed events."""
+"""Similarity of two event streams in space and time: correlation of events in small cubes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ CELL, STEP_US = 3, 2_000  # pixels, microseconds: side and duration of a cube
 
 
 def space_time_r(a: Events, b: Events, t0: int, t1: int) -> float | None:
-    """Pearson's r of ON less OFF events over cubes of CELL x CELL pixels and STEP_US of [t0, t1);
-    None where a stream does not vary. Memory goes by the events, not by the cubes."""
+    """Pearson's r of ON minus OFF events over cubes of CELL x CELL pixels and STEP_US in [t0, t1);
+    None where a stream does not vary. Memory is proportional to the events, not to the cubes."""
     width, height = a.size
     columns, rows = -(-width // CELL), -(-height // CELL)
     cubes = columns * rows * -(-(t1 - t0) // STEP_US)

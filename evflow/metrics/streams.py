@@ -21,23 +21,23 @@ from evflow.types import Events
 CURVE_STEPS = 120  # about as many points as a rate curve has
 CURVE_STEP_US = 1_000  # the shortest step of one
 LOG_EDGES = np.linspace(-6.0, 2.0, 65)  # log10 s: 1 us to 100 s, eight bins a decade
-TOUCHING = 0.01  # share of the shorter stream: who has no more in common is on another clock
-ALONE_US = 5_000  # no neighbour fired for this long: what a background-activity filter takes away
-NET_CELL, NET_US, NET_STEPS = 8, 20_000, 2_000  # pixels; us; most steps: memory
+TOUCHING = 0.01  # overlap, as share of the shorter stream, below which clocks are taken to differ
+ALONE_US = 5_000  # no neighbour fired for this long: removed by a background-activity filter
+NET_CELL, NET_US, NET_STEPS = 8, 20_000, 2_000  # pixels; us; limit of steps, for memory
 NEIGHBOURS = tuple((dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy)
-ASKED_EVENTS = 400_000  # events whose neighbourhood is looked at, evenly taken from the stream
+ASKED_EVENTS = 400_000  # events whose neighbours are searched, evenly taken from the stream
 
 
 def compare(
     real: Events, synthetic: Events, *, span_us: tuple[int, int] | None = None
 ) -> dict[str, Any]:
-    """How alike a recorded and a synthetic event stream are.
+    """Compare a recorded and a synthetic event stream.
 
     Args:
         real: the recorded stream.
         synthetic: the simulated stream, of the same sensor size.
-        span_us: (t0, t1), integer microseconds: the time [t0, t1) that is compared; None is what
-            both streams cover, and no stream is moved where it is given.
+        span_us: (t0, t1), integer microseconds: the time [t0, t1) to compare, without shifting a
+            stream; None: the time that both cover.
 
     Returns:
         A JSON-ready dict, None where a number is undefined.
@@ -165,7 +165,7 @@ def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:
 
 
 def _company(sides: dict[str, Events]) -> dict[str, Any]:
-    """What the events of a pixel have to do with those before and around it."""
+    """Intervals of events to those before at the same pixel and at its neighbours."""
     found = {name: _of_pixels(events) for name, events in sides.items()}
     around = {name: delays for name, (_, _, delays) in found.items()}
     same = {name: share for name, (_, share, _) in found.items()}

@@ -139,7 +139,8 @@ def which_simulator(
             ("v2e", scaled(scale), seen_by, _constants(found, scale), ()),
             ("esim", esim(theta), IDEAL, dict(zip(("theta_on", "theta_off"), theta, strict=True)),
              ()),
-            ("voltmeter", voltmeter(level), IDEAL, dataclasses.asdict(circuit), constants.untold))
+            ("voltmeter", voltmeter(level), IDEAL, dataclasses.asdict(circuit),
+             constants.undetermined))
     made = []
     for name, (camera, model), sight, values, untold in rows:
         numbers = likeness(tried, *(tried.simulated(k, camera, model, sight)

@@ -41,7 +41,7 @@ def optical_flow(
         layer = _foreground(scene, k)
         at = pose(layer.path, before)
         here = recycle(at, scene.radius[k], shape)
-        # It may leave during the interval and come in elsewhere: the point itself moves on.
+        # A layer may be recycled during the interval; its points still move on along the path.
         there = pose(layer.path, after)
         there = there._replace(x=there.x + (here.x - at.x), y=there.y + (here.y - at.y))
         covers = scene.opacity[k] * _alpha(layer, here, x, y) >= SOLID

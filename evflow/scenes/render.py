@@ -37,7 +37,7 @@ _LOOK_UNITS = 7  # draws that a layer's looks take; its motion takes TRAJECTORY_
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """What a layer looks like and how it moves; foregrounds are stacked on a leading axis.
+    """Appearance and motion of a layer; foregrounds are stacked on a leading axis.
 
     texture: (1, S, S) value of the background; (2, S, S) value and alpha of a cut-out; in [0, 1].
     anchor (2,): the texel (x, y) that sits on the trajectory; zoom: texels per pixel at scale 1.

@@ -34,8 +34,8 @@ def load_folder(
 ) -> dict[str, np.ndarray]:
     """name -> luma, float32 (H, W) in [0, 1], of a folder's images, in natural order.
 
-    limit: at most so many, drawn by `key`, or the first. Raises EV008 (no images), EV009
-    (damaged), EV016 (not there).
+    limit: largest number, drawn by `key`, else the first ones. Raises EV008 (no images), EV009
+    (damaged), EV016 (missing).
     """
     files = list_images(existing(folder))
     if not files:
@@ -60,9 +60,9 @@ def coco_bank(
 ) -> TextureBank:
     """A bank with `crops` backgrounds of each image in use and at most `limit` objects cut out.
 
-    coco: a json, with the folder of its images, or what `read_coco` gave. Left out are objects
-    below `min_area` pixels, and crowds unless wanted. Raises EV001 where none is left, and what
-    `read_coco` and `CocoObject.mask` raise.
+    coco: a json (images: their folder) or the result of `read_coco`. Objects below `min_area`
+    pixels, and crowds unless wanted, are left out. Raises EV001 where none is left, and as
+    `read_coco` and `CocoObject.mask`.
     """
     coco = coco if isinstance(coco, Coco) else read_coco(coco, images)
     fit = [o for o in coco.objects if (crowds or not o.crowd) and not o.area < min_area]
@@ -123,9 +123,9 @@ def cut_out(
 ) -> tuple[np.ndarray, float]:
     """An object's value and alpha (2, size, size) in [0, 1], and its diameter in texels.
 
-    picture: float32 (H, W); mask: bool (H, W); extent: the share of `size` to fill, less where
-    the object is too small to be enlarged so far. The circle around the object is centred. Around
-    the object its own nearest inner value goes on, so that no rim of what was behind it shows.
+    picture: float32 (H, W); mask: bool (H, W); extent: the share of `size` to fill, less for small
+    objects, which are enlarged up to FINEST. The circle around the object is centred. Outside the
+    object its nearest inner value is repeated, so that no rim of the background shows.
     """
     solid = mask.astype(np.uint8)
     edge = mask & (cv2.erode(solid, np.ones((3, 3), np.uint8)) == 0)

@@ -1,12 +1,12 @@
-"""How a running, lit camera sees a scene: the one way from a scene to events and frames.
+"""Simulation of a running camera before a scene: the one way from a scene to events and frames.
 
     scene ─ film ─ frames in DN ─┬─ light ─ draw_camera ─ a camera whose noise follows Eq. 12
                                  ├─ memory, voxels ─ its events, binned on the device
-                                 └─ recorded ─ the frames that it keeps
+                                 └─ recorded ─ the recorded frames
 
 A camera has been running when a recording begins: its memory is anywhere between the thresholds
-(`memory`), or the simulation starts `LEAD_MS` before what is kept. Noise rates are told at the
-mean intensity of what is kept, and simulated from that of the first frame (`noise_gain`).
+(`memory`), or the simulation starts `LEAD_MS` before the recording. Noise rates are reported at the
+recording's mean intensity, and simulated from that of the first frame (`noise_gain`).
 
 Pure functions of their keys. All but `film` batch by `vmap`; frames are (T, H, W).
 """
@@ -33,7 +33,7 @@ Array = jax.Array
 Parameters = TypeVar("Parameters", Camera, Summary)
 
 BLOCK = 64  # frames rendered at a time
-LEAD_MS = 20  # that a simulation on the host runs before the first frame that is kept
+LEAD_MS = 20  # simulated on the host before the first recorded frame
 
 draw_scene = jax.jit(sample_scene, static_argnames=("config", "shape"))
 
@@ -52,9 +52,8 @@ def film(
 def exposures(
     key: Array, times_s: Array, count: int, exposure_s: float, jitter_s: float
 ) -> Array:
-    """Instants (T, count) that the frames at times_s (T,) average: exposed for up to exposure_s,
-    and up to jitter_s (a standard deviation) from their time stamps. Half of the scenes have
-    neither fault."""
+    """Times (T, count) over which the frames at times_s (T,) are averaged: exposures of up to
+    exposure_s, with time stamps off by a std of up to jitter_s. Half of the scenes have neither."""
     k_some, k_span, k_late, k_frame = jax.random.split(key, 4)
     some = jax.random.bernoulli(k_some, 0.5, (2,))
     span = some[0] * exposure_s * jax.random.uniform(k_span)
@@ -71,20 +70,19 @@ def exposed(scene: Scene, instants_s: Array, shape: tuple[int, int]) -> Array:
 
 
 def recorded(key: Array, frames: Array | np.ndarray, noise_dn: float) -> Array:
-    """The frames as 8 bits hold them, whole DN, float32: with Gaussian noise of noise_dn."""
+    """The frames with Gaussian noise of noise_dn, rounded to 8 bits, as float32 DN."""
     frames = frames + noise_dn * jax.random.normal(key, frames.shape)
     return jnp.clip(jnp.round(frames), 0.0, 255.0)
 
 
 def light(frames: Values) -> Values:
-    """The intensity factor of Eq. 12 that noise follows, (...), of frames (..., H, W) DN."""
+    """Intensity factor of the noise in Eq. 12, (...), of frames (..., H, W) DN."""
     return noise_factor(normalised_intensity(frames).mean((-2, -1)))
 
 
 def noise_gain(model: SensorModel, light: Values, first: Values | float) -> Values | float:
-    """Mean noise rate of a recording relative to the simulator's reference, the first frame it
-    sees: by the factor of Eq. 12 of the recording's frames, or of all their pixels, and that of
-    the first."""
+    """Mean noise rate of a recording relative to the simulator's reference, the first frame. light,
+    first: intensity factors of Eq. 12 of the recording (per frame or pixel) and of that frame."""
     return light.mean() / first if model.eta_intensity else 1.0
 
 
@@ -98,15 +96,15 @@ def draw_camera(
     k_nominal: Array, k_pixels: Array, prior: CameraPrior, shape: tuple[int, int],
     light: Array | None,
 ) -> tuple[Summary, Camera]:
-    """The camera-wide values and the maps (H, W) of a camera of the prior. light: of the first
-    frame that it sees; None where its noise does not depend on a scene."""
+    """Draw a camera of the prior: its summary and maps (H, W). light: of the first frame; None
+    where the noise does not depend on the scene."""
     nominal = sample_nominal(k_nominal, (), prior, light)
     return nominal, sample_pixels(k_pixels, nominal, shape, prior.eta_spread)
 
 
 def memory(key: Array, camera: Camera) -> Array:
-    """Contrast (H, W) on the pixels of a camera that has been running: brightness lies anywhere
-    between the thresholds about the memory."""
+    """Initial contrast (H, W) of a running camera: brightness relative to the memory, uniform
+    between the thresholds."""
     return (jax.random.uniform(key, camera.theta_on.shape) * (camera.theta_on + camera.theta_off)
             - camera.theta_off)
 
@@ -116,7 +114,7 @@ def voxels(
     dt_s: Array | float, bins: int, phase: Array | float,
 ) -> Array:
     """Voxels (windows, H, W, 2 * bins) of log frames (windows * steps + 1, H, W) dt_s apart.
-    phase: the contrast that is on the pixels, `memory`, or 0 where it is the first frame."""
+    phase: initial contrast of the pixels: of `memory`, or 0 for a memory at the first frame."""
     law = Constants.of(model)
     medians = noise.nominal_thresholds(law, camera)
     pixels, state = sensor.start(key, log_frames[0], camera, law, medians, phase)

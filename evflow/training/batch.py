@@ -22,7 +22,7 @@ from evflow.training.config import NuisanceConfig, TrainConfig
 
 Array = jax.Array
 
-FIXED = 11  # folded into the seed's key: that of the sequences which a run sees again and again
+FIXED = 11  # folded into the seed's key, for the fixed sequences of a run
 
 
 @jax.tree_util.register_dataclass
@@ -46,9 +46,9 @@ class Batch:
 
 
 def sample_batch(key: Array, bank: TextureBank, config: TrainConfig) -> Batch:
-    """Render `scenes` scenes, see each with `cameras` cameras; B = scenes x cameras, the cameras
-    of one scene side by side. Under a mesh every device makes its own scenes. Of a fixed number of
-    sequences the key chooses."""
+    """Render `scenes` scenes, each seen by `cameras` cameras; B = scenes x cameras, the cameras of
+    one scene side by side. Under a mesh every device makes its own scenes. With config.sequences
+    the key chooses among that many fixed ones."""
     numbers = jnp.arange(config.scenes)
     if config.sequences:
         there = config.sequences // config.cameras
@@ -62,8 +62,8 @@ def sample_batch(key: Array, bank: TextureBank, config: TrainConfig) -> Batch:
 
 
 def _sample_scenes(key: Array, bank: TextureBank, numbers: Array, config: TrainConfig) -> Batch:
-    """The sequences of the scenes `numbers` (S,) of a batch. A scene depends on the key and its
-    number alone, so that any share of a batch can be made anywhere."""
+    """The sequences of the scenes `numbers` (S,) of a batch. A scene depends only on key and
+    number, so that a batch can be divided among devices."""
     each = jax.vmap(jax.random.fold_in, (None, 0))
     k_scene, k_window, k_camera = jax.random.split(key, 3)
     shape = (config.crop, config.crop)
@@ -107,8 +107,8 @@ def _sequence(
     key: Array, frames: Array, seen: Array, window_s: Array, *, model: SensorModel,
     config: TrainConfig,
 ) -> Batch:
-    """One camera on one scene: frames (W*steps + 1, H, W') DN for the events, seen (W+1, H, W')
-    what the frame camera makes of them."""
+    """One camera on one scene. frames: (W*steps + 1, H, W') DN, for the events; seen: (W+1, H, W')
+    recorded frames."""
     k_nominal, k_pixels, k_phase, k_sim, k_frame, k_odd, k_hot = jax.random.split(key, 7)
     shape = (frames.shape[1], frames.shape[2])
     first = watch.light(frames[0])
@@ -116,8 +116,8 @@ def _sequence(
     camera = _with_odd_pixels(k_odd, camera, config.nuisances)
     camera = _with_hot_pixels(k_hot, camera, config.nuisances)
     log_frames = lin_log(frames)
-    # A window is cut from a running camera, each pixel somewhere between its thresholds; or it
-    # is the start of a simulation, whose memory is the first frame.
+    # A window is cut from a running camera, whose memory lies anywhere between the thresholds, or
+    # starts like a simulation, with the memory at the first frame.
     k_phase, k_fresh = jax.random.split(k_phase)
     running = jax.random.bernoulli(k_fresh, 1.0 - config.nuisances.fresh).astype(jnp.float32)
     voxels = watch.voxels(
@@ -138,7 +138,7 @@ def _sequence(
 
 
 def _with_odd_pixels(key: Array, camera: Camera, nuisances: NuisanceConfig) -> Camera:
-    """Some pixels' thresholds, both of them, are far from the camera's."""
+    """Set both thresholds of some pixels far from the camera's."""
     if nuisances.odd_pixels == 0:
         return camera
     k_where, k_factor = jax.random.split(key)
@@ -152,7 +152,7 @@ def _with_odd_pixels(key: Array, camera: Camera, nuisances: NuisanceConfig) -> C
 
 
 def _with_hot_pixels(key: Array, camera: Camera, nuisances: NuisanceConfig) -> Camera:
-    """Some cameras have pixels that fire by themselves, ON or OFF, at tens of Hz."""
+    """Give some cameras hot pixels, ON or OFF, at tens of Hz."""
     k_some, k_where, k_rate = jax.random.split(key, 3)
     share = nuisances.hot_pixels * jnp.maximum(0.0, jax.random.uniform(k_some, (), minval=-1.0))
     hot = jax.random.bernoulli(k_where, share, (2, *camera.eta_on.shape))

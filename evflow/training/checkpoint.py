@@ -1,9 +1,9 @@
 """Training checkpoints through orbax: atomic, a few kept, restored bit for bit.
 
 A checkpoint holds the whole TrainState (parameters, average, optimiser, key, step); the
-configuration lies beside it as config.json, so a run explains itself. It is written by all
-processes of a run together (they share the folder) and restored onto any devices. One that cannot
-be read is set aside, and the run goes on from the one before.
+configuration is saved beside it as config.json. All processes of a run write it together (they
+share the folder); it can be restored onto any devices. An unreadable one is moved aside, and the
+run continues from the one before.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Checkpoints:
 
     @property
     def latest(self) -> int | None:
-        """The last step that is there, sound or not, or None."""
+        """The last step in the folder, readable or not, or None."""
         return max(self._found(), default=None)
 
     def _found(self) -> list[int]:
@@ -72,8 +72,8 @@ class Checkpoints:
             manager.save(step, args=ocp.args.StandardSave(state))
 
     def _manager(self) -> Any:
-        """What writes steps and removes old ones; it looks at all that are there, so that damaged
-        ones must be gone before. EV009 where it cannot."""
+        """orbax's manager, which writes steps and removes old ones. It reads all steps in the
+        folder, so damaged ones must be moved before. Raises EV009 where one remains."""
         if self._writer is None:
             options = ocp.CheckpointManagerOptions(
                 max_to_keep=self._keep, create=True, cleanup_tmp_directories=True)
@@ -88,8 +88,8 @@ class Checkpoints:
     def restore(self, like: Any) -> Any:
         """The latest state that can be read, in the structure (and on the devices) of `like`.
 
-        What cannot is set aside, with a word on stderr. Raises EV009 where no step can be read,
-        EV016 where there is none, EV018 where those that can are of another network.
+        Unreadable ones are moved aside, with a message on stderr. Raises EV009 where no step can be
+        read, EV016 without steps, EV018 where the readable ones are of another network.
         """
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
         faults: dict[int, str] = {}
@@ -126,7 +126,7 @@ class Checkpoints:
             print(f"step {step} cannot be read ({fault}): going on from step {used}. It was moved "
                   f"to {place}, which may be removed.", file=sys.stderr)
         if faults:
-            devices.agree(True)  # nobody goes on before they are moved
+            devices.agree(True)  # no process continues before they are moved
         self._manager()
 
     def _unreadable(self, faults: dict[int, str], like: Any) -> EvflowDataError:
@@ -183,8 +183,8 @@ class Checkpoints:
 
 
 def _sound(step: Path) -> Path:
-    """The folder of a step, of files that end: orbax reads those of metadata whole, whatever they
-    are. ValueError where one is a link to a device or a pipe, or has no end in reason."""
+    """The folder of a step. Raises ValueError where a file in it is a device, a pipe or far too
+    large, as orbax reads metadata files whole."""
     for place, _, names in os.walk(step):
         for path in map(Path(place).joinpath, names):
             if path.exists() and not path.is_file():
@@ -195,7 +195,7 @@ def _sound(step: Path) -> Path:
 
 
 def _stored_shape(leaf: Any) -> tuple[int, ...]:
-    """As a checkpoint has it: keys are their data."""
+    """Shape in a checkpoint, where random keys are stored as their data."""
     keys = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     return tuple((jax.random.key_data(leaf) if keys else leaf).shape)
 

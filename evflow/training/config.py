@@ -32,10 +32,10 @@ class LossConfig:
     inverse_flow: weight of L_F' (Eq. 10). It is minus the log-det part of L_F, so it cancels
         or runs away unless small: 0 by default.
     events: what L_E compares: "rate" the expected events, "edges" the paper's Eq. 9.
-    patches: side lengths of the local patches of Eq. 9. edges: what tells patches that move
-        there, "change" the log intensity's over the window, "gradient" the image's (as the paper
-        has it); edge: the log units, per pixel if a gradient, at which a patch counts fully.
-    elu: what Eq. 9 compares, ELU of the events made (sigma_3, as printed) or the asinh of both.
+    patches: side lengths of the local patches of Eq. 9. edges: how moving patches are detected,
+        by the "change" of log intensity over the window, or the "gradient" of the image (the
+        paper); edge: log units, per pixel if a gradient, at which a patch counts fully.
+    elu: compare ELU of the generated events in Eq. 9 (sigma_3, as printed), else asinh of both.
     """
 
     condition: float = 1.0
@@ -58,7 +58,7 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class NuisanceConfig:
-    """What real recordings add to the model; drawn anew for every sequence or scene.
+    """Imperfections of real recordings; drawn anew for every sequence or scene.
 
     fresh: share of sequences whose pixel memory starts at the first frame, as in a simulation.
     odd_pixels, odd_factor: share of pixels whose thresholds are off by a factor, whatever the
@@ -82,7 +82,7 @@ class NuisanceConfig:
 
     @property
     def sharp(self) -> bool:
-        """Whether the frames show exactly the instants of their time stamps."""
+        """Whether frames have neither exposure nor errors of their time stamps."""
         return self.jitter_s == 0 and self.exposure_s == 0
 
     @staticmethod
@@ -100,9 +100,9 @@ class TrainConfig:
     windows: windows per sequence; window_s: range of their length (log-uniform).
     steps_per_window: rendered frames per window; motion stays near 1 px per frame.
     block: pixels (h, w) of each crop that the flow sees; the summary sees the whole crop.
-    sequences: how many there are in all, drawn once and seen again and again (the paper's 300);
-        0 draws new ones in every step. images: what scenes are made of, a folder of pictures or a
-        COCO json of objects; None is procedural textures and scikit-image's photographs.
+    sequences: number of fixed sequences, drawn once (the paper's 300); 0 draws new ones in every
+        step. images: of the scenes, a folder of pictures or a COCO json of objects; None is
+        procedural textures and scikit-image's photographs.
     sensors: pixel models; a step draws as many neighbours among them as it has cameras, and
         splits the cameras evenly.
     parts: of the network that learn ("summary", "encoder", "flow", "spread"); the losses that
@@ -183,9 +183,9 @@ PAPER = TrainConfig(
 PRESETS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     # The default's parts that see pixels one by one: many small scenes rather than few large ones.
-    # Counts are compared pixel by pixel too, as a single one's thresholds may be asked for. They
-    # are those that a video and (theta, eta) tell: of a running camera without low-pass or dead
-    # time, whose light is followed between the bins.
+    # Counts are also compared pixel by pixel, as `generate` may change a single pixel's thresholds.
+    # They must follow from the video and (theta, eta): so the camera is running, has no low-pass or
+    # dead time, and is simulated at several frames per bin.
     "pixels": TrainConfig(
         loss=LossConfig(event=3.0, dequantise=0.005, patches=(1, 4, 8)),
         sensors=(*TrainConfig.sensors[:3], TrainConfig.sensors[0]),
@@ -194,8 +194,8 @@ PRESETS: dict[str, TrainConfig] = {
         steps_per_window=32, steps=4500),
     "paper": PAPER,
     # As printed, 34 core-hours and more: all pixels of 64x64 in the flow and L_E, its patches of
-    # several sizes told by the image's gradients, ELU; L_I in both directions, L_F' like L_F; 300
-    # sequences of a camera each (of 8 windows), 300 epochs of them, and none of our remedies.
+    # several sizes detected by the image's gradients, ELU; L_I in both directions, L_F' like L_F;
+    # 300 sequences of a camera each (of 8 windows), 300 epochs, and none of our changes.
     "literal": dataclasses.replace(
         PAPER, block=(64, 64), scenes=10, cameras=1, windows=8, sequences=300, steps=9000,
         warmup=300, clip=math.inf, ema=0.0,

@@ -30,8 +30,8 @@ Headline = Callable[[Metrics], str]
 class Log:
     """metrics.jsonl and the bar; only the main process has them. A context manager.
 
-    path: of metrics.jsonl. Lines beyond `step`, where the run goes on from, are dropped: no step is
-    logged twice. headline: what the bar says of a run's figures; "compiling" before the first.
+    path: of metrics.jsonl. Lines beyond `step`, from which the run continues, are dropped, so that
+    no step is logged twice. headline: text of the bar; "compiling" before the first step.
     """
 
     def __init__(self, path: Path, steps: int, step: int, headline: Headline) -> None:
@@ -61,13 +61,13 @@ class Log:
 
     def add(self, step: int, metrics: dict[str, jax.Array]) -> str:
         """Keep one step's metrics, still being computed, and write those of the step before;
-        returns what of these is not finite, "" where all is."""
+        returns a message naming non-finite ones among these, else ""."""
         lost = self.flush()
         self._waiting = step, metrics
         return lost
 
     def flush(self) -> str:
-        """Wait for the metrics that are kept, if any, and write them; returns as `add` does."""
+        """Wait for the kept metrics, if any, and write them; returns as `add`."""
         if self._waiting is None:
             return ""
         (step, metrics), self._waiting = self._waiting, None
@@ -87,8 +87,8 @@ class Log:
 
 
 def lines_until(path: Path, step: int) -> Iterator[str]:
-    """The lines of a log up to `step`; none where there is no log. A line that a crash cut short
-    lies beyond the last checkpoint."""
+    """The lines of a log up to `step`; none without a log. A line cut short by a crash is always
+    beyond the last checkpoint."""
     for line in read_whole(path).decode(errors="replace").splitlines() if is_there(path) else ():
         with contextlib.suppress(ValueError, KeyError, TypeError):
             if parse_json(line)["step"] <= step:

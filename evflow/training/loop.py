@@ -23,7 +23,7 @@ from evflow.training.options import RunOptions
 
 
 class Counted(Protocol):
-    """A state knows how many steps it is."""
+    """A state that counts its steps."""
 
     @property
     def step(self) -> jax.Array: ...
@@ -35,8 +35,8 @@ Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
 
 @dataclass(frozen=True)
 class Ended(Generic[State]):
-    """A run that ended: its last state, the mean metrics of its last hundred steps, and, if a
-    signal stopped this process, what there is to say of it."""
+    """Result of a run: its last state, the mean metrics of its last hundred steps, and a message if
+    a signal stopped this process."""
 
     state: State
     figures: Metrics
@@ -53,12 +53,19 @@ def train(
     begin: Callable[[], tuple[Advance[State], State]], config: Any, options: RunOptions,
     headline: Headline = lambda _: "training",
 ) -> Ended[State]:
-    """The state after config.steps steps, from a fresh one or the run in options.out.
+    """Train for config.steps steps, from a fresh state or the run in options.out.
 
-    begin: makes the step and the fresh state, once the folder is known to be this run's. config: a
-    dataclass that says what the run is; one in the folder must be the same. Every step is logged,
-    and the last one saved, also where time or a signal ends the run. Raises EV007 where a metric is
-    no longer finite: that state is not saved.
+    Every step is logged, and the last one saved, also where time or a signal ends the run.
+
+    Args:
+        begin: returns the step and the fresh state; called after the folder has been checked.
+        config: a dataclass that identifies the run; one in the folder must be equal.
+        options: where and how long to run.
+        headline: text of the progress bar from metrics.
+
+    Raises:
+        EvflowDataError: EV007 where a metric is not finite (that state is not saved), EV013 where
+            the folder holds another run, EV016 where there is none to resume, EV020.
     """
     if options.save_every < 1:
         raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
@@ -73,7 +80,7 @@ def train(
         path = options.out / "metrics.jsonl"
         with Log(path, config.steps, int(state.step), headline) as log:
             state, lost = _steps(advance, state, config.steps, options, checkpoints, log, requests)
-    # Raised out here, where checkpoints are written.
+    # Raised after the checkpoints have been written.
     if lost:
         raise EvflowDataError("EV007", f"{lost}.", f"Checkpoints before it are in {options.out}; "
                               "train at a lower rate.")
@@ -99,9 +106,9 @@ def _steps(
     advance: Advance[State], state: State, steps: int, options: RunOptions,
     checkpoints: Checkpoints, log: Log, requests: list[int],
 ) -> tuple[State, str]:
-    """The last state, and what of its metrics is not finite, if anything."""
+    """The last state, and a message naming metrics that are not finite, else ""."""
     step, votes = int(state.step), Votes()
-    # All processes must stop after the same step, but neither signals nor clocks are the same.
+    # All processes must stop after the same step, though signals and clocks differ.
     while step < steps and not votes.agree(bool(requests) or log.seconds >= options.max_seconds):
         state, metrics = advance(state)
         step += 1

@@ -13,8 +13,8 @@ from evflow.training.config import LossConfig
 Array = jax.Array
 
 EPSILON = 1e-3  # of the Charbonnier losses (Eq. 7)
-COUNT_LIMIT = 6.0  # asinh(200): events per bin above it are no camera's, only an untrained flow's
-RARE = 0.05  # events per bin below which errors count alike
+COUNT_LIMIT = 6.0  # asinh(200): more events per bin come from an untrained flow only
+RARE = 0.05  # events per bin below which the variance is constant
 FAR = 30.0  # standard deviations: pixels at the threshold's clamp fire a hundred times as often
 
 
@@ -48,7 +48,7 @@ def confidence_weight(voxels: Array) -> Array:
 def flow_loss(log_prior: Array, log_latent: Array, log_det: Array) -> Array:
     """L_F (Eq. 8): minus the log-likelihood, from log p(y), log p(z) and the log-det (...).
 
-    log p(y) is absent in the paper's preset (0), where L_P plays its part.
+    log p(y) is 0 in the paper's preset, where L_P takes its place.
     """
     return -(log_prior + log_latent + log_det)
 
@@ -59,17 +59,17 @@ def inverse_flow_loss(log_det: Array) -> Array:
 
 
 def edge_weight(strength: Array, size: int, edge: float) -> Array:
-    """1 - gamma of Eq. 9 for patches of side `size`: how much a patch is moving edge, in 0..1.
+    """1 - gamma of Eq. 9 for patches of side `size`: weight in 0..1 of a patch as a moving edge.
 
-    strength: of edges, (..., h, w): the total log-intensity change, or `gradient` of the image. A
-    patch counts fully where its root mean square reaches `edge`; elsewhere its events are noise.
+    strength: of edges, (..., h, w): the total log-intensity change, or `gradient` of the image. The
+    weight is 1 where its root mean square reaches `edge`; at 0 the patch's events are noise.
     """
     strength = jnp.sqrt(_patches(strength[..., None] ** 2, size).mean((-3, -2, -1)) + 1e-12)
     return jnp.clip(strength / edge, 0.0, 1.0)
 
 
 def gradient(image: Array) -> Array:
-    """How steep an image (..., h, w) is, per pixel, by central differences: (..., h, w)."""
+    """Magnitude of the gradient of an image (..., h, w) by central differences: (..., h, w)."""
     down, right = jnp.gradient(image, axis=(-2, -1))
     return jnp.sqrt(down**2 + right**2 + 1e-12)
 
@@ -78,9 +78,8 @@ def event_loss(generated: Array, voxels: Array, strength: Array, config: LossCon
     """L_E (Eq. 9), (..., h, w, 2B) -> (...), averaged over patches and summed over scales.
 
     generated: asinh of the generated voxels; voxels: the true ones; strength: of edges, (..., h,
-    w). Where edges move, they themselves are compared (Charbonnier, on asinh as counts span three
-    decades, or on ELU); elsewhere only the events per patch and polarity, against a variance of as
-    many events as were made.
+    w). At moving edges voxels are compared (Charbonnier, on asinh as counts span three decades, or
+    on ELU); elsewhere only events per patch and polarity, with the variance of a Poisson count.
     """
     events = linear(generated)
     if config.elu:
@@ -101,9 +100,9 @@ def event_loss(generated: Array, voxels: Array, strength: Array, config: LossCon
 def rate_loss(generated: Array, voxels: Array, expected: Array, sizes: tuple[int, ...]) -> Array:
     """L_E for generated voxels that are *expected* events: (..., h, w, 2B) -> (...).
 
-    Charbonnier errors (Eq. 9) pull towards the median, which for rare events is none at all;
-    these pull towards the mean, bin by bin and in the counts per patch and polarity. expected:
-    about how many events there should be, which sets the variance that errors are measured by.
+    Charbonnier errors (Eq. 9) are minimal at the median, which is 0 for rare events; these are
+    minimal at the mean, bin by bin and in the counts per patch and polarity. expected: approximate
+    number of events, which sets the variance of the errors.
     """
     events = linear(generated)
     total = dispersion(events, voxels, expected + RARE).mean((-3, -2, -1))
@@ -115,14 +114,14 @@ def rate_loss(generated: Array, voxels: Array, expected: Array, sizes: tuple[int
 
 
 def linear(generated: Array) -> Array:
-    """Events of their asinh, within what a camera can send."""
+    """Events from their asinh, limited to COUNT_LIMIT."""
     return jnp.sinh(jnp.clip(generated, -COUNT_LIMIT, COUNT_LIMIT))
 
 
 def dispersion(made: Array, true: Array, variance: Array | float) -> Array:
     """(made - true)^2 over twice the variance, linear beyond FAR deviations. The variance (no
-    gradient) must not follow `true`, nor the latents' noise in `made` where that is large: divided
-    by true + 1, say, the least error would lie at too few events."""
+    gradient) must not depend on `true`, or on the latents' noise in `made`: divided by true + 1,
+    for instance, the minimum would be at too few events."""
     error = (made - true) / jnp.sqrt(jax.lax.stop_gradient(variance))
     return FAR**2 * (jnp.sqrt(1.0 + (error / FAR) ** 2) - 1.0)
 

@@ -62,12 +62,12 @@ def over(y: Array, like: Array) -> Array:
 def summary_losses(
     net: dict[str, Any], batch: Batch, key: Array, config: TrainConfig
 ) -> tuple[Array, Array, Metrics]:
-    """Estimate each camera from the first 1..W windows (drawn per sequence, so that `finish`
-    meets little and much data). Returns the loss, y (B, 6) and metrics."""
+    """Estimate each camera from the first 1..W windows (drawn per sequence, so that `finish` is
+    trained on little and much data). Returns the loss, y (B, 6) and metrics."""
     count, windows = batch.dlogI.shape[:2]
     k_windows, k_intensity = jax.random.split(key)
     known = jax.random.bernoulli(k_intensity, 0.5, (count, 1, 1, 1))
-    intensity = jnp.where(known, batch.intensity, jnp.nan)  # half the users have none to give
+    intensity = jnp.where(known, batch.intensity, jnp.nan)  # unknown in half of them
     stats = _pool_windows(net["summary"], batch, intensity, config)
     used = jax.random.randint(k_windows, (count, 1), 1, windows + 1)
     keep = (jnp.arange(windows)[None] < used).astype(jnp.float32)
@@ -121,8 +121,8 @@ def pixel_losses(
     changes = predicted
     if c.code == "changes":
         parts["change_l1"] = _change_loss(predicted, block.changes)
-        # The encoder answers to the true changes alone: what would serve the flow better is no
-        # change of intensity any more, and a video could not supply it.
+        # The encoder is trained on true changes only: features that serve the flow better are no
+        # changes of intensity, which a video could supply.
         changes = jnp.where(even[:, None, None], encoder.split_sign(block.changes),
                             jax.lax.stop_gradient(predicted))
     if config.parts == ("encoder",) and c.code == "changes":
@@ -132,7 +132,7 @@ def pixel_losses(
 
 
 def _change_loss(predicted: Array, changes: Array) -> Array:
-    """Charbonnier of rises and falls in each part of the window, and of what they add up to."""
+    """Charbonnier loss of rises and falls in each part of the window, and of their sum."""
     up, down = jnp.split(predicted, 2, -1)
     off = jnp.cumsum(up - down - changes, -1)
     return (losses.charbonnier(predicted - encoder.split_sign(changes)).mean()
@@ -148,7 +148,7 @@ def _flow_losses(
     k_dequantise, k_latent = jax.random.split(key)
     u = architecture.condition(c, changes, block.context, y6)
     centre = architecture.centre(c, y6)
-    # The small noise that keeps L_F finite on zero-inflated counts serves L_P as well: a second
+    # L_P uses the pass with the small noise that keeps L_F finite on zero-inflated counts: a second
     # pass on clean voxels would cost another third of the step.
     noise = config.loss.dequantise * jax.random.normal(k_dequantise, block.voxels.shape)
     y, z, log_det = flow.forward(net["flow"], block.voxels + noise, u, flow_config)
@@ -158,8 +158,8 @@ def _flow_losses(
     generated, inverse_det = flow.inverse(net["flow"], block.y - centre, latent, u, plain)
     if not flow_config.asinh:
         generated = jnp.arcsinh(generated)
-    # Events are made from a video's own changes. In the encoder's, a pixel's excess of events is
-    # part of the code already, so that its thresholds would come to matter less.
+    # Events are generated from the true changes. Those of the encoder contain a pixel's excess of
+    # events, so that the flow would learn to use its thresholds less.
     share = jnp.where(even[:, 0], 2.0, 0.0) if c.code == "changes" else jnp.ones(())
     parts = {
         "parameter": _parameter_loss(y, block, config),
@@ -188,8 +188,7 @@ def _event_loss(generated: Array, block: Block, config: LossConfig) -> Array:
 
 
 def _expected(block: Block) -> Array:
-    """Events that each bin holds on average, (B, h, w, 2m): a pixel's changes in units of its
-    thresholds, and its noise."""
+    """Expected events per bin, (B, h, w, 2m): a pixel's changes over its thresholds, plus noise."""
     camera = squash(block.y)
     up, down = jnp.split(encoder.split_sign(block.changes), 2, -1)
     bins = block.changes.shape[-1]

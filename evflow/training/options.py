@@ -1,5 +1,5 @@
-"""Options that every training has; a command's own are added to them. Free of JAX, as commands are
-parsed before it is imported."""
+"""Options of every training; commands add their own. Free of JAX, as commands are parsed before it
+is imported."""
 
 from __future__ import annotations
 

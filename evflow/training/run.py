@@ -23,9 +23,8 @@ from evflow.training.step import TrainState, init_state, make_run_step, optimise
 
 
 def train_network(options: TrainOptions) -> Metrics:
-    """One run, from joining the other processes to weights.safetensors; returns the mean metrics
-    of its last hundred steps. A signal ends it with the weights of the last step, and then raises
-    KeyboardInterrupt: they are not those that were asked for."""
+    """Train the network and write weights.safetensors; returns the mean metrics of its last hundred
+    steps. On a signal it writes the weights of the last step and raises KeyboardInterrupt."""
     devices.initialise(options.coordinator, options.processes, options.process_id)
     mesh = devices.make_mesh()
     config, small = configuration(options, mesh.size), options.preset == "debug"
@@ -48,7 +47,7 @@ def train_network(options: TrainOptions) -> Metrics:
             **provenance()}
     if devices.is_main():
         save_weights(options.out / "weights.safetensors", ended.state.average, card, overwrite=True)
-    devices.agree(True)  # leave together: a process that ends alone is a dead one to the others
+    devices.agree(True)  # leave together: jax takes a process that ends alone for dead
     if ended.stopped:
         raise KeyboardInterrupt(
             f"{ended.stopped} {options.out / 'weights.safetensors'} is of that step.")
@@ -56,7 +55,7 @@ def train_network(options: TrainOptions) -> Metrics:
 
 
 def bank_of(config: TrainConfig, photos: bool) -> TextureBank:
-    """What the scenes are made of: one's own images, or textures, and photographs if wanted."""
+    """Textures of the scenes: the user's images, or procedural ones, with photographs if wanted."""
     key = jax.random.fold_in(jax.random.key(config.seed), 7)
     if config.images is None:
         return make_bank(key, config.textures, photos=photos)
@@ -70,8 +69,7 @@ def _headline(figures: Metrics) -> str:
 
 
 def configuration(options: TrainOptions, devices: int) -> TrainConfig:
-    """The preset with what the options say of its fields; EV020 where its scenes
-    cannot be shared out."""
+    """The preset, overridden by the options; EV020 where its scenes do not divide among devices."""
     changes = {f.name: getattr(options, f.name, None) for f in dataclasses.fields(TrainConfig)}
     config = dataclasses.replace(
         preset(options.preset), **{k: v for k, v in changes.items() if v is not None})
@@ -86,8 +84,8 @@ def configuration(options: TrainOptions, devices: int) -> TrainConfig:
 
 
 def network_name(model: ModelConfig) -> str:
-    """The name of a network's weights, which stands for all of it but the sizes that `config_of`
-    reads in the leaves; EV020 where no name does."""
+    """The name of a network's architecture, without the sizes that `config_of` reads from the
+    leaves. Raises EV020 for an architecture without a name."""
     for name, known in MODELS.items():
         flow = dataclasses.replace(known.flow, steps=model.flow.steps, hidden=model.flow.hidden)
         if model == dataclasses.replace(known, flow=flow, encoder_hidden=model.encoder_hidden,
@@ -103,8 +101,8 @@ def network_name(model: ModelConfig) -> str:
 
 
 def started_from(state: TrainState, weights: str) -> TrainState:
-    """The fresh state with every part of the network whose shapes agree taken from `weights`;
-    EV018 where none is."""
+    """The fresh state, with all parts of equal shape taken from `weights`; EV018 if there are
+    none."""
     (name, fresh), = state.params.items()
     known = load_weights(weights).get(name, {})
     taken = {k: known[k] for k, v in fresh.items() if k in known and shapes(known[k]) == shapes(v)}

@@ -38,8 +38,8 @@ class TrainState:
 
 
 def optimiser(config: TrainConfig) -> optax.GradientTransformation:
-    """Adam with warm-up and cosine decay, gradients clipped part by part: the flow's likelihood
-    has gradients 50 times those of the summary, which a common clip would silence."""
+    """Adam with warm-up and cosine decay, gradients clipped per part: those of the flow's
+    likelihood are 50 times the summary's, which a common clip would suppress."""
 
     def part(rate: float) -> optax.GradientTransformation:
         schedule = optax.warmup_cosine_decay_schedule(
@@ -77,14 +77,14 @@ def init_state(
                                           block.context, y)
     u = architecture.condition(config.model, changes, block.context, y)
     net["flow"] = flow.data_init(net["flow"], block.voxels, u, config.model.flow)
-    # A copy: the train step donates its state, and a buffer can be donated only once. One program
-    # each, not one a shape of the leaves.
+    # Copied, as the train step donates its state, and a buffer can be donated only once. One
+    # program for the tree, not one per shape of the leaves.
     average = jax.jit(lambda tree: jax.tree.map(jnp.copy, tree))(params)
     return TrainState(jnp.zeros((), jnp.int32), params, average, jax.jit(tx.init)(params), k_run)
 
 
 def step_key(state: TrainState, use: Literal["losses", "data"]) -> Array:
-    """The key of a step's random numbers, by what they are for."""
+    """The key of a step's random numbers, for losses or data."""
     kind = jax.random.fold_in(state.key, ("losses", "data").index(use))
     return jax.random.fold_in(kind, state.step)
 

@@ -60,7 +60,7 @@ def test_drift_and_diffusion_are_those_of_the_noise_s_rates() -> None:
 def test_all_six_constants_are_found_where_the_recording_tells_them(k2: float) -> None:
     true = dataclasses.replace(NOISY, k2=k2)
     found = measured_constants(crossed(0.2, 0.2, k2), rested(true, 4000.0))
-    assert found.untold == ()
+    assert found.undetermined == ()
     assert found.voltmeter.k2 == k2
     for name in ("k1", "k3", "k4", "k5", "k6"):
         assert getattr(found.voltmeter, name) == pytest.approx(getattr(true, name), rel=0.15)
@@ -69,12 +69,12 @@ def test_all_six_constants_are_found_where_the_recording_tells_them(k2: float) -
 def test_what_the_recording_does_not_tell_is_said() -> None:
     data = crossed(0.2, 0.2, 26.0)
     few = measured_constants(data, rested(NOISY, 1.0))
-    assert few.untold == ("k3", "k4", "k5", "k6")
+    assert few.undetermined == ("k3", "k4", "k5", "k6")
     assert few.voltmeter.k3 == few.voltmeter.k5 == 0
     one_light = rested(NOISY, 4000.0) * (np.arange(LIGHTS) == 3)
-    assert measured_constants(data, one_light).untold == ("k3", "k5")
+    assert measured_constants(data, one_light).undetermined == ("k3", "k5")
     bright = data._replace(dn=data.dn + 1e4)  # where log(L + k2) is the same for all k2
-    assert "k2" in measured_constants(bright, rested(NOISY, 1.0)).untold
+    assert "k2" in measured_constants(bright, rested(NOISY, 1.0)).undetermined
 
 
 def test_thresholds_of_both_polarities_are_told_apart_unless_tied() -> None:
