@@ -170,12 +170,15 @@ class Camera:
             if bad.any():
                 where = tuple(int(i) for i in np.argwhere(bad)[0])
                 rule = "> 0" if name.startswith("theta") else ">= 0"
+                why = ("Pixels that were not measured? Give them the median of the others." if
+                       not np.isfinite(array[where]) else
+                       "" if rule == ">= 0" else
+                       "Thresholds are magnitudes: leave out the sign." if array[where] < 0 else
+                       f"Clamp thresholds at {THETA_MIN}.")
                 raise EvflowDataError(
                     "EV014",
-                    f"{name} is {array[where]} at index {where} ({bad.sum()} such values).",
-                    f"It must be finite and {rule}"
-                    + (f"; clamp thresholds at {THETA_MIN}." if rule == "> 0" else "."),
-                )
+                    f"{name} is {array[where]:g} at index {where} ({bad.sum()} such values).",
+                    f"It must be finite and {rule}. {why}".rstrip())
 
     def _traced(self) -> bool:
         return any(isinstance(getattr(self, name), jax.core.Tracer) for name in PARAMETERS)

@@ -67,6 +67,9 @@ class Compare(Reading):
         (a, a_std), (b, b_std) = both
         numbers = compare_cameras(a, b, a_std, b_std, a_known=read_known(self.real),
                                   b_known=read_known(self.synthetic))
+        if a.shape != b.shape:
+            print(f"note: their maps are {a.shape} and {b.shape}: they are not compared pixel by "
+                  "pixel.", file=sys.stderr)
         facts = {"a": str(self.real), "b": str(self.synthetic), "verdict": verdict(numbers),
                  **numbers}
         names = _short(self.real), _short(self.synthetic)

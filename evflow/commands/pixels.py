@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
+
 from evflow.commands.options import refuse, value, warn_of_prior
 from evflow.errors import EvflowDataError
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 THRESHOLDS = ("theta_on", "theta_off", "mismatch", "eta_on", "eta_off")
 CIRCUIT = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz")
+MOST_THETA = 2.0  # log units; no sensor has a median above
 CHOICES = ("cutoff_by_light", "noise_resets_memory")
 
 
@@ -131,11 +134,18 @@ class Pixels:
             raise EvflowDataError("EV020", "--draw without --camera.",
                                   "It draws the pixels of a measured camera.")
         camera = self._measured(self.camera) if self.camera else self._drawn((size[1], size[0]))
+        if len(camera.shape) > 2:
+            raise EvflowDataError(
+                "EV002", f"{self.camera} holds maps of shape {camera.shape}.",
+                "Save one camera, of maps (H, W): jax.tree.map(lambda m: m[0], camera).save(path).")
         if camera.shape != size[::-1]:
             width, height = camera.shape[::-1]
+            turned = ("Were its maps saved as (W, H)? Transpose them. Else pass" if
+                      camera.shape == size and width != height else "Pass")
             raise EvflowDataError(
                 "EV015", f"the video is {size[0]}x{size[1]}, the camera {width}x{height}.",
-                f"Pass --sensor-size {width}x{height}to scale and crop the video.")
+                f"{turned} --sensor-size {width}x{height} to scale and crop the video.")
+        _doubt(camera)
         return camera
 
     def _measured(self, path: Path) -> Camera:
@@ -183,3 +193,11 @@ class Pixels:
                   **told, "sigma_on": self.mismatch, "sigma_off": self.mismatch}
         nominal = Summary(**{name: jnp.float32(number) for name, number in values.items()})
         return sample_pixels(key, nominal, shape).validate()
+
+
+def _doubt(camera: Camera) -> None:
+    """Warn on stderr of thresholds that no sensor has."""
+    theta = float(max(np.median(camera.theta_on), np.median(camera.theta_off)))
+    if theta > MOST_THETA:
+        print(f"warning: a threshold of {theta:.3g} log units is {100 * np.expm1(theta):,.0f} % of "
+              "contrast: was it given in percent? 20 % is log(1.2) = 0.18.", file=sys.stderr)

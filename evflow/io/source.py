@@ -1,5 +1,5 @@
-"""Frames from any source, one by one: a video file, a folder of images, a NumPy stack, or a
-recording with frames.
+"""Frames from any source, one by one: a video file, a folder of images, a picture of several
+pages, a NumPy stack, or a recording with frames.
 
 With `response` "auto" they are assumed to encode light as usual for their source: videos and 8-bit
 images are sRGB; raw mosaics, deeper images, arrays and frames recorded by an event camera are
@@ -20,6 +20,7 @@ from evflow.errors import EvflowDataError, naming
 from evflow.io.images import repeats, values
 from evflow.io.images.folder import RADIANCE, SUFFIXES, ImageFolder, open_folder
 from evflow.io.images.frames import FrameHints, Frames, FrameSource, Image, converted, existing
+from evflow.io.images.pages import open_pages, pages
 from evflow.io.images.stacks import is_stack, open_stack
 from evflow.io.registry import find_format, read_recording
 from evflow.notes import Note, why_no_frames
@@ -44,6 +45,12 @@ def _open(path: Path, told: FrameHints) -> FrameSource:
         told, notes = _responding(told, "linear", "numbers of a stack")
         return _source(stack.size, len(stack.times_us), lambda: stack.images(told.partial), told,
                        [*stack.notes, *notes])
+    if (count := pages(path)) > 1:
+        found = open_pages(path, count, told)
+        usual = ("srgb", "8-bit images") if found.first.dtype == np.uint8 else (
+            "linear", "images of more than 8 bits")
+        told, notes = _responding(told, *usual)
+        return _source(found.first.shape[1::-1], count, found.images, told, [*found.notes, *notes])
     if told.picture and path.suffix.lower() in SUFFIXES:
         return _of_images(ImageFolder((path,), np.zeros(1, np.int64), ()), told)
     if not _is_recording(path):
@@ -65,7 +72,13 @@ def _is_recording(path: Path) -> bool:
 
 
 def _folder(path: Path, told: FrameHints) -> FrameSource:
-    return _of_images(open_folder(path, told), told)
+    folder = open_folder(path, told)
+    if (count := pages(folder.files[0])) > 1:
+        raise EvflowDataError(
+            "EV008", f"{folder.files[0]} holds {count:,} pages, not one image.",
+            f"Pass the file itself{'' if len(folder.files) == 1 else ', one by one'}, or a folder "
+            "with one image a file.", where=path)
+    return _of_images(folder, told)
 
 
 def _of_images(folder: ImageFolder, told: FrameHints) -> FrameSource:

@@ -118,6 +118,7 @@ def with_frames(
 
 def _reworded(text: str) -> str:
     """Next to a recording, --time-unit is the events', and --fps that of a video to be written."""
+    text = text.replace(" with --frames (simulate: --time-unit)", "")
     return text.replace("--time-unit", "--timestamps-unit").replace("--fps", "--frames-fps")
 
 

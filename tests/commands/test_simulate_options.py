@@ -156,3 +156,34 @@ def test_options_out_of_range(
 ) -> None:
     assert main(["simulate", str(video), "-o", str(video.with_name("out.h5")), *BASE, *options])
     assert capsys.readouterr().err.startswith(code)
+
+
+@pytest.mark.parametrize(("shape", "change", "code", "said"), [
+    ((30, 40), {}, 1, "--sensor-size 40x30 to scale"),
+    ((32, 24), {}, 1, "saved as (W, H)? Transpose them."),
+    ((1, 24, 32), {}, 1, "Save one camera, of maps (H, W)"),
+    ((24, 32), {"theta_on": np.nan}, 1, "not measured? Give them the median"),
+    ((24, 32), {"theta_off": -0.2}, 1, "leave out the sign"),
+    ((24, 32), {"theta_off": 0.0}, 1, "Clamp thresholds at 0.01"),
+    ((24, 32), {"eta_on": -0.2}, 1, "finite and >= 0."),
+    ((24, 32), {"theta_on": 20.0}, 0, "was it given in percent?"),
+    ((24, 32), {"theta_on": 0.5}, 0, "")])
+def test_cameras_that_others_made(
+    video: Path, capsys: pytest.CaptureFixture[str], shape: tuple[int, ...],
+    change: dict[str, float], code: int, said: str
+) -> None:
+    maps = {name: np.full(shape, change.get(name, 0.2)) for name in (
+        "theta_on", "theta_off", "eta_on", "eta_off")}
+    camera = video.with_name("camera.npz")
+    np.savez(camera, **maps)
+    out = video.with_name("out.npz")
+    assert main(["simulate", str(video), *BASE, "--camera", str(camera), "-o", str(out)]) == code
+    err = capsys.readouterr().err
+    assert said in err
+    assert ("percent" in err) == (said.endswith("percent?"))
+
+
+def test_cameras_of_two_sizes_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [str(Camera.constant((4, n)).save(tmp_path / f"{n}.npz")) for n in (5, 6)]
+    assert main(["compare", *paths]) == 0
+    assert "(4, 5) and (4, 6)" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import arrays, columns, tables
 from evflow.io.decode.hdf5 import DAMAGE
-from evflow.io.decode.images_beside import beside
+from evflow.io.decode.images_beside import are_images, beside, times_of
 from evflow.io.decode.stream import Gathered
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
@@ -130,11 +130,27 @@ def told_size(f: Any, group: Any) -> Size | None:
     return None
 
 
+def arrays_in(f: Any) -> dict[str, Any]:
+    """All data sets by name, without the first slash."""
+    return {data.name.strip("/"): data for _, members in walk(f) for data in members.values()}
+
+
+def as_stack(f: Any) -> str:
+    """How to save the images of a file without events as a stack of frames; "" if it holds none."""
+    of = arrays_in(f)
+    name = next((name for name, data in of.items() if are_images(data)), "")
+    times = times_of(name, of) if name else ""
+    return "" if not name else (
+        f"It holds images and no events. As frames (--frames, evflow simulate): np.savez('a.npz', "
+        f"frames=f['{name}'][:]" + (f", frame_times=f['{times}'][:])" if times else
+                                   ", frame_times=their times)") + " with f = h5py.File(path).")
+
+
 def images_beside(
     path: Path, f: Any, found: Gathered, hints: Hints, events: str, notes: tuple[Note, ...] = ()
 ) -> Recording:
     """The recording of these events and of images anywhere in the file (`images_beside`)."""
-    of = {data.name.strip("/"): data for _, members in walk(f) for data in members.values()}
+    of = arrays_in(f)
 
     def checked(name: str) -> Any:
         return tables.dataset(path, f, name, (None,) * len(of[name].shape))

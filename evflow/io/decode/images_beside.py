@@ -45,7 +45,7 @@ def beside(
     """
     streams: list[Images] = []
     for name, array in arrays.items():
-        if _are_images(array):
+        if are_images(array):
             times = times_of(name, arrays)
             why = "" if times else f"without an array of {array.shape[0]} times"
             stream = ImageStream(name, frame_size(array), why, (Note(
@@ -77,7 +77,8 @@ def times_of(images: str, arrays: Mapping[str, Any]) -> str:
     return ""
 
 
-def _are_images(array: Any) -> bool:
+def are_images(array: Any) -> bool:
+    """Whether an array may be images."""
     shape = array.shape
     return (len(shape) in (3, 4) and min(shape[1:3]) >= LEAST_SIDE and shape[0] > 0
             and array.dtype.kind in "iuf" and (len(shape) == 3 or shape[3] in (1, 3, 4)))

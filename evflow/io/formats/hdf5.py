@@ -33,6 +33,7 @@ def read(path: Path, hints: Hints) -> Recording:
             raise EvflowDataError(
                 "EV008", f"{path} is HDF5 in an unknown layout. It holds "
                 f"{hdf5_search.listing(f)}.",
+                hdf5_search.as_stack(f) or
                 "Name the events x, y, t, p in one group, in Python: with h5py.File(path, 'a') as "
                 "f: f['events/x'] = f['its/name'], and so for y, t (us) and p. No data is copied.",
                 where=path)

@@ -1,7 +1,7 @@
 """Videos in NumPy files: memory-mapped .npy stacks, and .npz stacks decompressed frame by frame.
 
 A stack is (T, H, W) or (T, H, W, 3) in R, G, B. In an .npz it is called frames (or images, imgs,
-video, arr_0), and its times, if any, frame_times (or timestamps, times, t).
+video, arr_0), and its times, if any, frame_times (or timestamps, times, t, or another such name).
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.files.archives import BLOCK, DAMAGE, Member, is_zip, npy_header, unzipped
 from evflow.files.limits import check_expansion
+from evflow.io.decode.images_beside import times_of
 from evflow.io.images.frames import FrameHints, Image
-from evflow.io.images.times import read_times, to_us
+from evflow.io.images.times import mid_exposure, read_times, to_us
 from evflow.notes import Note
 
 FRAMES = ("frames", "images", "imgs", "video", "arr_0")
@@ -102,7 +103,7 @@ def open_stack(path: Path, hints: FrameHints) -> Stack:
             "EV009", f"{path} is not a valid .npy ({e or type(e).__name__}).",
             "Copy or save it again.", where=path) from e
     _check(stack)
-    us, notes = _times(stack, hints, times)
+    us, notes = frame_times(path, stack.shape[0], hints, times)
     return dataclasses.replace(stack, times_us=us, notes=notes)
 
 
@@ -137,10 +138,10 @@ def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
                 f"Expected {', '.join(FRAMES)}; or t, x, y, p for a recording.", where=path)
         with archive.open(member + ".npy") as f:
             shape, fortran, dtype = npy_header(f)
-        clock = next((name for name in TIMES if name in names), None)
-        times = None
-        if clock is not None:
-            times = Member(archive, archive.getinfo(clock + ".npy")).whole()
+        arrays = {name: Member(archive, archive.getinfo(f"{name}.npy")) for name in names}
+        clock = next((name for name in TIMES if name in names), "") or (
+            times_of(member, arrays) if shape else "")
+        times = mid_exposure(arrays[clock].whole(), f"{clock} in {path}") if clock else None
     if fortran and len(shape) > 1:
         raise EvflowDataError(
             "EV009", f"{path} holds {member} in Fortran order, in which frames are not contiguous.",
@@ -165,24 +166,25 @@ def _check(stack: Stack) -> None:
                               where=stack.path)
 
 
-def _times(
-    stack: Stack, hints: FrameHints, times: np.ndarray | None
+def frame_times(
+    path: Path, count: int, hints: FrameHints, times: np.ndarray | None, unit: str = "auto"
 ) -> tuple[np.ndarray, tuple[Note, ...]]:
-    count = stack.shape[0]
+    """Times (count,) of the frames in a file, int64 us: those of the options, else its own in
+    that unit; and notes. EV002 (another number), EV020 (none)."""
     if hints.fps is not None:
         return np.array([hints.at_rate(i) for i in range(count)], np.int64), ()
     if hints.timestamps is not None:
         where: Any = Path(hints.timestamps)
         us, _, notes = read_times(where, hints.time_unit)
     elif times is not None:
-        where = f"the times in {stack.path}"
-        us, notes = to_us(times, where, hints.time_unit)
+        where = "but"
+        us, notes = to_us(times, path, hints.time_unit if hints.time_unit != "auto" else unit)
     else:
         raise EvflowDataError(
-            "EV020", f"{stack.path} holds {count:,} frames but no times.",
-            "Pass --fps or --timestamps FILE.", where=stack.path)
+            "EV020", f"{path} holds {count:,} frames but no times.",
+            "Pass --fps or --timestamps FILE.", where=path)
     if len(us) != count and not (hints.partial and len(us) > count):
         raise EvflowDataError(
-            "EV002", f"{stack.path} holds {count:,} frames, {where} {len(us):,} times.",
-            "Give one time per frame, or pass --fps.", where=stack.path)
+            "EV002", f"{path} holds {count:,} frames, {where} {len(us):,} times.",
+            "Give one time per frame, or pass --fps.", where=path)
     return us[:count], notes

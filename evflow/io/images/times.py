@@ -1,8 +1,9 @@
 """Files of frame times: one time per line, alone, before or after the frame's name.
 
 Supported layouts: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time` (DVS-Voltmeter),
-`index time`, begin and end of the exposure (DSEC; the middle is used); separated by blanks, tabs,
-commas or semicolons; and .npy arrays. Lines that begin with # are comments. A unit written in a
+`index time`, begin and end of the exposure (DSEC; the middle is used), or any number of columns of
+which a header names one as the time; separated by blanks, tabs, commas or semicolons; and .npy
+arrays. Lines that begin with # are comments. A unit written in a
 comment or header is used ("[ns]", "timestamp_us"); otherwise the only unit that makes the numbers a
 plausible video, with a note.
 """
@@ -20,6 +21,7 @@ from evflow.errors import EvflowDataError, naming
 from evflow.files.archives import npy_header
 from evflow.files.arrays import mapped
 from evflow.files.limits import read_whole
+from evflow.io.decode.columns import meaning
 from evflow.io.decode.text import is_float
 from evflow.io.decode.units import (
     UNITS_US,
@@ -51,8 +53,13 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> T
     if existing(path).suffix == ".npy":
         us, notes = to_us(_stored(path), path, unit)
         return us, [], notes
-    rows, written = _rows(path)
-    times, labels = _columns(path, rows, names)
+    rows, header, written = _rows(path)
+    named = [i for i, field in enumerate(header) if meaning(field) == "t"]
+    if len(header) == len(rows[0] if rows else ()) and len(named) == 1:
+        times, labels = _numbers(path, rows, named[0]), _labels(rows, names)
+        written = written_unit(header[named[0]])
+    else:
+        times, labels = _columns(path, rows, names)
     us, notes = to_us(times, path, unit if unit != "auto" else written)
     return us, labels, notes
 
@@ -149,8 +156,9 @@ def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
         f"Is it {', '.join(UNITS_US)}? {TELL.capitalize()}.", where=where)
 
 
-def _rows(path: Path) -> tuple[list[list[str]], str]:
-    """The fields of every line with data, equally many, and the written unit, or "auto"."""
+def _rows(path: Path) -> tuple[list[list[str]], list[str], str]:
+    """The fields of every line with data, equally many; those of the last line before them; and the
+    written unit, or "auto"."""
     try:
         text = read_whole(path, MAX_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
@@ -158,19 +166,40 @@ def _rows(path: Path) -> tuple[list[list[str]], str]:
     if "\0" in text:
         raise EvflowDataError("EV009", f"{path} is not a text file of times.", where=path)
     rows: list[list[str]] = []
-    words = ""
+    words, header = "", [""]
     for number, line in enumerate(text.splitlines(), 1):
         content, _, comment = line.partition("#")
-        fields = [f for f in re.split(r"[\s,;]+", content) if f]
+        fields = _fields(content)
         if not fields or (not rows and not any(map(is_float, fields))):
-            words += f" {comment if not fields else content}"  # a comment or the header
+            said = comment if not fields else content  # a comment or the header
+            words, header = f"{words} {said}", header if rows else _fields(said)
             continue
         if rows and len(fields) != len(rows[0]):
             raise EvflowDataError(
                 "EV009", f"{path}, line {number:,} is {line[:60]!r}; lines before it have "
                 f"{len(rows[0])} columns.", "Truncated or damaged? Copy it again.", where=path)
         rows.append(fields)
-    return rows, written_unit(words)
+    return rows, header, written_unit(words)
+
+
+def _fields(line: str) -> list[str]:
+    return [field for field in re.split(r"[\s,;]+", line) if field]
+
+
+def _labels(rows: list[list[str]], names: Collection[str]) -> list[str]:
+    """The names of images in the only column that holds them; none if there is no such column."""
+    known = _known(names)
+    found = [column for column in zip(*rows, strict=True) if all(_tail(f) in known for f in column)]
+    return [known[_tail(field)] for field in found[0]] if len(found) == 1 else []
+
+
+def _known(names: Collection[str]) -> dict[str, str]:
+    """The names, by themselves and by their stems."""
+    return {key: name for name in names for key in (PurePosixPath(name).stem, name)}
+
+
+def _tail(field: str) -> str:
+    return PurePosixPath(field.replace("\\", "/")).name
 
 
 def _columns(
@@ -180,9 +209,8 @@ def _columns(
     columns = list(zip(*rows, strict=True))
     if len(columns) <= 1:
         return _numbers(path, rows, 0), []
-    known = {key: name for name in names for key in (PurePosixPath(name).stem, name)}
-    label = [all(PurePosixPath(f.replace("\\", "/")).name in known for f in column)
-             for column in columns]
+    known = _known(names)
+    label = [all(_tail(f) in known for f in column) for column in columns]
     if sum(label) != 1:  # not the images at hand: names are non-numbers, or count up
         label = [not all(map(is_float, column)) or _counts(column) for column in columns]
     clock = [i for i, named in enumerate(label) if not named]
@@ -196,8 +224,7 @@ def _columns(
     named = columns[label.index(True)] if any(label) else ()
     if all(map(str.isdecimal, named)) and not set(named) <= set(known):
         return times, []
-    tails = [PurePosixPath(f.replace("\\", "/")).name for f in named]
-    return times, [known.get(tail, tail) for tail in tails]
+    return times, [known.get(_tail(f), _tail(f)) for f in named]
 
 
 def middle(begin: np.ndarray, end: np.ndarray) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from helpers.recordings import SIZE, equal, make, refused
 
 from evflow.io import read_events, read_recording
 from evflow.io.registry import find_format
+from evflow.io.source import open_frames
 from evflow.types import Events
 
 EVENTS = make(300, 0).events
@@ -167,6 +168,18 @@ def test_a_matrix_that_is_none_of_events(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as f:
         f["poses"] = np.random.default_rng(0).normal(size=(50, 4))
     assert refused(tmp_path / "a.h5", size=SIZE).code == "EV008"
+
+
+def test_images_without_events_become_a_stack_as_the_message_says(tmp_path: Path) -> None:
+    path, frames = tmp_path / "a.h5", np.arange(3 * 48 * 64, dtype=np.uint8).reshape(3, 48, 64)
+    with h5py.File(path, "w") as f:
+        f["cam/images"], f["cam/ts"] = frames, [0, 40_000, 80_000]
+    fix = refused(path).fix
+    with h5py.File(path) as f:
+        exec(fix[fix.index("np.savez"): fix.index(" with f =")].replace("'a.npz'", "out"),
+             {"np": np, "f": f, "out": tmp_path / "a.npz"})
+    found = open_frames(tmp_path / "a.npz", response="linear").open()
+    np.testing.assert_array_equal([frame for frame, _ in found], frames)
 
 
 def test_no_event_at_all(tmp_path: Path) -> None:

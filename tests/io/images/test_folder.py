@@ -118,6 +118,10 @@ LAYOUTS = {
         f"{1000 * t},img{i}.png" for i, t in enumerate(TIMES_US, 1)),
     "stems": "\n".join(f"img{i};{t}" for i, t in enumerate(TIMES_US, 1)),
     "indices": "\n".join(f"{i}\t{t / 1e6:.6f}" for i, t in enumerate(TIMES_US)),
+    "exposures": "frame_id,timestamp_us,exposure_us,gain\n" + "\n".join(
+        f"{i},{t},8000,1.5" for i, t in enumerate(TIMES_US)),
+    "two clocks": "device_ns, timestamp_ns, file\n" + "\n".join(
+        f"{77 * t}, {1000 * t}, img{i}.png" for i, t in enumerate(TIMES_US, 1)),
     "header": "index,time_us\n" + "\n".join(f"{i},{t}" for i, t in enumerate(TIMES_US)),
 }
 
@@ -217,6 +221,14 @@ def test_stacks(tmp_path: Path) -> None:
         seen, times, _ = read(tmp_path / "a.npz", time_unit="us")
         np.testing.assert_array_equal(seen, frames)
         assert times == [0, 4000, 8000, 12_000, 16_000]
+    for name, stamps in (("ts", np.arange(5) * 4000), ("image_timestamps", np.arange(5) * 4e-3),
+                         ("exposure_ts", np.arange(5)[:, None] * 4000 + [-9, 9])):
+        np.savez(tmp_path / "b.npz", images=frames, gain=np.ones(5), **{name: stamps})
+        assert read(tmp_path / "b.npz")[1] == times
+        np.save(tmp_path / "t.npy", stamps)
+        assert read(path, timestamps=tmp_path / "t.npy")[1] == times
+    np.save(tmp_path / "t.npy", np.array([[5, 9.0]] * 5))
+    assert "not begin and end" in message(lambda: read(path, timestamps=tmp_path / "t.npy"))
 
 
 def test_an_npz_whose_frames_claim_less_is_damaged(tmp_path: Path) -> None:

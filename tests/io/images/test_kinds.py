@@ -152,3 +152,40 @@ def test_arrays_of_other_types_are_refused_with_what_to_do(dtype: str, fix: str)
         white_of(np.dtype(dtype), "frame 0")
     assert raised.value.code == "EV003"
     assert fix in str(raised.value)
+
+
+def turned(frames: np.ndarray) -> list[np.ndarray]:
+    return [np.repeat(frame[..., None], 3, -1) for frame in frames]
+
+
+def animation(path: Path, frames: np.ndarray) -> None:
+    """Shown for 40 and 80 ms in turn."""
+    made = cv2.Animation()
+    made.frames = turned(frames)
+    made.durations = np.array([40, 80] * len(frames), np.int32)[: len(frames)]
+    assert cv2.imwriteanimation(str(path), made)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_pages_are_frames(tmp_path: Path, suffix: str) -> None:
+    path, timed = tmp_path / f"a{suffix}", suffix == ".png"
+    if timed:
+        animation(path, FRAMES)
+    else:
+        assert cv2.imwritemulti(str(path), list(FRAMES))
+        with pytest.raises(EvflowDataError, match="6 frames but no times"):
+            open_frames(path)
+    for hints in ({"fps": 50.0}, *([{}] if timed else [])):
+        found = list(open_frames(path, response="linear", **hints).open())
+        np.testing.assert_array_equal([frame for frame, _ in found], FRAMES)
+        steps = [20_000] * 5 if hints else [40_000, 80_000, 40_000, 80_000, 40_000]
+        assert np.diff([time for _, time in found]).tolist() == steps
+    with pytest.raises(EvflowDataError, match="holds 6 pages, not one image"):
+        open_frames(tmp_path, fps=50)
+
+
+def test_reduced_copies_of_a_picture_are_no_frames(tmp_path: Path) -> None:
+    for i in range(2):
+        assert cv2.imwritemulti(str(tmp_path / f"{i}.tif"), [FRAMES[i], FRAMES[i][::2, ::2]])
+    found = [frame for frame, _ in open_frames(tmp_path, fps=50, response="linear").open()]
+    np.testing.assert_array_equal(found, FRAMES[:2])
