@@ -90,6 +90,8 @@ class Pixels:
         else:
             refuse(self, CHOICES, f"--sensor {self.sensor} has no such choice")
         model = dataclasses.replace(model, **told)
+        if not model.leak_hz:
+            refuse(self, ("leak_jitter", "leak_fpn_decades"), "there is no leak without --leak-hz")
         return model if self.photoreceptor == "first-order" else self._second_order(model)
 
     def _second_order(self, model: SensorModel) -> SensorModel:

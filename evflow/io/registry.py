@@ -92,12 +92,12 @@ def find_format(path: str | os.PathLike) -> Format:
         return claims[0]
     if not path.is_dir() and not head:
         raise EvflowDataError("EV009", f"{path} is empty (0 bytes).", "Copy it again.", where=path)
-    if not path.is_dir() and (other := unread.known(path, head)):
+    if other := unread.known(path, head) if not path.is_dir() else unread.folder(
+            path, lambda file: any(f.sniff(file, _head(file)) for f in FORMATS)):
         raise EvflowDataError("EV008", f"{path} is {other.what}.", other.fix, where=path)
-    seen = (f"the folder holds {sorted(p.name for p in path.iterdir())[:5]}" if path.is_dir()
-            else f"it begins with {head[:16]!r}")
     raise EvflowDataError(
-        "EV008", f"{path} is none of {', '.join(f.NAME for f in FORMATS)}: {seen}.",
+        "EV008", f"{path} is none of {', '.join(f.NAME for f in FORMATS)}: it begins with "
+        f"{head[:16]!r}.",
         "Convert it, or check that it was copied completely. Text must have lines of numbers "
         "`t x y p`, decimal points, and a header if the order differs.", where=path)
 

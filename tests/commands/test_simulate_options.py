@@ -147,7 +147,7 @@ def test_frames_of_light_in_a_format_of_bytes(
     (["--shot-hz", "-1"], "EV020"), (["--sensor", "esim", "--cutoff-hz", "30"], "EV020"),
     (["--mismatch", "-0.1"], "EV020"), (["--mismatch", "0.1", "--theta-on", "0"], "EV014"),
     (["--saccades", "5"], "EV020"), (["--crop", "99x9"], "EV020"),
-    (["--slow-motion", "0"], "EV020"),
+    (["--slow-motion", "0"], "EV020"), (["--leak-jitter", "0.1"], "EV020"),
     (["--photoreceptor", "second-order", "--cutoff-hz", "0"], "EV020"),
     (["--photoreceptor", "second-order", "--sensor", "esim"], "EV020"),
     (["--photoreceptor", "second-order", "--no-cutoff-by-light"], "EV020")])

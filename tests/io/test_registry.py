@@ -254,7 +254,7 @@ def test_a_file_of_an_unknown_format(tmp_path: Path) -> None:
 
 def test_paths_that_lead_nowhere(tmp_path: Path) -> None:
     assert refused(tmp_path / "none.h5").code == "EV016"
-    assert "the folder holds []" in str(refused(tmp_path))
+    assert "a folder of nothing" in str(refused(tmp_path))
     (tmp_path / "zero.h5").write_bytes(b"")
     assert refused(tmp_path / "zero.h5").code == "EV009"
     (tmp_path / "text.txt").write_text("hello")

@@ -25,7 +25,7 @@ from evflow.io.decode import tables, text
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.formats import plain_text
 from evflow.io.hints import Hints
-from evflow.io.images.folder import decode
+from evflow.io.images.folder import decode, unread_images
 from evflow.io.images.streams import ImageStream, events_alone
 from evflow.notes import Note
 from evflow.types import Recording
@@ -103,7 +103,9 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
         size = told.size or seen
         found = gather(path, _some(path, chunks, hints, size), hints, size, native)
     if not indexed:
-        return Recording.of_events(found.events, (*told.notes, *found.notes))
+        beside = unread_images(root) if isinstance(root, Path) and name == EVENTS and not (
+            hints.no_frames) else ()
+        return Recording.of_events(found.events, (*told.notes, *found.notes, *beside))
 
     def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
         seconds, names = _read_index(root / IMAGES)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
+from evflow.errors import EvflowDataError
 from evflow.files.archives import DAMAGE, npy_header
+from evflow.io.decode.columns import meaning
 from evflow.io.formats import unread_text
 from evflow.io.formats.unread_text import Known
 
@@ -42,10 +46,15 @@ MAGICS: tuple[tuple[int, bytes, Known], ...] = (  # at a byte of the file
     (0, b"SQLite format 3\0", Known(
         "an SQLite database without ROS 2 messages", "For a ROS 2 bag pass the folder, or the .db3 "
         "with its metadata.yaml.")),
+    (0, b"version https://git-lfs", Known(
+        "a pointer to a file in Git LFS", "Fetch the file itself: git lfs pull.")),
+    (0, b"<!DOCTYPE html", Known("a web page", "The download failed, or needs a login.")),
+    (0, b"<html", Known("a web page", "The download failed, or needs a login.")),
     (0, b"\x89PNG\r\n", VIDEO), (0, b"\xff\xd8\xff", VIDEO), (0, b"GIF8", VIDEO),
     (0, b"II*\0", VIDEO), (0, b"MM\0*", VIDEO), (4, b"ftyp", VIDEO), (0, b"\x1aE\xdf\xa3", VIDEO),
     (0, b"RIFF", VIDEO),
 )
+MOST = 20  # files of a folder that are examined
 PICKLES = tuple(bytes([0x80, version]) for version in (2, 3, 5))
 
 
@@ -70,6 +79,25 @@ def known(path: Path, head: bytes) -> Known | None:
                      "Open it in jAER, and log it again: that writes AEDAT 2.")
     words = unread_text.known(head)
     return None if words is None else _of(path, words)
+
+
+def folder(path: Path, is_recording: Callable[[Path], bool]) -> Known:
+    """What a folder holds that no format claims, and which of its files can be read."""
+    files = sorted(p for p in path.iterdir() if p.is_file())[:MOST]
+    columns = {found: p for p in files if p.suffix == ".npy"
+               and (found := meaning(p.stem.rpartition("_")[2]))}
+    what = f"a folder of {', '.join(p.name for p in sorted(path.iterdir())[:5]) or 'nothing'}"
+    if len(columns) == 4:
+        loaded = ", ".join(f"{name}=np.load('{columns[name].name}')" for name in "txyp")
+        return Known(what, f"Put the columns into one file: np.savez('events.npz', {loaded}, "
+                     "size=(width, height)), t in microseconds.")
+    recordings = []
+    for file in files:
+        with contextlib.suppress(EvflowDataError, OSError):
+            recordings += [file] if is_recording(file) else []
+    others = " and others one by one" if len(recordings) > 1 else ""
+    return Known(what, f"Pass {recordings[0]}{others}." if recordings else
+                 "Pass a recording in it; none of its own files is one.")
 
 
 def _of(path: Path, found: Known) -> Known:

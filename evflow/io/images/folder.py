@@ -105,6 +105,17 @@ def list_images(folder: Path) -> list[Path]:
                    and not p.name.startswith(".")), key=lambda p: natural(p.name))
 
 
+def unread_images(root: Path) -> tuple[Note, ...]:
+    """A note on images that lie in or below the folder of a recording that names none."""
+    for folder in (root, *sorted(p for p in root.iterdir() if p.is_dir())):
+        if files := list_images(folder):
+            times = next((p for place in dict.fromkeys((folder, root)) for name in TIMES
+                          if is_there(p := place / name)), "FILE")
+            return (Note("frames.unused", f"{len(files):,} images in {folder} were not read, as no "
+                         f"images.txt names their times: --frames {folder} --timestamps {times}"),)
+    return ()
+
+
 def natural(name: str) -> tuple[list[str | int], str]:
     """A sort key that compares digits in names as numbers."""
     parts = re.split(r"([0-9]+)", name.lower())

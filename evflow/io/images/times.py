@@ -112,6 +112,10 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
     notes: Notes = ()
     if unit == "auto":
         unit, notes = _video_unit(times, where)
+    elif (likely := video_unit(times)[0]) and unit not in video_unit(times)[1]:
+        notes = (Note("frames.unit", f"times of {where}, read in {unit}, are "
+                      f"{1e-6 * UNITS_US[unit] * usual_step(times):.3g} s apart; in {likely} they "
+                      "would be those of a video."),)
     us = Hints(time_unit=unit).microseconds(times, unit)
     with naming(where):
         return check_times(us, f"times read in {unit}", strict=True), notes

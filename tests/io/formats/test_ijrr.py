@@ -12,6 +12,7 @@ import pytest
 from helpers.recordings import SIZE, equal, make, refused, write_ijrr, zipped
 
 from evflow.io import read_events, read_recording, write_events
+from evflow.io.source import open_frames
 
 
 def test_ijrr_rounds_nanosecond_text(tmp_path: Path) -> None:
@@ -131,3 +132,13 @@ def test_real_slider_depth_text(data_file: Callable[[str], Path], tmp_path: Path
     again = read_recording(tmp_path / "a.h5")
     equal(again.events, got.events)
     np.testing.assert_array_equal(again.frames, got.frames)
+
+
+def test_images_without_an_index_are_told_with_how_to_read_them(tmp_path: Path) -> None:
+    write_ijrr(tmp_path, make())
+    (tmp_path / "images.txt").rename(tmp_path / "image_timestamps.txt")
+    note = read_recording(tmp_path, size=SIZE).notes[-1].text
+    assert "6 images in" in note
+    folder, times = re.findall(r"--frames (\S+) --timestamps (\S+)", note)[0]
+    assert len(list(open_frames(folder, timestamps=times).open())) == 6
+    assert read_recording(tmp_path, size=SIZE, no_frames=True).notes == ()

@@ -47,6 +47,8 @@ FILES = {  # name: bytes, and what the message says
     "old.dat": (b"\0\1\0\2\0\3" * 9, "AEDAT 1"),
     "utf16.csv": ("t,x,y,p\n0.1,3,4,1\n".encode("utf-16"), "iconv -f UTF-16 -t UTF-8"),
     "mac.csv": (b"t,x,y,p\r0.1,3,4,1\r0.2,3,4,1\r", "tr '\\r' '\\n' <"),
+    "lfs.h5": (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "git lfs pull"),
+    "page.npz": (b"<!DOCTYPE html><html>", "The download failed"),
     "a.json": (b'{"t": 0.1, "x": 3}\n' * 9, "is JSON"),
     "half.txt": (b"0.1 3 4 2\n0.2 3 4 1\n0.3 5 4 1\n" * 9, "number 4 holds 1, 2"),
     "three.txt": (b"0.1 3 4\n0.2 7 4\n0.3 5 4\n" * 9, "Events need a polarity"),
@@ -66,3 +68,14 @@ def test_what_is_named(tmp_path: Path, name: str) -> None:
 def test_frames_are_still_frames(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((3, 48, 64), np.uint8))
     assert open_frames(tmp_path / "a.npy", fps=25).size == (64, 48)
+
+
+@pytest.mark.parametrize(("names", "said"), [
+    (["events.csv"], "Pass {}/events.csv."), (["a.csv", "b.csv"], "Pass {}/a.csv and others"),
+    (["a.md"], "none of its own files is one"), ([], "a folder of nothing"),
+    ([f"events_{c}.npy" for c in "txyp"], "x=np.load('events_x.npy')")])
+def test_folders_name_what_to_pass(tmp_path: Path, names: list[str], said: str) -> None:
+    for name in names:
+        (tmp_path / name).write_text("0.1 3 4 1\n0.2 3 4 0\n" if name.endswith(".csv") else "x")
+    error = refused(tmp_path)
+    assert (error.code, said.format(tmp_path) in str(error)) == ("EV008", True)

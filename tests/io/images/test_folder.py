@@ -221,6 +221,8 @@ def test_stacks(tmp_path: Path) -> None:
         seen, times, _ = read(tmp_path / "a.npz", time_unit="us")
         np.testing.assert_array_equal(seen, frames)
         assert times == [0, 4000, 8000, 12_000, 16_000]
+    notes = read(tmp_path / "a.npz", time_unit="s")[2]
+    assert "read in s, are 4e+03 s apart; in us" in notes[0].text
     for name, stamps in (("ts", np.arange(5) * 4000), ("image_timestamps", np.arange(5) * 4e-3),
                          ("exposure_ts", np.arange(5)[:, None] * 4000 + [-9, 9])):
         np.savez(tmp_path / "b.npz", images=frames, gain=np.ones(5), **{name: stamps})
