@@ -1,5 +1,5 @@
-"""Networks that turn events into video (E2VID, FireNet) and optical flow (EV-FlowNet), usable
-on their own, with the weights that others have published.
+"""Networks that turn events into video (E2VID, FireNet) and optical flow (EV-FlowNet). Published
+weights can be loaded.
 
     network, params = load_published("E2VID_plus.pth.tar")
     images = reconstruct(network, params, events, frame_times_us)

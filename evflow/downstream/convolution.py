@@ -1,10 +1,10 @@
 """The convolution of the event networks, whose kernel gradient is also fast on a CPU.
 
-XLA:CPU takes that gradient as a convolution whose window is the whole image, at 10 to 30 GFLOP/s
-of one core where few features leave a layer, or where the image is larger than a cache, while
-forward and input gradient reach 60 to 130. There it is a matrix product here: x against copies of
-the cotangent moved by every offset of the kernel, a few hundred pixels at a time so that the
-copies stay in a cache (33 to 80 GFLOP/s). The derivative is exact; other devices keep XLA's own.
+XLA:CPU computes that gradient as a convolution whose window is the whole image, at 10 to 30 GFLOP/s
+of one core for layers with few output features or images larger than a cache, while forward and
+input gradient reach 60 to 130. In these cases it is a matrix product here: x against copies of the
+cotangent shifted by every offset of the kernel, a few hundred pixels at a time so that the copies
+stay in a cache (33 to 80 GFLOP/s). The derivative is exact; other devices use XLA's own.
 """
 
 from __future__ import annotations
@@ -17,11 +17,14 @@ from jax import lax
 
 Array = jax.Array
 
-PIXELS = 256  # of one product: at 48x48, 32 to 16 features, 1024 of them take 1.3 times as long...
-PRODUCT = 32 * 144 * PIXELS  # ...and multiplications: XLA lets two cores share one of twice as
-# many, which takes 1.8 times as long as one core alone (32 to 32 features at 128x128)
-FEW = 32  # output features, from which on XLA's gradient keeps up (67 to 95 GFLOP/s)...
-LARGE = 1 << 14  # ...on a batch of at most so many pixels (30 GFLOP/s at four of 128x128)
+PIXELS = 256  # of one product; 1024 take 1.3 times as long (48x48, 32 to 16 features)
+# Limit of multiplications of a product: XLA divides one of twice as many between two cores, which
+# takes 1.8 times as long as one core alone (32 to 32 features at 128x128).
+PRODUCT = 32 * 144 * PIXELS
+# XLA's gradient is used for FEW and more output features (67 to 95 GFLOP/s) on a batch of at most
+# LARGE pixels (30 GFLOP/s at four of 128x128).
+FEW = 32
+LARGE = 1 << 14
 
 
 def convolve(x: Array, kernel: Array) -> Array:
@@ -35,7 +38,8 @@ def convolve(x: Array, kernel: Array) -> Array:
 
 
 def for_flax(x: Array, kernel: Array, *_: Any, **__: Any) -> Array:
-    """`convolve` as `nn.Conv` calls it; its other arguments must be those of `convolve`."""
+    """`convolve` with the signature that `nn.Conv` calls. Its other arguments are ignored, and must
+    describe the same convolution."""
     return convolve(x, kernel)
 
 
@@ -85,7 +89,7 @@ def _kernel_gradient(x: Array, kernel: Array, cotangent: Array) -> Array:
     images = max(1, min(batch, pixels // (height * width)))
     images, more = (images, -batch % images) if rows == height else (1, 0)
     below, around = -height % rows, size // 2
-    x = jnp.pad(x, ((0, more), (0, below), (0, 0), (0, 0)))  # what is added counts nothing
+    x = jnp.pad(x, ((0, more), (0, below), (0, 0), (0, 0)))  # padding adds 0
     cotangent = jnp.pad(
         cotangent, ((0, more), (around, around + below), (around, around), (0, 0)))
     strips = (height + below) // rows

@@ -1,10 +1,11 @@
 """EV-FlowNet: an event tensor -> optical flow, by a U-Net without memory (Zhu et al., RSS 2018).
 
 Two forms: one linear prediction at full resolution, trained on true flow (Stoffregen et al.,
-ECCV 2020); or the original's predictions 256 tanh at four scales, each fed to the next decoder. Of
-the original that form has neither the batch norm nor the input, which are counts and last times
-per polarity, and its residual blocks end in a ReLU; its training had rotations, windows of one to
-five frame intervals and weight decay. The flow is (..., 2, H, W) = (x, y), px over the window.
+ECCV 2020); or the original's predictions 256 tanh at four scales, each fed to the next decoder. The
+second differs from the original by having no batch norm, another input (the original's is counts
+and last times per polarity) and a ReLU after residual blocks; the original was trained with
+rotations, windows of one to five frame intervals and weight decay. The flow is (..., 2, H, W) =
+(x, y), px over the window.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Array = jax.Array
 ENCODERS = 4
 BLOCKS = 2
 MOST_PX = 256.0  # what the original's tanh is scaled to
-NEAR_ZERO = 0.1  # px, what predictions begin with where features are 1
+NEAR_ZERO = 0.1  # px: initial predictions for features of 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,9 +54,9 @@ class EVFlowNet(Network):
     def init(self, key: Array, shape: tuple[int, int]) -> Params:
         """Fresh params by He et al., ICCV 2015, and predictions near zero flow.
 
-        Flax's own kernels halve the variance at each layer with a ReLU, of which the deepest path
-        has eight and the shortest two: what sees motion of many pixels would hardly be heard. And
-        where the flow leaves the image, frames teach nothing.
+        Flax's default kernels halve the variance at each layer with a ReLU. The deepest path has
+        eight of these, the shortest two, so the path for large motion would contribute little.
+        Predictions start near zero, as flow that leaves the image gets no gradient from frames.
         """
         params = super().init(key, shape)
         near_zero = NEAR_ZERO if self.scales == 1 else NEAR_ZERO / MOST_PX
@@ -71,8 +72,8 @@ class EVFlowNet(Network):
         return jnp.moveaxis(image, -1, -3)
 
     def pyramid(self, params: Params, voxels: Array) -> tuple[Array, ...]:
-        """Flows at 1/8, 1/4, 1/2 and full resolution (scales = 4), or the one, each in pixels of
-        its own; of tensors whose H and W are multiples of 16."""
+        """Flows at 1/8, 1/4, 1/2 and full resolution (scales = 4), or only the last, each in pixels
+        of its own scale. H and W must be multiples of 16."""
         flows: Any = self.module().apply({"params": params}, voxels, method="flows")
         return tuple(self._finish(flow) for flow in flows)
 

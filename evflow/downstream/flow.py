@@ -20,11 +20,11 @@ from evflow.types import Events
 
 SAMPLED = 8  # windows by which the colours' scale is chosen
 FULL_PERCENTILE = 99.0
-SHARED = ("convention", "outlier_px")  # of a result: what is no mean
+SHARED = ("convention", "outlier_px")  # entries of a result that are no means
 
 
 def flow_of(trained: Trained) -> Trained:
-    """The network itself; EV020 where it gives images instead of flow."""
+    """The network; raises EV020 if it gives images instead of flow."""
     if not isinstance(trained.network, EVFlowNet):
         raise EvflowDataError("EV020", f"these weights are of {type(trained.network).__name__}, "
                               "which gives images.", "Choose weights of EV-FlowNet.")
@@ -38,8 +38,8 @@ def window_flows(trained: Trained, events: Events, edges_us: np.ndarray) -> Iter
 
 
 def full_motion(trained: Trained, events: Events, edges_us: np.ndarray) -> float:
-    """The motion in px a window that 1 % of the pixels with events exceed, of a few windows; at
-    least 1, so that noise at rest is no storm."""
+    """Motion in px per window that 1 % of the pixels with events exceed, over a few windows; at
+    least 1, so that noise at rest is not shown in full colour."""
     some = np.unique(np.linspace(0, len(edges_us) - 2, SAMPLED).astype(int))
     speeds = []
     for i in some:
@@ -60,9 +60,9 @@ class FlowTruth:
 
 
 def load_truth(path: str | os.PathLike, size: tuple[int, int]) -> FlowTruth:
-    """The true flow of an .npz for a sensor of `size`: flow, edges_us and, where not all of it is
-    known, valid. Raises EV016 (no such file), EV008 (arrays missing), EV015 (another size), EV004
-    (edges fall)."""
+    """Read the true flow from an .npz with flow, edges_us and, if not all is known, valid, for a
+    sensor of `size`. Raises EV016 (no such file), EV008 (arrays missing), EV015 (another size),
+    EV004 (edges fall)."""
     if not Path(path).is_file():
         raise EvflowDataError("EV016", f"no file with the true flow at {path}.")
     data = load_npz(Path(path))
@@ -106,8 +106,8 @@ class FlowScores:
             self._events, self._edges[i:i + 2], flow[None], truth=truth, valid=valid))
 
     def result(self) -> dict[str, Any]:
-        """Means over the windows where a score is defined, None where none is; "windows": how
-        many had events."""
+        """Means over the windows where a score is defined, None without any; "windows": number with
+        events."""
         names = dict.fromkeys(name for row in self._rows for name in row)
         means: dict[str, Any] = {name: self._rows[0][name] for name in SHARED}
         for name in (n for n in names if n not in SHARED):

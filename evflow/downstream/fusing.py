@@ -1,10 +1,9 @@
 """The element-wise part of recurrent layers, written so that XLA:CPU fuses it well.
 
-Left alone, XLA fuses two things to their harm. A chain of cheap operations goes into each of its
-users: where a state is carried by such a chain and the sequence is unrolled, the gradient of a
-window is computed anew, for each of its uses, from those of all windows after it. And what is
-written into a concatenation of channels is computed with a branch for every number. Values and
-gradients are the plain ones, on every device; differentiable in reverse mode.
+Two default fusions are slow. A chain of cheap operations is recomputed in each of its users: if
+such a chain carries the state of an unrolled sequence, the gradient of a window is recomputed from
+those of all later windows. And operands of a concatenation of channels are computed with a branch
+per element. Values and gradients are unchanged, on every device; differentiable in reverse mode.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ Array = jax.Array
 
 @jax.custom_vjp
 def carried(state: Array) -> Array:
-    """The state (..., C) as it is. On a CPU its gradient goes through a product with the identity,
-    the cheapest operation that XLA does not fuse."""
+    """The unchanged state (..., C). On a CPU its gradient passes through a product with the
+    identity, the cheapest operation that XLA does not fuse."""
     return state
 
 
@@ -36,7 +35,7 @@ carried.defvjp(lambda state: (state, None), _cut)
 
 
 def joined(*parts: Array) -> Array:
-    """Arrays (..., C_i) -> (..., their channels after one another)."""
+    """Concatenation of arrays (..., C_i) along the channels."""
     dtype = jnp.result_type(*parts)
     whole = jnp.zeros((*parts[0].shape[:-1], sum(part.shape[-1] for part in parts)), dtype)
     at = 0

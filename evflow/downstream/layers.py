@@ -35,8 +35,8 @@ def upsample2(x: Array) -> Array:
 
 
 class FrozenBatchNorm(nn.Module):
-    """y = scale (x - mean) / sqrt(var + 1e-5) + bias by the stored statistics, which no gradient
-    reaches: a published network is run, or tuned with the statistics it has."""
+    """y = scale (x - mean) / sqrt(var + 1e-5) + bias with stored statistics, which get no gradient:
+    published networks are run, or fine-tuned, with their statistics."""
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -72,8 +72,8 @@ class ConvLayer(nn.Module):
 
 class TransposedConvLayer(nn.Module):
     """Transposed convolution 5x5, stride 2, padding 2, output padding 1: twice as large; then
-    as ConvLayer. The kernel is HWIO and already flipped, as a convolution of the input with
-    zeros between its pixels takes it."""
+    as ConvLayer. The kernel is HWIO and already flipped, for a convolution of the input with zeros
+    between its pixels."""
 
     features: int
     norm: str = "none"

@@ -23,7 +23,7 @@ DN = 255.0  # of a frame's white
 
 def reconstruction(images: Array, frames: Array, lpips_params: Params | None = None) -> Array:
     """Images and true frames (T, B, H, W) on [0, 1]: LPIPS with its weights, else L1 plus
-    1 - SSIM; both see structure rather than brightness, which events do not tell."""
+    1 - SSIM; both measure structure rather than brightness, which events do not determine."""
     if lpips_params is not None:
         return jnp.mean(lpips(lpips_params, images, frames))
     return jnp.mean(jnp.abs(images - frames)) + jnp.mean(1.0 - ssim(images, frames))
@@ -31,8 +31,8 @@ def reconstruction(images: Array, frames: Array, lpips_params: Params | None = N
 
 def temporal(images: Array, frames: Array, back: Array, visible: Array, skip: int = 2) -> Array:
     """Temporal consistency (Lai et al., ECCV 2018) of images after the first `skip`: the image
-    before, moved along the true flow, should be this one, where the frames themselves agree. S2R's
-    L0 counts what is compared, so its 2 is a skip of 1.
+    before, moved along the true flow, should equal this one, where the frames themselves do. S2R's
+    L0 is the first image compared, so its 2 is a skip of 1.
 
     images, frames, visible: (T, B, H, W); back (T, B, 2, H, W): from frame t to where its points
     were in frame t - 1.
@@ -66,13 +66,13 @@ def flow_l1(flow: Array, truth: Array, weight: Array | float = 1.0) -> Array:
 
 
 def photometric(flows: Sequence[Array], before: Array, after: Array) -> Array:
-    """Loss of flow without a true one, from the frames at a window's ends (EV-FlowNet, Zhu et al.,
-    RSS 2018, Eqs. 3-5), summed over scales: `after` read where the flow points should be `before`,
-    both (..., H, W) on [0, 1], and neighbours should move alike.
+    """Self-supervised loss of flow from the frames at a window's ends (EV-FlowNet, Zhu et al., RSS
+    2018, Eqs. 3-5), summed over scales: `after` warped by the flow against `before`, plus
+    smoothness.
 
-    flows: one (..., 2, h, w) per scale, px of that scale. Frames are compared in DN, as by its
-    authors: the weight of smoothness is that beside grey levels, and on [0, 1] it would outweigh
-    them. Outside the image is black: to leave it costs, or leaving all of it would be the best.
+    before, after: (..., H, W) on [0, 1]. flows: one (..., 2, h, w) per scale, px of that scale.
+    Frames are compared in DN, as by the authors, for whose scale the weight of smoothness was
+    chosen. Outside the image is black, so that flow out of the image is penalised.
     """
     total = jnp.zeros((), before.dtype)
     for flow in flows:
@@ -89,7 +89,7 @@ def _charbonnier(x: Array) -> Array:
 
 
 def _roughness(flow: Array) -> Array:
-    """Mean difference of neighbours: below, beside and along both diagonals."""
+    """Mean difference to neighbours: vertical, horizontal and along both diagonals."""
     pairs = ((flow[..., 1:, :], flow[..., :-1, :]), (flow[..., 1:], flow[..., :-1]),
              (flow[..., 1:, 1:], flow[..., :-1, :-1]), (flow[..., 1:, :-1], flow[..., :-1, 1:]))
     return sum((jnp.mean(_charbonnier(a - b)) for a, b in pairs), jnp.zeros(())) / len(pairs)

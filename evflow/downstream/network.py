@@ -27,8 +27,8 @@ PADDINGS = {"zeros": "constant", "reflect": "reflect"}
 class Network:
     """A network from event tensors (..., H, W, bins) to images; see the subclasses.
 
-    bins: channels of the event tensor; base: features of the first layer; padding: how H and W
-    are filled up to what the network can halve, at all sides, "zeros" or "reflect".
+    bins: channels of the event tensor; base: features of the first layer; padding: of H and W to
+    multiples of `stride`, at all sides, "zeros" or "reflect".
     """
 
     bins: int = 5
@@ -43,7 +43,7 @@ class Network:
 
     @property
     def stride(self) -> int:
-        """H and W are padded to a multiple of it."""
+        """H and W are padded to a multiple of this."""
         raise NotImplementedError
 
     def module(self) -> nn.Module:
@@ -55,11 +55,11 @@ class Network:
         raise NotImplementedError
 
     def _finish(self, image: Array) -> Array:
-        """(..., H, W, C) as `apply` gives it."""
+        """Convert (..., H, W, C) to the output of `apply`."""
         return image[..., 0]
 
     def init(self, key: Array, shape: tuple[int, int]) -> Params:
-        """Fresh params; shape: (H, W) of any input, of which they do not depend."""
+        """Fresh params; shape: (H, W) of any input (they do not depend on it)."""
         size = tuple(n + -n % self.stride for n in shape)
         x = jnp.zeros((1, *size, self.bins))
         variables = jax.jit(self.module().init)(key, x, self._start((1, *size), x.dtype))
@@ -92,7 +92,7 @@ class Network:
         return self._finish(image[..., top:top + height, left:left + width, :]), state
 
     def _require_state(self, state: State, voxels: Array) -> None:
-        """EV002 unless the state's arrays are those before a tensor like `voxels`."""
+        """Raise EV002 unless the state fits a tensor like `voxels`."""
         wanted = jax.tree.leaves(jax.eval_shape(lambda: self.start(voxels.shape[:-1])))
         have, fitting = ([jnp.shape(a) for a in leaves]
                          for leaves in (jax.tree.leaves(state), wanted))
@@ -102,8 +102,8 @@ class Network:
                 f"It follows a state of {fitting}; begin another size or batch with state=None.")
 
     def _pad(self, x: Array) -> tuple[Array, tuple[int, int]]:
-        """x with more rows and columns, of an odd number one more at the top and left, as the
-        published evaluations do; and how many were put there."""
+        """Padded x, and the rows and columns added at the top and left: the larger part of an odd
+        number, as in the published evaluations."""
         spare = [-n % self.stride for n in x.shape[-3:-1]]
         before = [(n + 1) // 2 for n in spare]
         if not any(spare):
@@ -114,7 +114,7 @@ class Network:
 
 
 def as_floats(voxels: Any, params: Params) -> Array:
-    """On the device, of the dtype that the network's numbers will have."""
+    """On the device, in the dtype of the network's arithmetic."""
     return jnp.asarray(voxels, jnp.result_type(voxels, *jax.tree.leaves(params)))
 
 
@@ -123,9 +123,9 @@ def run(
 ) -> tuple[Array, State]:
     """Event tensors (T, ..., H, W, bins) -> images (T, ..., H, W) and the last state.
 
-    train: that gradients will be taken. XLA:CPU runs the gradient of a convolution inside a loop
-    17 times slower than outside of one, so there the sequence is unrolled; elsewhere each step
-    is recomputed in the backward pass, which keeps the memory of one. Raises EV002 where the
+    train: whether gradients will be taken. XLA:CPU computes the gradient of a convolution within a
+    loop 17 times slower than outside, so on a CPU the sequence is unrolled; elsewhere each step is
+    recomputed in the backward pass, which needs the memory of one step only. Raises EV002 where
     shapes do not fit.
     """
     voxels = as_floats(voxels, params)

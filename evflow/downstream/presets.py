@@ -23,13 +23,13 @@ from evflow.errors import EvflowDataError
 KINDS: dict[str, type[Network]] = {"e2vid": E2VID, "firenet": FireNet, "evflownet": EVFlowNet}
 
 WIDE = SequenceConfig(prior=WidePrior())
-# Of scenes and cameras as those of images, half of the windows show fewer than one pixel in eight
-# anything to see a motion by. Noise on every bin would hide what deviation the events have.
+# With scenes and cameras as for images, in half of the windows fewer than one pixel in eight shows
+# any motion. Noise on every bin would hide the events' deviation.
 _FLOW = dataclasses.replace(
     WIDE, sequences=16, windows=2, crop=64, noise=0.0, prior=WidePrior(theta=(0.05, 0.5)),
     scene=dataclasses.replace(WIDE.scene, contrast=(0.5, 1.0), speed_px_s=(10.0, 350.0)))
-# Long enough to see scenes stand still: a memory of fewer windows fades. And many as a camera at
-# rest sees them: where little happens for long, noise must not grow into shapes.
+# Long enough for scenes that pause: a network trained on fewer windows forgets them. And many
+# scenes before a resting camera: noise must not accumulate into shapes where little happens.
 _LONG = dataclasses.replace(
     WIDE, sequences=3, windows=40, scene=dataclasses.replace(WIDE.scene, resting_fraction=0.4))
 _TINY = dataclasses.replace(WIDE, sequences=2, windows=4, crop=16, steps_per_window=2)

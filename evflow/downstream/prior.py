@@ -1,4 +1,4 @@
-"""A wide prior of cameras, for networks whose camera is not known at training: wider than the
+"""A wide prior of cameras, for networks trained without knowing their camera: wider than the
 estimate's prior, so that one network serves all."""
 
 from __future__ import annotations

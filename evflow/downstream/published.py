@@ -1,7 +1,8 @@
 """Published weights as params, matched by the names and shapes of their PyTorch modules.
 
 E2VID, E2VID+, FireNet (2020 and S2R's), EV-FlowNet (S2R's). The structure (sizes, decoder, norm,
-skips) is read off the arrays, so that networks of other sizes trained by the same code load too.
+skips) is derived from the arrays, so that networks of other sizes trained by the same code load
+too.
 """
 
 from __future__ import annotations
@@ -30,14 +31,13 @@ SPLIT_BINS = 10  # S2R's later models: five of ON events, then five of OFF
 def load_published(path: str | os.PathLike) -> tuple[Network, Params]:
     """The network and params of a published PyTorch checkpoint; no PyTorch is needed.
 
-    Raises what `read_checkpoint` does, EV007 where weights are not finite, EV018 where they are
-    of no known network.
+    Raises as `read_checkpoint`, EV007 where weights are not finite, EV018 for unknown networks.
     """
     return read_published(path)[:2]
 
 
 def read_published(path: str | os.PathLike) -> tuple[Network, Params, bool]:
-    """`load_published`, and whether the network wants its event tensors normalised."""
+    """`load_published`, and whether the network needs normalised event tensors."""
     checkpoint = read_checkpoint(path)
     with naming(path):
         network = recognise(checkpoint.arrays, checkpoint.settings)
@@ -47,14 +47,14 @@ def read_published(path: str | os.PathLike) -> tuple[Network, Params, bool]:
 
 def normalised(network: Network, arrays: Arrays) -> bool:
     """E2VID of 2019 and FireNet of 2020 were trained on normalised tensors; E2VID+, FireNet+ and
-    EV-FlowNet were not. The two FireNets are one network: their names tell them apart."""
+    EV-FlowNet were not. The two FireNets have one structure, and differ by the layers' names."""
     if isinstance(network, FireNet):
         return any("head.recurrent_block" in name for name in arrays)
     return isinstance(network, E2VID) and network.output == "sigmoid"
 
 
 def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network:
-    """The structure behind a state dict; EV018 where it is of no known network.
+    """The network of a state dict; EV018 if it is unknown.
 
     The output's activation and the padding are not in the weights: E2VID's own files, which
     have settings under "model" or batch norm, are sigmoid (if "final_activation" there is no
@@ -140,8 +140,8 @@ def _ours(layer: str, leaf: str, array: np.ndarray, transposed: bool) -> tuple[s
 
 
 def _stripped(arrays: Arrays) -> Arrays:
-    """Without the prefix of a module around the network. Names beside it stay as they are, to be
-    named as what does not belong."""
+    """Names without the prefix of a module around the network. Names without it are unchanged, and
+    will be reported as foreign."""
     for prefix in PREFIXES:
         if any(name.startswith(prefix) for name in arrays):
             return {name.removeprefix(prefix): array for name, array in arrays.items()}

@@ -15,7 +15,7 @@ _HALVES = {1: "first", 2: "second"}  # of a residual block
 
 
 def modules(network: Network) -> dict[str, str]:
-    """Our layer by the name of each module that a file of this network may have."""
+    """Our layer by each module name that a file of this network may have."""
     if isinstance(network, E2VID):
         return _e2vid(network)
     if isinstance(network, FireNet):
@@ -25,7 +25,7 @@ def modules(network: Network) -> dict[str, str]:
 
 
 def published(network: Network, path: str) -> str:
-    """What files call the weights at our path, "a or b" where they differ."""
+    """The published names of the weights at our path, "a or b" where files differ."""
     layer, _, ours = path.rpartition("/")
     leaf = next((theirs for theirs, name in LEAVES.items() if name == ours), "weight")
     return " or ".join(

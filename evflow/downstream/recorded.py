@@ -1,7 +1,7 @@
 """Training sequences from real recordings instead of simulation.
 
-What a recording does not tell stays out of the loss: there is no true flow (EV-FlowNet learns from
-the frames at the ends of its windows, see `losses.photometric`) and no temporal consistency.
+There is no true flow (EV-FlowNet learns from the frames at the ends of its windows, see
+`losses.photometric`) and so no temporal consistency.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class RecordedBank:
 def recorded_bank(
     recordings: Sequence[Recording], config: SequenceConfig, most_bytes: int = MOST_BYTES
 ) -> RecordedBank:
-    """Runs of config.windows neighbouring frame intervals without gap or fault, evenly spread over
-    all there are where they take more than most_bytes.
+    """Runs of config.windows neighbouring frame intervals without gap or glitch, evenly thinned to
+    most_bytes.
 
     Raises EV015 for recordings of several sizes or smaller than the crop, EV017 where no run is
-    long enough, and what `plan_windows` raises.
+    long enough, and as `plan_windows`.
     """
     sizes = {r.events.size for r in recordings}
     if len(sizes) != 1 or min(min(s) for s in sizes) < config.crop:
@@ -88,8 +88,8 @@ def _run(
 def sample_recorded(
     key: Array, bank: RecordedBank, config: SequenceConfig, _camera: Camera | None = None
 ) -> Sequences:
-    """A batch in the place of `sample_sequences`: random crops of random runs, with the same noise
-    on the tensors. The camera is whichever recorded them; flow is 0 and nothing counts as visible.
+    """A batch in place of `sample_sequences`: random crops of random runs, with the same noise on
+    the tensors. The camera is ignored; flow is 0 and no pixel counts as visible.
     """
     keys = jax.random.split(key, config.sequences)
 

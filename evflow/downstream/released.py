@@ -1,4 +1,4 @@
-"""Released event networks: parameters, with architecture and training in the model card.
+"""Released event networks, with architecture and training in the model card.
 
     trained = load_network("e2vid-small")          # released; or a .safetensors file of a training,
     trained = load_network("E2VID_plus.pth.tar")   # or a published checkpoint
@@ -22,14 +22,14 @@ from evflow.errors import EvflowDataError
 from evflow.network.weights import load_weights, model_card, save_weights, weights_path
 from evflow.process.provenance import sha256
 
-PUBLISHED = (".pth", ".pt", ".tar")  # where there is no such file; else any but .safetensors
+PUBLISHED = (".pth", ".pt", ".tar")  # for missing files; existing ones: all but .safetensors
 RELEASED = {"e2vid-small": "e2vid", "evflownet-small": "evflownet"}  # name: network
 
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A network with its params. normalised, split: whether its event tensors are; card: who made
-    it of what, empty for a published checkpoint; sha256: of the file, where there is one."""
+    """A network with its params. normalised, split: whether its event tensors are; card: model
+    card, empty for a published checkpoint; sha256: of the file, if there is one."""
 
     network: Network
     params: Params
@@ -48,7 +48,7 @@ def save_network(
     path: str | os.PathLike, network: Network, params: Params, card: dict[str, Any], *,
     normalised: bool = False, overwrite: bool = False,
 ) -> Path:
-    """Write a network as .safetensors; card: any JSON-ready dict that says how it was made."""
+    """Write a network as .safetensors; card: JSON-ready dict on its training."""
     kind = next(name for name, cls in KINDS.items() if type(network) is cls)
     card = card | {"network": kind, "structure": dataclasses.asdict(network),
                    "normalised": normalised}
@@ -76,7 +76,7 @@ def load_network(name_or_path: str | os.PathLike) -> Trained:
     try:
         network = kind(**card["structure"])
         expected = jax.eval_shape(lambda: network.init(jax.random.key(0), (16, 16)))
-    except Exception as e:  # a card may say anything
+    except Exception as e:  # a card may hold anything
         raise EvflowDataError("EV009", f"{file}: its model card does not describe a network "
                               f"({type(e).__name__}: {e}).") from e
     if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
@@ -86,7 +86,7 @@ def load_network(name_or_path: str | os.PathLike) -> Trained:
 
 
 def _file(name_or_path: str | os.PathLike) -> Path:
-    """Where the weights are; EV016 that says how to come by released ones that are missing."""
+    """The path of the weights; EV016 explains how to obtain missing released ones."""
     kind = RELEASED.get(str(name_or_path))
     try:
         return weights_path(name_or_path)

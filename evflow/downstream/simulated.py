@@ -1,12 +1,12 @@
 """Training sequences for the event networks, simulated on the device: scene, camera, event
 tensors, target frames and flow. One pure function of (key, bank, config).
 
-The camera is drawn from a prior, or is a measured one, of which every sequence sees a random
-crop: training data as that very camera would have recorded them.
+The camera is drawn from a prior, or is a measured one, with a random crop for every sequence:
+training data as this camera would record them.
 
-Time in a window runs from border to border here, as it is binned while it is simulated; of a
-recording (`event_tensor`) from its first event to its last, as published networks have it. Where
-a window holds hundreds of events the two are the same to a per cent.
+Time in a window is binned from border to border here, during simulation; in `event_tensor` from the
+first event to the last, as for published networks. With hundreds of events in a window the two
+agree to a per cent.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ Array = jax.Array
 
 @dataclasses.dataclass(frozen=True)
 class SequenceConfig:
-    """What the networks are trained on.
+    """Training data of the networks.
 
     sequences: a batch; windows: T of each; steps_per_window: rendered frames in one; crop: side
     in pixels; window_s: of a window. prior, model, scene: as everywhere.
-    pause, resume: chance a window that the scene stops, and that it goes on (S2R: .05, .1).
-    noise: deviation of Gaussian noise on every bin but of the first window; hot_pixels: at most
-    this share of pixels carries, in all bins and windows, a constant of the same deviation.
+    pause, resume: probability per window that the scene stops, and that it continues (S2R: .05,
+    .1). noise: std of Gaussian noise on every bin but of the first window; hot_pixels: largest
+    share of pixels with a constant offset of the same std in all bins and windows.
     """
 
     sequences: int = 8
@@ -71,8 +71,8 @@ class SequenceConfig:
 class Sequences:
     """T windows of B sequences, time first as the networks run.
 
-    tensors (T, B, H, W, bins): signed events of each window; noise, of the same shape: what is
-    put on them for training. borders (T + 1, B, H, W): frames at the windows' borders, on [0, 1].
+    tensors (T, B, H, W, bins): signed events of each window; noise, of the same shape: to be added
+    for training. borders (T + 1, B, H, W): frames at the windows' borders, on [0, 1].
     flow (T, B, 2, H, W): (x, y) px over the window, at its start. back (T, B, 2, H, W): from its
     end to where that point was at its start; visible (T, B, H, W): it was seen there.
     """
@@ -95,8 +95,7 @@ class Sequences:
         return self.borders[1:]
 
     def given(self, normalised: bool) -> Array:
-        """What a network gets: the noise goes on top of normalised events, as it would else be
-        taken for events and measured with them."""
+        """Input of a network. Noise is added after normalisation, which would else include it."""
         return (normalise(self.tensors) if normalised else self.tensors) + self.noise
 
 
@@ -131,21 +130,21 @@ def _sequence(
 
 
 def scene_clock(key: Array, config: SequenceConfig) -> Array:
-    """Scene time (T * steps + 1,) in s: it stands still in some windows, as the world does."""
+    """Scene time (T * steps + 1,) in s, which pauses in some windows."""
     def window(running: Array, draw: Array) -> tuple[Array, Array]:
         running = jnp.where(running, draw >= config.pause, draw < config.resume)
         return running, running
 
     draws = jax.random.uniform(key, (config.windows,))
     _, running = jax.lax.scan(window, jnp.array(True), draws)
-    # Whole steps are added: a sum of seconds would drift, and never quite stand still.
+    # Whole steps are added: sums of seconds would drift, also in pauses.
     steps = jnp.cumsum(jnp.repeat(running.astype(jnp.int32), config.steps_per_window))
     steps = jnp.concatenate([jnp.zeros(1, steps.dtype), steps])
     return steps.astype(jnp.float32) * (config.window_s / config.steps_per_window)
 
 
 def _draw(key: Array, prior: CameraPrior | WidePrior, frame: Array) -> Camera:
-    """A camera of the prior that looks at the frame (H, W), by whose light its noise may go."""
+    """A camera of the prior; its noise may depend on the light of the frame (H, W)."""
     height, width = frame.shape
     if isinstance(prior, WidePrior):
         return prior.sample(key, (height, width))
@@ -154,7 +153,7 @@ def _draw(key: Array, prior: CameraPrior | WidePrior, frame: Array) -> Camera:
 
 
 def _crop(key: Array, camera: Camera, shape: tuple[int, int]) -> Camera:
-    """A random part of a camera's maps, or of one of several cameras'."""
+    """A random crop of a camera's maps, or of one of several cameras."""
     k_row, k_column, k_which = jax.random.split(key, 3)
     *several, rows, columns = camera.shape
     start = [jax.random.randint(k_row, (), 0, rows - shape[0] + 1),
@@ -188,17 +187,18 @@ def draw_noise(key: Array, config: SequenceConfig) -> Array:
 
 
 def has_events(tensors: Array) -> Array:
-    """Where (..., H, W) the tensors (..., H, W, bins) hold more than what a lone event leaves."""
+    """(..., H, W) bool: pixels of tensors (..., H, W, bins) with more than a single event."""
     return jnp.abs(tensors).sum(-1) > 1.0
 
 
 def _flows(scene: Scene, edges: Array, shape: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Flow of every window forward and back, and what of its end was visible at its start."""
+    """Flow of every window, forward and back, and which pixels of its end were visible at its
+    start."""
     def window(ends: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         there, _ = optical_flow(scene, *ends, shape)
         return there, *optical_flow(scene, *ends[::-1], shape)
 
-    # A loop, whose results are kept: under vmap XLA works the flow out again wherever the loss
-    # reads it, and a training step takes twice as long.
+    # A loop, so that results are stored: under vmap XLA recomputes the flow wherever the loss reads
+    # it, and a training step takes twice as long.
     flows: tuple[Array, Array, Array] = jax.lax.map(window, (edges[:-1], edges[1:]))
     return flows

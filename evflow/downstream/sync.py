@@ -1,5 +1,5 @@
-"""The instants at which a network runs on a stream of events: at the frames, after a fixed
-number of events, or at equal intervals."""
+"""Times at which a network runs on a stream of events: at the frames, after a fixed number of
+events, or at equal intervals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evflow.types import Recording
 
 Sync = Literal["auto", "frames", "events", "ms"]
 
-PER_PIXEL = 0.35  # events a pixel in a window, what E2VID was published with
+PER_PIXEL = 0.35  # events per pixel in a window, as published for E2VID
 WINDOW_US = 33_000
 MOST_WINDOWS = 10_000_000  # four days of them; a clock that jumps to Unix time makes 5e10
 
@@ -21,9 +21,9 @@ def sync_times(
     recording: Recording, sync: Sync = "auto", *, count: int | None = None,
     window_us: int = WINDOW_US,
 ) -> np.ndarray:
-    """Rising instants (T,) int64 us, each the end of a window: of the frames; of every `count`
-    events (default: .35 a pixel); or of every window_us from the first event on. What is left at
-    the end and fills no window is left out, but one window there always is.
+    """Increasing times (T,) int64 us, the ends of windows: at the frames; after every `count`
+    events (default: .35 per pixel); or every window_us from the first event on. An incomplete
+    window at the end is left out, unless it is the only one.
 
     auto: the frames, where there are two or more, else equal intervals.
     Raises EV001 (no events), EV011 (no frames to follow), EV020 (another sync, a count or length
@@ -47,7 +47,7 @@ def sync_times(
         if not _counts(count):
             raise EvflowDataError("EV020", f"{count!r} events a window.",
                                   "Give a whole number, one or more.")
-        # Two windows can end within one microsecond: they are one.
+        # Windows that end at the same microsecond are merged.
         return np.unique(t[count - 1::count] if count <= len(t) else t[-1:])
     if not _counts(window_us):
         raise EvflowDataError("EV020", f"windows of {window_us!r} us.",
@@ -67,9 +67,9 @@ def _counts(value: object) -> bool:
 
 
 def window_edges(recording: Recording, times: np.ndarray) -> np.ndarray:
-    """The edges (T + 1,) int64 of the windows that end at times (T,): the first begins with the
-    first event; a time that is not after it ends no window. Where none is, EV012 of frames and
-    EV017 of events; EV001 without events or times."""
+    """Edges (T + 1,) int64 of the windows that end at times (T,). The first window begins at the
+    first event; times up to it are left out. Raises EV012 (frames) or EV017 (events) where none is
+    left, EV001 without events or times."""
     if not len(recording.events) or not len(times):
         what = "times to end windows" if len(recording.events) else "events"
         raise EvflowDataError("EV001", f"there are no {what}.")

@@ -1,8 +1,8 @@
-"""Event tensors as E2VID, FireNet and EV-FlowNet take them, and video from a stream of events.
+"""Event tensors of E2VID, FireNet and EV-FlowNet, and video from a stream of events.
 
-B signed bins: t* = (B - 1)(t - t_first) / (t_last - t_first) between the first and the last
-EVENT of a window, polarity +-1, bilinear in time. E2VID and FireNet want it normalised, E2VID+
-and FireNet+ (S2R) raw, which keeps the scale of the camera's thresholds in it.
+B signed bins: t* = (B - 1)(t - t_first) / (t_last - t_first) between the first and the last EVENT
+of a window, polarity +-1, bilinear in time. E2VID and FireNet need normalised tensors, E2VID+ and
+FireNet+ (S2R) raw ones, which keep the scale of the camera's thresholds.
 """
 
 from __future__ import annotations
@@ -46,15 +46,14 @@ def event_tensor(events: Events, bins: int = BINS, split: bool = False) -> np.nd
     late = position - low
     size = height * width * bins
     grid = np.bincount(index, sign * (1.0 - late), size)
-    inside = low < steps - 1  # the last event falls on the last bin: nothing is left for a next
+    inside = low < steps - 1  # the last event is on the last bin, with no share in a next one
     grid += np.bincount(index[inside] + 1, (sign * late)[inside], size)
     return grid.astype(np.float32).reshape(height, width, bins)
 
 
 def prepared(events: Events, bins: int = BINS, split: bool = False) -> np.ndarray:
-    """`event_tensor`, of split bins scaled as S2R's later models are given them ("RobustNorm" of
-    its inference): cut off at the 95th percentile of all entries, which becomes 1. Where that is
-    0, as most entries are, it stays as it is."""
+    """`event_tensor`; split bins are scaled as for S2R's later models ("RobustNorm"): clipped at
+    the 95th percentile of all entries, which becomes 1. Unchanged where that is 0."""
     tensor = event_tensor(events, bins, split)
     if not (split and tensor.size):
         return tensor
@@ -70,21 +69,21 @@ def signed(voxels: Array) -> Array:
 
 
 def normalise(tensor: Array) -> Array:
-    """(..., H, W, B): its entries other than 0 with mean 0 and standard deviation 1 over the
-    whole tensor, 0 kept. One value alone becomes 0."""
+    """(..., H, W, B), with nonzero entries scaled to mean 0 and standard deviation 1 over the whole
+    tensor; zeros are kept. A single distinct value becomes 0."""
     axes = (-3, -2, -1)
     some = (tensor != 0).astype(tensor.dtype)
     count = jnp.maximum(some.sum(axes, keepdims=True), 1.0)
     off_mean = some * (tensor - tensor.sum(axes, keepdims=True) / count)
     variance = (off_mean**2).sum(axes, keepdims=True) / count
     varies = variance > 1e-30
-    # The root is taken of 1 where it is not used: its gradient at 0 would make all of them NaN.
+    # The unused root is taken of 1, as its gradient at 0 would make all gradients NaN.
     return off_mean * jnp.where(varies, jax.lax.rsqrt(jnp.where(varies, variance, 1.0)), 0.0)
 
 
 def windows_between(times_us: np.ndarray, frame_times_us: np.ndarray) -> list[slice]:
-    """Which events make each frame: those since the one before, up to its time stamp; of the
-    first frame, since the beginning."""
+    """Events of each frame: those since the frame before, up to its time stamp; for the first
+    frame, since the beginning."""
     stops = np.searchsorted(times_us, frame_times_us, "right")
     return [slice(int(a), int(b)) for a, b in zip([0, *stops[:-1]], stops, strict=True)]
 
@@ -100,11 +99,11 @@ def reconstructions(
     network: Network, params: Params, events: Events, frame_times_us: np.ndarray, *,
     normalised: bool = False, split: bool = False, hold: bool = False,
 ) -> Iterator[np.ndarray]:
-    """What `reconstruct` stacks, one at a time: images (H, W), or flow (2, H, W).
+    """Outputs of `reconstruct`, one at a time: images (H, W), or flow (2, H, W).
 
-    hold: where not one event came since the image before, that one again, and the memory as it
-    was; a network's memory of a scene fades after more windows than it was trained on.
-    Raises, before the first image, what `reconstruct` raises.
+    hold: without any event since the image before, yield that image again and keep the state; a
+    network forgets a scene after more windows than it was trained on. Raises as `reconstruct`,
+    before the first image.
     """
     times = np.asarray(frame_times_us)
     if not times.size:
@@ -112,7 +111,7 @@ def reconstructions(
     if times.dtype.kind not in "iu":
         raise EvflowDataError("EV003", f"frame_times_us has dtype {times.dtype}.",
                               "Times are integer microseconds: np.rint(t * 1e6).astype(np.int64).")
-    times = times.astype(np.int64)  # differences of unsigned ones never fall
+    times = times.astype(np.int64)  # unsigned differences are never negative
     if np.any(np.diff(times) < 0):
         raise EvflowDataError("EV004", "frame_times_us falls.", "Pass them in order.")
 

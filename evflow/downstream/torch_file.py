@@ -1,8 +1,8 @@
-"""PyTorch checkpoints as NumPy arrays, without PyTorch and without running what they hold.
+"""PyTorch checkpoints as NumPy arrays, without PyTorch and without executing their pickles.
 
-Both containers are read: the zip of PyTorch 1.6 and later, and the chain of pickles before it
-(the published E2VID, FireNet and EV-FlowNet files). Names are allow-listed: tensors are built,
-objects of the training code (configuration, paths) are dropped, anything else is refused.
+Both containers are read: the zip of PyTorch 1.6 and later, and the older chain of pickles (the
+published E2VID, FireNet and EV-FlowNet files). Names are allow-listed: tensors are built, objects
+of the training code (configuration, paths) are dropped, anything else is refused.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ MAGIC = 0x1950A86A20F9469CFC6C  # of the chain of pickles
 PROTOCOL = 1001
 MOST_BYTES = 2**31  # E2VID with its optimiser takes 128 MB
 MOST_AXES = 8
-MOST_EXPANDED = 1 << 24  # elements of a tensor that shows those of its storage repeatedly
+MOST_EXPANDED = 1 << 24  # elements of a tensor that repeats those of its storage
 STORAGES = {
     "Float": "<f4", "Double": "<f8", "Half": "<f2", "Long": "<i8", "Int": "<i4", "Short": "<i2",
     "Char": "i1", "Byte": "u1", "Bool": "?", "BFloat16": "<u2",
 }
 WRAPPERS = ("module.", "_orig_mod.")
-# What a training program puts beside its weights, of which nothing is needed.
+# Objects that training programs save beside the weights, and which are dropped.
 DROPPED = (
     "parse_config.ConfigParser", "pathlib.PosixPath", "pathlib.PurePosixPath",
     "pathlib.WindowsPath", "pathlib.PureWindowsPath", "pathlib._local.PosixPath",
@@ -73,8 +73,8 @@ class Checkpoint:
 
 
 def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
-    """Weights from a file of torch.save: its "state_dict", else the one dict in it that holds
-    tensors, else the dict itself. Prefixes "module." and, where all have it, "model." are cut.
+    """Weights from a file of torch.save: its "state_dict", else the only dict in it that holds
+    tensors, else the dict itself. The prefixes "module." and, if all have it, "model." are removed.
 
     Raises EV016 (no file), EV008 (not a PyTorch file), EV009 (damaged, or it holds what no
     checkpoint needs), EV018 (no weights in it), EV020 (larger than 2 GiB).
@@ -131,8 +131,8 @@ def _read_chain(path: Path) -> Any:
 
 
 def _read_zip(path: Path) -> Any:
-    """The members data.pkl and data/<key> of the archive's one folder. What the pickle asks for is
-    judged outside of `unzipped`, to which all that is wrong is damage."""
+    """The members data.pkl and data/<key> of the archive's one folder. The pickle is read outside
+    of `unzipped`, which reports any error as damage."""
     with unzipped(path) as archive:
         sizes = {info.filename: info.file_size for info in archive.infolist()}
         roots = [n.removesuffix("data.pkl") for n in sizes if n.endswith("/data.pkl")]
@@ -161,8 +161,8 @@ def _ordered(*items: Any) -> dict[Any, Any]:
 
 
 def _refer(found: dict[str, _Storage], there: int, identity: Any) -> _Storage:
-    """("storage", type, key, location, elements, None): a storage, noted in `found`. there: the
-    bytes that all of them may take."""
+    """A storage from ("storage", type, key, location, elements, None), recorded in `found`. there:
+    limit of the bytes of all storages."""
     if not (isinstance(identity, tuple) and len(identity) in (5, 6) and identity[0] == "storage"):
         raise ValueError("a storage is referred to in an unknown way")
     _, named, key, _, count, *view = identity
@@ -205,7 +205,7 @@ def _whole(value: Any) -> bool:
 
 
 def _array(tensor: np.ndarray) -> np.ndarray:
-    """A copy of its own; bfloat16, the upper half of a float32, came as the only uint16."""
+    """A copy; uint16 is bfloat16, the upper half of a float32."""
     if tensor.dtype == np.uint16:
         return (tensor.astype(np.uint32) << 16).view(np.float32)
     return tensor.copy()
@@ -248,7 +248,7 @@ def _tensors(value: Any) -> dict[str, np.ndarray]:
 
 
 def _bare(name: str) -> str:
-    """Without what data-parallel and compiled modules put before the names of what they hold."""
+    """Names without the prefixes of data-parallel and compiled modules."""
     while name.startswith(WRAPPERS):
         name = name.partition(".")[2]
     return name

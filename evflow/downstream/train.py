@@ -34,10 +34,9 @@ Array = jax.Array
 class LearningConfig:
     """data: the sequences. steps, warmup, rate, clip: Adam whose rate rises for `warmup` steps
     and falls as a cosine, gradients clipped to a norm. temporal: weight of temporal consistency,
-    after the first `skip` images. elsewhere: weight, in the L1 of flow, of pixels where at
-    most one event is left after ON and OFF cancel (`has_events`). normalised: event tensors of
-    deviation 1, which hides the scale of the camera's thresholds.
-    seed: of params and data."""
+    after the first `skip` images. elsewhere: weight, in the L1 of flow, of pixels with at most one
+    net event (`has_events`). normalised: event tensors of std 1, which hides the scale of the
+    camera's thresholds. seed: of params and data."""
 
     data: SequenceConfig = dataclasses.field(default_factory=SequenceConfig)
     steps: int = 300
@@ -82,7 +81,7 @@ def init_state(
     network: Network, config: LearningConfig, tx: optax.GradientTransformation,
     params: Params | None = None,
 ) -> LearningState:
-    """The state before the first step; params: those to go on from, or None for fresh ones."""
+    """The state before the first step; params: to start from, or None for fresh ones."""
     k_params, k_run = jax.random.split(jax.random.key(config.seed))
     if params is None:
         params = network.init(k_params, (config.data.crop, config.data.crop))
@@ -130,8 +129,8 @@ def sequence_loss(
     network: Network, params: Params, sequences: Sequences, config: LearningConfig,
     lpips_params: Params | None = None,
 ) -> tuple[Array, dict[str, Array]]:
-    """The loss of a network on sequences, and its parts: of EV-FlowNet L1 of the flow, or the
-    photometric loss where it has four scales; else reconstruction and temporal consistency."""
+    """The loss of a network on sequences, and its parts: L1 of the flow for EV-FlowNet, the
+    photometric loss if it has four scales; else reconstruction and temporal consistency."""
     tensors = sequences.given(config.normalised)
     if isinstance(network, EVFlowNet):
         loss = _flow_loss(network, params, tensors, sequences, config.elsewhere)
@@ -147,7 +146,7 @@ def sequence_loss(
 def _flow_loss(
     network: EVFlowNet, params: Params, tensors: Array, sequences: Sequences, elsewhere: float
 ) -> Array:
-    """Without memory the windows are one batch."""
+    """All windows as one batch, as the network has no memory."""
     if network.scales == 1:
         flow, _ = network.apply(params, tensors)
         weight = jnp.where(has_events(sequences.tensors), 1.0, elsewhere)

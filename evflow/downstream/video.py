@@ -1,4 +1,4 @@
-"""Recordings through a trained network: frames for recordings without any, and scores of images
+"""Frames reconstructed by a trained network for recordings without any, and scores of images
 against recorded frames."""
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from evflow.notes import Note
 from evflow.types import Recording
 
 FRAME_US = 30_000  # windows that the released networks were trained on
-WARM_UP = 5  # images until a network's memory holds the scene: .15 s
-# Of log(theta / truth): .65 on hidden cameras (a constant: .39), 1.2 on a Newton's cradle.
+WARM_UP = 5  # images until a network has seen the scene: .15 s
+# RMS of log(theta / truth): .65 on hidden cameras (a constant: .39), 1.2 on a Newton's cradle.
 GUESS_ERROR = 1.0
 GUESSED = Note(
     "theta.guessed", "the frames were made from the events by a network: their contrast is its "
-    "guess, not measured light, and thresholds scale with it. Their errors are widened to what "
-    "such guesses were off by: as much as the thresholds themselves.")
+    "guess, not measured light, and thresholds scale with it. Their errors are widened by that of "
+    "such guesses, which is as large as the thresholds themselves.")
 SCORED_AT_ONCE = 64  # images held for scoring
 
 Progress = Callable[[int, int], None]
 
 
 def images_of(trained: Trained) -> Trained:
-    """The network itself; EV020 where it gives flow instead of images."""
+    """The network; raises EV020 if it gives flow instead of images."""
     if isinstance(trained.network, EVFlowNet):
         raise EvflowDataError("EV020", "these weights are of EV-FlowNet, which gives flow.",
                               "Choose weights of E2VID or FireNet.")
@@ -47,12 +47,24 @@ def with_reconstructed_frames(
     recording: Recording, trained: Trained | str = "e2vid-small", *, sync: Sync = "ms",
     window_us: int = FRAME_US, warm_up: int = WARM_UP, progress: Progress | None = None,
 ) -> Recording:
-    """The recording with frames that a network makes of its events, every window_us, in place of
-    any it has; float32 DN, the network's 0..1 as 0..255. The first `warm_up` are left out. A note
-    says that they are made, not seen: brightness and contrast are the network's guess.
+    """The recording with frames reconstructed from its events, in place of any it has.
 
-    Raises EV001 (no events), EV017 (too short), EV020 (a network that gives flow), and what
-    `load_network` raises.
+    A note says that they are reconstructed: brightness and contrast are the network's guess.
+
+    Args:
+        recording: with events.
+        trained: E2VID or FireNet, or the name or path of one.
+        sync: when to reconstruct, see `sync_times`.
+        window_us: interval of the frames for sync "ms".
+        warm_up: number of first frames to leave out.
+        progress: called with (done, all).
+
+    Returns:
+        A recording with float32 frames in DN, the network's 0..1 as 0..255.
+
+    Raises:
+        EvflowDataError: EV001 (no events), EV017 (too short), EV020 (a network that gives flow),
+            and as `load_network`.
     """
     name = trained if isinstance(trained, str) else "a given network"
     trained = images_of(load_network(trained) if isinstance(trained, str) else trained)
@@ -74,8 +86,8 @@ def with_reconstructed_frames(
 
 
 def doubted(found: CameraEstimate) -> CameraEstimate:
-    """An estimate against made frames: a note, and `GUESS_ERROR` of every threshold and
-    mismatch in its std, which all pixels share."""
+    """An estimate from reconstructed frames: adds a note, and `GUESS_ERROR` to the std of every
+    threshold and mismatch."""
     def widened(std: Any, of: Any, names: Iterable[str]) -> Any:
         return dataclasses.replace(std, **{
             name: jnp.hypot(getattr(std, name), GUESS_ERROR * getattr(of, name))
@@ -89,8 +101,8 @@ def doubted(found: CameraEstimate) -> CameraEstimate:
 
 
 class FrameScores:
-    """Scores of images against the frames of their times, `SCORED_AT_ONCE` of them in memory;
-    the first `warm_up` do not count."""
+    """Scores of images against frames at their times, computed for `SCORED_AT_ONCE` images at a
+    time; the first `warm_up` are skipped."""
 
     def __init__(
         self, protocol: ImageProtocol, lpips_params: Params | None, warm_up: int = WARM_UP
