@@ -22,6 +22,7 @@ from evflow.checks import COLUMNS, plain
 from evflow.errors import EvflowDataError
 from evflow.simulator import pack
 from evflow.simulator.active import BLOCK
+from evflow.simulator.arguments import check_arguments
 from evflow.simulator.circuits import circuit
 from evflow.simulator.constants import Constants
 from evflow.simulator.frames import blocks
@@ -70,7 +71,7 @@ def simulate(
         EvflowDataError: EV001 (fewer than two frames), EV002 (shapes), EV003 (dtype or range),
             EV004 (times do not increase), EV007 (NaN), EV014 (camera out of range, or more events
             or noise than an interval holds), EV015 (frames and camera of different size), EV020
-            (called within jit, vmap or grad).
+            (called within jit, vmap or grad; no key, camera or model).
 
     Example:
         >>> camera = ef.Camera.sample(jax.random.key(0), frames.shape[1:])
@@ -80,12 +81,15 @@ def simulate(
            for leaf in jax.tree.leaves((key, frames, times_us, camera, model))):
         raise EvflowDataError("EV020", "simulate was called within jit, vmap or grad.",
                               "There take simulate_voxels, or simulate_counts.")
+    check_arguments(key, camera, model)
     frames = np.asarray(plain("frames", frames))
     times_us = np.asarray(plain("times_us", times_us))
     if frames.ndim != 3 or times_us.shape != frames.shape[:1]:
         raise EvflowDataError(
             "EV002", f"frames {frames.shape} with times {times_us.shape}.",
-            "Expected (T, H, W) frames and T times in microseconds.")
+            "Expected (T, H, W) frames and T times in microseconds."
+            + (" Colour? evflow.light.colour.luma(frames[..., ::-1]) of R, G, B." if
+               frames.ndim == 4 and frames.shape[-1] == 3 else ""))
     video = blocks([frames], [times_us], camera.shape, BLOCK, copy=False)
     parts = list(_packed(key, video, camera, Constants.of(model or SensorModel())))
     height, width = camera.shape
@@ -133,6 +137,7 @@ def simulate_stream(
         ...     for events in ef.simulate_stream(key, frames, times_us, camera):
         ...         out.append(events)
     """
+    check_arguments(key, camera, model)
     video = blocks(frames_iter, times_iter, camera.shape, BLOCK, copy=True)
     packed = _packed(key, video, camera, Constants.of(model or SensorModel()))
     return packed if labels else (events for events, _ in packed)

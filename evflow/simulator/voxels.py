@@ -24,6 +24,7 @@ from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.simulator import circuits, noise, sensor
 from evflow.simulator.active import BLOCK
+from evflow.simulator.arguments import check_arguments
 from evflow.simulator.bins import Schedule
 from evflow.simulator.constants import Constants
 from evflow.simulator.grids import Touched, as_log, put, scan, scan_brownian
@@ -126,6 +127,7 @@ def simulate_voxels(
         >>> log_frames = to_log(frames)  # of evflow.light.log_maps
         >>> voxels = ef.simulate_voxels(key, log_frames, camera, frame_dt_s=1e-3)
     """
+    check_arguments(key, camera, model)
     law = Constants.of(model or SensorModel())
     log_frames = jnp.asarray(plain("log_frames", log_frames))
     if log_frames.dtype != jnp.uint8:
