@@ -65,7 +65,7 @@ def optimise_often_run() -> None:
     if quickly(os.environ):
         import jax
 
-        options = {"xla_backend_optimization_level": 1}
+        options = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": True}
         for where, names in OFTEN.items():
             module = importlib.import_module(where)
             for name in names:
