@@ -3,6 +3,8 @@ so that tests of the NumPy-only rooms never load it and subprocesses inherit it.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import gc
 import os
 import signal
@@ -20,6 +22,11 @@ remember(os.environ)
 # To look through what JAX has traced for what nobody needs, every 700 new objects, takes 4 % of the
 # time.
 gc.set_threshold(20_000, 20, 20)
+# Arrays of megabytes come and go: were each a mapping of its own, the system would fill it with
+# zeros every time, which takes longer than many programs run.
+with contextlib.suppress(AttributeError, OSError, TypeError):  # other libraries than glibc
+    for setting, size in ((-3, 1 << 30), (-1, (1 << 31) - 1)):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
+        ctypes.CDLL(None).mallopt(setting, size)
 # Of memory, that compiled programs may fill before they are forgotten: a fifth for each of two.
 MOST_MB = max(2500, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 5_000_000)
 

@@ -76,7 +76,8 @@ def trained() -> str:
     config = small_config(steps=2, warmup=1)
     tx = optimiser(config)
     bank = make_bank(jax.random.key(0), 4, photos=False, size=64, cutout_size=32)
-    state = init_state(config, tx, bank, "default")
+    # Committed, as in training/test_step.py, whose program this is.
+    state = jax.device_put(init_state(config, tx, bank, "default"), jax.devices()[0])
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)  # a minute less of compilation
     try:

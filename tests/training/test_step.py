@@ -28,7 +28,7 @@ from evflow.training.step import (
     step_key,
 )
 
-CONFIG = small_config(steps=40, warmup=2)
+CONFIG = small_config(steps=2, warmup=1)  # that of test_same_bytes.py: compiled once for both
 TX = optimiser(CONFIG)
 WEIGHTS = configs.LossConfig(inverse_flow=0.5)
 PARTS = ("summary", "condition", "change_l1", "parameter", "flow", "event", "inverse_flow",
@@ -120,8 +120,11 @@ def test_every_step_and_use_has_random_numbers_of_its_own(
 
 
 @pytest.mark.slow
-def test_the_summary_learns(bank: TextureBank, fresh: TrainState, step) -> None:
-    state, losses = fresh, []
+def test_the_summary_learns(bank: TextureBank) -> None:
+    config = small_config(steps=40, warmup=2)
+    tx = optimiser(config)
+    state, step, losses = init_state(config, tx, bank, "default"), jax.jit(
+        make_run_step(config, tx)), []
     for _ in range(40):
         state, metrics = step(state, bank)
         losses.append(float(metrics["loss/summary"]))

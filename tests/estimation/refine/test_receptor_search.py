@@ -59,26 +59,31 @@ def integrated(
 def events_of(
     path: np.ndarray, dt_s: float, delay_s: float, on: float, off: float, noise_hz: float = 0.0
 ) -> Events:
-    """Events of pixels that see path (T, H, W), instants dt_s apart: loops, one pixel at a time.
-    Noise of either polarity stores what is seen, as every event does."""
-    rows = []
+    """Events of pixels that see path (T, H, W), instants dt_s apart: one instant and event at a
+    time. Noise of either polarity stores what is seen, as every event does."""
     rng = np.random.default_rng(1)
-    for y, x in np.ndindex(path.shape[1:]):
-        a, b = rng.normal(on, 0.03 * on), rng.normal(off, 0.03 * off)
-        memory = path[0, y, x] + rng.uniform(-a, b)
-        for i in range(1, len(path)):
-            before, now = path[i - 1, y, x], path[i, y, x]
-            if noise_hz and rng.random() < 2 * noise_hz * dt_s:
-                memory = now
-                rows.append((x, y, round((i * dt_s + delay_s) * 1e6), rng.random() < 0.5))
-            while now - memory > a or memory - now > b:
-                up = now > memory
-                memory += a if up else -b
-                part = (memory - before) / (now - before)
-                rows.append((x, y, round(((i - 1 + part) * dt_s + delay_s) * 1e6), up))
-    rows.sort(key=lambda row: row[2])
-    x, y, t, p = (np.array(column) for column in zip(*rows, strict=True))
-    return Events(x, y, t + 10_000, p, SHAPE[::-1])
+    a, b = (rng.normal(theta, 0.03 * theta, path.shape[1:]) for theta in (on, off))
+    memory = path[0] + rng.uniform(-a, b)
+    rows = []
+
+    def happen(where: np.ndarray, at: np.ndarray, up: np.ndarray) -> None:
+        y, x = np.nonzero(where)
+        rows.append(np.stack([x, y, np.round((at * dt_s + delay_s) * 1e6)[where], up[where]]))
+
+    for i in range(1, len(path)):
+        before, now = path[i - 1], path[i]
+        if noise_hz:
+            struck = rng.random(now.shape) < 2 * noise_hz * dt_s
+            memory = np.where(struck, now, memory)
+            happen(struck, np.full(now.shape, i), rng.random(now.shape) < 0.5)
+        while (crossed := (now - memory > a) | (memory - now > b)).any():
+            up = now > memory
+            memory = memory + np.where(up, a, -b) * crossed
+            part = (memory - before) / np.where(crossed, now - before, 1.0)
+            happen(crossed, i - 1 + part, up)
+    x, y, t, p = np.concatenate(rows, 1).astype(np.int64)
+    order = np.argsort(t, kind="stable")
+    return Events(x[order], y[order], t[order] + 10_000, p[order] > 0, SHAPE[::-1])
 
 
 @pytest.mark.parametrize(("offset", "tau_s", "by_light"), [
