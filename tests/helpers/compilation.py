@@ -14,6 +14,7 @@ import importlib.metadata
 import os
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
+from typing import Any
 
 TESTS = Path(__file__).parents[1]
 OPTIMISED = "EVFLOW_TESTS_OPTIMISED"
@@ -54,10 +55,15 @@ def as_in_use() -> dict[str, str]:
     return environment
 
 
-def precise() -> dict[str, bool]:
+def precise() -> dict[str, Any]:
     """Compiler options for programs whose rounding is what is tested: the older emitters round
     double precision to some 4e-7."""
     return {"xla_cpu_use_fusion_emitters": True} if quickly(os.environ) else {}
+
+
+def often() -> dict[str, Any]:
+    """Compiler options for programs that run longer than they compile."""
+    return precise() and precise() | {"xla_backend_optimization_level": 1}
 
 
 def optimise_often_run() -> None:
@@ -65,12 +71,11 @@ def optimise_often_run() -> None:
     if quickly(os.environ):
         import jax
 
-        options = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": True}
         for where, names in OFTEN.items():
             module = importlib.import_module(where)
             for name in names:
                 plain = getattr(module, name).__wrapped__
-                setattr(module, name, jax.jit(plain, compiler_options=options))
+                setattr(module, name, jax.jit(plain, compiler_options=often()))
 
 
 def remember(environment: MutableMapping[str, str]) -> None:

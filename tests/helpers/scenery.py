@@ -11,6 +11,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from helpers.compilation import often
 
 from evflow.scenes import (
     Layer,
@@ -47,7 +48,7 @@ def draw(seed: int, config: SceneConfig | None = None, shape: tuple[int, int] = 
     return _draw(jax.random.split(jax.random.key(seed), 64), bank(), config or SceneConfig(), shape)
 
 
-@functools.partial(jax.jit, static_argnames="shape")
+@functools.partial(jax.jit, static_argnames="shape", compiler_options=often())
 def show(scenes: Scene, times: jax.Array, shape: tuple[int, int] = SHAPE) -> jax.Array:
     """Frames (N, T, H, W) of a batch of scenes."""
     return jax.vmap(lambda s: render(s, times, shape))(scenes)
