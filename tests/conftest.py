@@ -23,10 +23,12 @@ remember(os.environ)
 # time.
 gc.set_threshold(20_000, 20, 20)
 # Arrays of megabytes come and go: were each a mapping of its own, the system would fill it with
-# zeros every time, which takes longer than many programs run.
-with contextlib.suppress(AttributeError, OSError, TypeError):  # other libraries than glibc
-    for setting, size in ((-3, 1 << 30), (-1, (1 << 31) - 1)):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
-        ctypes.CDLL(None).mallopt(setting, size)
+# zeros every time, which takes longer than many a program runs.
+LIBC: Any = None
+with contextlib.suppress(AttributeError, OSError, TypeError):  # libraries other than glibc
+    LIBC = ctypes.CDLL(None)
+    for setting, megabytes in ((-3, 64), (-1, 256)):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
+        LIBC.mallopt(setting, megabytes << 20)
 # Of memory, that compiled programs may fill before they are forgotten: a fifth for each of two.
 MOST_MB = max(2500, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 5_000_000)
 
@@ -58,6 +60,8 @@ def _bounded_memory() -> Iterator[None]:
     if "jax" in sys.modules and int(resident) > MOST_MB * 1024:
         sys.modules["jax"].clear_caches()
         gc.collect()
+        with contextlib.suppress(AttributeError):
+            LIBC.malloc_trim(0)
 
 
 @pytest.fixture(scope="module")
