@@ -103,6 +103,9 @@ def measure(
     """`estimate_camera`, with what a report needs. stage(name) is called when one begins."""
     check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")),
                   effort=(effort, EFFORTS))
+    for name, call in (("progress", progress), ("until", until)):
+        if call is not None and not callable(call):
+            raise EvflowDataError("EV020", f"{name}={call!r}.", "It is a function, or None.")
     recording = recording_or_path
     if not isinstance(recording, Recording):
         stage("reading the file")

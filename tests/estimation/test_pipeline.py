@@ -172,6 +172,7 @@ def test_refusals(watched: tuple[Recording, Camera]) -> None:
     for code, call in (
         ("EV011", lambda: estimate_camera(bare, params)),
         ("EV020", lambda: estimate_camera(recording, params, refine="always")),
+        ("EV020", lambda: estimate_camera(recording, params, until=0.01)),
         ("EV016", lambda: estimate_camera("/nonexistent.aedat4", params)),
         ("EV020", lambda: estimate_camera(recording.events, params)),
     ):

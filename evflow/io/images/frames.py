@@ -28,6 +28,7 @@ from evflow.light.colour import (
     parse_pattern,
     seen_note,
 )
+from evflow.light.ranges import DARKEST_DN
 from evflow.notes import Note
 
 Frames = Iterator[tuple[np.ndarray, int]]
@@ -143,10 +144,11 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
     does not advance), EV007 (NaN), EV015 (the size changes); each message names the frame.
     """
     first: tuple[np.ndarray, np.dtype] | None = None
-    last, bright = 0, False
+    last, bright, peak = 0, False, 0
     for image in images:
         frame, bright = _seen(image, hints, bright, notes)
         depth = image.pixels.dtype
+        peak = max(peak, int(image.pixels.max(initial=0))) if depth == np.uint16 else peak
         if first is None:
             first = frame, depth
             said = {note.code for note in notes}  # may include the response already
@@ -171,6 +173,10 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
                 "All frames must have one bit depth and number of channels.", where=image.where)
         last = image.time_us
         yield frame, last
+    if hints.full_scale is None and 0 < peak <= DARKEST_DN * 257:
+        raise EvflowDataError(
+            "EV003", f"no value of the 16-bit frames is above {peak}, where white is 65535.",
+            f"Pass the value of white: --full-scale {values.likely_white(peak):g} (full_scale=).")
 
 
 def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> tuple[Array, bool]:

@@ -100,9 +100,10 @@ def _scaled(
         raise EvflowDataError("EV003", f"{where} spans {low:g}..{high:g}, with white at "
                               f"{white:g}: {told.what}?", told.fix, where=where)
     if high > white * 1.001:
+        likely = high if floats else likely_white(high)
         raise EvflowDataError(
             "EV003", f"{where} reaches {high:g}, beyond white at {white:g}.",
-            f"Pass the value of white: --full-scale {_likely_white(high, floats):g} (full_scale=).",
+            f"Pass the value of white: --full-scale {likely:g} (full_scale=).",
             where=where)
     return pixels.astype(np.float32) * np.float32(255 / white), bright or high > 0
 
@@ -130,7 +131,7 @@ def _check_finite(pixels: np.ndarray, where: str) -> None:
             "A log of dark pixels? Use linear intensity.", where=where)
 
 
-def _likely_white(high: float, floats: bool) -> float:
-    """The smallest usual white that is not below `high`."""
+def likely_white(high: float) -> float:
+    """The smallest usual white of integers that is not below `high`."""
     usual = [float(2**bits - 1) for bits in (8, 10, 12, 14, 16)]
-    return high if floats else next((white for white in usual if high <= white), high)
+    return next((white for white in usual if high <= white), high)

@@ -21,6 +21,7 @@ from evflow import (
     simulate_voxels,
     write_events,
 )
+from evflow.errors import EvflowDataError
 from evflow.io.source import open_frames
 from evflow.light.colour import luma, mosaic
 
@@ -174,3 +175,17 @@ def test_what_the_messages_tell_to_do_gives_the_light(tmp_path: Path) -> None:
 def test_voxels_of_what_are_no_logarithms(values: np.ndarray, code: str) -> None:
     assert code_of(lambda: simulate_voxels(
         KEY, values.astype(np.float32), CAMERA, frame_dt_s=1e-3)) == code
+
+
+@pytest.mark.parametrize(("bits", "white"), [(8, 255), (10, 1023)])
+def test_integers_of_few_bits_in_sixteen_need_their_white(
+    tmp_path: Path, bits: int, white: int
+) -> None:
+    frames = np.linspace(0, 2**bits - 9, 3 * 9 * 16).reshape(3, 9, 16).astype(np.uint16)
+    np.save(tmp_path / "a.npy", frames)
+    with pytest.raises(EvflowDataError, match=f"EV003.*--full-scale {white} "):
+        list(open_frames(tmp_path / "a.npy", fps=30).open())
+    seen = [frame for frame, _ in open_frames(tmp_path / "a.npy", fps=30, full_scale=white).open()]
+    np.testing.assert_allclose(seen, frames * (255 / white), rtol=1e-6)
+    np.save(tmp_path / "a.npy", np.concatenate([frames, 64 * frames]))  # begins in the dark
+    assert len(list(open_frames(tmp_path / "a.npy", fps=30).open())) == 6
