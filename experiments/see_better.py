@@ -101,7 +101,7 @@ def main(options: Options) -> dict[str, Any]:
     result = {k: gains.compared(scores) for k, scores in runs.scores(conditions).items()}
     untrained = runs.untrained(options.task)
     text = "\n\n".join((heading(options.task, options.preset, setting), gains.report(
-        result, options.task, runs.told(conditions), left, untrained)))
+        result, options.task, runs.camera_medians(conditions), left, untrained)))
     write_result(
         options.out / "see_better.json",
         {"targets": result, "without_network": untrained, "missing": left,

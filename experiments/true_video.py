@@ -28,7 +28,7 @@ from evflow.estimation.refine import pixel_posterior, refine_summary, refinement
 from evflow.recordings.windows import plan_windows
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
-from experiments.shared.known_video import known_path, noise_told
+from experiments.shared.known_video import known_path, noise_on_video
 from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH, protocols
 from experiments.shared.video_strata import mean, strata
@@ -64,7 +64,7 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     maps, _ = pixel_posterior(
         functools.reduce(operator.add, (c.evidence for c in known)), best)
     found = estimate_camera(recording, params)
-    told = noise_told(params, known, best, start)
+    rates = noise_on_video(params, known, best, start)
     signal, counts = hidden.signal_events(), recording.events.count_map()
     exposure = 1e-6 * recording.events.duration_us * counts[0].size
     result = {"speed": float(np.mean(np.concatenate([c.motion_px for c in chunks])))}
@@ -83,7 +83,7 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
             f"ours/{eta}": abs(float(getattr(found.summary, eta)) - noise),
             f"known/{eta}": float(np.sqrt(2 / np.pi * noise / exposure)),
             f"ours/{eta} beside the known video": abs(float(getattr(found.summary, eta)) - noise),
-            f"known/{eta} beside the known video": abs(float(told[i]) - noise)}
+            f"known/{eta} beside the known video": abs(float(rates[i]) - noise)}
     return result
 
 

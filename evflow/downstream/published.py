@@ -69,9 +69,9 @@ def recognise(arrays: Arrays, settings: dict[str, Any] | None = None) -> Network
     if "recurrent_block.Gates" in names:
         base, bins = _conv_sizes(arrays, "head.conv2d.weight")
         batch = "running_mean" in names
-        told = (settings or {}).get("model")
-        original = batch or told is not None
-        last = told.get("final_activation", "sigmoid") if isinstance(told, dict) else "sigmoid"
+        stated = (settings or {}).get("model")
+        original = batch or stated is not None
+        last = stated.get("final_activation", "sigmoid") if isinstance(stated, dict) else "sigmoid"
         return E2VID(
             bins=bins, base=base,
             encoders=count(r"encoders\.\d\.recurrent_block\.Gates\.weight"),

@@ -101,8 +101,8 @@ def _fwl_truth(
     known = jnp.isfinite(truth).all(0)
     known = known if valid is None else known & valid
     x, y, t, p, weight = events
-    told = known[y.astype(jnp.int32), x.astype(jnp.int32)]
-    weight = jnp.where(told, weight, 0.0)
+    valid_at = known[y.astype(jnp.int32), x.astype(jnp.int32)]
+    weight = jnp.where(valid_at, weight, 0.0)
     return fwl(x, y, t, p, weight, jnp.where(known[None], truth, 0.0), convention)
 
 

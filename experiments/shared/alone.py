@@ -1,8 +1,8 @@
-"""Who says it: the flow by itself, the set network by itself, and the whole estimate, each named.
+"""Maps of each estimator separately: flow, set network, whole estimate.
 
-Footnote 1 of the paper averages |map - value of the sequence| over the pixels of every window: so
-do the rows "one window". A map that is right about its pixels cannot make that small: with a
-mismatch of .15 the truth itself scores .114, as its pixels lie that far from the sequence's value.
+Footnote 1 of the paper averages |map - value of the sequence| over the pixels of every window, and
+so do the rows "one window". Even the true map does not make that small: at a mismatch of .15 it
+scores .114, the mean distance of its pixels from the sequence's value.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from evflow.estimation.unpooled import WINDOW_US
 from evflow.network.architecture import config_of
 from evflow.recordings.windows import iter_windows
 
-Maps = list[np.ndarray]  # (4, H, W) by PARAMETERS each: one, or one a window
+Maps = list[np.ndarray]  # (4, H, W) by PARAMETERS each: one, or one per window
 
 WINDOW, FLOW = "flow, one window", "flow, all windows"
 PAPER_WINDOW, PAPER_FLOW = "paper's flow, one window", "paper's flow, all windows"
 NETWORK, SUMMARY, WHOLE = "set network alone", "summary everywhere", "whole estimate"
 ESTIMATORS = (PAPER_WINDOW, PAPER_FLOW, WINDOW, FLOW, NETWORK, SUMMARY, WHOLE)
-RATES = (PAPER_WINDOW, WINDOW, NETWORK)  # whose noise rates are their own
+RATES = (PAPER_WINDOW, WINDOW, NETWORK)  # estimators that estimate noise rates themselves
 SAID = ("One window in one call is the paper's estimator, and `mae_sequence` its footnote 1: |map "
         "− θ| over pixels and windows. A map that is right about its pixels cannot have it small: "
         "the truth's own is the mean |pixel − θ|, .024 at a mismatch of .03 and .114 at .15. "
@@ -44,7 +44,7 @@ def paper_weights() -> Any:
 
 
 def pools(params: Any) -> bool:
-    """Whether the network has a summary of the camera, and tells errors."""
+    """Whether the network estimates a summary of the camera and errors."""
     return config_of(params).pool
 
 
@@ -54,7 +54,7 @@ def stacked(camera: Camera) -> np.ndarray:
 
 
 def everywhere(summary: Summary, shape: tuple[int, ...]) -> np.ndarray:
-    """A map (4, H, W) that is the summary in every pixel."""
+    """A constant map (4, H, W) of the summary."""
     values = np.array([float(getattr(summary, name)) for name in PARAMETERS])
     return np.broadcast_to(values[:, None, None], (4, *shape))
 
@@ -62,7 +62,7 @@ def everywhere(summary: Summary, shape: tuple[int, ...]) -> np.ndarray:
 def windows(
     params: Any, recording: Recording, min_window_us: int, summary: Summary | None
 ) -> Maps:
-    """What the flow says of each window alone, knowing the camera's summary if there is one."""
+    """The flow's maps of each window, given the camera's summary if there is one."""
     found = []
     for window in iter_windows(recording, min_window_us):
         voxels, dlogI, given = window_inputs(window)
@@ -73,9 +73,17 @@ def windows(
 def said(
     params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
 ) -> dict[str, Maps]:
-    """Maps by ESTIMATORS, of a recording whose whole estimate is `found`: those of the given
-    weights, and of the paper's, in windows as short as it was trained on. None of a scene at rest,
-    whose thresholds nobody tells."""
+    """Maps by ESTIMATORS.
+
+    Args:
+        params: weights; the paper's are used too, with windows as short as in its training.
+        recording: to estimate from.
+        found: its whole estimate.
+        min_window_us: of the windows.
+
+    Returns:
+        Maps by name; empty for a scene at rest, whose thresholds are undetermined.
+    """
     if not found.windows:
         return {}
 
@@ -100,8 +108,8 @@ def said(
 def fitted(
     params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
 ) -> dict[str, Fitted]:
-    """The estimators of `said` that give one map, but for the whole estimate, as systems that are
-    compared: their thresholds are the medians of their maps."""
+    """The estimators of `said` with one map (without the whole estimate) as compared systems;
+    their thresholds are the medians of the maps."""
     rows = {}
     for name, maps in said(params, recording, found, min_window_us).items():
         if name in (PAPER_FLOW, FLOW, NETWORK, SUMMARY):
@@ -112,8 +120,8 @@ def fitted(
 
 
 def rates(params: Any, recording: Recording) -> dict[str, np.ndarray]:
-    """Noise rates (2,) of the estimators in RATES, means over pixels and windows; NaN where there
-    is no window that shows events, or nothing that pools."""
+    """Noise rates (2,) of the estimators in RATES, means over pixels and windows; NaN without
+    windows with events, or without a set network."""
     found = dict.fromkeys(RATES, np.full(2, np.nan))
 
     def mean(maps: Maps) -> np.ndarray:

@@ -124,7 +124,7 @@ def estimator(weights: str | Path, *parts: str) -> tuple[str, dict[str, Any]]:
     if missing := [part for part in parts if part not in net]:
         raise EvflowDataError(
             "EV018", f"{weights} has no part {' and '.join(missing)}: its network ({name}) sees "
-            "every pixel alone, and tells no errors.", "Take weights of the default network.")
+            "every pixel alone, and estimates no errors.", "Take weights of the default network.")
     return name, net
 
 

@@ -1,8 +1,8 @@
-"""What networks are trained on: the cameras of each condition of `experiments.see_better`.
+"""The cameras that networks are trained for in each condition of `experiments.see_better`.
 
-Every condition gives maps of the same number K of cameras and of one size, so that one compiled
-training step serves them all: drawn ones, the target's own K times, or K draws from an estimate
-and its errors. Two have no maps: EventGAN's events, and the target's own recordings.
+Every condition gives maps of the same number K of cameras and of one size, so that they share one
+compiled training step: drawn ones, the target's K times, or K draws from an estimate and its
+errors. Two have no maps: EventGAN's events, and the target's own recordings.
 """
 
 from __future__ import annotations
@@ -36,9 +36,8 @@ Shape = tuple[int, int]
 
 DEFAULT, WIDE, WIDE_LOG, E2V = "default", "wide", "wide-log", "e2vid"
 OURS, ORACLE, RAW = "evflow", "oracle", "raw"
-FREE = (DEFAULT, WIDE, WIDE_LOG, E2V)  # that do not depend on the target
-# Thresholds .1 to 1 as many at .9 as at .2, or, of the prior that serves unknown cameras, .05 to 1
-# as many at .05 to .1 as at .5 to 1.
+FREE = (DEFAULT, WIDE, WIDE_LOG, E2V)  # independent of the target
+# Thresholds uniform in .1 to 1, or log-uniform in .05 to 1 (the prior for unknown cameras).
 PRIORS = {WIDE: WidePrior(theta=(0.1, 1.0), uniform=True), WIDE_LOG: WidePrior()}
 DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
 E2V_THETA = (0.18, 0.03)  # mean and deviation over cameras (Rebecq et al., PAMI 2021)
@@ -46,10 +45,9 @@ E2V_THETA = (0.18, 0.03)  # mean and deviation over cameras (Rebecq et al., PAMI
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Condition:
-    """label: its name in the tables; name: of the run, one for each thing that is trained;
-    targets: what it is tested on; make: maps of K cameras (K, H, W), or None where no simulated
-    camera makes the events; source: of the file that it rests on, so that another is not taken for
-    it; generator: weights of the EventGAN that makes the events."""
+    """One condition. label: its name in the tables; name: of the run, one per training; targets:
+    to test on; make: maps of K cameras (K, H, W), or None where events do not come from a simulated
+    camera; source: digest of the file that it is made from; generator: weights of EventGAN."""
 
     label: str
     name: str
@@ -61,7 +59,7 @@ class Condition:
 
 @dataclasses.dataclass(frozen=True)
 class Files:
-    """Conditions from files, by name: weights of estimators of ours, what they alone see; weights
+    """Conditions from files, by name: weights of our estimators, used without refinement; weights
     of EventGAN's generator; camera files."""
 
     estimators: dict[str, Path] = dataclasses.field(default_factory=dict)
@@ -85,8 +83,8 @@ def named_files(given: tuple[str, ...]) -> dict[str, Path]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workshop:
-    """What conditions are made of. record: a target's recording; count: K; folder: where
-    estimates are kept; params: of evflow's estimator."""
+    """Makes the cameras of conditions. record: returns a target's recording; count: K; folder: of
+    saved estimates; params: of evflow's estimator."""
 
     shape: Shape
     count: int
@@ -107,7 +105,7 @@ class Workshop:
         return jax.vmap(lambda key: PRIORS[name].sample(key, self.shape))(keys)
 
     def e2vid(self) -> Camera:
-        """Cameras of the original E2VID: one threshold a polarity for all pixels, no noise."""
+        """Cameras of the original E2VID: one threshold per polarity for all pixels, no noise."""
         mean, deviation = E2V_THETA
         drawn = mean + deviation * jax.random.normal(jax.random.key(4), (2, self.count, 1, 1))
         on, off = jnp.broadcast_to(
@@ -138,21 +136,21 @@ class Workshop:
         return jax.vmap(lambda key: whole.drawn(key, error))(keys)
 
     def estimated(self, target: Target) -> Camera:
-        """The target as `estimate_camera` sees its recording."""
+        """`estimate_camera` of the target's recording."""
         return self.kept(target, OURS, lambda r: estimate_camera(r, self.params))
 
     def mapped(self, target: Target, name: str, params: Params) -> Camera:
-        """The target as a network alone sees its recording."""
+        """Maps of the target's recording by a network alone."""
         return self.kept(target, name, lambda r: network_maps(r, params))
 
     def compared(self, target: Target, name: str) -> Camera:
-        """The target as a compared system sees its recording."""
+        """Estimate of the target's recording by a compared system."""
         return self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera)
 
     def kept(
         self, target: Target, name: str, measure: Callable[[Recording], Camera | CameraEstimate]
     ) -> Camera:
-        """What was measured of the target's recording, now or before."""
+        """A measurement of the target's recording, saved on first use."""
         path = self.folder / f"{target.name} {name}.npz"
         if not path.is_file():
             measured = measure(self.record(target))
@@ -162,9 +160,10 @@ class Workshop:
 
 
 def network_maps(recording: Recording, params: Params) -> Camera:
-    """Maps (H, W) that the network gives of a recording, averaged over its windows in y: neither
-    refinement nor its own word on how little a pixel tells, which leaves most of a weak network's
-    maps to the summary, makes up for its faults."""
+    """The network's maps (H, W) of a recording, averaged over its windows in y.
+
+    Without refinement, and without shrinking pixels to the summary by the network's std, which
+    would hide a weak network's errors."""
     config, summary = config_of(params), None
     if config.pool:
         summary, _ = finish(params, pool_recording(params, recording)[0])
@@ -226,14 +225,14 @@ def _bound(make: Callable[..., Camera], *arguments: Any) -> Callable[[], Camera 
 
 
 def digest(path: Path) -> str:
-    """Of a file's content; EV016 without the file."""
+    """Digest of a file's content; EV016 without the file."""
     if not path.is_file():
         raise EvflowDataError("EV016", f"no file at {path}.")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
-def told(camera: Camera) -> dict[str, float]:
+def camera_medians(camera: Camera) -> dict[str, float]:
     """Medians over all cameras and pixels, and the thresholds' spread within a camera."""
     medians = {k: float(np.median(v)) for k, v in dataclasses.asdict(camera).items()}
     spread = {f"sigma_{p}": float(np.median(np.std(getattr(camera, f"theta_{p}"), (-2, -1))))

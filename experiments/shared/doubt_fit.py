@@ -13,8 +13,8 @@ from evflow.estimation.refine.doubt import MOST_DEVIATIONS, relative_error
 from experiments.shared.rows import Rows
 
 FOLDS, STEPS = 5, 2000
-RIDGE = 20.0  # recordings' worth of evidence that a sign says nothing
-DEGREES = 8.0  # of Student's t: a few recordings say nothing and must not decide alone
+RIDGE = 20.0  # precision of the prior of a sign's weight, about 0
+DEGREES = 8.0  # of Student's t, which bounds the influence of a few uninformative recordings
 
 
 def fit(x: np.ndarray, left: np.ndarray, before: np.ndarray) -> dict[str, np.ndarray]:
@@ -61,7 +61,7 @@ def cross_validated(rows: Rows) -> np.ndarray:
 
 
 def figures_of(left: np.ndarray, std: np.ndarray, label: str) -> dict[str, float]:
-    """Of errors of log theta (N,) and their std."""
+    """Coverage of errors of log theta (N,) by their std, under a label."""
     z = np.abs(left) / std
     return {f"{label}/median_std": float(np.median(std)),
             f"{label}/inside_68": float((z < 1).mean()),

@@ -18,12 +18,12 @@ METRICS = ("mae_sequence", "mae_pixel", "mae_fired", "median")
 
 
 def inside(error: float, width: float) -> float:
-    """1 where an error is within the width, 0 where not, NaN where no width is told."""
+    """1 if the error is within the width, else 0; NaN without a finite width."""
     return float(abs(error) < width) if np.isfinite(width) else np.nan
 
 
 def mean(values: np.ndarray) -> float:
-    """Of what is finite; NaN of nothing."""
+    """Mean of the finite values; NaN without any."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else np.nan
 

@@ -20,9 +20,9 @@ from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.scenes import make_bank
 from experiments.shared.generated import Row, Windows, compare, figures, scene_of, simulated
+from experiments.shared.network_figures import HELD_OUT
 
 Array = jax.Array
-HELD_OUT = 4_000_037  # seed of scenes, textures and cameras never trained on
 COLUMNS = ("on", "off", "empty", "correlation", "two simulations", "relative")
 
 

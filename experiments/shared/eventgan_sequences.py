@@ -1,4 +1,4 @@
-"""Training sequences whose events EventGAN makes from their frames: it knows no camera."""
+"""Training sequences with events by EventGAN from their frames, without a camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def sample(
 
 
 def rebinning(bins: int, fewer: int) -> np.ndarray:
-    """(bins, fewer): how the events of a bin are shared out to the bins around its time; each
-    gives all it has."""
+    """(bins, fewer): weights that distribute a bin's events to the bins around its time; each row
+    sums to 1."""
     places = np.arange(bins) * ((fewer - 1) / (bins - 1))
     return np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(fewer)))

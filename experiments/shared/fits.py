@@ -21,8 +21,8 @@ def all_fits(params: Any, recording: Recording, systems: dict[str, System]) -> d
 
 
 def ours(params: Any, recording: Recording) -> dict[str, Fitted]:
-    """`estimate_camera` as one of the systems, whose thresholds are those of the summary, after
-    what is in it by itself."""
+    """`estimate_camera` as one of the systems, with the thresholds of its summary, after the
+    estimators that it contains."""
     start = time.perf_counter()
     span = min(40_000, int(recording.frame_times[-1] - recording.frame_times[0]))
     found = estimate_camera(recording, params, min_window_us=span)

@@ -1,5 +1,5 @@
-"""Paired gains of `experiments.see_better`: what a condition adds to another, how surely, and how
-much of the oracle's gain that is; the tables and the picture, with the paper's figures beside.
+"""Paired gains of `experiments.see_better`: differences between conditions with their intervals,
+and their share of the oracle's gain; tables and picture, beside the paper's figures.
 
 A difference is that of two networks of the same seed, averaged over clips; its 95 % interval is
 Student's over seeds. The bootstrap resamples clips, or seeds and clips for the share.
@@ -54,7 +54,7 @@ ABLATIONS = {
 
 def compared(rows: Rows) -> Result:
     """Every condition's means, its paired differences to default and wide, and its share of the
-    oracle's gain over default where that gain is sure."""
+    oracle's gain over default where that gain is significant."""
     result: Result = {}
     for label, measures in rows.items():
         result[label] = {}
@@ -75,7 +75,7 @@ def compared(rows: Rows) -> Result:
 
 
 def paired(one: dict[int, np.ndarray], *others: dict[int, np.ndarray]) -> list[np.ndarray]:
-    """Each as (seeds, clips), of the seeds that all have."""
+    """Each as (seeds, clips), for the seeds that all have."""
     seeds = sorted(set(one).intersection(*others))
     return [np.array([scores[s] for s in seeds]) for scores in (one, *others)]
 
@@ -204,7 +204,7 @@ def paper(task: str, labels: Collection[str] = ()) -> list[str]:
 
 def picture(result: dict[str, Result], path: Path) -> None:
     """Paired differences to default with their intervals; a row for every target, a panel for
-    every measure; the dashed line is the oracle's. Of no measures there is none."""
+    every measure; the dashed line is the oracle's. Without measures no file is written."""
     measures = [n for n in (*VIDEO, *FLOW) if n not in CONSTANT and any(
         n in m for rows in result.values() for m in rows.values())]
     if not measures:

@@ -1,4 +1,4 @@
-"""Generated windows of events against simulated ones: of the inverse direction, and EventGAN."""
+"""Generated windows of events (by the inverse direction or EventGAN) against simulated ones."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Row = dict[str, np.ndarray]
 MODEL = SensorModel(eta_intensity=True)
 SCENE = SceneConfig(speed_px_s=(5.0, 350.0), contrast=(0.2, 1.0))
 BINS = 16
-ENOUGH = 20  # events of a scene below which its correlation says nothing
+ENOUGH = 20  # events of a scene, for a meaningful correlation
 
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
-    """Whose cameras see them, how long they are, their pixels (H, W)."""
+    """Windows to generate: the cameras' prior, duration, (H, W)."""
 
     prior: CameraPrior
     window_s: float
@@ -60,8 +60,8 @@ def simulated(
 
 
 def compare(made: Array, one: Array, two: Array, where: Array) -> Row:
-    """Sums that add over scenes: generated voxels against two simulations of the same camera.
-    Correlations are those of a scene with at least ENOUGH events."""
+    """Additive sums: generated voxels against two simulations of the same camera. Correlations
+    count only for scenes with at least ENOUGH events."""
     def counts(voxels: Array) -> Array:
         on, off = jnp.split(voxels, 2, -1)
         return jnp.stack([on.sum(-1), off.sum(-1)])
@@ -81,7 +81,7 @@ def compare(made: Array, one: Array, two: Array, where: Array) -> Row:
 
 
 def figures(total: Row) -> dict[str, float]:
-    """Ratios of the added sums."""
+    """Ratios of the sums over scenes."""
     with_one, between, scenes = total["correlations"]
     ratio = total["made"] / total["simulated"]
     return {"on": float(ratio[0]), "off": float(ratio[1]),

@@ -1,4 +1,4 @@
-"""Scores of a trained network on clips of held-out scenes, one number a clip and measure."""
+"""Scores of a trained network on clips of held-out scenes, one number per clip and measure."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ class Clips:
 
 
 def scored_by(task: str, perceptual: bool = True) -> dict[str, Any]:
-    """The conventions of `VIDEO` or of `FLOW`, for "flow"; perceptual: LPIPS was at hand."""
+    """The conventions of `VIDEO`, or of `FLOW` for "flow". perceptual: with LPIPS."""
     if task == "flow":
         return {"fwl": CONVENTION.as_dict(), **ENDPOINTS}
     return {**dataclasses.asdict(PROTOCOL), "lpips_net": "alex v0.1" if perceptual else None}
 
 
 def installed_lpips(say: Callable[[str], object] | None = None) -> Params | None:
-    """Weights of LPIPS; None where they are not installed, and why to `say`."""
+    """Weights of LPIPS; None where they are not installed, with the reason passed to `say`."""
     try:
         return load_lpips()
     except EvflowDataError as error:
@@ -118,8 +118,8 @@ def flow_scores(flows: Array | np.ndarray, clips: Clips, skipped: int) -> Scores
 
 def without_network(task: str, clips: Clips, skipped: int, lpips: Params | None
                     ) -> dict[str, Scores]:
-    """The same scores of what needs no network: images of even grey; for "flow" none, and the mean
-    of each clip's true flow, which is not known to a network."""
+    """Scores of baselines without a network: uniformly grey images; for "flow" zero flow, and the
+    mean of each clip's true flow (which no network knows)."""
     if task == "video":
         return {"even grey": video_scores(jnp.full_like(clips.frames, 0.5), clips, skipped, lpips)}
     mean = np.nanmean(clips.flow[skipped:], (0, 3, 4), keepdims=True)

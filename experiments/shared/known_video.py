@@ -34,7 +34,7 @@ def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
                                evidence=evidence_of(sightings, first=first == 0))
 
 
-def noise_told(params: Any, known: list[Chunk], best: Summary, start: Summary) -> np.ndarray:
+def noise_on_video(params: Any, known: list[Chunk], best: Summary, start: Summary) -> np.ndarray:
     """Noise rates (2,) in Hz on the true video, by the separation of noise with a wide prior."""
     theta = np.array([float(best.theta_on), float(best.theta_off)])
     before = np.log([float(start.eta_on), float(start.eta_off)])

@@ -22,8 +22,8 @@ Score = Callable[[Any, Hidden, Protocol], Result]  # params, recording, what it 
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """What all recordings share. photos: whether the scenes show those of the training too;
-    images: a folder or COCO json of what they show instead."""
+    """Settings common to all recordings. photos: whether scenes also show the training's
+    photographs; images: a folder or COCO json of pictures to show instead."""
 
     weights: str
     seed: int
@@ -66,8 +66,8 @@ def study(
     score: Score[Result | None], setup: Setup, protocols: Sequence[Protocol], workers: int,
     title: str,
 ) -> list[Result]:
-    """`scores` of one recording of each protocol, numbered from 0; without those that are None,
-    of recordings that tell nothing."""
+    """`scores` of one recording of each protocol, numbered from 0; without those that are None
+    (insufficient recordings)."""
     rows = scores(score, setup, list(enumerate(protocols)), workers, title)
     return [row for row in rows if row is not None]
 

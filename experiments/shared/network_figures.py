@@ -17,6 +17,7 @@ from evflow.downstream.train import LearningConfig
 from evflow.metrics.flow import aee
 from evflow.metrics.image_scores import frame_scores
 from evflow.scenes import make_bank
+from experiments.shared.common import markdown
 from experiments.shared.held_out import PROTOCOL, installed_lpips
 
 Array = jax.Array
@@ -79,6 +80,4 @@ def _flow_figures(
 def table(result: dict[str, Any]) -> str:
     """Markdown, one row."""
     names = [name for name, value in result.items() if isinstance(value, int | float)]
-    cells = (f"{result[name]:.4g}" for name in names)
-    return "\n".join((f"| {' | '.join(names)} |", "|" + "---|" * len(names),
-                      f"| {' | '.join(cells)} |"))
+    return markdown(names, [[f"{result[name]:.4g}" for name in names]])

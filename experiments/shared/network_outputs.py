@@ -101,8 +101,8 @@ class Synthetic:
 
 
 def _outputs(trained: Trained, clips: held_out.Clips) -> Any:
-    """What a network makes of clips, time first; those that take other event tensors than the
-    clips', one clip after the other."""
+    """A network's outputs for clips, time first. Networks with other event tensors than the clips'
+    are run clip by clip."""
     network, params = trained.network, trained.params
     if network.bins == clips.tensors.shape[-1] and not trained.split:
         return held_out.outputs(network, params, clips.tensors, trained.normalised)
@@ -111,6 +111,6 @@ def _outputs(trained: Trained, clips: held_out.Clips) -> Any:
 
 
 def _mean(scores: np.ndarray) -> float | None:
-    """Of the clips that have a score; None where none has."""
+    """Mean over the clips with a score; None without any."""
     known = scores[np.isfinite(scores)]
     return float(known.mean()) if known.size else None

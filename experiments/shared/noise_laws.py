@@ -1,4 +1,4 @@
-"""What the sensors of `noise` should send: expected events on a changing screen and at rest."""
+"""Expected events of the sensors of `noise`, on a changing screen and at rest."""
 
 from __future__ import annotations
 

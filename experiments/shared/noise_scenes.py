@@ -83,5 +83,5 @@ def record(
 
 
 def counting(recording: Recording) -> np.ndarray:
-    """Events per pixel and second (2,), whatever sent them."""
+    """Events per pixel and second (2,), of any cause."""
     return recording.events.count_map().mean((1, 2)) / (1e-6 * recording.events.duration_us)

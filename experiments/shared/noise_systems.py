@@ -22,7 +22,7 @@ NOMINAL = SENSORS["v2e"].theta  # the threshold at which v2e's rate is r / 2
 
 
 def closed_forms(theta: np.ndarray, dn: float, bench: np.ndarray) -> Rates:
-    """What simulators say of nominal thresholds (2,) in this light. bench: rates (2,) of BENCH."""
+    """Rates by simulators' closed forms at nominal thresholds (2,). bench: rates (2,) of BENCH."""
     def shot(thresholds: np.ndarray, light: float) -> np.ndarray:
         return np.array([float(v2e_noise(t, light, nominal=NOMINAL)) for t in thresholds])
 
@@ -34,11 +34,11 @@ def closed_forms(theta: np.ndarray, dn: float, bench: np.ndarray) -> Rates:
 
 
 def scored(rates: Rates, name: str) -> dict[str, Any]:
-    """Mean |η - truth| over the cells, ON and OFF, with its 95 % interval over seeds; the share of
-    cells that the system has an answer for (only these are scored)."""
+    """Mean |η - truth| over the cells, ON and OFF, with its 95 % interval over seeds; "told" is the
+    share of cells with an answer (only these are scored)."""
     error = np.abs(rates[name] - rates["truth"])
-    told = np.isfinite(error).all(-1)
-    means = np.array([e[t].mean(0) for e, t in zip(error, told, strict=True) if t.any()])
+    answered = np.isfinite(error).all(-1)
+    means = np.array([e[t].mean(0) for e, t in zip(error, answered, strict=True) if t.any()])
     nothing = (float("nan"), 0.0)
-    return {"told": float(told.mean()), **{
+    return {"told": float(answered.mean()), **{
         side: mean_ci(means[:, i]) if len(means) else nothing for i, (side, _) in enumerate(SIDES)}}

@@ -14,8 +14,8 @@ JUDGED, BOUND = 10_000, 0.02
 
 
 def totals(result: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """What is judged, where the law gives at least JUDGED events: each screen, and of the noise
-    of each sensor and polarity the sums over luminance and the sums over thresholds."""
+    """Counts to compare with laws that give at least JUDGED events: each screen, and for the noise
+    of each sensor and polarity the sums over luminance and over thresholds."""
     sums = {f"{name} SCP {scp} {kind}": cell
             for name, rows in result["table II"].items()
             for scp, row in zip(SCP, rows, strict=True) for kind, cell in row.items()}
@@ -40,7 +40,7 @@ def cells(result: dict[str, Any]) -> dict[str, float]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Table II as ratios to SCP 161, then what deviates."""
+    """Table II as ratios to SCP 161, noise rates, and the largest deviations."""
     lines = []
     for p in ("on", "off"):
         lines += [f"| θ {p.upper()} | paper, events | paper | 1/θ | "

@@ -6,7 +6,7 @@ from evflow.camera import CameraPrior
 from evflow.camera.sensors import SENSORS, SensorModel
 from experiments.shared.cameras import Protocol
 
-ENOUGH = 200  # signal events of a polarity: all but the noise expected
+ENOUGH = 200  # signal events of a polarity (all minus expected noise)
 V2E = SensorModel(timestamps="v2e", noise_resets_memory=True)
 
 

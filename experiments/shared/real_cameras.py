@@ -1,4 +1,4 @@
-"""Cameras whose pixels are slow and whose frames are no measurement of light, by what differs."""
+"""Cameras that are not ideal (slow pixels, frames with offset, noise or exposure), by condition."""
 
 from __future__ import annotations
 
@@ -44,13 +44,12 @@ CHANGES: dict[str, dict[str, Any]] = {
 
 
 def added_light(protocol: Protocol) -> float:
-    """DN that pixels see beside the light of frames that show anything."""
+    """DN of light that pixels see in addition to the frames'."""
     return protocol.dark_dn - protocol.black_dn
 
 
 def shot_rates(hidden: Hidden, protocol: Protocol) -> np.ndarray:
-    """(2, H, W) the true noise rates ON and OFF in Hz: v2e's shot noise, and what is beside it but
-    for leak."""
+    """(2, H, W) true noise rates ON and OFF in Hz: v2e's shot noise and eta, without leak."""
     frames = hidden.recording.frames.astype(np.float64) - protocol.black_dn
     factor = noise_factor(normalised_intensity(np.clip(frames, 0.0, 255.0))).mean(0)
     half, camera = 0.5 * protocol.model.shot_hz * np.asarray(factor), hidden.camera
@@ -60,13 +59,13 @@ def shot_rates(hidden: Hidden, protocol: Protocol) -> np.ndarray:
 
 
 def ideal(protocol: Protocol) -> bool:
-    """Whether its pixels follow at once, and its frames show what they see."""
+    """Whether pixels have no low-pass, and frames measure the light that they see."""
     return not (protocol.model.cutoff_hz or protocol.model.refractory_s or protocol.exposure_ms
                 or protocol.dark_dn or protocol.black_dn or protocol.frame_noise_dn > 0.5)
 
 
 def draw_real(rng: np.random.Generator) -> Protocol:
-    """A camera as it may be: a quarter are ideal, of the others each part is absent in some."""
+    """A camera of the mixture: a quarter are ideal, the others have random imperfections."""
     mismatch = float(np.exp(rng.uniform(np.log(0.02), np.log(0.15))))
     protocol = dataclasses.replace(
         BASE, prior=CameraPrior(theta=(0.1, 0.5), mismatch=(mismatch, mismatch)),
@@ -94,7 +93,7 @@ def draw_real(rng: np.random.Generator) -> Protocol:
 
 
 def draw_other(rng: np.random.Generator) -> Protocol:
-    """What `draw_real` leaves out: DVS-Voltmeter's pixels, and else such a camera seen for 5 s."""
+    """Cameras beside `draw_real`: DVS-Voltmeter's pixels, else one of `draw_real` seen for 5 s."""
     protocol = draw_real(rng)
     if rng.random() < 0.2:
         return dataclasses.replace(protocol, intervals=round(5e3 / protocol.frame_ms))

@@ -1,4 +1,4 @@
-"""Cameras that are not ideal: what was measured of each beside what is true, and tables of it."""
+"""Measured against true values of cameras that are not ideal, and their tables."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def thresholds(found: CameraEstimate, truth: np.ndarray) -> Row:
 
 
 def score(params: Any, hidden: Hidden, protocol: Protocol) -> Row:
-    """What was measured of a camera, and what is true."""
+    """Measured and true values of a camera."""
     truth = np.array([float(hidden.nominal.theta_on), float(hidden.nominal.theta_off)])
     found = estimate_camera(hidden.recording, params)
     sensor, optics = found.sensor, found.optics
     row: Row = {
         "measured": thresholds(found, truth),
-        "sensor": {name: [getattr(sensor, name), told(found.sensor_std.get(name)),
+        "sensor": {name: [getattr(sensor, name), finite(found.sensor_std.get(name)),
                           getattr(protocol.model, name)] for name in MEASURED},
-        "light": [optics.offset_dn, told(optics.offset_dn_std), added_light(protocol)]}
+        "light": [optics.offset_dn, finite(optics.offset_dn_std), added_light(protocol)]}
     if protocol.model.shot_hz:
         maps = np.stack([found.camera.eta_on, found.camera.eta_off])
         sides = maps, shot_rates(hidden, protocol)
@@ -46,19 +46,19 @@ def score(params: Any, hidden: Hidden, protocol: Protocol) -> Row:
     return row
 
 
-def told(value: float | None) -> float | None:
-    """None for NaN, which JSON does not know."""
+def finite(value: float | None) -> float | None:
+    """The value; None for NaN, which JSON cannot represent."""
     return value if value is not None and np.isfinite(value) else None
 
 
 def score_ideal(params: Any, hidden: Hidden, _protocol: Protocol) -> Row:
-    """Thresholds of the estimate that takes pixels for ideal."""
+    """Thresholds of the estimate that assumes ideal pixels."""
     truth = np.array([float(hidden.nominal.theta_on), float(hidden.nominal.theta_off)])
     return thresholds(estimate_camera(hidden.recording, params, pixel="ideal"), truth)
 
 
 def key(name: str, number: int, *, ideal: bool = False) -> str:
-    """Of a row: a condition's camera, taken for ideal or not."""
+    """Key of a row: condition, number of the camera, whether assumed ideal."""
     return f"{name} {number}{' ideal' * ideal}"
 
 
@@ -77,7 +77,7 @@ def gathered(rows: dict[str, Row], names: Sequence[str]) -> dict[str, list[Row]]
 
 
 def held(error: np.ndarray, std: np.ndarray) -> str:
-    """How many per cent of errors lie within 1 and 1.96 std."""
+    """Per cent of errors within 1 and 1.96 std."""
     z = np.abs(error) / std
     return f"{100 * (z < 1).mean():.0f} / {100 * (z < 1.96).mean():.0f} %" if z.size else "–"
 

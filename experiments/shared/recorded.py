@@ -1,5 +1,5 @@
-"""Real recordings as event networks are evaluated on them: which part of a sequence counts, which
-events make which frame, and how histograms are equalised.
+"""Real recordings prepared for evaluating event networks: the scored part of a sequence, the events
+of each frame, and equalisation of histograms.
 
 The clock of a sequence starts at its first event or frame, whichever is earlier (EVREAL). An image
 is made at every frame's time, from the events since the frame before; networks with a memory run
@@ -23,8 +23,8 @@ from evflow import Recording, read_recording
 from evflow.errors import EvflowDataError
 from evflow.types import Events
 
-# Seconds from the start of the clock, of EVREAL's and S2R's evaluations; what is not here counts
-# as a whole (HQF, EVIMO2v2, one's own).
+# Seconds from the start of the clock, as in EVREAL's and S2R's evaluations; other sequences (HQF,
+# EVIMO2v2, the user's) are scored whole.
 CUTS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("boxes_6dof", "calibration", "dynamic_6dof", "poster_6dof", "shapes_6dof"),
                     (5.0, 20.0)),
@@ -41,7 +41,7 @@ ROBUST = (1.0, 99.0)  # percentiles that become 0 and 1
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Part:
-    """What is run of a sequence. edges_us (T + 1,): image i is made at edges_us[i + 1] of the
+    """The part of a sequence to run. edges_us (T + 1,): image i is made at edges_us[i + 1] from the
     events since edges_us[i]; the first `warmup` images are not scored; frames (T, H, W) on
     [0, 1], or None."""
 
@@ -61,7 +61,7 @@ def sequence_name(path: Path) -> str:
 
 
 def cut_of(path: Path) -> tuple[float, float]:
-    """Seconds (start, stop) of a sequence that count; all of one whose file is called cut."""
+    """Seconds (start, stop) of a sequence that are scored; all of it if its file is called cut."""
     whole = (0.0, np.inf)
     return whole if _stem(path).endswith("_cut") else CUTS.get(sequence_name(path).lower(), whole)
 
@@ -76,9 +76,9 @@ def read_part(
     path: Path, warmup_s: float, window_ms: float, cut: bool = True,
     size: tuple[int, int] | None = None,
 ) -> Part:
-    """The part of a sequence that counts, and its warm-up. window_ms: of recordings without
-    frames; size: (width, height) of the sensor, where the file does not tell it. Raises what
-    `read_recording` raises, and EV012 where nothing lies in the cut."""
+    """The scored part of a sequence, and its warm-up. window_ms: of recordings without frames;
+    size: (width, height) of the sensor, if the file does not contain it. Raises as
+    `read_recording`, and EV012 where the cut is empty."""
     start, stop = cut_of(path) if cut else (0.0, np.inf)
     recording = read_recording(path, size=size)
     return part_of(recording, sequence_name(path), start, stop, warmup_s, window_ms)

@@ -1,4 +1,4 @@
-"""What the fits of the refinement share: where it starts, and how wide its intervals are made."""
+"""Shared by the fits of the refinement: its inputs, and the coverage of its intervals."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier t
 
 
 def undoubted(params: Any, recording: Recording) -> tuple[Any, Summary, Summary] | None:
-    """What refine/doubt.py goes by, and the summary and its std without it; None where too little
-    happens."""
+    """The signs of refine/doubt.py, and the summary and its std before it is applied; None with too
+    few events."""
     if len(recording.events) < 10 or not plan_windows(recording).pairs:
         return None
     refined = refine(read_whole(recording, params))
@@ -27,8 +27,7 @@ def undoubted(params: Any, recording: Recording) -> tuple[Any, Summary, Summary]
 def before_refinement(
     params: Any, recording: Recording
 ) -> tuple[list[Chunk], Summary, Summary] | None:
-    """What the refinement starts from: chunks, the network's summary and its std; None where
-    nothing fired."""
+    """Inputs of the refinement: chunks, the network's summary and its std; None without events."""
     if len(recording.events) < 10:
         return None
     plan = plan_windows(recording)

@@ -1,4 +1,4 @@
-"""What was measured on many hidden recordings, stacked, and kept in a file to go on from."""
+"""Measurements of many hidden recordings, stacked, and saved in a file to resume from."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def collected(
     row: Callable[[Any, Hidden, Protocol], Row | None], setup: Setup,
     protocols: Sequence[Protocol], workers: int, path: Path | None, origin: str,
 ) -> Rows:
-    """Rows of one recording of each protocol, stacked, without those that are None. path: where
-    they are kept, and read from where it holds some of the same origin (weights, seed)."""
+    """Rows of one recording of each protocol, stacked, without those that are None. path: file to
+    save them in, and to resume from if it holds rows of the same origin (weights, seed)."""
     found: list[Row] = []
     begin = 0
     if path and path.exists():
@@ -41,8 +41,8 @@ def collected(
 
 
 def saved_rows(path: Path, origin: str, most: int) -> tuple[int, list[Row]]:
-    """How many recordings are done, and their rows. Raises EV009 where the file holds none, EV013
-    where they are of other weights or another seed, or of more recordings than `most`."""
+    """Number of finished recordings, and their rows. Raises EV009 where the file holds none, EV013
+    where they are of other weights, another seed, or more recordings than `most`."""
     try:
         with open(path, "rb") as file, np.load(file) as saved:
             kept = dict(saved)

@@ -49,7 +49,7 @@ def carried(n: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
 def held_out(
     params: Any, recording: Recording, systems: dict[str, System]
 ) -> dict[str, Any]:
-    """Each system's thresholds from the first half, and how well they foretell the second:
+    """Each system's thresholds from the first half, and how well they predict the second:
     residual over the change, root mean squares, of pixels that changed; `frame regression` is
     fitted to the second half itself and bounds what two numbers can do."""
     first, second = halves(recording)

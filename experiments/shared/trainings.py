@@ -31,7 +31,15 @@ from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
 from experiments.shared import eventgan_sequences, gains, held_out, targets
 from experiments.shared.common import slug, write_result
-from experiments.shared.conditions import NONE, RAW, Condition, Files, Workshop, conditions, told
+from experiments.shared.conditions import (
+    NONE,
+    RAW,
+    Condition,
+    Files,
+    Workshop,
+    camera_medians,
+    conditions,
+)
 
 Params = dict[str, Any]
 Scores = dict[str, dict[str, dict[str, dict[int, np.ndarray]]]]  # target, label, measure, seed
@@ -85,20 +93,20 @@ class Trainings:
         return targets.held_out_bank(self.setting.textures // 2)
 
     def network(self, condition: Condition) -> Network:
-        """What a condition trains."""
+        """The network of a condition."""
         return self._of_recordings if condition.label == RAW else self.setting.network
 
     @property
     def _of_recordings(self) -> Network:
-        """EV-FlowNet learns from recordings, which tell no true flow, in its form of several
-        scales, from their frames."""
+        """For recordings, which have no true flow, EV-FlowNet's form of several scales, which
+        learns from frames."""
         network = self.setting.network
         if isinstance(network, EVFlowNet):
             return dataclasses.replace(network, scales=network.encoders)
         return network
 
     def recorded(self, target: targets.Target) -> RecordedBank:
-        """What the target itself records of scenes as all are trained on."""
+        """The target's own recordings of training scenes."""
         if target.name not in self._recorded:
             data = self.setting.learning.data
             made = held_out.gather(targets.clips(
@@ -195,7 +203,7 @@ class Trainings:
             raise EvflowDataError("EV007", f"{condition.name}, seed {seed}: the loss is {loss}.")
         card = {"condition": condition.name, "seed": seed, "steps": steps, "loss": loss,
                 "seconds": time.monotonic() - began, "made_from": condition.source,
-                "cameras": told(camera) if camera is not None else {}, **provenance()}
+                "cameras": camera_medians(camera) if camera is not None else {}, **provenance()}
         path.parent.mkdir(parents=True, exist_ok=True)
         save_network(path, network, state.params, card,
                      normalised=self.setting.learning.normalised)
@@ -219,7 +227,7 @@ class Trainings:
                                  sample_recorded))
 
     def _start(self, seed: int, network: Network) -> LearningState:
-        """Where every condition of a seed starts, if it trains this network."""
+        """The common initial state of a seed's conditions that train this network."""
         if (seed, network) not in self._starts:
             learning = dataclasses.replace(self.setting.learning, seed=seed)
             self._starts[seed, network] = init_state(network, learning, self._tx)
@@ -234,7 +242,7 @@ class Trainings:
         return held_out.video_scores(made, clips, s.skipped, self.lpips)
 
     def scores(self, wanted: list[Condition]) -> Scores:
-        """What there is: clips' scores by target, condition, measure and seed."""
+        """Saved scores of clips, by target, condition, measure and seed."""
         found: Scores = {t.name: {} for t in self.targets}
         for condition in wanted:
             for target in condition.targets:
@@ -248,15 +256,15 @@ class Trainings:
         return found
 
     def untrained(self, task: str) -> dict[str, gains.Means]:
-        """Means of what needs no network, by target."""
+        """Means of the baselines without a network, by target."""
         return {t.name: {label: {name: float(np.nanmean(v)) for name, v in scores.items()}
                          for label, scores in held_out.without_network(
                              task, self.clips(t), self.setting.skipped, self.lpips).items()}
                 for t in self.targets}
 
-    def told(self, wanted: list[Condition]) -> dict[str, dict[str, float]]:
-        """What is known of the cameras that each condition was trained on, and the truth."""
-        found = {f"{t.name}, truth": told(t.camera) for t in self.targets}
+    def camera_medians(self, wanted: list[Condition]) -> dict[str, dict[str, float]]:
+        """Medians of the cameras that each condition was trained for, and of the true ones."""
+        found = {f"{t.name}, truth": camera_medians(t.camera) for t in self.targets}
         for condition in wanted:
             path = self.folder(condition, 0) / "weights.safetensors"
             if path.is_file() and model_card(path)["cameras"]:

@@ -28,10 +28,10 @@ from experiments.shared.common import slug
 from experiments.shared.conditions import (
     Files,
     Workshop,
+    camera_medians,
     conditions,
     named_files,
     network_maps,
-    told,
 )
 from experiments.shared.see_better_settings import preset_of
 from experiments.shared.trainings import SIMULATED, Trainings
@@ -60,7 +60,7 @@ def test_circuits_share_the_camera_and_none_is_the_one_that_trains() -> None:
     noisy, brownian = target(), target(circuit="voltmeter")
     jax.tree.map(np.testing.assert_array_equal, noisy.camera, brownian.camera)
     assert SequenceConfig().model not in targets.CIRCUITS.values()
-    seen = told(noisy.camera)
+    seen = camera_medians(noisy.camera)
     for name, value in zip(("theta_on", "theta_off", "eta_on", "eta_off"), targets.CAMERAS["high"],
                            strict=False):
         assert seen[name] == pytest.approx(value, abs=0.02)
@@ -131,7 +131,7 @@ def test_every_condition_has_cameras_of_one_shape(tmp_path: Path) -> None:
     np.testing.assert_array_equal(made["high oracle"].theta_on[3], target().camera.theta_on)
     assert [t.name for t in found["high oracle"].targets] == ["high noisy", "high esim"]
     assert len(found["default"].targets) == 3
-    assert told(made["default"])["sigma_on"] == pytest.approx(0.03, abs=0.003)
+    assert camera_medians(made["default"])["sigma_on"] == pytest.approx(0.03, abs=0.003)
     wide, low = (np.median(made[name].theta_on, (1, 2)) for name in ("wide", "wide-log"))
     assert 0.05 < min(low) < min(wide)
     assert min(np.std(wide), np.std(low)) > 0.05
