@@ -78,7 +78,7 @@ def intervals() -> dict[str, Figures]:
         "40 recordings of 2 to 8 s": of("coverage_long", *whole),
         "30 recordings of .2 s": of("coverage_0.2s", *whole),
         "30 recordings of 1 s": of("coverage_1s", *whole),
-        "12 recordings of 5 s": of("coverage_5s", *whole),
+        "50 recordings of 5 s": of("coverage_5s", *whole),
         "the held-out recordings": [*theta, 12, *eta, *free],  # 12: Eq. 12
     }
 
