@@ -13,6 +13,7 @@ from evflow.files.archives import DAMAGE, npy_header
 from evflow.io.decode.columns import meaning
 from evflow.io.formats import unread_text
 from evflow.io.formats.unread_text import Known
+from evflow.io.images.folder import list_images
 
 NPZ = "np.savez('events.npz', t=t, x=x, y=y, p=p, size=(width, height)), t in microseconds"
 VIDEO = Known(
@@ -95,9 +96,13 @@ def folder(path: Path, is_recording: Callable[[Path], bool]) -> Known:
     for file in files:
         with contextlib.suppress(EvflowDataError, OSError):
             recordings += [file] if is_recording(file) else []
+    if not recordings:
+        return Known(what, "Pass a recording in it; none of its own files is one.")
+    if images := [p for p in sorted(path.iterdir()) if p.is_dir() and list_images(p)]:
+        return Known(what, f"Pass {recordings[0]} with its frames: --frames {images[0]} "
+                     "--timestamps FILE, the file of their times.")
     others = " and others one by one" if len(recordings) > 1 else ""
-    return Known(what, f"Pass {recordings[0]}{others}." if recordings else
-                 "Pass a recording in it; none of its own files is one.")
+    return Known(what, f"Pass {recordings[0]}{others}.")
 
 
 def _of(path: Path, found: Known) -> Known:

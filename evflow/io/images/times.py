@@ -2,10 +2,10 @@
 
 Supported layouts: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time` (DVS-Voltmeter),
 `index time`, begin and end of the exposure (DSEC; the middle is used), or any number of columns of
-which a header names one as the time; separated by blanks, tabs, commas or semicolons; and .npy
-arrays. Lines that begin with # are comments. A unit written in a
-comment or header is used ("[ns]", "timestamp_us"); otherwise the only unit that makes the numbers a
-plausible video, with a note.
+which a header names one as the time; separated by blanks, tabs, commas or semicolons; and arrays in
+.npy or .npz. Lines that begin with # are comments. A unit written in a comment or header is used
+("[ns]", "timestamp_us"); otherwise the only unit that makes the numbers a plausible video, with a
+note.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from evflow.checks import check_times
 from evflow.errors import EvflowDataError, naming
-from evflow.files.archives import npy_header
+from evflow.files.archives import load_npz, npy_header
 from evflow.files.arrays import mapped
 from evflow.files.limits import read_whole
 from evflow.io.decode.columns import meaning
@@ -37,6 +37,7 @@ from evflow.notes import Note
 from evflow.types import Events
 
 MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
+ENDS = re.compile(r"start|begin"), re.compile(r"end|stop")  # of an exposure, in an array's name
 TELL = "pass --timestamps-unit with --frames (simulate: --time-unit)"
 
 Notes = tuple[Note, ...]
@@ -50,8 +51,8 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> T
     Raises EV008 (columns of unclear meaning), EV009 (damaged), EV001 (none), EV003 (unclear unit),
     EV004 (not increasing), EV007 (NaN), EV016 (not found).
     """
-    if existing(path).suffix == ".npy":
-        us, notes = to_us(_stored(path), path, unit)
+    if (suffix := existing(path).suffix) in (".npy", ".npz"):
+        us, notes = to_us(_stored(path) if suffix == ".npy" else _archived(path), path, unit)
         return us, [], notes
     rows, header, written = _rows(path)
     named = [i for i, field in enumerate(header) if meaning(field) == "t"]
@@ -72,6 +73,21 @@ def _stored(path: Path) -> np.ndarray:
     except (OSError, EOFError, ValueError):  # `mapped` explains
         pairs = False
     return mid_exposure(np.array(mapped(path, (None, 2) if pairs else (None,))), path)
+
+
+def _archived(path: Path) -> np.ndarray:
+    """Times (T,) of an .npz: its only array, or the one that is named a time, or begin and end of
+    the exposures."""
+    arrays = {name: array for name, array in load_npz(path).items() if array.ndim}
+    for named in (arrays, [name for name in arrays if meaning(name) == "t"]):
+        if len(named) == 1:
+            return mid_exposure(arrays[next(iter(named))], path)
+    ends = [array for word in ENDS for name, array in arrays.items() if word.search(name)]
+    if len(ends) == 2 and ends[0].shape == ends[1].shape == (len(ends[0]),):
+        return mid_exposure(np.stack(ends, 1), path)
+    raise EvflowDataError(
+        "EV008", f"{path} holds {', '.join(arrays) or 'no array'}; which are the frames' times?",
+        "Call that array t, or save it alone (.npy).", where=path)
 
 
 def mid_exposure(times: np.ndarray, where: object) -> np.ndarray:

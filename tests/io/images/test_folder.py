@@ -229,6 +229,13 @@ def test_stacks(tmp_path: Path) -> None:
         assert read(tmp_path / "b.npz")[1] == times
         np.save(tmp_path / "t.npy", stamps)
         assert read(path, timestamps=tmp_path / "t.npy")[1] == times
+    begin = np.arange(5) * 4000 - 9
+    exposed = {"exposure_start": begin, "exposure_end": begin + 18}
+    for arrays in ({"t": times}, {"a": times}, exposed, {"t": times, "u": begin, "fps": 250}):
+        np.savez(tmp_path / "t.npz", **arrays)
+        assert read(path, timestamps=tmp_path / "t.npz")[1] == times
+    np.savez(tmp_path / "t.npz", a=times, b=times)
+    assert "holds a, b; which" in message(lambda: read(path, timestamps=tmp_path / "t.npz"))
     np.save(tmp_path / "t.npy", np.array([[5, 9.0]] * 5))
     assert "not begin and end" in message(lambda: read(path, timestamps=tmp_path / "t.npy"))
 
