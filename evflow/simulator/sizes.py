@@ -18,7 +18,7 @@ import numpy as np
 # Not smaller: a call hands work to another thread and back, which costs more than cache misses.
 ACTIVE: tuple[int, ...] = (4096, 8192, 12288, 16384, 20480)
 PATIENCE = 1 << 19  # pixels of padding before a smaller size: some .1 s; compiling takes .3 s
-ROOM = 2  # first size relative to the pixels of the first block
+ROOM = 2  # room of a new size, relative to the pixels that need it
 
 
 class Sizes:

@@ -14,7 +14,7 @@ Array = jax.Array
 
 EPSILON = 1e-3  # of the Charbonnier losses (Eq. 7)
 COUNT_LIMIT = 6.0  # asinh(200): more events per bin come from an untrained flow only
-RARE = 0.05  # events per bin below which the variance is constant
+RARE = 0.05  # events per bin, added to the expected ones as the least variance
 FAR = 30.0  # standard deviations: pixels at the threshold's clamp fire a hundred times as often
 
 

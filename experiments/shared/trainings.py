@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow import load_weights
+from evflow import Camera, load_weights
 from evflow.downstream import EVFlowNet, Network
 from evflow.downstream.recorded import RecordedBank, sample_recorded
 from evflow.downstream.released import save_network
@@ -70,6 +70,12 @@ class Setting:
     windows: int = 20
     skipped: int = 6
     perceptual: bool = False
+
+
+def run_card(condition: Condition, camera: Camera | None, **figures: float) -> dict[str, Any]:
+    """The model card of a training; made_from: digest of the file that its camera comes from."""
+    return {**provenance(), **figures, "condition": condition.name, "made_from": condition.source,
+            "cameras": {} if camera is None else camera_medians(camera)}
 
 
 class Trainings:
@@ -201,9 +207,8 @@ class Trainings:
         loss = float(jnp.mean(jnp.stack(losses[-max(1, steps // 10):])))
         if not math.isfinite(loss):
             raise EvflowDataError("EV007", f"{condition.name}, seed {seed}: the loss is {loss}.")
-        card = {"condition": condition.name, "seed": seed, "steps": steps, "loss": loss,
-                "seconds": time.monotonic() - began, "made_from": condition.source,
-                "cameras": camera_medians(camera) if camera is not None else {}, **provenance()}
+        card = run_card(condition, camera, seed=seed, steps=steps, loss=loss,
+                        seconds=time.monotonic() - began)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_network(path, network, state.params, card,
                      normalised=self.setting.learning.normalised)

@@ -19,6 +19,7 @@ from evflow.camera import Camera
 from evflow.downstream.released import load_network
 from evflow.downstream.simulated import SequenceConfig, Sequences, _crop
 from evflow.errors import EvflowDataError
+from evflow.process.provenance import provenance
 from evflow.scenes import make_bank
 from evflow.types import Events
 from experiments import see_better
@@ -34,7 +35,7 @@ from experiments.shared.conditions import (
     network_maps,
 )
 from experiments.shared.see_better_settings import preset_of
-from experiments.shared.trainings import SIMULATED, Trainings
+from experiments.shared.trainings import SIMULATED, Trainings, run_card
 
 SHAPE = (24, 32)
 
@@ -171,6 +172,16 @@ def test_unclear_conditions_are_refused(tmp_path: Path) -> None:
             named_files(given)
     assert named_files(("8 steps=a/b.npz",)) == {"8 steps": Path("a/b.npz")}
     assert slug("L_P + L_F/x") == "L_P_+_L_F_x"
+
+
+def test_a_run_is_that_of_the_file_its_camera_comes_from(tmp_path: Path) -> None:
+    path = tmp_path / "mine.npz"
+    Camera.constant(SHAPE).save(path)
+    condition, = conditions(workshop(tmp_path), [target()], (), Files(cameras={"mine": path}))
+    card = run_card(condition, condition.make(), seed=3)
+    assert card["made_from"] == condition.source
+    assert card["cameras"]["theta_on"] == pytest.approx(0.2)
+    assert {"seed", "condition", *provenance()} <= card.keys()
 
 
 def test_sequences_see_crops_of_all_cameras_of_a_stack() -> None:
