@@ -33,6 +33,9 @@ CHANCE = 8.0  # over the root of the number of cells: more than r of any displac
 UNRELATED = 0.06  # maximum over all interpretations; 26 recordings that agree have at least .12
 STRONG = 0.3  # mean change of log brightness in a cell, above noise and drift
 LEAST_CHANGE, MOST_THETA = 500.0, 10.0  # log units in all; real recordings have >= .4 per event
+PARTS, IN_PART = 4, 0.4  # of the steps; least r of the best one
+LOST, SHOWN = 0.4, 0.25  # share of that r below which another part disagrees (sound recordings vary
+# by .1), if its frames change by at least that share
 LATENCY_US = 4_000
 LEAST_OFFSET_US = 10_000
 
@@ -47,12 +50,14 @@ def agreement(recording: Recording) -> list[Finding]:
         return found
     if np.isnan(here := steps.correlation()):
         return []
+    if found := _comes_and_goes(steps):
+        return found
     offsets, r = steps.sweep()
     flips = {flip: steps.correlation(flip=flip) for flip in steps.changes if flip}
     flip = max(flips, key=lambda f: abs(flips[f]))
     if abs(flips[flip]) > AGREES and abs(flips[flip]) > np.nanmax(np.abs(r)) + BETTER:
         return [_mirrored(flip, here, flips[flip])]
-    if found := _displaced(steps, here, float(np.nanmax(np.abs(r)))):
+    if found := _displaced(steps, float(np.nanmax(np.abs(r)))):
         return found
     over = f"r={here:+.2f} over {len(steps.bounds)} frame steps"
     inverted = _inverted(r)
@@ -131,11 +136,34 @@ def _frozen(recording: Recording, steps: Steps) -> list[Finding]:
         "measured from such frames; --no-frames uses the events alone.")]
 
 
-def _displaced(steps: Steps, here: float, best: float) -> list[Finding]:
+def _comes_and_goes(steps: Steps) -> list[Finding]:
+    """EV024 if events and frames agree in one part of the recording and not in another, though the
+    frames change there as well."""
+    parts = [steps.part(i, PARTS) for i in range(PARTS)]
+    r = np.array([part.correlation() if len(part.bounds) else np.nan for part in parts])
+    rms = np.array([np.sqrt((np.nan_to_num(part.changes[""]) ** 2).sum() / max(
+        int(np.isfinite(part.changes[""]).sum()), 1)) for part in parts])
+    if np.isnan(r).all() or not (most := float(np.nanmax(r))) > IN_PART:
+        return []
+    lost = (r < LOST * most) & (rms > SHOWN * rms[np.nanargmax(r)])
+    if not lost.any():
+        return []
+    at, off = (float(parts[i].bounds.mean() - steps.events.t[0]) / 1e6
+               for i in (np.nanargmax(r), np.argmin(np.where(lost, r, np.inf))))
+    return [Finding(
+        "EV024", "error" if lost.sum() >= PARTS / 2 else "warning",
+        f"events and frames agree around {at:.2f} s (r {most:+.2f}) but not around {off:.2f} s "
+        f"(r {r[lost].min():+.2f}).",
+        "Do the frames' times run too fast or slow (--frames-fps, --timestamps), are frames out of "
+        "order, or does the polarity change? --start and --stop select a part that agrees.")]
+
+
+def _displaced(steps: Steps, best: float) -> list[Finding]:
     """EV037 if events and frames agree better some pixels apart than at any time offset."""
     cells = int(np.isfinite(steps.changes[""]).sum())
-    r, dx, dy = displacement(steps)
-    if r < AGREES or r < best + max(BETTER, CHANCE / np.sqrt(cells)) or cells < LEAST_CELLS:
+    here, r, dx, dy = displacement(steps)
+    least = max(AGREES, max(best, here) + max(BETTER, CHANCE / np.sqrt(max(cells, 1))))
+    if r < least or cells < LEAST_CELLS:
         return []
     return [Finding(
         "EV037", "error", f"events lie about {abs(dx)} px to the {'right' if dx > 0 else 'left'} "

@@ -77,6 +77,13 @@ class Steps:
         cells = int(np.isfinite(self.changes[""]).sum())
         return cells >= SURE_CELLS and len(self.events.slice(first, last)) >= SURE_EVENTS
 
+    def part(self, number: int, of: int) -> Steps:
+        """One of `of` parts of the steps, in time."""
+        edges = np.linspace(0, len(self.bounds), of + 1).astype(int)
+        kept = slice(edges[number], edges[number + 1])
+        return dataclasses.replace(self, bounds=self.bounds[kept], changes={
+            flip: change[kept] for flip, change in self.changes.items()})
+
     def sweep(self) -> tuple[np.ndarray, np.ndarray]:
         """Offsets of the frames' clock in us, and r at each."""
         reach = min(SWEEP_INTERVALS * self.interval_us, SWEEP_US)
@@ -111,9 +118,10 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
                  interval)
 
 
-def displacement(steps: Steps) -> tuple[float, int, int]:
-    """The largest r if events lie dx, dy pixels from where the frames show changes, by up to half
-    the sensor; and dx, dy."""
+def displacement(steps: Steps) -> tuple[float, float, int, int]:
+    """r of the recording as it is, and the largest r if events lie dx, dy pixels from where the
+    frames show changes, by up to half the sensor; and dx, dy. What a frame changes as a whole is
+    left out of both."""
     columns = -(-steps.events.size[0] // steps.cell)
     rows = len(steps.changes[""][0]) // columns
     shape = 2 * rows, columns + 1  # spectra of images beside zeros, so that nothing wraps round
@@ -136,10 +144,11 @@ def displacement(steps: Steps) -> tuple[float, int, int]:
                      for s in (product, energy))
     whole = float(square[up, left])
     if not whole * power > 0:
-        return 0.0, 0, 0
+        return 0.0, 0.0, 0, 0
     r = along / np.sqrt(power * np.maximum(square, LEAST_OVERLAP * whole))
     y, x = np.unravel_index(int(np.argmax(r)), r.shape)
-    return float(r[y, x]), steps.cell * (int(x) - left), steps.cell * (int(y) - up)
+    return (float(r[up, left]), float(r[y, x]), steps.cell * (int(x) - left),
+            steps.cell * (int(y) - up))
 
 
 def _change(before: np.ndarray, after: np.ndarray) -> np.ndarray:

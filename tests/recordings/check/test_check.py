@@ -376,7 +376,28 @@ def shown(r: Recording, frames: np.ndarray) -> Recording:
     return dataclasses.replace(r, frames=np.broadcast_to(frames, r.frames.shape).copy())
 
 
+def turned_midway(r: Recording) -> Recording:
+    return dataclasses.replace(r, events=dataclasses.replace(
+        r.events, p=r.events.p ^ (r.events.t > np.median(r.frame_times))))
+
+
+def timed(r: Recording, factor: float) -> Recording:
+    first = int(r.frame_times[0])
+    return dataclasses.replace(
+        r, frame_times=first + np.rint((r.frame_times - first) * factor).astype(np.int64))
+
+
+def by_name(r: Recording) -> Recording:
+    """Frames in the order 1, 10, 11, 2, 3, ..."""
+    return dataclasses.replace(r, frames=r.frames[sorted(range(len(r.frames)), key=str)])
+
+
 @pytest.mark.parametrize(("make", "code", "severity", "said"), [
+    (turned_midway, "EV024", "error", "but not around"),
+    (lambda r: timed(r, 0.7), "EV024", "error", "--frames-fps"),
+    (lambda r: timed(r, 1.1), "EV024", "warning", "--frames-fps"),
+    (lambda r: timed(r, 2.0), "EV024", "error", "--frames-fps"),
+    (by_name, "EV024", "error", "out of order"),
     (transposed, "EV029", "error", "rows and columns of the frames swapped"),
     (lambda r: transposed(r, 1), "EV029", "error", "mirrored in the"),
     (lambda r: displaced(r, 9, -6), "EV037", "error", "px to the right and"),
@@ -390,6 +411,13 @@ def test_what_makes_thresholds_wrong_is_told(
 ) -> None:
     findings = {f.code: f for f in check(make(sound)).findings}
     assert (findings[code].severity, said in str(findings[code])) == (severity, True)
+
+
+def test_an_exposure_that_varies_displaces_nothing(sound: Recording) -> None:
+    """Frames that change as a whole agree less with events at any time, but not in any place."""
+    gain = np.where(np.arange(len(sound.frames)) % 2, 0.7, 1.0)[:, None, None]
+    varied = dataclasses.replace(sound, frames=np.rint(sound.frames * gain).astype(np.uint8))
+    assert {"EV024", "EV029", "EV037"} & set(codes(varied)) == set()
 
 
 def test_a_clock_of_few_digits_may_repeat_events(sound: Recording) -> None:
