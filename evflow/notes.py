@@ -14,6 +14,7 @@ from evflow.errors import CODES
 NOTES: dict[str, str] = {
     "events.layout": "how the file is laid out was inferred",
     "events.coarse": "event times have a coarse resolution",
+    "events.narrow": "coordinates are stored in too few bits for the sensor",
     "events.late": "events with decreasing times were left out, sorted or joined",
     "events.outside": "events outside the sensor were left out",
     "events.partial": "only the part before the damage was read",

@@ -16,6 +16,7 @@ from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
 from evflow.io.decode import late, written
 from evflow.io.decode.chunk import Chunk
+from evflow.io.decode.units import UNITS_US
 from evflow.io.hints import Hints, dropped, within
 from evflow.notes import Note
 from evflow.types import Events
@@ -66,6 +67,7 @@ class Gathering:
         t = self.hints.microseconds(chunk.t, self.native, self.offset)
         t = self.joint(t) if self.joint else t
         if not self.seen:
+            self._narrow(chunk)
             self.first = self.last = int(t[0])
             self.start, self.stop = self.hints.span_us(self.first)
         return t
@@ -170,13 +172,31 @@ class Gathering:
                 self.last = int(t[i - ahead - 1])
             return EvflowDataError(
                 "EV004", f"{self.path}: time goes back from {before:,} to {t[i]:,} us at {spot}"
-                f"{self.so_far()}", late.advice(t, i, before) + self.sound_part(), where=self.path)
+                f"{self.so_far()}", late.advice(t, i, before, self._turns(chunk))
+                + self.sound_part(), where=self.path)
         width, height = self.size or (1 << 16, 1 << 16)
         return EvflowDataError(
             "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "
             f"{width}x{height}, at {spot}{self.so_far()}",
             _outside(chunk.x, chunk.y, (width, height)) + self.sound_part(),
             where=self.path)
+
+    def _turns(self, chunk: Chunk) -> tuple[int, ...]:
+        """After how many us times of so few bits as those of the chunk begin anew."""
+        kind = chunk.t.dtype
+        unit = self.native if self.hints.time_unit == "auto" else self.hints.time_unit
+        return (round(2 ** (8 * kind.itemsize) * UNITS_US[unit]),) if (
+            kind.kind in "iu" and kind.itemsize < 8) else ()
+
+    def _narrow(self, chunk: Chunk) -> None:
+        """A note if coordinates have too few bits for the sensor: larger ones came back as small
+        ones."""
+        for name, side in zip(("x", "y"), self.size or (0, 0), strict=True):
+            kind = getattr(chunk, name).dtype
+            if kind == np.uint8 and side > 256:
+                self.notes.append(Note(
+                    "events.narrow", f"{name} has 8 bits, up to 255, but the sensor {side} pixels: "
+                    "did larger ones begin anew at 0? Export it again with 16 bits"))
 
     def _keep(self, chunk: Chunk, t: np.ndarray, a: int, b: int) -> None:
         """Keep the events from a to b and skip those before a."""

@@ -20,6 +20,7 @@ from evflow.notes import Note
 LOOK = 1 << 16  # events examined after the first that goes back
 WRAPS = 1 << 32, 1 << 31  # us: where times of 32 bits, or 31 and a sign, begin anew
 NEAR_WRAP = 1 / 64  # of it: a step back that is smaller by no more than this is a wrap
+SAWS, SAW = 3, 0.25  # falls that make a sawtooth; how near to its ends, as a share of its height
 FEW = 16  # at most this many events ahead of all later ones count as wrong
 
 
@@ -40,24 +41,41 @@ def ahead_of(t: np.ndarray, i: int) -> int:
     return ahead if ahead <= min(FEW, i - 1) and ahead < behind else 0
 
 
-def advice(t: np.ndarray, i: int, before: int) -> str:
-    """What it means that t[i] is smaller than `before`, its predecessor, and what to do."""
+def advice(t: np.ndarray, i: int, before: int, turns: tuple[int, ...] = ()) -> str:
+    """What it means that t[i] is smaller than `before`, its predecessor, and what to do. turns:
+    after how many us the stored numbers begin anew, beside `WRAPS`."""
+    step = before - int(t[i])
+    if step <= RESET_US and _turn(step, turns):
+        return ("The stored integers begin anew, as they have too few bits: write them as 64-bit "
+                "ones, np.unwrap(t.astype(np.int64), period=2**bits)")
     if ahead := ahead_of(t, i):
         return (f"The {ahead} events before it are ahead of all later ones: damaged times? Leave "
                 "them out: --late drop (late='drop')")
-    if before - int(t[i]) > RESET_US and not (t[i : i + LOOK] >= before).any():
-        if turn := _turn(before - int(t[i])):
-            return (f"Times of {turn.bit_length() - 1} bits that begin anew? Write them as 64-bit "
-                    "integers, or continue them, without frames: --late join (late='join')")
+    if _sawtooth(t):
+        return ("Times begin anew again and again: are they relative to their packet or frame? Add "
+                "the time at which each of these begins; sorting would mix them")
+    if step > RESET_US and not (t[i : i + LOOK] >= before).any():
+        if _turn(step, (*WRAPS, *turns)):
+            return ("Times of 32 bits that begin anew? Write them as 64-bit integers, or continue "
+                    "them, without frames: --late join (late='join')")
         return ("A camera reset, or two recordings joined? Read one after the other: --late join "
                 "(late='join')")
     return ("Packets that were overtaken? Leave late events out: --late drop (late='drop'), or "
             "sort them in: --late sort")
 
 
-def _turn(step: int) -> int:
+def _sawtooth(t: np.ndarray) -> bool:
+    """Whether times rise from near their least to near their largest and fall back, repeatedly."""
+    low, high = int(t.min()), int(t.max())
+    at = np.flatnonzero(t[1:] < t[:-1]) + 1
+    near = SAW * (high - low)
+    return len(at) >= SAWS and bool(
+        (t[at] - low <= near).all() and (high - t[at - 1] <= near).all())
+
+
+def _turn(step: int, turns: tuple[int, ...] = WRAPS) -> int:
     """The wrap-around that explains a step back in us, 0 if none does."""
-    return next((turn for turn in WRAPS if 0 <= turn - step <= NEAR_WRAP * turn), 0)
+    return next((turn for turn in turns if 0 <= turn - step <= NEAR_WRAP * turn), 0)
 
 
 def begin(t: np.ndarray, start: int) -> int:

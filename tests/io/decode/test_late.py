@@ -167,6 +167,24 @@ def test_times_of_32_bits_go_on_where_they_begin_anew(tmp_path: Path, dtype: Any
     np.testing.assert_array_equal(read_events(path, late="join").t, whole)
 
 
+@pytest.mark.parametrize(("t", "said"), [
+    (T.astype(np.uint16), "too few bits"), (T % 50_000, "relative to their packet or frame"),
+    (np.concatenate([T[:900], T[850:]]), "--late drop")])
+def test_what_begins_anew_is_not_late(tmp_path: Path, t: np.ndarray, said: str) -> None:
+    assert said in refused(npz(tmp_path, table(t))).fix
+
+
+@pytest.mark.parametrize(("side", "dtype", "told"), [
+    (64, np.uint8, False), (346, np.uint8, True), (346, np.uint16, False)])
+def test_coordinates_of_too_few_bits_are_told(
+    tmp_path: Path, side: int, dtype: Any, told: bool
+) -> None:
+    columns = table(T)
+    path = tmp_path / "a.npz"
+    np.savez(path, **(columns | {"x": columns["x"].astype(dtype), "size": (side, 48)}))
+    assert ("events.narrow" in [note.code for note in read_recording(path).notes]) == told
+
+
 @pytest.mark.parametrize("kind", ENCODERS)
 def test_streams_of_cameras_drop_and_sort(tmp_path: Path, kind: str) -> None:
     """An early burst between two parts of a recording, as a packet that was overtaken."""
