@@ -28,6 +28,7 @@ from evflow.notes import Note
 from evflow.types import Events, Recording
 
 LEAST_SIDE = 8  # pixels; smaller ones are no images
+ENCODED = {"frame", "image", "img", "picture", "photo", "jpeg", "jpg", "png"}
 TIMES = re.compile(r"(?:^|_)ts?$|(?:time|stamp)s?$")
 
 Pixels = Callable[[str, slice], Iterable[np.ndarray]]
@@ -52,6 +53,10 @@ def beside(
                 "frames.stream", f"frames are from {name}, at the times in {times}"),))
             streams.append(Images(stream, _loading(
                 name, times, whole, pixels, path, found.events)))
+        elif array.dtype.hasobject and _words(name) & ENCODED:
+            streams.append(Images(ImageStream(
+                name, None, "of variable length, as encoded images are: save them as arrays, or as "
+                "files for --frames"), lambda: (np.zeros(0), lambda part: ())))
     try:
         return with_frames(path, found, hints, streams, "us", notes, events=events)
     except EvflowDataError as e:

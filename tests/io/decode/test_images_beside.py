@@ -88,6 +88,13 @@ def test_what_cannot_be_frames_leaves_the_events_and_is_told(
         assert not read_recording(write(tmp_path, arrays), no_frames=True).notes
 
 
+def test_encoded_images_are_told(tmp_path: Path) -> None:
+    path = h5("x y t p")(tmp_path, {"image_ts": TIMES})
+    with h5py.File(path, "a") as f:
+        f.create_dataset("images", 6, h5py.vlen_dtype(np.uint8))
+    assert "images (of variable length" in read_recording(path).notes[0].text
+
+
 def test_a_stream_that_is_named_is_read_or_refused(tmp_path: Path) -> None:
     path = h5("x y t p")(tmp_path, {"blurred": FRAMES, "blurred_ts": TIMES, "raw": FRAMES // 2,
                                     "raw_ts": TIMES})
