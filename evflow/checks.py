@@ -187,8 +187,11 @@ def check_frames(frames: np.ndarray, size: Size) -> None:
     if frames.ndim != 3:
         raise EvflowDataError("EV002", f"frames have shape {frames.shape}.", "Expected (T, H, W).")
     if frames.dtype not in (np.uint8, np.uint16, np.float32):
-        raise EvflowDataError(
-            "EV003", f"frames have dtype {frames.dtype}.", "Expected uint8, uint16 or float32 DN.")
+        fix = {"f": " Convert them: frames.astype(np.float32).",
+               "i": " Convert them: frames.astype(np.uint16), if none is negative.",
+               "b": " Convert them: 255 * frames.astype(np.uint8)."}.get(frames.dtype.kind, "")
+        raise EvflowDataError("EV003", f"frames have dtype {frames.dtype}.",
+                              f"Expected uint8, uint16 or float32 DN.{fix}")
     if frames.shape[1:] != (height, width):
         swapped = " Swap width and height of size." if frames.shape[1:] == (width, height) else ""
         raise EvflowDataError(

@@ -42,7 +42,8 @@ def voxelize(events: Events, t0_us: int, window_us: int, bins: int = BINS) -> np
     Example:
         >>> voxels = ef.voxelize(window.events, window.t0_us, window.t1_us - window.t0_us)
     """
-    need(events, Events, "events", "For a path: evflow.read_events(path).")
+    need(events, Events, "events",
+         "For a recording: recording.events; for a path: evflow.read_events(path).")
     for name, value in (("t0_us", t0_us), ("window_us", window_us)):
         if not isinstance(value, int | np.integer):
             raise EvflowDataError("EV003", f"{name} is {value!r}.",
