@@ -47,7 +47,7 @@ def fresh(key: Array, network: nn.Module, x: Array) -> dict[str, Any]:
             bound = gain * math.sqrt(6.0 / math.prod(leaf.shape[:-1]))
             made.append(bound * drawn[ends[i]:ends[i + 1]].reshape(leaf.shape))
         else:
-            made.append(jnp.full(leaf.shape, float(name == "scale")))
+            made.append(jnp.full(leaf.shape, float(name == "scale"), leaf.dtype))
     return jax.tree.unflatten(tree, made)
 
 
