@@ -250,7 +250,7 @@ def from_events(columns: list[tuple], bins: int, size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("constants", "shape", "speed"), [
-    (DVS346, SHAPE, 0.5), (NOISY, SHAPE, 3.0), (NOISY, (40, 60), 3.0)])
+    (DVS346, SHAPE, 0.5), (NOISY, (40, 60), 3.0)])
 def test_both_exits_have_the_same_events(
     constants: Voltmeter, shape: tuple[int, int], speed: float
 ) -> None:

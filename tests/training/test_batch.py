@@ -19,6 +19,7 @@ from evflow.training.batch import sample_batch as sample_batch_eagerly
 from evflow.training.config import PRESETS, NuisanceConfig
 
 sample_batch = jax.jit(sample_batch_eagerly, static_argnames="config")
+LIVELY = small_config(scene=SceneConfig(speed_px_s=(100.0, 300.0), static_fraction=0.0))
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +29,7 @@ def bank() -> TextureBank:
 
 @pytest.fixture(scope="module")
 def batch(bank: TextureBank) -> Batch:
-    config = small_config(scene=SceneConfig(speed_px_s=(100.0, 300.0), static_fraction=0.0))
-    return sample_batch(jax.random.key(1), bank, config=config)
+    return sample_batch(jax.random.key(1), bank, config=LIVELY)
 
 
 def test_fixed_sequences_are_the_same_in_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,8 +84,7 @@ def test_cameras_share_scenes_not_parameters(batch: Batch) -> None:
 
 
 def test_key_decides_everything(bank: TextureBank) -> None:
-    config = small_config()
-    one, same, other = (sample_batch(jax.random.key(k), bank, config=config) for k in (3, 3, 4))
+    one, same, other = (sample_batch(jax.random.key(k), bank, config=LIVELY) for k in (3, 3, 4))
     jax.tree.map(np.testing.assert_array_equal, one, same)
     assert not np.array_equal(one.voxels, other.voxels)
 
