@@ -34,10 +34,16 @@ AGAIN = "Copy or create it again."
 
 
 def weights_path(name_or_path: str | os.PathLike = "default") -> Path:
-    """The file of a released name ("default"), or the path itself."""
+    """The file of a released name ("default"), or the path itself; EV008, EV016 if it is none."""
     need(name_or_path, str | os.PathLike, "name_or_path", "Give a released name or a path.")
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
+        inside = path / "weights.safetensors"
+        if inside.is_file():
+            raise EvflowDataError("EV016", f"{path} is a folder.", f"Pass {inside}.", where=path)
+        if path.is_file():
+            raise EvflowDataError("EV008", f"{path} is not a .safetensors.", "Pass the "
+                                  "weights.safetensors that evflow train writes.", where=path)
         path = FOLDER / f"{name_or_path}.safetensors"
     if not path.is_file():
         known = sorted(p.stem for p in FOLDER.glob("*.safetensors"))

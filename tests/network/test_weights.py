@@ -123,3 +123,14 @@ def test_shipped_weights_are_small_finite_and_explained() -> None:
     steps = trained_steps(card)
     assert {"pixels", "summary"} <= set(steps)
     assert all(count > 0 for count in steps.values())
+
+
+def test_a_run_and_other_files_are_told_from_weights(tmp_path: Path) -> None:
+    (tmp_path / "weights.safetensors").write_bytes(b"")
+    (tmp_path / "model.pth").write_bytes(b"")
+    for path, code, said in ((tmp_path, "EV016", "weights.safetensors."),
+                             (tmp_path / "model.pth", "EV008", "not a .safetensors"),
+                             ("model", "EV016", "Released names")):
+        with pytest.raises(EvflowDataError) as raised:
+            weights_path(path)
+        assert (raised.value.code, said in str(raised.value)) == (code, True)
