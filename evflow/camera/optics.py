@@ -78,9 +78,10 @@ def read_known(path: str | os.PathLike) -> dict[str, tuple[float, float]]:
     a whole: the determined part of its summary, and its circuit. Raises EV009, EV016."""
     held = load_npz(Path(path))
     values, errors = read_summary(path) or ({}, {})
-    untold = {f"{kind}_{name.partition('_')[2]}" for name in read_undetermined(path)
+    undetermined = {f"{kind}_{name.partition('_')[2]}" for name in read_undetermined(path)
               for kind in ("theta", "sigma")}
-    known = {name: (value, errors[name]) for name, value in values.items() if name not in untold}
+    known = {name: (value, errors[name]) for name, value in values.items()
+             if name not in undetermined}
     sensor = read_sensor(path)[0]
     for name in MEASURED:
         error = float(held.get(f"sensor_{name}_std", np.nan))

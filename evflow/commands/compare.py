@@ -92,11 +92,11 @@ class Compare(Reading):
 
     def _compared(self, *labels: str) -> dict[str, str]:
         """The facts that a page states: the two files, the command and the versions."""
-        from evflow.process.provenance import sha256, told
+        from evflow.process.provenance import one_line, sha256
 
         shown = {label: f"{path}, sha256 {sha256(path)}" for label, path in zip(
             labels, (self.real, self.synthetic), strict=True)}
-        return {**shown, "Command": shlex.join(["evflow", *sys.argv[1:]]), "Versions": told()}
+        return {**shown, "Command": shlex.join(["evflow", *sys.argv[1:]]), "Versions": one_line()}
 
     def run(self) -> None:
         from evflow.metrics.streams import compare

@@ -266,8 +266,8 @@ class Estimate(Compiling, Reading):
         from evflow.io.triggers import read_triggers
 
         if self.protocol == "step":
-            told = read_triggers(self.triggers, recording.events) if self.triggers else None
-            return Measured(calibrate_step(recording, lux=self.lux, triggers_us=told)), {}
+            triggers = read_triggers(self.triggers, recording.events) if self.triggers else None
+            return Measured(calibrate_step(recording, lux=self.lux, triggers_us=triggers)), {}
         found = estimate_noise(recording, lux=self.lux[0] if self.lux else None)
         if self.more:
             others = []

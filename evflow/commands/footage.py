@@ -76,10 +76,10 @@ class Footage:
         from evflow.io.source import open_frames
 
         check_finite(self)
-        told = {name: getattr(self, name) for name in (
+        options = {name: getattr(self, name) for name in (
             "fps", "timestamps", "colour", "time_unit", "full_scale", "partial", "bayer",
             "response", "background", "frames_topic", "repeated")}
-        source = open_frames(path, **told, flip=self.flip_frames, start_s=self.start,
+        source = open_frames(path, **options, flip=self.flip_frames, start_s=self.start,
                              stop_s=self.stop, picture=self.saccades is not None)
         if self.saccades is not None:
             source = swept(source, self.saccades, crop=self.crop, resize=self.resize,

@@ -117,13 +117,13 @@ class Reading:
         from evflow import io
 
         check_finite(self)
-        if self.frames is None and (told := given(self, ELSEWHERE)):
+        if self.frames is None and (options := given(self, ELSEWHERE)):
             raise EvflowDataError(
-                "EV020", f"{told} without --frames: it applies to frames from another file.",
+                "EV020", f"{options} without --frames: it applies to frames from another file.",
                 "Pass --frames too.")
-        if self.frames is not None and (told := given(self, OWN)):
+        if self.frames is not None and (options := given(self, OWN)):
             raise EvflowDataError(
-                "EV020", f"{told} with --frames, which replaces the recording's own.",
+                "EV020", f"{options} with --frames, which replaces the recording's own.",
                 "Give only one of them.")
         if self.bayer is not None and self.colour != "luma":
             raise EvflowDataError(

@@ -83,13 +83,13 @@ class Pixels:
                  else known_sensor(self.sensor).model)
         if self._is_measured and (self.leak_hz, self.shot_hz) != (None, None):
             model = dataclasses.replace(model, leak_hz=0.0, shot_hz=0.0, eta_is_all=False)
-        told: dict[str, Any] = {name: number for name in CIRCUIT
+        given: dict[str, Any] = {name: number for name in CIRCUIT
                                 if (number := getattr(self, name)) is not None}
         if model.kind == "v2e":
-            told |= {name: getattr(self, name) for name in CHOICES}
+            given |= {name: getattr(self, name) for name in CHOICES}
         else:
             refuse(self, CHOICES, f"--sensor {self.sensor} has no such choice")
-        model = dataclasses.replace(model, **told)
+        model = dataclasses.replace(model, **given)
         if not model.leak_hz:
             refuse(self, ("leak_jitter", "leak_fpn_decades"), "there is no leak without --leak-hz")
         return model if self.photoreceptor == "first-order" else self._second_order(model)
@@ -181,18 +181,18 @@ class Pixels:
         from evflow.camera.sensors import known_sensor
 
         key, known = jax.random.key(self.seed), known_sensor(self.sensor)
-        told: dict[str, float] = {
+        given: dict[str, float] = {
             name: number for name in PARAMETERS if (number := getattr(self, name)) is not None}
-        even = {name: jnp.full(shape, number, jnp.float32) for name, number in told.items()}
+        even = {name: jnp.full(shape, number, jnp.float32) for name, number in given.items()}
         if self.mismatch is None:
             drawn = Camera.sample(key, shape, CameraPrior(
                 (known.theta,) * 2, (known.mismatch,) * 2, noise="none"))
             return dataclasses.replace(drawn, **even).validate()
         if not self.mismatch >= 0:
             raise EvflowDataError("EV020", f"--mismatch {self.mismatch}.", "It must be >= 0.")
-        Camera.constant((1, 1), **told)  # raises EV014 for the values themselves
+        Camera.constant((1, 1), **given)  # raises EV014 for the values themselves
         values = {"theta_on": known.theta, "theta_off": known.theta, "eta_on": 0.0, "eta_off": 0.0,
-                  **told, "sigma_on": self.mismatch, "sigma_off": self.mismatch}
+                  **given, "sigma_on": self.mismatch, "sigma_off": self.mismatch}
         nominal = Summary(**{name: jnp.float32(number) for name, number in values.items()})
         return sample_pixels(key, nominal, shape).validate()
 

@@ -38,14 +38,14 @@ class Extent:
         """Notes about it; none if everything was read."""
         if self.whole:
             return []
-        told = (f"{self.read_s:.1f} of {self.seconds:.1f} s were read, in {self.stretches} of "
-                f"{self.of} stretches")
+        extent = (f"{self.read_s:.1f} of {self.seconds:.1f} s were read, in {self.stretches} of "
+                  f"{self.of} stretches")
         if self.ended:
-            return [Note("reading.ended", f"{told}: reading was stopped. The estimate uses what "
+            return [Note("reading.ended", f"{extent}: reading was stopped. The estimate uses what "
                          "was read; its errors say how well that determines the camera.")]
         more = (f"; with twice as much the pixels' errors would be {self.gain:.0%} smaller"
                 if self.gain == self.gain else "")
-        return [Note("reading.part", f"{told}, those with most activity{more}. "
+        return [Note("reading.part", f"{extent}, those with most activity{more}. "
                      "To read everything: --effort full (effort='full').")]
 
     def as_dict(self) -> dict[str, Any]:

@@ -30,12 +30,12 @@ class Division:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class First:
-    """What an estimate computed from a recording's first part. state: of what was read of it; told:
-    the stretches in which its photoreceptor was looked for; rest: (first, last) frame of the
-    rest."""
+    """What an estimate computed from a recording's first part. state: the sums over what was read
+    of it; searched: the stretches in which its photoreceptor was looked for; rest: (first, last)
+    frame of the rest."""
 
     state: State
-    told: tuple[Stretch, ...]
+    searched: tuple[Stretch, ...]
     rest: tuple[int, int]
 
     def estimate(self) -> CameraEstimate:
@@ -66,9 +66,9 @@ def divided(stretches: Sequence[Stretch]) -> Division | None:
 def _on_its_own(first: First) -> State:
     """The state with photoreceptor and dead time as measured on the first part itself."""
     state, eyes = first.state, first.state.eyes
-    runs, told = ([(s.recording, s.run) for s in part] for part in (state.read, first.told))
+    runs, searched = ([(s.recording, s.run) for s in part] for part in (state.read, first.searched))
     found = eyes.found
-    if found is not None and receptor_places(runs) != receptor_places(told):
+    if found is not None and receptor_places(runs) != receptor_places(searched):
         found = find_photoreceptor(runs, eyes.noise_dn)
     seen_by = found.seen if found is not None and found.needed else IDEAL
     events = state.read[0].recording.events

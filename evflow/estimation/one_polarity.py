@@ -19,7 +19,7 @@ BEYOND_NOISE = 3.0  # standard deviations by which events must exceed the noise
 UNREFINED = (0.5, 1.0)  # relative errors of theta, eta from the network alone
 
 
-def untold(stats: Stats, summary: Summary) -> tuple[str, ...]:
+def undetermined(stats: Stats, summary: Summary) -> tuple[str, ...]:
     """The polarities, "on" and "off", with no more events than noise explains."""
     found = []
     for name in POLARITIES:
@@ -37,13 +37,13 @@ def without(
     the other polarity by itself, unless a high threshold in the summary already explains the
     missing events."""
     known = {f"theta_{n}": _theta_prior() for n in names}
-    for told, name in enumerate(POLARITIES):
-        if name in names or (chunks and high_threshold_explains(chunks, summary, std, told)):
+    for side, name in enumerate(POLARITIES):
+        if name in names or (chunks and high_threshold_explains(chunks, summary, std, side)):
             continue
         theta, eta = (float(getattr(summary, f"{p}_{name}")) for p in ("theta", "eta"))
         if chunks:
             *alone, noise = refine_alone(
-                chunks, *_changed(summary, std, known), told, _theta_prior())
+                chunks, *_changed(summary, std, known), side, _theta_prior())
             known[f"theta_{name}"] = alone[0], alone[1]
             if not noise:
                 known[f"eta_{name}"] = _eta_prior()

@@ -16,7 +16,7 @@ FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
 
 def camera_notes(
-    stats: Stats, unknown: tuple[str, ...], n_events: np.ndarray, summary: Summary,
+    stats: Stats, undetermined: tuple[str, ...], n_events: np.ndarray, summary: Summary,
     hot: np.ndarray, dead: np.ndarray,
 ) -> list[Note]:
     found = []
@@ -33,7 +33,7 @@ def camera_notes(
     low, high = PRESETS["default"].prior.theta
     for name, events in (("on", stats.events_on), ("off", stats.events_off)):
         theta = float(getattr(summary, f"theta_{name}"))
-        if name in unknown:
+        if name in undetermined:
             found.append(Note(
                 f"theta_{name}.undetermined", f"only {int(events)} {name.upper()} events, no more "
                 f"than noise: theta_{name} is undetermined and has the prior's value; the other "

@@ -75,10 +75,10 @@ class CameraEstimate:
 
     def __repr__(self) -> str:
         height, width = np.shape(self.valid)
-        told = [name for name in THRESHOLDS if name not in self.undetermined]
+        determined = [name for name in THRESHOLDS if name not in self.undetermined]
         values = "".join(f", {name} {float(getattr(self.summary, name)):.4g} ± "
                          f"{float(getattr(self.summary_std, name)):.2g}"
-                         for name in (*told, "eta_on", "eta_off"))
+                         for name in (*determined, "eta_on", "eta_off"))
         return f"CameraEstimate({width}x{height}{values}, {len(self.notes)} notes)"
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:

@@ -104,6 +104,6 @@ def at_mean_light(
     shot = np.maximum(events - leaked * seconds, 0.1) / falling
     there = shot * factor + leaked
     own = np.hypot(std / eta, np.log(factor * seconds / falling)) ** -2.0
-    told = 1.0 / (1.0 / events + error**2)
-    rates = np.exp((own * np.log(eta) + told * np.log(there)) / (own + told))
-    return rates, rates * (own + told) ** -0.5
+    seen = 1.0 / (1.0 / events + error**2)
+    rates = np.exp((own * np.log(eta) + seen * np.log(there)) / (own + seen))
+    return rates, rates * (own + seen) ** -0.5

@@ -20,7 +20,7 @@ from evflow.estimation import drift, maps
 from evflow.estimation.dead_time import DeadTime, dead_time
 from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.leak import Leak, measured_leak
-from evflow.estimation.one_polarity import untold, without
+from evflow.estimation.one_polarity import undetermined, without
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times, window_counts, window_stats
 from evflow.estimation.refine import (
     Chunk,
@@ -159,11 +159,11 @@ def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
     chunk = make_chunk(*place, STEPS, seen_by, state.eyes.noise_dn, first=stretch.first,
                        film=state.eyes.films.pop(of_place(*place), None))
     kept = simulated_part(chunk, place, seen_by) if simulate else None
-    told = State(state.params, state.eyes, evidence=chunk.evidence, quiet=chunk.quiet,
-                 chunks=(without_evidence(kept),) if kept else (),
-                 parts=(drift.part(stretch.span_us, chunk.evidence),))
+    added = State(state.params, state.eyes, evidence=chunk.evidence, quiet=chunk.quiet,
+                  chunks=(without_evidence(kept),) if kept else (),
+                  parts=(drift.part(stretch.span_us, chunk.evidence),))
     del chunk  # a film of the whole sensor
-    return state + told
+    return state + added
 
 
 def glance(state: State) -> tuple[Summary, Summary]:
@@ -212,7 +212,7 @@ def estimate(
     state: State, *, extent: Extent | None = None, before: Sequence[Note] = (),
     after: Sequence[Note] = (), advance: Advance = lambda: None, stage: Stage = lambda _: None,
 ) -> CameraEstimate:
-    """The camera, from all that was read. extent: how much that is; before, after: notes on
+    """The camera, from all that was read. extent: how much was read; before, after: notes on
     reading, placed around its own; advance() is called after every window that is read again,
     stage() with the name of each stage."""
     assert state.stats is not None
@@ -224,12 +224,12 @@ def estimate(
     hot, summary, std = refined.hot, refined.summary, refined.std
     dead = dead_pixels(n_events)
     doubt = next(iter(state.params.values())).get("doubt")
-    if unknown := untold(stats, summary):
-        summary, std = without(unknown, list(refined.chunks), summary, std)
+    if lacking := undetermined(stats, summary):
+        summary, std = without(lacking, list(refined.chunks), summary, std)
     elif doubt is not None and refined.signs is not None:
         std = doubted(doubt, refined.signs, summary, std)
     stage("noise rates and maps")
-    quiet = quiet_times(_told(_windows(state.read), advance), summary, hot, eyes.seen_by)
+    quiet = quiet_times(_counted(_windows(state.read), advance), summary, hot, eyes.seen_by)
     leak = measured_leak(quiet.waits)
     shot = measured_shot(quiet.light, leak.rate_hz, scatter(quiet.maps, hot), SIGNAL_ERROR)
     sent = quiet.maps
@@ -239,17 +239,17 @@ def estimate(
     if state.evidence is not None:
         camera, error = maps.by_regression(state.evidence, summary, std)
     else:
-        again = _told(_windows(state.read), advance)
+        again = _counted(_windows(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
     camera, error = maps.with_rates(camera, error, sent, hot, summary, std)
     extent, thirds = extent or EVERYTHING, drift.thirds(state.parts)
     return CameraEstimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
-        (*before, *camera_notes(stats, unknown, n_events, summary, hot, dead),
+        (*before, *camera_notes(stats, lacking, n_events, summary, hot, dead),
          *receptor_notes(eyes.found), *noise_notes(shot), *after, *extent.notes(),
          *drift.notes(thirds)),
-        tuple(f"theta_{name}" for name in unknown), **_measured(eyes, leak, shot),
+        tuple(f"theta_{name}" for name in lacking), **_measured(eyes, leak, shot),
         extent=extent, thirds=thirds)
 
 
@@ -286,7 +286,8 @@ def _windows(stretches: Sequence[Stretch]) -> Iterator[Window]:
         release(stretch.recording)
 
 
-def _told(windows: Iterator[Window], advance: Advance) -> Iterator[Window]:
+def _counted(windows: Iterator[Window], advance: Advance) -> Iterator[Window]:
+    """The windows; advance() is called after each."""
     for window in windows:
         yield window
         advance()

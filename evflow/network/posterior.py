@@ -62,8 +62,8 @@ def posterior(found: Evidence, y6: Array, y6_std: Array) -> tuple[Camera, Camera
     known, centre = squash_summary(y6), _values(y6[..., :4])
     sigma = jnp.stack([known.sigma_on, known.sigma_off], -1)
     about = jnp.concatenate([sigma, jnp.full_like(sigma, ETA_SPREAD)], -1)
-    told = found.precision > 0
-    mean = jnp.where(told, found.weighted / jnp.where(told, found.precision, 1.0), centre)
+    informed = found.precision > 0
+    mean = jnp.where(informed, found.weighted / jnp.where(informed, found.precision, 1.0), centre)
     off = mean - centre
     share = _share(about, found.precision)
     hot = _hot(off[..., 2:], found.precision[..., 2:])
@@ -72,7 +72,7 @@ def posterior(found: Evidence, y6: Array, y6_std: Array) -> tuple[Camera, Camera
     theta, y_eta = v[..., :2], v[..., 2:]
     camera = Camera(theta[..., 0], theta[..., 1], *jnp.moveaxis(_rates(y_eta), -1, 0))
     # The product's own width would count two estimates with the same error as independent.
-    width = jnp.minimum(about, jnp.where(told, found.precision, 1e-12) ** -0.5)
+    width = jnp.minimum(about, jnp.where(informed, found.precision, 1e-12) ** -0.5)
     slope = jnp.concatenate([jnp.ones_like(theta), _rates(y_eta)], -1)
     shared = y6_std[..., :4] * per_channel(SCALE, v) * jnp.concatenate(
         [theta, jnp.ones_like(theta)], -1)

@@ -75,18 +75,18 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _shape(told: Any) -> tuple[int, ...]:
-    if not isinstance(told, list) or len(told) > 32 or not all(
-            type(n) is int and 0 <= n <= MOST_SIDE for n in told):
-        raise ValueError(f"a shape is {str(told)[:80]}")
-    return tuple(told)
+def _shape(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list) or len(value) > 32 or not all(
+            type(n) is int and 0 <= n <= MOST_SIDE for n in value):
+        raise ValueError(f"a shape is {str(value)[:80]}")
+    return tuple(value)
 
 
-def _span(told: Any) -> tuple[int, int]:
-    if not isinstance(told, list) or len(told) != 2 or not all(type(n) is int for n in told) or (
-            not 0 <= told[0] <= told[1]):
-        raise ValueError(f"an offset is {str(told)[:80]}")
-    return told[0], told[1]
+def _span(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int for n in value) or (
+            not 0 <= value[0] <= value[1]):
+        raise ValueError(f"an offset is {str(value)[:80]}")
+    return value[0], value[1]
 
 
 def _check_kind(name: str, kind: Any) -> None:

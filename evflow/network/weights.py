@@ -159,8 +159,8 @@ def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:
 def _card(data: bytes) -> dict[str, Any]:
     """The model card stored in the file; raises EV009."""
     try:
-        told = tensors.read_header(data)[0].get(tensors.CARD, {})
-        card = parse_json(told.get("card", "{}"))
+        metadata = tensors.read_header(data)[0].get(tensors.CARD, {})
+        card = parse_json(metadata.get("card", "{}"))
         if not isinstance(card, dict):
             raise TypeError(f"it is not an object but a {type(card).__name__}")
     except (ValueError, TypeError, AttributeError) as e:

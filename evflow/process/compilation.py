@@ -56,14 +56,14 @@ def remember(environ: Mapping[str, str] = os.environ) -> Path | None:
 
 
 @contextlib.contextmanager
-def told_of(tell: Callable[[bool], None]) -> Iterator[None]:
-    """Call tell(True) whenever a program is about to be compiled or looked up in this block, and
-    tell(False) when it is ready."""
+def announced(announce: Callable[[bool], None]) -> Iterator[None]:
+    """Call announce(True) whenever a program is about to be compiled or looked up in this block,
+    and announce(False) when it is ready."""
     import jax
 
     def listen(event: str, duration_secs: float, **_: str | int) -> None:
         if event in (LOWERED, COMPILED):
-            tell(event == LOWERED)
+            announce(event == LOWERED)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:

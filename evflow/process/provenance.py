@@ -34,7 +34,7 @@ def provenance() -> dict[str, Any]:
             "machine": machine}
 
 
-def told() -> str:
+def one_line() -> str:
     """The provenance in one line, for people."""
     known = provenance()
     parts = {"evflow": known["evflow"], "source": known["source"], **known["versions"],

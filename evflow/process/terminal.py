@@ -16,7 +16,7 @@ from typing import Any, NoReturn, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from evflow.process.compilation import told_of
+from evflow.process.compilation import announced
 
 INTERRUPTED = 130  # the shell's exit code of Ctrl-C
 
@@ -79,7 +79,7 @@ def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[R
         def compiling(begins: bool) -> None:
             live.update(task, description=f"{said} (compiling)" if begins else said)
 
-        with told_of(compiling) if compiles and not live.disable else contextlib.nullcontext():
+        with announced(compiling) if compiles and not live.disable else contextlib.nullcontext():
             yield report
 
 

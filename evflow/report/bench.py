@@ -16,7 +16,7 @@ import numpy as np
 from evflow.estimation.bench.levels import Bench, cutoff_hz
 from evflow.estimation.result import CameraEstimate
 from evflow.notes import texts
-from evflow.process.provenance import sha256, told
+from evflow.process.provenance import one_line, sha256
 from evflow.report import bench_figures, page
 from evflow.report.maps import fault_panel, map_panel, scatter_panel
 from evflow.report.page import (
@@ -255,7 +255,7 @@ def _facts(recording: Recording, source: Source) -> Panel:
                 or "–",
         "Recording": "; ".join(f"{p}, sha256 {sha256(p)}" for p in source.recordings)
                      or "given from Python",
-        "Command": source.command or "–", "Versions": told()}
+        "Command": source.command or "–", "Versions": one_line()}
     coded = {"Recording", "Command"}
     rows = [[page.text(k), f"<code>{page.text(v)}</code>" if k in coded else page.text(v)]
             for k, v in facts.items()]

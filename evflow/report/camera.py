@@ -22,7 +22,7 @@ from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import Stage
 from evflow.network.weights import load_weights, weights_hash
 from evflow.notes import texts
-from evflow.process.provenance import sha256, told
+from evflow.process.provenance import one_line, sha256
 from evflow.recordings.check import Report, check
 from evflow.recordings.check.steps import frame_steps
 from evflow.report import page
@@ -77,7 +77,7 @@ class Evidence:
     held: Trial | None
     why_not: str = ""
     why_not_held: str = ""
-    foretold: tuple[float, float] | None = None
+    held_out_shares: tuple[float, float] | None = None
 
 
 def write_report(
@@ -135,7 +135,7 @@ def write_report(
     stage("drawing")
     judged = judge_estimate(found, evidence.trial, evidence.held)
     panels = [_verdict(found, evidence, judged), map_panel(found), scatter_panel(found),
-              *_trial_panels(recording, evidence), receptor_panel(found, evidence.foretold),
+              *_trial_panels(recording, evidence), receptor_panel(found, evidence.held_out_shares),
               fault_panel(found), extent_panel(found),
               held_panel(found, evidence.half, evidence.held, evidence.why_not_held),
               _assumptions(
@@ -278,7 +278,7 @@ def _assumptions(
         "Weights": f"{weights}, sha256 {weights_hash(weights)}",
         "Recording": f"{source}, sha256 {sha256(source)}" if source else "given from Python",
         "Command": command or "–",
-        "Versions": told()}
+        "Versions": one_line()}
     if not recording.has_frames:
         facts["Alignment"] = facts["Response"] = "No frames."
     coded = {"Weights", "Recording", "Command"}

@@ -9,10 +9,10 @@ from evflow.report.page import Panel, figure, grid, number, paragraph, spread, t
 TITLE = "Photoreceptor, additional light and delay"
 
 
-def receptor_panel(found: CameraEstimate, foretold: tuple[float, float] | None) -> Panel:
-    """Share explained over the cutoff, what was measured, and its test on the other half. foretold:
-    shares of the second half explained with the first one's constants, for an ideal pixel and as
-    measured; None if it was not tested."""
+def receptor_panel(found: CameraEstimate, held_out_shares: tuple[float, float] | None) -> Panel:
+    """Share explained over the cutoff, what was measured, and its test on the other half.
+    held_out_shares: shares of the second half explained with the first one's constants, for an
+    ideal pixel and as measured; None if it was not tested."""
     receptor = found.receptor
     if receptor is None:
         return Panel("receptor", TITLE, paragraph(
@@ -33,8 +33,8 @@ def receptor_panel(found: CameraEstimate, foretold: tuple[float, float] | None) 
               for label, name, value in (("leak", "leak_hz", sensor.leak_hz),
                                          ("shot noise in the dark", "shot_hz", sensor.shot_hz)))]
     shares = [["all that was read", *(number(v, 3) for v in receptor.explained)]]
-    if foretold is not None:
-        shares.append(["second half, by the first", *(number(v, 3) for v in foretold)])
+    if held_out_shares is not None:
+        shares.append(["second half, by the first", *(number(v, 3) for v in held_out_shares)])
     said = ("The estimate assumes pixels with these constants." if receptor.needed else
             "An ideal pixel is as probable: the estimate assumes one.")
     return Panel("receptor", TITLE, grid([

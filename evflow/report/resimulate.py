@@ -179,16 +179,16 @@ def held_out(
     recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int,
     first: First | None = None, pictures: Pictures | None = None,
 ) -> tuple[CameraEstimate, Trial, tuple[float, float] | None]:
-    """An estimate from the first part of a recording, tested on the rest, and what it predicts
-    there (`foretold`). first: what an estimate computed; without it, that is the first half of the
-    longest run, its last LEARNT_SECONDS. Raises EV017 if a half is too short to estimate from."""
+    """An estimate from the first part of a recording, tested on the rest, and `held_out_shares`
+    there. first: what an estimate computed; without it, the first part is the last LEARNT_SECONDS
+    of the first half of the longest run. Raises EV017 if a half is too short to estimate from."""
     if first is not None:
         found, rest = first.estimate(), first.rest
     else:
         half, rest = _halved(recording, runs)
         found = estimate_camera(half, params, min_window_us=min_window_us)
     trial = resimulate(recording, found, busiest(recording, [rest]), seed, pictures)
-    return found, trial, foretold(recording, found, rest)
+    return found, trial, held_out_shares(recording, found, rest)
 
 
 def _halved(recording: Recording, runs: list[Run]) -> tuple[Recording, Run]:
@@ -204,7 +204,9 @@ def _halved(recording: Recording, runs: list[Run]) -> tuple[Recording, Run]:
                      recording.frames[begin:middle + 1], times[begin:middle + 1]), (middle, last)
 
 
-def foretold(recording: Recording, found: CameraEstimate, run: Run) -> tuple[float, float] | None:
+def held_out_shares(
+    recording: Recording, found: CameraEstimate, run: Run
+) -> tuple[float, float] | None:
     """Shares of the variance of brightness at the events of other frames (first, last) that an
     estimate's thresholds explain: with an ideal pixel, and with the measured photoreceptor. None if
     one of the two is undefined."""

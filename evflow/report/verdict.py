@@ -112,8 +112,8 @@ def _threshold(found: CameraEstimate, key: str) -> Judged:
 def known(found: CameraEstimate, key: str) -> bool:
     """Whether the recording determined this polarity's threshold at all."""
     theta, std = (float(getattr(s, f"theta_{key}")) for s in (found.summary, found.summary_std))
-    told = np.isfinite(std) or any(note.code == "std.none" for note in found.notes)
-    return bool(np.isfinite(theta) and told and theta > 0
+    has_error = np.isfinite(std) or any(note.code == "std.none" for note in found.notes)
+    return bool(np.isfinite(theta) and has_error and theta > 0
                 and f"theta_{key}" not in found.undetermined)
 
 

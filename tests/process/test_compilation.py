@@ -69,7 +69,7 @@ def test_commands_that_compile_remember(monkeypatch, more, kept, capsys):
 
 def test_told_when_a_program_is_compiled():
     said = []
-    with compilation.told_of(said.append):
+    with compilation.announced(said.append):
         jax.jit(lambda x: x * 17.25 + 3)(jnp.ones(3))
     assert said[0]
     assert not said[-1]

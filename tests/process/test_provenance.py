@@ -62,7 +62,7 @@ def test_without_a_source_tree_the_version_tells(
 
 
 def test_all_is_told_in_one_line() -> None:
-    known, line = provenance.provenance(), provenance.told()
+    known, line = provenance.provenance(), provenance.one_line()
     assert known.keys() == {"evflow", "source", "versions", "machine"}
     assert {"python", "jax", "numpy", "scikit-image"} <= known["versions"].keys()
     for said in (known["source"], *known["versions"].values(), known["machine"]["device"]):
