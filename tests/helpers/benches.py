@@ -28,12 +28,14 @@ def bench(
     camera: Camera, levels: list[float], before: tuple[float, ...] = (),
     model: SensorModel = IDEAL,
 ) -> Recording:
-    """Events of a screen and its frames every 10 ms. before: levels that the camera saw first."""
+    """Events of a screen and its frames every 10 ms. before: levels that the camera saw first.
+    The simulation is shown every ms of a ramp, and of a rest no more than the frames."""
     lead = len(screen([*before, levels[0]])) - 100 if before else 0
     dn = screen([*before, *levels])
     frames, times = np.broadcast_to(dn[:, None, None], (len(dn), *SHAPE)), 1000 * np.arange(len(dn))
-    events = simulate(jax.random.key(0), frames, times, camera, model=model)
-    kept = np.arange(lead, len(dn), 10)
+    kept, moving = np.arange(lead, len(dn), 10), np.diff(dn, prepend=dn[0], append=dn[-1]) != 0
+    shown = np.union1d(np.flatnonzero(moving[:-1] | moving[1:]), np.arange(0, len(dn), 10))
+    events = simulate(jax.random.key(0), frames[shown], times[shown], camera, model=model)
     events = events.slice(int(times[lead]) + 1, int(times[-1]) + 1)
     return Recording(events, np.ascontiguousarray(frames[kept]), times[kept])
 
