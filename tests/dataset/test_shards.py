@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import functools
 import json
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 from helpers.datasets import CONFIG, assert_tidy, cached_compilation, contents, refused
 
-from evflow.dataset import build, verify
+from evflow.dataset import build, shards, verify
 from evflow.dataset.manifest import Manifests
 from evflow.io.decode.hdf5 import Disk
 
@@ -23,6 +24,15 @@ from evflow.io.decode.hdf5 import Disk
 def shared_programs() -> Iterator[None]:
     with cached_compilation():
         yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def sequences() -> Iterator[Any]:
+    """Each is made once in this module: what it holds depends on its numbers alone."""
+    made = functools.cache(shards.make_sequence)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "make_sequence", made)
+        yield made
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +50,10 @@ def copied(whole: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_shards_make_the_same_files_in_any_order(whole: Path, tmp_path: Path) -> None:
+def test_shards_make_the_same_files_in_any_order(
+    whole: Path, tmp_path: Path, sequences: Any
+) -> None:
+    sequences.cache_clear()
     for index in (2, 0, 3, 1):
         made = build(tmp_path, CONFIG, shard=(index, 4))
         assert made == list(CONFIG.names[index::4])
