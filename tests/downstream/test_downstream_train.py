@@ -147,15 +147,17 @@ def test_the_true_flow_explains_the_frames_best() -> None:
     texture = jax.image.resize(jnp.asarray(rng.uniform(size=(1, 16, 16))), (1, 64, 64), "cubic")
     before, after = texture[:, 8:40, 8:40], texture[:, 7:39, 6:38]
 
+    photometric = jax.jit(losses.photometric)
+
     def loss(x: float, y: float) -> float:
-        full = jnp.broadcast_to(jnp.array([x, y]).reshape(1, 2, 1, 1), (1, 2, 32, 32))
-        return float(losses.photometric((0.5 * full[..., ::2, ::2], full), before, after))
+        full = np.broadcast_to(np.float32([x, y]).reshape(1, 2, 1, 1), (1, 2, 32, 32))
+        return float(photometric((0.5 * full[..., ::2, ::2], full), before, after))
 
     true = loss(2.0, 1.0)
     assert true < min(loss(*other) for other in ((0, 0), (-2, -1), (1, 1), (2, 2), (3, 1)))
-    rough = jnp.asarray(rng.normal(size=(1, 2, 32, 32)), jnp.float32)
-    same = jnp.zeros_like(before)
-    assert float(losses.photometric((rough,), same, same)) > 0.2  # by its roughness alone
+    rough = rng.normal(size=(1, 2, 32, 32)).astype(np.float32)
+    same = np.zeros(before.shape, np.float32)
+    assert float(photometric((rough,), same, same)) > 0.2  # by its roughness alone
 
 
 def test_leaving_the_image_costs() -> None:

@@ -28,16 +28,21 @@ def made(module: encoder.IntensityEncoder) -> Any:
 def test_columns_are_the_module(outputs: int, changes: int) -> None:
     config = dataclasses.replace(CONFIG, changes=changes)
     module = encoder.IntensityEncoder(config, outputs)
-    x = jnp.asarray(3.0 * np.random.default_rng(0).standard_normal((50, 10)) + 1.0, jnp.float32)
+    x = np.float32(3.0 * np.random.default_rng(0).standard_normal((50, 10)) + 1.0)
     params = made(module)
-    expected: Any = module.apply({"params": params}, x)
-    logits, feature = expected
-    folded = encoder.fold(params)
-    got = encoder.feature_columns(folded, x.T)
-    np.testing.assert_allclose(got.T, feature, atol=2e-5)
-    columns = encoder.change_columns(folded, got, config)
-    assert columns.shape == (outputs * changes, len(x))
-    np.testing.assert_allclose(columns.T, encoder.changes_of_logits(logits), atol=5e-5)
+
+    @jax.jit
+    def both(params: Any, x: jax.Array) -> Any:
+        logits, feature = module.apply({"params": params}, x)
+        folded = encoder.fold(params)
+        got = encoder.feature_columns(folded, x.T)
+        return (feature, encoder.changes_of_logits(logits)), (
+            got.T, encoder.change_columns(folded, got, config).T)
+
+    expected, columns = both(params, x)
+    assert columns[1].shape == (len(x), outputs * changes)
+    np.testing.assert_allclose(columns[0], expected[0], atol=2e-5)
+    np.testing.assert_allclose(columns[1], expected[1], atol=5e-5)
 
 
 def test_folded_layers_have_no_mean_to_take_off() -> None:

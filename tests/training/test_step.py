@@ -69,11 +69,11 @@ def gradients(bank: TextureBank, fresh: TrainState) -> tuple[dict[str, Any], Any
             metrics = loss_fn(params, batch, jax.random.key(2), config)[1]
             return {k: v for k, v in metrics.items() if k.startswith("loss")}
 
-        found, pullback = jax.vjp(of, params)
+        found, pullback = jax.vjp(of, jax.tree.map(lambda p: p + 0.01, params))
         rows = dict(zip(found, jnp.eye(len(found)), strict=True))
         return found, jax.vmap(lambda row: pullback(row)[0])(rows)
 
-    return program(jax.tree.map(lambda p: p + 0.01, fresh.params))
+    return jax.tree.map(np.asarray, program(fresh.params))
 
 
 def test_every_trainable_leaf_gets_a_gradient(gradients: tuple[dict[str, Any], Any]) -> None:
