@@ -34,8 +34,8 @@ UNRELATED = 0.06  # maximum over all interpretations; 26 recordings that agree h
 STRONG = 0.3  # mean change of log brightness in a cell, above noise and drift
 LEAST_CHANGE, MOST_THETA = 500.0, 10.0  # log units in all; real recordings have >= .4 per event
 PARTS, IN_PART = 4, 0.4  # of the steps; least r of the best one
-LOST, SHOWN = 0.4, 0.25  # share of that r below which another part disagrees (sound recordings vary
-# by .1), if its frames change by at least that share
+LOST, SHOWN = 0.25, 0.25  # share of that r below which another part disagrees (the least in 28
+# sound recordings is .4), if its frames change by at least that share
 LATENCY_US = 4_000
 LEAST_OFFSET_US = 10_000
 

@@ -395,7 +395,7 @@ def by_name(r: Recording) -> Recording:
 @pytest.mark.parametrize(("make", "code", "severity", "said"), [
     (turned_midway, "EV024", "error", "but not around"),
     (lambda r: timed(r, 0.7), "EV024", "error", "--frames-fps"),
-    (lambda r: timed(r, 1.1), "EV024", "warning", "--frames-fps"),
+    (lambda r: timed(r, 0.9), "EV024", "warning", "--frames-fps"),
     (lambda r: timed(r, 2.0), "EV024", "error", "--frames-fps"),
     (by_name, "EV024", "error", "out of order"),
     (transposed, "EV029", "error", "rows and columns of the frames swapped"),
