@@ -79,6 +79,7 @@ def intervals() -> dict[str, Figures]:
         "30 recordings of .2 s": of("coverage_0.2s", *whole),
         "30 recordings of 1 s": of("coverage_1s", *whole),
         "50 recordings of 5 s": of("coverage_5s", *whole),
+        "16 recordings of 30 s": of("coverage_30s", *whole),
         "the held-out recordings": [*theta, 12, *eta, *free],  # 12: Eq. 12
     }
 
