@@ -139,11 +139,14 @@ class Interval:
                 cv2.copyTo(seen_b[edge], cv2.compare(in_b, in_a, cv2.CMP_GT), picture[edge])
             np.clip(picture, min(least_a, least_b), max(most_a, most_b), out=picture)
 
-    def _reach(self) -> int:
-        """Largest displacement in pixels at any fraction of the interval."""
-        bent = sum(cv2.norm(bend, cv2.NORM_INF) for bend in self.bends or ())
-        flows = (cv2.norm(flow, cv2.NORM_INF) for flow in (self.motion.there, self.motion.back))
-        return math.ceil(max(flows) + bent) + 1
+    def _reach(self) -> tuple[int, int]:
+        """Largest displacement (x, y) in pixels at any fraction of the interval."""
+        def largest(moved: np.ndarray) -> np.ndarray:
+            return np.abs(moved).max((0, 1))
+
+        bent = sum(largest(bend) for bend in self.bends or ())
+        x, y = np.maximum(largest(self.motion.there), largest(self.motion.back)) + bent
+        return math.ceil(x) + 1, math.ceil(y) + 1
 
 
 def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
@@ -154,13 +157,15 @@ def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
     yield from (slice(top, min(top + band, shape[0])) for top in range(0, shape[0], band))
 
 
-def _edges(rows: slice, shape: tuple[int, ...], reach: int) -> Iterator[tuple[slice, slice]]:
-    """Disjoint parts of some rows of a frame (H, W) that cover its border of width `reach`;
-    indices count from the first of these rows."""
-    (height, width), count = shape, rows.stop - rows.start
-    top = min(max(reach - rows.start, 0), count)
-    bottom = min(max(height - reach - rows.start, top), count)
-    columns = [slice(None)] if 2 * reach >= width else [slice(reach), slice(width - reach, None)]
+def _edges(
+    rows: slice, shape: tuple[int, ...], reach: tuple[int, int]
+) -> Iterator[tuple[slice, slice]]:
+    """Disjoint parts of some rows of a frame (H, W) that cover its border of width `reach` (x, y)
+    pixels; indices count from the first of these rows."""
+    (x, y), (height, width), count = reach, shape, rows.stop - rows.start
+    top = min(max(y - rows.start, 0), count)
+    bottom = min(max(height - y - rows.start, top), count)
+    columns = [slice(None)] if 2 * x >= width else [slice(x), slice(width - x, None)]
     parts = [(slice(top), slice(None)), *((slice(top, bottom), some) for some in columns),
              (slice(bottom, count), slice(None))]
     yield from ((along, across) for along, across in parts if along.stop > (along.start or 0))

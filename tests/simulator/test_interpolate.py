@@ -152,10 +152,10 @@ def test_lengths_of_flow_do_not_depend_on_where_they_lie_in_memory() -> None:
 
 
 @pytest.mark.parametrize("shape", [(20, 30), (20, 31), (7, 40)])
-@pytest.mark.parametrize("reach", [1, 3, 9, 10, 400])
+@pytest.mark.parametrize("reach", [(1, 1), (3, 9), (9, 3), (10, 400), (400, 1)])
 @pytest.mark.parametrize("band", [1, 4, 40])
 def test_edges_hold_all_that_is_near_the_border_once(
-    shape: tuple[int, int], reach: int, band: int
+    shape: tuple[int, int], reach: tuple[int, int], band: int
 ) -> None:
     seen = np.zeros(shape, int)
     for top in range(0, shape[0], band):
@@ -163,7 +163,8 @@ def test_edges_hold_all_that_is_near_the_border_once(
         for edge in _edges(rows, shape, reach):
             seen[rows][edge] += 1
     y, x = np.indices(shape)
-    near = np.minimum(np.minimum(y, shape[0] - 1 - y), np.minimum(x, shape[1] - 1 - x)) < reach
+    near = (np.minimum(x, shape[1] - 1 - x) < reach[0]) | (
+        np.minimum(y, shape[0] - 1 - y) < reach[1])
     assert seen.max() == 1
     assert (seen[near] == 1).all()
 
