@@ -72,7 +72,7 @@ def make_errors(config: TrainConfig, bank: TextureBank) -> Callable[..., dict[st
         y6 = jnp.zeros((*block.dlogI.shape, 6))
         if config.model.pool:
             y6 = architecture.over_pixels(
-                summary_losses(net, batch, k_summary, config)[1], block.dlogI.shape[1:])
+                summary_losses(net, batch, k_summary, config)[1], block.dlogI.shape)
         model = config.model
         changes, _ = architecture.encode_changes(
             model, net, block.voxels, block.dlogI, block.context, y6)

@@ -201,7 +201,8 @@ def test_without_data_synthetic_cameras_are_seen(
 ) -> None:
     monkeypatch.delenv("EVFLOW_DATA", raising=False)
     trained = load_network(saved(tmp_path, EVFlowNet(base=2)))
-    assert evaluate_network.parts(Options()) == []
+    options = Options()
+    assert evaluate_network.parts(options.data, options.warmup_s, options.window_ms) == []
     assert evaluate_network.rotations() == {}
     monkeypatch.setattr(targets, "CAMERAS", {"low": (0.12, 0.16, 4.0, 2.5, 0.03)})
     monkeypatch.setattr(targets, "CIRCUITS", {
