@@ -16,7 +16,6 @@ import datetime
 import json
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -59,9 +58,9 @@ class Options:
     JSON lines on the disk. Every case runs in a process of its own, and those of a task take
     turns, except with --quick. If one failed the exit code is 1.
 
-    Example: evflow bench --only simulator voxels
+    Example: python -m benchmarks --only simulator voxels
 
-    Example: evflow bench --quick
+    Example: python -m benchmarks --quick
     """
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
@@ -138,14 +137,9 @@ def select(only: tuple[str, ...]) -> list[Case]:
             for case in cases]
 
 
-def command(arguments: Sequence[str], prog: str) -> None:
-    """What a command line says; prog: the program's name in its help. Leaves with the exit code."""
-    sys.exit(main(tyro.cli(Options, args=arguments, prog=prog)))
-
-
 if __name__ == "__main__":
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # inherited by the cases' processes
     try:
-        command(sys.argv[1:], "python -m benchmarks")
+        sys.exit(main(tyro.cli(Options, prog="python -m benchmarks")))
     except EvflowDataError as e:
         sys.exit(str(e))

@@ -14,7 +14,6 @@ from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
-from evflow.commands.bench import Bench, at_hand, forwarded
 from evflow.commands.check import Check
 from evflow.commands.compare import Compare
 from evflow.commands.convert import Convert
@@ -43,9 +42,9 @@ COMMANDS: dict[str, type] = {
 
 
 def offered(arguments: Sequence[str] = ()) -> Any:
-    """The type that tyro parses: one of the commands by its name. `bench` is offered only where
-    benchmarks/ exists; the options of `train` are built only when `train` is called."""
-    found = COMMANDS | ({"bench": Bench} if at_hand() else {})
+    """The type that tyro parses: one of the commands by its name. The options of `train` are built
+    only when `train` is called."""
+    found = dict(COMMANDS)
     if arguments[:1] == ["train"]:
         found["train"] = with_configuration(arguments)
     named = tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in found.items())
@@ -57,13 +56,13 @@ def understood(arguments: list[str]) -> list[str]:
     first = arguments[0] if arguments else ""
     if first == "--version":
         return ["version", *arguments[1:]]
-    if first and not first.startswith("-") and first not in {*COMMANDS, "bench"}:
+    if first and not first.startswith("-") and first not in COMMANDS:
         near = difflib.get_close_matches(first, COMMANDS, n=1)
         fix = f"Did you mean: evflow {near[0]}?" if near else (
             "To measure a recording: evflow estimate RECORDING -o cam/."
             if Path(first).exists() else f"Commands: {', '.join(COMMANDS)}.")
         raise EvflowDataError("EV020", f"evflow has no command {first!r}.", fix)
-    return forwarded(arguments)
+    return arguments
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,9 +1,8 @@
-"""Training, of the installed package alone; benchmarks, where the source tree is at hand."""
+"""Training, of the installed package alone."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import shutil
 import subprocess
@@ -15,7 +14,6 @@ import tyro
 
 import evflow
 from evflow.cli import main
-from evflow.commands.bench import forwarded
 from evflow.commands.train import with_configuration
 from evflow.errors import EvflowDataError
 from evflow.scenes import sources
@@ -45,45 +43,13 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_follows_is_the_benchmarks_own() -> None:
-    assert forwarded(["bench", "--out", "a", "--help"]) == ["bench", "--", "--out", "a", "--help"]
-    assert forwarded(["bench", "--", "--out", "a"]) == ["bench", "--", "--out", "a"]
-    for other in (["info", "bench"], ["--help"], []):
-        assert forwarded(other) == other
-
-
-def test_benchmarks_are_offered_where_there_are_any(installed: Path, tmp_path: Path) -> None:
-    shown = run(tmp_path, "--help")
-    alone = run(tmp_path, "--help", package=installed)
-    assert shown.returncode == alone.returncode == 0
-    assert "• bench" in shown.stdout
-    assert "• bench" not in alone.stdout
-    assert "• train" in alone.stdout
-    refused = run(tmp_path, "bench", "--quick", package=installed)
-    assert refused.returncode == 2
-    assert "Traceback" not in refused.stderr
-
-
-def test_the_benchmarks_help_and_errors_are_their_own(tmp_path: Path) -> None:
-    shown = run(tmp_path, "bench", "--help")
-    assert shown.returncode == 0
-    assert "--quick" in shown.stdout
-    wrong = run(tmp_path, "bench", "--only", "nothing")
-    assert wrong.returncode == 2
-    assert "EV020" in wrong.stderr
-    assert "Traceback" not in wrong.stderr
-
-
-@pytest.mark.parametrize("verb", ["train", "bench"])
-def test_help_is_of_the_command_and_has_an_example(
-    verb: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_is_of_the_command_and_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main([verb, "--help"])
+        main(["train", "--help"])
     assert caught.value.code == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"usage: evflow {verb} [-h]" in shown
-    assert f"Example: evflow {verb}" in shown
+    assert "usage: evflow train [-h]" in shown
+    assert "Example: evflow train" in shown
     assert "python -m" not in shown
 
 
@@ -100,14 +66,11 @@ def test_what_a_training_cannot_do_is_told_at_once(
 
 
 @pytest.mark.slow
-def test_they_run_from_any_folder(installed: Path, tmp_path: Path) -> None:
+def test_it_runs_from_any_folder(installed: Path, tmp_path: Path) -> None:
     trained = run(tmp_path, "train", "--preset", "debug", "--steps", "2", "--out", "run",
                   package=installed)
     assert trained.returncode == 0, trained.stderr
     assert (tmp_path / "run/weights.safetensors").is_file()
-    timed = run(tmp_path, "bench", "--quick", "--only", "voxels", "--out", "times.jsonl")
-    assert timed.returncode == 0, timed.stderr
-    assert all(json.loads(line) for line in (tmp_path / "times.jsonl").read_text().splitlines())
 
 
 def parsed(*words: str, preset: str = "debug") -> TrainConfig:
