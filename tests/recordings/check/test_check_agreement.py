@@ -1,0 +1,136 @@
+"""What makes thresholds wrong without looking wrong: events and frames that do not belong together,
+or not like this."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evflow import Events, Recording, check
+from evflow.recordings.adjust import flipped, shifted
+from evflow.recordings.check import frames_offset
+
+
+def codes_of(recording: Recording) -> set[str]:
+    return {finding.code for finding in check(recording).findings}
+
+
+@pytest.mark.parametrize("side", ["horizontal", "vertical", "both"])
+def test_mirrored_frames(sound: Recording, side: str) -> None:
+    (error,) = check(flipped(sound, side)).errors
+    assert error.code == "EV029"
+    assert error.fix == f"Pass --flip-frames {side}, or remove what was passed."
+
+
+def test_events_and_frames_that_are_unrelated_are_an_error(sound: Recording) -> None:
+    e = sound.events
+    order = np.random.default_rng(0).permutation(64 * 48)
+    pixel = order[e.y.astype(int) * 64 + e.x]
+    scattered = dataclasses.replace(e, x=pixel % 64, y=pixel // 64)
+    assert "EV034" in codes_of(dataclasses.replace(sound, events=scattered))
+
+
+@pytest.mark.parametrize("offset_ms", [-40, 30])
+def test_inversion_and_offset_are_found_together(sound: Recording, offset_ms: int) -> None:
+    swapped = dataclasses.replace(sound.events, p=~sound.events.p)
+    moved = shifted(dataclasses.replace(sound, events=swapped), offset_ms * 1000)
+    (finding,) = check(moved).errors
+    assert finding.code == "EV021"
+    assert frames_offset(moved) == pytest.approx(-offset_ms * 1000, abs=8_000)
+
+
+def test_mirrored_and_inverted_are_found_together(sound: Recording) -> None:
+    swapped = dataclasses.replace(sound.events, p=~sound.events.p)
+    (finding,) = check(flipped(dataclasses.replace(sound, events=swapped), "horizontal")).errors
+    assert finding.code == "EV029"
+    assert "--polarity invert" in finding.fix
+
+
+def rows_of(events: Events, rows: Any, **columns: Any) -> Events:
+    """Some rows of the events, with other values in some columns."""
+    kept = {n: getattr(events, n)[rows] for n in ("x", "y", "t", "p")} | {"size": events.size}
+    return Events(**(kept | columns))
+
+
+def transposed(r: Recording, turns: int = 0) -> Recording:
+    """The square part of a recording, its events with x and y swapped; frames turned by 90
+    degrees."""
+    side = min(r.events.size)
+    kept = (r.events.x < side) & (r.events.y < side)
+    frames = np.rot90(r.frames[:, :side, :side], turns, (1, 2)).copy()
+    x, y = r.events.x[kept], r.events.y[kept]
+    return Recording(rows_of(r.events, kept, x=y, y=x, size=(side, side)), frames, r.frame_times)
+
+
+def displaced(r: Recording, dx: int, dy: int) -> Recording:
+    x, y = r.events.x.astype(int) + dx, r.events.y.astype(int) + dy
+    kept = (x >= 0) & (x < r.events.size[0]) & (y >= 0) & (y < r.events.size[1])
+    return dataclasses.replace(r, events=rows_of(r.events, kept, x=x[kept], y=y[kept]))
+
+
+def again(r: Recording, share: float) -> Recording:
+    """The recording with the first part of its events written twice."""
+    n = len(r.events)
+    rows = np.sort(np.concatenate([np.arange(n), np.arange(int(share * n))]))
+    return dataclasses.replace(r, events=rows_of(r.events, rows))
+
+
+def shown(r: Recording, frames: np.ndarray) -> Recording:
+    return dataclasses.replace(r, frames=np.broadcast_to(frames, r.frames.shape).copy())
+
+
+def turned_midway(r: Recording) -> Recording:
+    return dataclasses.replace(r, events=dataclasses.replace(
+        r.events, p=r.events.p ^ (r.events.t > np.median(r.frame_times))))
+
+
+def timed(r: Recording, factor: float) -> Recording:
+    first = int(r.frame_times[0])
+    return dataclasses.replace(
+        r, frame_times=first + np.rint((r.frame_times - first) * factor).astype(np.int64))
+
+
+def by_name(r: Recording) -> Recording:
+    """Frames in the order 1, 10, 11, 2, 3, ..."""
+    return dataclasses.replace(r, frames=r.frames[sorted(range(len(r.frames)), key=str)])
+
+
+@pytest.mark.parametrize(("make", "code", "severity", "said"), [
+    (turned_midway, "EV024", "error", "but not around"),
+    (lambda r: timed(r, 0.7), "EV024", "error", "--frames-fps"),
+    (lambda r: timed(r, 0.9), "EV024", "warning", "--frames-fps"),
+    (lambda r: timed(r, 2.0), "EV024", "error", "--frames-fps"),
+    (by_name, "EV024", "error", "out of order"),
+    (transposed, "EV029", "error", "rows and columns of the frames swapped"),
+    (lambda r: transposed(r, 1), "EV029", "error", "mirrored in the"),
+    (lambda r: displaced(r, 9, -6), "EV037", "error", "px to the right and"),
+    (lambda r: displaced(r, -9, 6), "EV037", "error", "px below"),
+    (lambda r: again(r, 1.0), "EV038", "error", "50%"),
+    (lambda r: again(r, 0.04), "EV038", "warning", "4%"),
+    (lambda r: shown(r, r.frames[3]), "EV034", "error", "are alike"),
+    (lambda r: shown(r, np.uint8(90)), "EV034", "error", "are alike")])
+def test_what_makes_thresholds_wrong_is_found(
+    sound: Recording, make: Callable[[Recording], Recording], code: str, severity: str, said: str
+) -> None:
+    findings = {f.code: f for f in check(make(sound)).findings}
+    assert (findings[code].severity, said in str(findings[code])) == (severity, True)
+
+
+def test_an_exposure_that_varies_displaces_nothing(sound: Recording) -> None:
+    """Frames that change as a whole agree less with events at any time, but not in any place."""
+    gain = np.where(np.arange(len(sound.frames)) % 2, 0.7, 1.0)[:, None, None]
+    varied = dataclasses.replace(sound, frames=np.rint(sound.frames * gain).astype(np.uint8))
+    assert {"EV024", "EV029", "EV037"} & codes_of(varied) == set()
+
+
+def test_a_clock_of_few_digits_may_repeat_events(sound: Recording) -> None:
+    """As a simulator that stamps all events of a step alike does."""
+    coarse = dataclasses.replace(sound, events=dataclasses.replace(
+        sound.events, t=sound.events.t // 20_000 * 20_000))
+    assert len(np.unique(np.stack([coarse.events.t, coarse.events.x]), axis=1).T) < len(
+        coarse.events)
+    assert "EV038" not in codes_of(coarse)
