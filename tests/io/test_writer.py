@@ -6,6 +6,7 @@ import itertools
 import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,14 @@ def test_events_and_frames_come_back(tmp_path: Path, kind: str) -> None:
     equal(part.events, want.events.slice(T0 + 100_000, T0 + 200_000))
     if want.has_frames:  # those at 101 and 151 ms
         np.testing.assert_array_equal(part.frames, want.frames[2:4])
+
+
+@pytest.mark.parametrize("kind", ["npz", "e2vid"])
+def test_archives_do_not_say_when_they_were_written(tmp_path: Path, kind: str) -> None:
+    path = place(tmp_path, kind)
+    write_events(path, make(50).events, kind)
+    with zipfile.ZipFile(path) as archive:
+        assert {info.date_time[0] for info in archive.infolist()} == {1980}
 
 
 @each

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import numpy as np
 
 from evflow.checks import COLUMNS, Size, check_columns
 from evflow.errors import EvflowDataError
-from evflow.files.archives import DAMAGE, Member, members
+from evflow.files.archives import BLOCK, DAMAGE, Member, members
 from evflow.files.arrays import GrowingArray
 from evflow.files.atomic import aside
 from evflow.files.moves import remove
@@ -207,7 +208,10 @@ class NpzWriter(EventWriter):
         for name, column in self._columns.items():
             column.close()
             self._sizes[f"{name}.npy"] = (self._folder / f"{name}.npy").stat().st_size
-            self._archive.write(self._folder / f"{name}.npy", f"{name}.npy")
+            # not archive.write, which stores when the column was written
+            with open(self._folder / f"{name}.npy", "rb") as f, self._archive.open(
+                    f"{name}.npy", "w", force_zip64=True) as member:
+                shutil.copyfileobj(f, member, BLOCK)
         with self._archive.open("size.npy", "w") as f:
             np.lib.format.write_array(f, np.array(self.size, np.int32))
 
