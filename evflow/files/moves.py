@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
+from evflow.process.signals import uninterrupted
 
 NOREPLACE, EXCHANGE = 1, 2  # from linux/fs.h
 AT_FDCWD = -100
@@ -45,8 +46,8 @@ def swap_folders(new: Path, old: Path, aside: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or folder if it exists and can be removed."""
-    with contextlib.suppress(OSError):  # where even the folder around it is missing
+    """Remove a file or folder if it exists and can be removed; signals wait until it is done."""
+    with uninterrupted(), contextlib.suppress(OSError):  # even the folder around it may be missing
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:

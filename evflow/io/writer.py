@@ -9,6 +9,7 @@ nothing is left behind.
 from __future__ import annotations
 
 import abc
+import atexit
 import contextlib
 import os
 import sys
@@ -64,6 +65,7 @@ class EventWriter(abc.ABC):
 
     def __enter__(self: Self) -> Self:
         self._session = self._writing()
+        atexit.register(self._abandon)
         try:
             with uninterrupted():
                 self._session.__enter__()
@@ -75,19 +77,33 @@ class EventWriter(abc.ABC):
     def __exit__(
         self, kind: type[BaseException] | None, e: BaseException | None, tb: TracebackType | None
     ) -> None:
-        self._session.__exit__(kind, e, tb)
+        try:
+            self._session.__exit__(kind, e, tb)
+        finally:
+            atexit.unregister(self._abandon)
+
+    def _abandon(self) -> None:
+        """Leave nothing behind where a signal came before `__exit__` began."""
+        self._session.gen.close()
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
         """The lifetime of the file, from its creation to its final name."""
         with self._place() as temporary:
-            with contextlib.ExitStack() as self._stack:
+            self._stack = contextlib.ExitStack()
+            try:
                 with self._guard():
                     self._open(temporary, self._stack)
                 yield
                 self._flush()
                 with self._guard():
                     self._finish()
+                with uninterrupted():  # else what is closed last would be left
+                    self._stack.close()
+            except BaseException:
+                with uninterrupted(), contextlib.suppress(Exception):  # the first error counts
+                    self._stack.close()
+                raise
             self._verify(temporary)
 
     def append(self, events: Events) -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -283,3 +286,21 @@ def test_a_staged_folder_is_new_as_a_whole(tmp_path: Path) -> None:
         (stage / "a.txt").write_text("two")
     assert sorted(p.name for p in folder.iterdir()) == ["a.txt", "mine.txt"]  # b.txt was stale
     assert (folder / "a.txt").read_text() == "two"
+
+
+def test_an_interrupt_leaves_no_half_removed_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "a").touch()
+    rmtree = shutil.rmtree
+
+    def slow(path: Path, **options: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        rmtree(path, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", slow)
+    with pytest.raises(KeyboardInterrupt):
+        moves.remove(folder)
+    assert not folder.exists()
