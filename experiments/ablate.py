@@ -25,30 +25,18 @@ import jax
 import numpy as np
 import tyro
 
-from evflow.network.config import ModelConfig
 from evflow.process.devices import compiled_quickly
-from evflow.report import plots
 from evflow.scenes import make_bank
-from evflow.training.config import PARTS, PRESETS, LossConfig, TrainConfig
+from evflow.training.config import TrainConfig
 from experiments.shared import variants
-from experiments.shared.common import at_least, begin, conclude, markdown, run_script, slug
-from experiments.shared.images import mean_ci
+from experiments.shared.ablate_pages import CONSTANT, draw, table
+from experiments.shared.ablated import Study, base_config, chosen
+from experiments.shared.common import at_least, begin, conclude, run_script, slug
 from experiments.shared.kept import resumed
 from experiments.shared.variants import NAMES, Row
 
-Study = Literal["losses", "steps", "networks"]
-FLOW_STEPS = (8, 12, 16, 20, 24)
 RATES = (0.3, 1.0, 3.0)  # times the preset's, 1e-3 (flow 5e-4)
 TUNED, TUNING, HELD = 7_000_029, 8_100_037, 8_000_009  # seeds: tuning's own, its cameras, the score
-CONSTANT = "constant"
-HEADS = ("variant", "theta, sequence", "paper", "eta, sequence", "paper", "theta, pixel",
-         "to the first, theta", "shows from", "events made / true", "log p(z) + log det", "rate",
-         "seconds")
-PAPER = {  # Table VIII: theta_on, theta_off, eta_on, eta_off
-    "L_P": (0.074, 0.064, 0.038, 0.046), "L_P + L_F + L_F'": (0.055, 0.075, 0.037, 0.054),
-    "L_P + L_E": (0.037, 0.073, 0.054, 0.048),
-    "L_P + L_F + L_F' + L_E": (0.032, 0.046, 0.066, 0.065),
-    "the same, weights adapted": (0.018, 0.024, 0.045, 0.027)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,44 +55,6 @@ class Options:
     """Held-out batches to score on."""
     rows: Path | None = None
     """Where scores are kept, to go on from when interrupted."""
-
-
-def base_config(steps: int, small: bool) -> TrainConfig:
-    """The paper's network and cameras, in crops that a core trains eight times as fast."""
-    config = dataclasses.replace(
-        PRESETS["paper"], crop=32, block=(8, 8), scenes=2 if small else 8, cameras=2, steps=steps,
-        warmup=min(100, steps // 5), textures=16 if small else 192)
-    if not small:
-        return config
-    flow = dataclasses.replace(config.model.flow, steps=2)
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, flow=flow),
-                               steps_per_window=16)
-
-
-def chosen(study: Study, base: TrainConfig) -> dict[str, TrainConfig]:
-    """Training configurations by name, the one that the others are compared to first."""
-    def losses(**changes: Any) -> TrainConfig:
-        return dataclasses.replace(base, loss=dataclasses.replace(base.loss, **changes))
-
-    def steps(k: int) -> TrainConfig:
-        return dataclasses.replace(base, model=dataclasses.replace(
-            base.model, flow=dataclasses.replace(base.model.flow, steps=k)))
-
-    if study == "losses":
-        plain = {"adaptive": False}
-        return {"L_P": losses(flow=0.0, inverse_flow=0.0, event=0.0, **plain),
-                "L_P + L_F": losses(inverse_flow=0.0, event=0.0, **plain),
-                "L_P + L_F + L_F'": losses(event=0.0, **plain),
-                "L_P + L_E": losses(flow=0.0, inverse_flow=0.0, **plain),
-                "L_P + L_F + L_F' + L_E": losses(**plain),
-                "the same, weights adapted": base}
-    if study == "steps":
-        return {f"{k} steps": steps(k) for k in FLOW_STEPS}
-    ours = ModelConfig()
-    ours = dataclasses.replace(ours, flow=dataclasses.replace(
-        ours.flow, steps=base.model.flow.steps))
-    return {"paper": base, "default": dataclasses.replace(
-        base, model=ours, loss=LossConfig(), parts=PARTS)}
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -157,57 +107,6 @@ def compared(name: str, config: TrainConfig, banks: Any, seeds: list[int], optio
 def loss(row: Row) -> list[float]:
     """What a rate is chosen by: errors of the sequence; one that diverged is never chosen."""
     return [np.nan_to_num(row[f"sequence/{name}"], nan=np.inf) for name in NAMES]
-
-
-def theta(row: Row) -> float:
-    """Mean of the two thresholds' errors."""
-    return float(np.mean([row["sequence/theta_on"], row["sequence/theta_off"]]))
-
-
-def table(result: dict[str, Row], steps: int) -> str:
-    """ON / OFF means over seeds, the paper's figures beside ours; "shows from": the half-width of
-    the difference's 95 % interval."""
-    def pair(rows: list[Row], kind: str, parameter: str) -> str:
-        return " / ".join(f"{np.mean([r[f'{kind}/{parameter}_{p}'] for r in rows]):.3f}"
-                          for p in ("on", "off"))
-
-    first = next(name for name in result if name != CONSTANT)
-    cells = []
-    for name, found in result.items():
-        rows = [found] if name == CONSTANT else found["seeds"]
-        on, off, eta_on, eta_off = PAPER.get(name, (np.nan,) * 4)
-        more = [""] * 6
-        if name != CONSTANT:
-            apart, wide = mean_ci(np.array([theta(a) - theta(b) for a, b in zip(
-                rows, result[first]["seeds"], strict=True)]))
-            more = [*(["", ""] if name == first else [f"{apart:+.4f}", f"{wide:.4f}"]),
-                    f"{np.median([r['events'] for r in rows]):.3g}",
-                    f"{np.mean([r['log p(z)'] for r in rows]):.1f}", f"{found['rate']:g}",
-                    f"{np.mean([r['seconds'] for r in rows]):.0f}"]
-        cells.append([name, pair(rows, "sequence", "theta"), f"{on:.3f} / {off:.3f}",
-                      pair(rows, "sequence", "eta"), f"{eta_on:.3f} / {eta_off:.3f}",
-                      pair(rows, "pixel", "theta"), *more])
-    text = f"{steps} training steps each.\n\n" + markdown(HEADS, cells)
-    return text.replace("nan / nan", "")
-
-
-def draw(result: dict[str, Row], path: Path) -> None:
-    """Errors of every seed, the constant's as a line (Fig. 14, of thresholds and noise)."""
-    figure = plots.new_figure(8, 3.2)
-    names = [name for name in result if name != CONSTANT]
-    for k, (parameter, letter) in enumerate((("theta", "θ"), ("eta", "η")), 1):
-        axis = figure.add_subplot(1, 2, k)
-        for side, marker in (("on", "o"), ("off", "s")):
-            at = f"sequence/{parameter}_{side}"
-            points = [(i, row[at]) for i, name in enumerate(names)
-                      for row in result[name]["seeds"]]
-            line, = axis.plot(*zip(*points, strict=True), marker, markersize=4,
-                              label=side.upper())
-            axis.axhline(result[CONSTANT][at], color=line.get_color(), linestyle=":")
-        axis.set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=7)
-        axis.set(ylim=(0, None), ylabel=f"|{letter} − of the sequence|")
-        axis.legend(frameon=False, fontsize=8, title="dotted: constant", title_fontsize=7)
-    plots.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -13,11 +13,11 @@ import evflow as ef
 from evflow import load_weights
 from evflow.training.config import as_dict
 from experiments import ablate
-from experiments.shared import variants
+from experiments.shared import ablate_pages, ablated, variants
 from experiments.shared.common import slug
 
 STUDIES = ("losses", "steps", "networks")
-BASE = ablate.base_config(400, small=False)
+BASE = ablated.base_config(400, small=False)
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
@@ -27,16 +27,16 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("study", "of"), [("losses", ".loss."), ("steps", ".model.flow.steps")])
-def test_variants_differ_in_what_is_ablated_alone(study: ablate.Study, of: str) -> None:
+def test_variants_differ_in_what_is_ablated_alone(study: ablated.Study, of: str) -> None:
     base = flat(as_dict(BASE))
-    for config in ablate.chosen(study, BASE).values():
+    for config in ablated.chosen(study, BASE).values():
         changed = {k for k, v in flat(as_dict(config)).items() if base[k] != v}
         assert all(name.startswith(of) for name in changed)
     assert base[".model.pool"] is False  # no summary, so none to hand over
 
 
 def test_the_two_networks_see_the_same_cameras() -> None:
-    paper, ours = map(as_dict, ablate.chosen("networks", BASE).values())
+    paper, ours = map(as_dict, ablated.chosen("networks", BASE).values())
     assert ours["model"]["pool"]
     assert ours["model"]["flow"]["steps"] == paper["model"]["flow"]["steps"]
     same = set(paper) - {"model", "loss", "parts"}
@@ -54,26 +54,26 @@ def test_a_rate_at_which_training_diverged_is_not_taken() -> None:
 
 def test_the_table_says_what_so_many_seeds_show(tmp_path: Path) -> None:
     """Differences -.01 and -.03: mean -.02, Student's t of one degree 12.706, times .01."""
-    result = {ablate.CONSTANT: row(0.1),
+    result = {ablate_pages.CONSTANT: row(0.1),
               "L_P": {"rate": 1.0, "seeds": [row(0.10), row(0.12)]},
               "L_P + L_E": {"rate": 0.3, "seeds": [row(0.09), row(0.09)]}}
-    lines = ablate.table(result, 400).splitlines()
+    lines = ablate_pages.table(result, 400).splitlines()
     assert lines[-1].startswith("| L_P + L_E | 0.090 / 0.090 | 0.037 / 0.073 |")
     assert "| -0.0200 | 0.1271 |" in lines[-1]
     assert lines[-3].startswith("| constant | 0.100 / 0.100 |  |")
-    ablate.draw(result, tmp_path / "a.png")
+    ablate_pages.draw(result, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("study", STUDIES)
-def test_ablations_train_and_score(study: ablate.Study, tmp_path: Path) -> None:
+def test_ablations_train_and_score(study: ablated.Study, tmp_path: Path) -> None:
     def run(out: Path) -> dict[str, Any]:
         return ablate.main(ablate.Options(
             study, out=out, steps=2, batches=1, rows=tmp_path / "rows.json"))
 
     result = run(tmp_path)
-    names = [name for name in result if name != ablate.CONSTANT]
+    names = [name for name in result if name != ablate_pages.CONSTANT]
     assert len(names) == 2
     for name in names:  # weights that estimate
         assert np.isfinite(result[name]["seeds"][0]["pixel/theta_on"])
