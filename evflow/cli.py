@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
+from evflow.commands.arguments import check_options, check_rest, flowing
 from evflow.commands.check import Check
 from evflow.commands.compare import Compare
 from evflow.commands.convert import Convert
@@ -43,10 +44,13 @@ COMMANDS: dict[str, type] = {
 
 def offered(arguments: Sequence[str] = ()) -> Any:
     """The type that tyro parses: one of the commands by its name. The options of `train` are built
-    only when `train` is called."""
-    found = dict(COMMANDS)
-    if arguments[:1] == ["train"]:
+    only when `train` is called. Raises EV020 for options that the called command lacks."""
+    found, verb = dict(COMMANDS), next(iter(arguments), "")
+    if verb == "train":
         found["train"] = with_configuration(arguments)
+    if verb in found:
+        check_options(verb, found[verb], arguments[1:])
+        found[verb] = flowing(found[verb])
     named = tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in found.items())
     return Union[named]  # noqa: UP007 - built at run time
 
@@ -71,10 +75,11 @@ def main(argv: list[str] | None = None) -> int:
         early.interrupt_as_usual()
         with stoppable():
             arguments = understood(sys.argv[1:] if argv is None else argv)
-            command = tyro.cli(
-                offered(arguments), args=arguments, prog="evflow",
+            command, rest = tyro.cli(
+                offered(arguments), args=arguments, prog="evflow", return_unknown_args=True,
                 description="Measure an event camera from its recording; simulate any video as it "
                 "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
+            check_rest(arguments[0], rest)
             if isinstance(command, Compiling) and command.compile_cache:
                 remember()
             early.settle()

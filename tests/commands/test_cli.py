@@ -106,6 +106,39 @@ def test_usage_errors_exit_2() -> None:
     assert caught.value.code == 2
 
 
+@pytest.mark.parametrize(("line", "said"), [
+    ("simulate -i r.mp4 --pos_thres .2 --dvs346", "v2e's -i is VIDEO without an option here. v2e's "
+     "--pos_thres is --theta-on here. v2e's --dvs346 is --sensor-size davis346 here."),
+    ("simulate r.mp4 -o r.h5 --sensr=v2e", "no option --sensr. Did you mean --sensor?"),
+    ("render r.h5 -o r.png --slow-motion 3", "Did you mean --slow?"),
+    ("estimate r.h5 -out cam", "no option -out. Did you mean --out?"),
+    ("train --presett debug --loss.flow 1", "Did you mean --preset?"),
+    ("convert a.h5 b.h5 --pos_thres -3", "no option --pos_thres. evflow convert --help"),
+    ("convert a.h5 b.h5 c.h5", "one word too many: 'c.h5'"),
+])
+def test_an_unknown_option_is_named_with_the_nearest(
+    line: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line.split()) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_options_are_spelled_in_every_way(flight: Path, tmp_path: Path) -> None:
+    assert main(["render", str(flight), f"-o{tmp_path / 'part.png'}", "--window_ms=20",
+                 "--no_caption"]) == 0
+
+
+def test_help_breaks_lines_at_the_margin_alone(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "400")
+    with pytest.raises(SystemExit):
+        main(["convert", "--help"])
+    rows = capsys.readouterr().out.splitlines()
+    wide = next(row for row in rows if "Of a damaged or truncated file" in row)
+    assert "a time that goes back). (default: False)" in wide
+
+
 @pytest.mark.parametrize("verb", ["info", "estimate", "simulate", "version"])
 def test_every_command_has_help_with_an_example(
     verb: str, capsys: pytest.CaptureFixture[str]
