@@ -60,6 +60,8 @@ def understood(arguments: list[str]) -> list[str]:
     first = arguments[0] if arguments else ""
     if first == "--version":
         return ["version", *arguments[1:]]
+    if first == "help":
+        return [*arguments[1:2], "--help"]
     if first and not first.startswith("-") and first not in COMMANDS:
         near = difflib.get_close_matches(first, COMMANDS, n=1)
         fix = f"Did you mean: evflow {near[0]}?" if near else (

@@ -236,7 +236,8 @@ class Recording:
         return any(note.code == "frames.made" for note in self.notes)
 
     def __repr__(self) -> str:
-        return f"{self.events!r}, {len(self.frames)} frames ({self.frames.dtype})"
+        frames = f"{len(self.frames)} frames ({self.frames.dtype})"
+        return f"{self.events!r}, {frames if self.has_frames else 'no frames'}"
 
     @property
     def has_frames(self) -> bool:

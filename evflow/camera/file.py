@@ -89,4 +89,6 @@ def _check_kind(path: Path) -> None:
     if head == np.lib.format.MAGIC_PREFIX:
         raise EvflowDataError("EV008", f"{path} is one array (.npy), not a camera.", EXPECTED)
     if head[:2] != b"PK" and path.suffix.lower() != ".npz":
-        raise EvflowDataError("EV008", f"{path} is not an .npz: it begins with {head!r}.", EXPECTED)
+        beside = path.with_name("camera.npz")
+        raise EvflowDataError("EV008", f"{path} is not an .npz: it begins with {head!r}.", EXPECTED
+                              + (f" Beside it lies {beside}." if beside.is_file() else ""))

@@ -38,8 +38,8 @@ class Export:
         from evflow.camera.optics import read_sensor, read_summary, read_undetermined
 
         need_folder(self.out)
-        need_absent(self.out, self.overwrite, self.camera)
         camera, std = Camera.load_with_std(self.camera)
+        need_absent(self.out, self.overwrite, self.camera)
         known = read_summary(self.camera)
         sensor, optics = read_sensor(self.camera)
         export, maps = export_camera(

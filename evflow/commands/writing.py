@@ -65,4 +65,6 @@ def need_absent(path: Path, overwrite: bool, *sources: Path | None) -> None:
         raise EvflowDataError("EV020", f"the output {path} is the input, or lies in it.",
                               "Choose another: no command replaces its input.")
     if not overwrite:
-        raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite.")
+        raise EvflowDataError(
+            "EV013", f"{path} exists.", "Pass --overwrite if this command made that folder; "
+            "choose another if not." if path.is_dir() else "Pass --overwrite.")

@@ -14,6 +14,7 @@ from evflow.io.decode.columns import meaning
 from evflow.io.formats import unread_text
 from evflow.io.formats.unread_text import Known
 from evflow.io.images.folder import list_images
+from evflow.io.images.times import read_times
 
 NPZ = "np.savez('events.npz', t=t, x=x, y=y, p=p, size=(width, height)), t in microseconds"
 VIDEO = Known(
@@ -56,6 +57,7 @@ MAGICS: tuple[tuple[int, bytes, Known], ...] = (  # at a byte of the file
     (0, b"RIFF", VIDEO),
 )
 MOST = 20  # files of a folder that are examined
+LONGEST = 1 << 22  # bytes of a file of frame times that is examined
 PICKLES = tuple(bytes([0x80, version]) for version in (2, 3, 5))
 
 
@@ -99,10 +101,21 @@ def folder(path: Path, is_recording: Callable[[Path], bool]) -> Known:
     if not recordings:
         return Known(what, "Pass a recording in it; none of its own files is one.")
     if images := [p for p in sorted(path.iterdir()) if p.is_dir() and list_images(p)]:
-        return Known(what, f"Pass {recordings[0]} with its frames: --frames {images[0]} "
-                     "--timestamps FILE, the file of their times.")
+        times = _times_of(len(list_images(images[0])), [*files, *sorted(images[0].iterdir())])
+        events = next((r for r in recordings if r != times), recordings[0])
+        return Known(what, f"Pass {events} with its frames: --frames {images[0]} --timestamps "
+                     f"{times or 'FILE, the file of their times'}.")
     others = " and others one by one" if len(recordings) > 1 else ""
     return Known(what, f"Pass {recordings[0]}{others}.")
+
+
+def _times_of(n_images: int, files: list[Path]) -> Path | None:
+    """The first of the files that holds as many increasing times as there are images."""
+    for file in files:
+        with contextlib.suppress(EvflowDataError, OSError):
+            if file.stat().st_size < LONGEST and len(read_times(file, "us")[0]) == n_images:
+                return file
+    return None
 
 
 def _of(path: Path, found: Known) -> Known:

@@ -170,9 +170,10 @@ def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
         return unit, (Note("frames.unit", f"times of {where} were read in {unit} ({rate}); if that "
                            f"is wrong, {TELL}."),)
     would = ", ".join(f"{rate:.4g} frames/s in {u}" for u, rate in rates.items())
+    what = (f"steps of {usual_step(times):g} (from {times[0]}) have" if len(times) > 1 else
+            f"a single time ({times[0]}) has")
     raise EvflowDataError(
-        "EV003", f"{where}: steps of {usual_step(times):g} (from {times[0]}) have no clear unit"
-        + (f": {would}." if would else "."),
+        "EV003", f"{where}: {what} no clear unit" + (f": {would}." if would else "."),
         f"Is it {', '.join(UNITS_US)}? {TELL.capitalize()}.", where=where)
 
 

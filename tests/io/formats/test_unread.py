@@ -73,12 +73,14 @@ def test_frames_are_still_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("names", "said"), [
     (["events.csv"], "Pass {}/events.csv."),
     (["events.csv", "images/1.png"], "Pass {0}/events.csv with its frames: --frames {0}/images -"),
+    (["events.csv", "images/1.png", "a_times.txt", "note.txt"], "--timestamps {}/a_times.txt."),
     (["a.csv", "b.csv"], "Pass {}/a.csv and others"),
     (["a.md"], "none of its own files is one"), ([], "a folder of nothing"),
     ([f"events_{c}.npy" for c in "txyp"], "x=np.load('events_x.npy')")])
 def test_folders_name_what_to_pass(tmp_path: Path, names: list[str], said: str) -> None:
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("0.1 3 4 1\n0.2 3 4 0\n" if name.endswith(".csv") else "x")
+        (tmp_path / name).write_text("0.1 3 4 1\n0.2 3 4 0\n" if name.endswith(".csv") else
+                                     "40000\n" if name.endswith("times.txt") else "x")
     error = refused(tmp_path)
     assert (error.code, said.format(tmp_path) in str(error)) == ("EV008", True)
