@@ -55,10 +55,11 @@ class Camera:
         return tuple(np.shape(self.theta_on))
 
     def __repr__(self) -> str:
-        """One line: the size and the median of each map; only the shape for traced maps."""
+        """One line: the size and the median of each map; only the shape where maps have no values
+        (traced, or of `jax.eval_shape`)."""
         size = "x".join(str(n) for n in self.shape)
-        if self._traced() or 0 in self.shape or any(
-                getattr(getattr(self, n), "dtype", np.dtype("O")).kind not in "fiu"
+        if self._traced() or 0 in self.shape or not all(
+                isinstance(m := getattr(self, n), np.ndarray | Array) and m.dtype.kind in "fiu"
                 for n in PARAMETERS):
             return f"Camera({size})"
         middle = (f"{n} {np.median(np.asarray(getattr(self, n))):.4g}" for n in PARAMETERS)

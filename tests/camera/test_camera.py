@@ -317,6 +317,7 @@ def test_it_is_shown_in_one_line() -> None:
         "Camera(4x5, medians: theta_on 0.25, theta_off 0.2, eta_on 0, eta_off 0)")
     shown = []
     jax.jit(lambda c: shown.append(repr(c)) or c.theta_on)(Camera.constant((4, 5)))
+    assert repr(jax.eval_shape(lambda: Camera.constant((4, 5)))) == "Camera(4x5)"
     assert shown == ["Camera(4x5)"]
     one = Summary(*map(jnp.float32, (0.25, 0.2, 0.1, 0.1, 0.03, 0.03)))
     assert repr(one).startswith("Summary(theta_on=0.25, theta_off=0.2, eta_on=0.1, ")
