@@ -60,6 +60,13 @@ def _help(cls: type) -> Iterator[tuple[str, str]]:
             yield ast.unparse(field.target), " ".join(ast.literal_eval(text.value).split())
 
 
+def attributes(cls: type) -> dict[str, str]:
+    """The section `Attributes:` of a docstring: each name and its text in one line."""
+    section = (inspect.getdoc(cls) or "").partition("\nAttributes:\n")[2]
+    return {name: " ".join(text.split())
+            for name, text in re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", section, re.M)}
+
+
 def check_options(verb: str, command: type, arguments: Sequence[str]) -> None:
     """Raise EV020 if options among the arguments are none of the command's. Those with a dot are
     left to `with_configuration`."""

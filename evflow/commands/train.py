@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from evflow.commands.arguments import attributes
 from evflow.errors import EvflowDataError
 from evflow.training.options import TrainOptions
 
@@ -62,7 +63,9 @@ def with_configuration(arguments: Sequence[str]) -> type[Train]:
     fields: list[tuple[str, Any, Any]] = [
         ("preset", Annotated[Literal[tuple(PRESETS)], explained],  # type: ignore[misc]
          dataclasses.field(default=preset.default))]
-    fields += [(f.name, hints[f.name], dataclasses.field(default=getattr(config, f.name)))
+    explained_by = attributes(TrainConfig)
+    fields += [(f.name, Annotated[hints[f.name], tyro.conf.arg(help=explained_by.get(f.name))],
+                dataclasses.field(default=getattr(config, f.name)))
                for f in dataclasses.fields(TrainConfig)
                if f.name not in own and f.name not in PYTHON]
     return dataclasses.make_dataclass(

@@ -15,13 +15,21 @@ from evflow.network.flow.config import FlowConfig
 class ModelConfig:
     """Static structure of the network.
 
-    pool: estimate a camera summary from all pixels and condition on it (a single pixel cannot
-        determine its threshold: Bayes error .105 against .003 pooled).
-    code: "changes" builds the condition from the m signed intensity changes alone, so that a
-        video is enough to generate; "feature" passes the encoder's hidden feature, which
-        contains the events themselves (paper).
-    output: "log" or "tanh" coordinates of the parameters (see coordinates.py).
-    changes: m, intensity changes per window. piece: encoder features per change.
+    Attributes:
+        bins: time bins of a window, for each polarity.
+        changes: m, intensity changes per window.
+        piece: encoder features per change.
+        encoder_hidden: width of the encoder.
+        summary_hidden: width of the summary's networks.
+        summary_features: features of a pixel that the summary pools over pixels with events.
+        rate_features: features that it pools for the noise rates.
+        gates: learned weightings of the pixels in its sums.
+        pool: estimate a camera summary from all pixels and condition on it (a single pixel cannot
+            determine its threshold: Bayes error .105 against .003 pooled).
+        code: "changes" builds the condition from the m signed intensity changes alone, so that a
+            video is enough to generate; "feature" passes the encoder's hidden feature, which
+            contains the events themselves (paper).
+        output: "log" or "tanh" coordinates of the parameters (see coordinates.py).
     """
 
     flow: FlowConfig = FlowConfig(condition=41)

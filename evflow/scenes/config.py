@@ -24,18 +24,23 @@ _PROBABILITIES = ("foreground_probability", "static_fraction", "resting_fraction
 class SceneConfig:
     """The distribution of scenes.
 
-    speed_px_s: speed of the background and of each foreground, drawn apart (log).
-    foregrounds, foreground_probability: how many cut-outs at most, and the chance of each.
-    diameter_px: largest extent of a cut-out in a 64-pixel frame; scales with the shorter side.
-    rotation_deg_s, scale_rate_per_s: rates of the similarity motion; the scale is exp(rate t).
-    zoom: background texels per sensor pixel (log).
-    static_fraction: scenes in which nothing moves at all; resting_fraction: others whose
-        background stands still behind what moves, as a camera at rest sees the world.
-    contrast: span of a layer as a fraction of 255 DN (log); above 1 it clips.
-    brightness: where that span lies between as dark (0) and as bright (1) as fits into 255 DN.
-    gamma: exponent of the whole scene (log), DN = 255 x^gamma: below 1 bright, above 1 dark.
-    shake_probability, shake_px, shake_hz: a sinusoidal shake on top of the constant velocity;
-        its peak speed is held below the highest of `speed_px_s`.
+    Attributes:
+        speed_px_s: speed of the background and of each foreground, drawn apart (log).
+        foregrounds: how many cut-outs at most.
+        foreground_probability: the chance of each cut-out.
+        diameter_px: largest extent of a cut-out in a 64-pixel frame; scales with the shorter side.
+        rotation_deg_s: rate of the rotation.
+        scale_rate_per_s: rate r of the scaling, exp(r t).
+        zoom: background texels per sensor pixel (log).
+        static_fraction: share of scenes in which nothing moves at all.
+        resting_fraction: share of scenes whose background stands still behind what moves, as a
+            camera at rest sees the world.
+        contrast: span of a layer as a fraction of 255 DN (log); above 1 it clips.
+        brightness: where that span lies between as dark (0) and as bright (1) as fits into 255 DN.
+        gamma: exponent of the whole scene (log), DN = 255 x^gamma: below 1 bright, above 1 dark.
+        shake_probability: share of scenes with a sinusoidal shake on top of the constant velocity.
+        shake_px: amplitude of the shake; its peak speed is held below the highest of `speed_px_s`.
+        shake_hz: frequency of the shake.
     """
 
     speed_px_s: Range = (2.0, 350.0)

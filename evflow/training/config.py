@@ -25,17 +25,26 @@ PARTS = ("summary", "encoder", "flow", "spread")
 class LossConfig:
     """Weights of the losses (Eq. 11), and how they are evaluated.
 
-    adaptive: scale each loss by a power of ten into 0..10 (Section IV-D3).
-    change_l1: Charbonnier on the intensity changes beside Eq. 6 (its gradient vanishes
-        quadratically near the target, and most targets are ~.01).
-    confidence: weight L_P by the sample's share of the batch's events (lambda of Eq. 7).
-    inverse_flow: weight of L_F' (Eq. 10). It is minus the log-det part of L_F, so it cancels
-        or runs away unless small: 0 by default.
-    events: what L_E compares: "rate" the expected events, "edges" the paper's Eq. 9.
-    patches: side lengths of the local patches of Eq. 9. edges: how moving patches are detected,
-        by the "change" of log intensity over the window, or the "gradient" of the image (the
-        paper); edge: log units, per pixel if a gradient, at which a patch counts fully.
-    elu: compare ELU of the generated events in Eq. 9 (sigma_3, as printed), else asinh of both.
+    Attributes:
+        condition: weight of L_C (Eq. 6), the intensity changes that the encoder predicts.
+        change_l1: weight of a Charbonnier loss beside it, whose gradient does not vanish near the
+            target (most targets are about .01).
+        parameter: weight of L_P (Eq. 7), the pixels' parameters.
+        flow: weight of L_F (Eq. 8), the likelihood of the events.
+        event: weight of L_E (Eq. 9), generated against recorded events.
+        inverse_flow: weight of L_F' (Eq. 10). It is minus the log-det part of L_F, so it cancels
+            or runs away unless small.
+        summary: weight of the camera's summary.
+        spread: weight of the pixels' standard deviations.
+        adaptive: scale each loss by a power of ten into 0..10 (Section IV-D3).
+        confidence: weight L_P by the sample's share of the batch's events (lambda of Eq. 7).
+        dequantise: standard deviation of the noise added to the counts of the flow.
+        events: what L_E compares: "rate" the expected events, "edges" the paper's Eq. 9.
+        patches: side lengths of the local patches of Eq. 9.
+        edge: change or gradient in log units (per pixel) at which a patch counts fully.
+        edges: how moving patches are detected: by the "change" of log intensity over the window, or
+            the "gradient" of the image (the paper).
+        elu: compare ELU of the generated events in Eq. 9 (sigma_3, as printed), else asinh of both.
     """
 
     condition: float = 1.0
@@ -60,14 +69,16 @@ class LossConfig:
 class NuisanceConfig:
     """Imperfections of real recordings; drawn anew for every sequence or scene.
 
-    fresh: share of sequences whose pixel memory starts at the first frame, as in a simulation.
-    odd_pixels, odd_factor: share of pixels whose thresholds are off by a factor, whatever the
-        camera's mismatch.
-    hot_pixels, hot_hz: largest share of hot pixels per polarity (half of the cameras have
-        none), and their rates.
-    jitter_s: largest standard deviation of the frame times' error; exposure_s: longest
-        exposure, averaged over `exposures` instants.
-    frame_noise_dn: standard deviation of the frames' noise before rounding to 8 bits.
+    Attributes:
+        fresh: share of sequences whose pixel memory starts at the first frame, as in a simulation.
+        odd_pixels: share of pixels whose thresholds are off, whatever the camera's mismatch.
+        odd_factor: range of the factor by which these thresholds are off.
+        hot_pixels: largest share of hot pixels per polarity; half of the cameras have none.
+        hot_hz: range of the hot pixels' rates.
+        jitter_s: largest standard deviation of the frame times' error.
+        exposure_s: longest exposure.
+        exposures: instants that are averaged over an exposure.
+        frame_noise_dn: standard deviation of the frames' noise before rounding to 8 bits.
     """
 
     fresh: float = 0.3
@@ -96,18 +107,33 @@ class NuisanceConfig:
 class TrainConfig:
     """One training run. Content of step i depends on (config, seed, i) alone.
 
-    scenes x cameras: sequences per step; cameras share a scene (rendering is the dearer part).
-    windows: windows per sequence; window_s: range of their length (log-uniform).
-    steps_per_window: rendered frames per window; motion stays near 1 px per frame.
-    block: pixels (h, w) of each crop that the flow sees; the summary sees the whole crop.
-    sequences: number of fixed sequences, drawn once (the paper's 300); 0 draws new ones in every
-        step. images: of the scenes, a folder of pictures or a COCO json of objects; None is
-        procedural textures and scikit-image's photographs.
-    sensors: pixel models; a step draws as many neighbours among them as it has cameras, and
-        splits the cameras evenly.
-    parts: of the network that learn ("summary", "encoder", "flow", "spread"); the losses that
-        touch none of them are not computed. The pixels' parts train without the summary on the
-        true one plus N(0, summary_noise^2) in its coordinates y.
+    Attributes:
+        sensors: pixel models; a step draws as many neighbours among them as it has cameras, and
+            splits the cameras evenly.
+        parts: parts of the network that learn ("summary", "encoder", "flow", "spread"); the losses that
+            touch none of them are not computed.
+        summary_noise: the pixels' parts train without the summary on the true one plus N(0, this^2)
+            in its coordinates y.
+        crop: side of the crop in pixels, all of which the summary sees.
+        block: height and width in pixels of the part of each crop that the flow sees.
+        scenes: scenes per step.
+        cameras: cameras that share a scene (rendering is the dearer part).
+        windows: windows per sequence.
+        window_s: range of a window's length in seconds (log-uniform).
+        steps_per_window: rendered frames per window; motion stays near 1 px per frame.
+        textures: textures and photographs in the bank that scenes are made of.
+        sequences: number of fixed sequences, drawn once (the paper's 300); 0 draws new ones in
+            every step.
+        images: pictures of the scenes, a folder of pictures or a COCO json of objects; None is procedural
+            textures and scikit-image's photographs.
+        steps: optimiser steps.
+        warmup: steps over which the learning rates rise from 0; then they fall as a cosine.
+        learning_rate: highest learning rate of the encoder and the spread.
+        summary_rate: highest learning rate of the summary.
+        flow_rate: highest learning rate of the flow.
+        clip: largest norm of each part's gradient.
+        ema: decay of the moving average of the weights, which is what is saved.
+        seed: of data and first parameters.
     """
 
     model: ModelConfig = ModelConfig()

@@ -13,12 +13,17 @@ import pytest
 import tyro
 
 import evflow
+from evflow.camera import CameraPrior
 from evflow.cli import main
+from evflow.commands.arguments import attributes
 from evflow.commands.train import with_configuration
 from evflow.errors import EvflowDataError
+from evflow.network.config import ModelConfig
+from evflow.network.flow.config import FlowConfig
 from evflow.scenes import sources
+from evflow.scenes.config import SceneConfig
 from evflow.training import run as runs
-from evflow.training.config import PRESETS, TrainConfig
+from evflow.training.config import PRESETS, LossConfig, NuisanceConfig, TrainConfig
 from evflow.training.run import configuration
 
 ROOT = Path(__file__).parents[2]
@@ -131,3 +136,11 @@ def test_presets_are_the_choices(
     assert f"{{{','.join(PRESETS)}}}" in shown  # those of documents that ran, too
     assert "--clip FLOAT (default: 0.25)" in shown.replace(" │ │ ", " ")
     assert "--model.flow.hidden INT" in shown
+
+
+@pytest.mark.parametrize("held", [
+    TrainConfig, LossConfig, NuisanceConfig, ModelConfig, FlowConfig, SceneConfig, CameraPrior])
+def test_every_number_of_a_training_is_explained(held: type) -> None:
+    named = {f.name for f in dataclasses.fields(held)
+             if not dataclasses.is_dataclass(getattr(held(), f.name))}
+    assert set(attributes(held)) == named

@@ -22,12 +22,14 @@ Params: TypeAlias = dict[str, Any]  # nested dict of arrays
 class FlowConfig:
     """Static structure of the conditional flow (paper, Section IV-B and IV-C).
 
-    channels: voxel channels per pixel (2 polarities x 16 bins).
-    levels, steps: L and K of Eq. 8.
-    hidden: width of the coupling and injector networks.
-    condition: channels of the condition u.
-    injector: an affine function of u alone at the start of every level.
-    asinh: element-wise asinh before the first level, for counts with many zeros.
+    Attributes:
+        channels: voxel channels per pixel (2 polarities x 16 bins).
+        levels: L of Eq. 8.
+        steps: K of Eq. 8, steps in each level.
+        hidden: width of the coupling and injector networks.
+        condition: channels of the condition u.
+        injector: an affine function of u alone at the start of every level.
+        asinh: element-wise asinh before the first level, for counts with many zeros.
     """
 
     channels: int = 32
