@@ -62,7 +62,7 @@ def _help(cls: type) -> Iterator[tuple[str, str]]:
 
 def attributes(cls: type) -> dict[str, str]:
     """The section `Attributes:` of a docstring: each name and its text in one line."""
-    section = (inspect.getdoc(cls) or "").partition("\nAttributes:\n")[2]
+    section = (inspect.getdoc(cls) or "").partition("\nAttributes:\n")[2].partition("\n\n")[0]
     return {name: " ".join(text.split())
             for name, text in re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", section, re.M)}
 

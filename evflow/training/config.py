@@ -110,8 +110,8 @@ class TrainConfig:
     Attributes:
         sensors: pixel models; a step draws as many neighbours among them as it has cameras, and
             splits the cameras evenly.
-        parts: parts of the network that learn ("summary", "encoder", "flow", "spread"); the losses that
-            touch none of them are not computed.
+        parts: parts of the network that learn ("summary", "encoder", "flow", "spread"); the losses
+            that touch none of them are not computed.
         summary_noise: the pixels' parts train without the summary on the true one plus N(0, this^2)
             in its coordinates y.
         crop: side of the crop in pixels, all of which the summary sees.
@@ -124,7 +124,7 @@ class TrainConfig:
         textures: textures and photographs in the bank that scenes are made of.
         sequences: number of fixed sequences, drawn once (the paper's 300); 0 draws new ones in
             every step.
-        images: pictures of the scenes, a folder of pictures or a COCO json of objects; None is procedural
+        images: of the scenes, a folder of pictures or a COCO json of objects; None is procedural
             textures and scikit-image's photographs.
         steps: optimiser steps.
         warmup: steps over which the learning rates rise from 0; then they fall as a cosine.
