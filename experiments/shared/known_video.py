@@ -21,14 +21,32 @@ from experiments.shared.cameras import Hidden
 def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
     """The chunk whose first frame is frame `first` of the recording, with the true video between
     its frames (linear between its milliseconds)."""
+    low, part = _fine(hidden, chunk, first)
+    log_video = np.asarray(lin_log(hidden.video[low[0]:low[-1] + 2]))
+    step = low - low[0]
+    return _along(hidden, chunk, first, log_video[step] * (1 - part) + log_video[step + 1] * part)
+
+
+def blended_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
+    """The same with a fade from each frame to the next, as without optical flow."""
+    frames = hidden.recording.frames[first:first + len(chunk.dt_s) + 1].astype(np.float32)
+    part = np.linspace(0, 1, STEPS, endpoint=False, dtype=np.float32)[:, None, None]
+    faded = [a * (1 - part) + b * part for a, b in itertools.pairwise(frames)]
+    return _along(hidden, chunk, first, np.asarray(lin_log(np.concatenate([*faded, frames[-1:]]))))
+
+
+def _fine(hidden: Hidden, chunk: Chunk, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each fine frame: the true video's picture before it, and how far it is on to the next."""
     kept = hidden.kept[first:first + len(chunk.dt_s) + 1]
     at = np.concatenate([np.linspace(a, b, STEPS, endpoint=False)
                          for a, b in itertools.pairwise(kept)] + [kept[-1:]])
     low = np.minimum(at.astype(int), len(hidden.video) - 2)
-    log_video = np.asarray(lin_log(hidden.video[low[0]:low[-1] + 2]))
-    step, part = low - low[0], (at - low)[:, None, None].astype(np.float32)
-    path = log_video[step] * (1 - part) + log_video[step + 1] * part
-    times = hidden.recording.frame_times[first:first + len(kept)]
+    return low, (at - low)[:, None, None].astype(np.float32)
+
+
+def _along(hidden: Hidden, chunk: Chunk, first: int, path: np.ndarray) -> Chunk:
+    """The chunk with another path of log intensity between its frames."""
+    times = hidden.recording.frame_times[first:first + len(chunk.dt_s) + 1]
     sightings = sight(hidden.recording.events, times, path, STEPS)
     return dataclasses.replace(chunk, path=path.astype(np.float32), sightings=sightings,
                                evidence=evidence_of(sightings, first=first == 0))
