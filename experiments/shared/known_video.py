@@ -15,6 +15,7 @@ from evflow.estimation.refine.pixels import evidence_of
 from evflow.estimation.refine.sightings import sight
 from evflow.estimation.refine.signal import separated_noise_rates
 from evflow.light.log_maps import lin_log
+from evflow.simulator.between import intervals
 from experiments.shared.cameras import Hidden
 
 
@@ -33,6 +34,18 @@ def blended_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
     part = np.linspace(0, 1, STEPS, endpoint=False, dtype=np.float32)[:, None, None]
     faded = [a * (1 - part) + b * part for a, b in itertools.pairwise(frames)]
     return _along(hidden, chunk, first, np.asarray(lin_log(np.concatenate([*faded, frames[-1:]]))))
+
+
+def straight_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:
+    """The same with optical flow along straight lines at constant speed between two frames."""
+    kept = slice(first, first + len(chunk.dt_s) + 1)
+    frames = hidden.recording.frames[kept].astype(np.float32)
+    times = hidden.recording.frame_times[kept].tolist()
+    pictures = []
+    for interval in intervals(zip(frames, times, strict=True), jerk=False):
+        straight = dataclasses.replace(interval, bends=None)
+        pictures += [interval.a.dn, *straight.at(np.arange(1, STEPS) / STEPS, sharp=False)]
+    return _along(hidden, chunk, first, np.asarray(lin_log(np.stack([*pictures, frames[-1]]))))
 
 
 def _fine(hidden: Hidden, chunk: Chunk, first: int) -> tuple[np.ndarray, np.ndarray]:

@@ -166,11 +166,10 @@ def sequences() -> dict[str, Figures]:
 
 
 def ablations() -> dict[str, Figures]:
-    def of(source: str, rows: str) -> Figures:
-        return [values(source, rows, "theta, sequence", k)[0] for k in range(2)]
-
-    return {"`default` |": of("ablate_networks", "default"), "`paper`": of(
-        "ablate_networks", "paper"), "`default`, L_P alone": of("ablate_losses", r"L_P\|")}
+    return {label: [values("ablate_networks", rf"{name}\|", f"{of}, sequence", k)[0]
+                    for of in ("theta", "eta") for k in range(2)]
+            for label, name in (("a constant", "constant"), ("`paper`", "paper"),
+                                ("`default`", "default"))}
 
 
 def generate() -> dict[str, Figures]:
