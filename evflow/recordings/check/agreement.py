@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 
 from evflow.io.decode.units import too_few
+from evflow.recordings.check.drift import backwards, drifting
 from evflow.recordings.check.findings import Finding
 from evflow.recordings.check.steps import (
     LEAST_CELLS,
     LEAST_EVENTS,
-    SWEEP_STEP_US,
     TURNED,
     Steps,
     displacement,
@@ -36,7 +36,6 @@ LEAST_CHANGE, MOST_THETA = 500.0, 10.0  # log units in all; real recordings have
 PARTS, IN_PART = 4, 0.4  # of the steps; least r of the best one
 LOST, SHOWN = 0.25, 0.25  # share of that r below which another part disagrees (the least in 28
 # sound recordings is .4), if its frames change by at least that share
-LATENCY_US = 4_000
 LEAST_OFFSET_US = 10_000
 
 
@@ -46,23 +45,24 @@ def agreement(recording: Recording) -> list[Finding]:
     steps = frame_steps(recording)
     if steps is None:
         return []
-    if found := _missing(steps) or _frozen(recording, steps):
-        return found
+    if wrong := _missing(steps) or _frozen(recording, steps):
+        return wrong
     if np.isnan(here := steps.correlation()):
         return []
-    if found := _comes_and_goes(steps):
-        return found
-    offsets, r = steps.sweep()
+    r = steps.sweep()
     flips = {flip: steps.correlation(flip=flip) for flip in steps.changes if flip}
     flip = max(flips, key=lambda f: abs(flips[f]))
+    otherwise = max(float(np.nanmax(np.abs(r))), abs(flips[flip]))
+    if found := backwards(steps, otherwise) or drifting(steps) or _comes_and_goes(steps):
+        return [found]
     if abs(flips[flip]) > AGREES and abs(flips[flip]) > np.nanmax(np.abs(r)) + BETTER:
         return [_mirrored(flip, here, flips[flip])]
-    if found := _displaced(steps, float(np.nanmax(np.abs(r)))):
-        return found
+    if wrong := _displaced(steps, float(np.nanmax(np.abs(r)))):
+        return wrong
     over = f"r={here:+.2f} over {len(steps.bounds)} frame steps"
     inverted = _inverted(r)
     if inverted:
-        offset, best = _peak(offsets, -r)
+        offset, best = steps.peak(-r)
         late = _is_offset(steps, offset, best, -here)
         also = (f" The frame times are off too: add {offset / 1e3:.1f} to --frames-offset-ms."
                 if late else "")
@@ -71,7 +71,7 @@ def agreement(recording: Recording) -> list[Finding]:
             f"({over}{f', {-best:+.2f} at its clearest' if late else ''}): ON and OFF are swapped.",
             "Pass --polarity invert (polarity='invert'), or remove it if it was passed; or "
             f"check the exporter.{also}")]
-    offset, best = _peak(offsets, r)
+    offset, best = steps.peak(r)
     if _is_offset(steps, offset, best, here):
         side = "late" if offset < 0 else "early"
         severity: Literal["error", "warning"] = "error" if here < 0.5 * best else "warning"
@@ -136,26 +136,28 @@ def _frozen(recording: Recording, steps: Steps) -> list[Finding]:
         "measured from such frames; --no-frames uses the events alone.")]
 
 
-def _comes_and_goes(steps: Steps) -> list[Finding]:
+def _comes_and_goes(steps: Steps) -> Finding | None:
     """EV024 if events and frames agree in one part of the recording and not in another, though the
     frames change there as well."""
-    parts = [steps.part(i, PARTS) for i in range(PARTS)]
-    r = np.array([part.correlation() if len(part.bounds) else np.nan for part in parts])
-    rms = np.array([np.sqrt((np.nan_to_num(part.changes[""]) ** 2).sum() / max(
-        int(np.isfinite(part.changes[""]).sum()), 1)) for part in parts])
+    parts = steps.parts(PARTS)
+    middle = len(steps.offsets_us) // 2
+    r = np.array([steps.sweep(part)[middle] for part in parts])
+    changes = [steps.changes[""][part] for part in parts]
+    rms = np.array([np.sqrt((np.nan_to_num(change) ** 2).sum() / max(
+        int(np.isfinite(change).sum()), 1)) for change in changes])
     if np.isnan(r).all() or not (most := float(np.nanmax(r))) > IN_PART:
-        return []
+        return None
     lost = (r < LOST * most) & (rms > SHOWN * rms[np.nanargmax(r)])
     if not lost.any():
-        return []
-    at, off = (float(parts[i].bounds.mean() - steps.events.t[0]) / 1e6
+        return None
+    at, off = (float(steps.bounds[parts[i]].mean() - steps.events.t[0]) / 1e6
                for i in (np.nanargmax(r), np.argmin(np.where(lost, r, np.inf))))
-    return [Finding(
+    return Finding(
         "EV024", "error" if lost.sum() >= PARTS / 2 else "warning",
         f"events and frames agree around {at:.2f} s (r {most:+.2f}) but not around {off:.2f} s "
         f"(r {r[lost].min():+.2f}).",
         "Do the frames' times run too fast or slow (--frames-fps, --timestamps), are frames out of "
-        "order, or does the polarity change? --start and --stop select a part that agrees.")]
+        "order, or does the polarity change? --start and --stop select a part that agrees.")
 
 
 def _displaced(steps: Steps, best: float) -> list[Finding]:
@@ -179,9 +181,9 @@ def frames_offset(recording: Recording) -> int:
     steps = frame_steps(recording)
     if steps is None or np.isnan(here := steps.correlation()):
         return 0
-    offsets, r = steps.sweep()
+    r = steps.sweep()
     sign = -1.0 if _inverted(r) else 1.0
-    offset, best = _peak(offsets, sign * r)
+    offset, best = steps.peak(sign * r)
     return offset if _is_offset(steps, offset, best, sign * here) else 0
 
 
@@ -193,15 +195,3 @@ def _inverted(r: np.ndarray) -> bool:
 def _is_offset(steps: Steps, offset: int, best: float, here: float) -> bool:
     least = max(steps.interval_us / 2, LEAST_OFFSET_US)
     return abs(offset) > least and best > AGREES and best > here + BETTER
-
-
-def _peak(offsets: np.ndarray, r: np.ndarray) -> tuple[int, float]:
-    """The offset of the largest r (interpolated by a parabola, without the events' latency), and
-    that r."""
-    i = int(np.nanargmax(r))
-    if 0 < i < len(r) - 1 and np.isfinite(r[i - 1:i + 2]).all():
-        left, top, right = r[i - 1:i + 2]
-        bend = left - 2 * top + right
-        shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
-        return round(float(offsets[i] + shift * SWEEP_STEP_US)) - LATENCY_US, float(top)
-    return int(offsets[i]) - LATENCY_US, float(r[i])

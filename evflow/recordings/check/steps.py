@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -26,9 +28,11 @@ LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer are not enough to decide
 SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # with this many, chance correlations are at most .03
 SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # range of the sweep: frame intervals, at most us
 SWEEP_STEP_US = 5_000
+LATENCY_US = 4_000  # of the events, in the mean
 LEAST_OVERLAP = 0.25  # of the events' power, of displaced frames
 
 FLIPS = {"horizontal": (1,), "vertical": (0,), "both": (0, 1)}
+WHOLE = slice(None)
 TURNED = " of the transpose"  # square sensors: the same of frames with rows and columns swapped
 
 
@@ -46,8 +50,13 @@ class Steps:
 
     def correlations(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
         """Pearson's r with the frames' clock shifted by each offset; NaN if there are too few."""
-        sums = np.zeros((6, len(offsets_us)))
-        for change, (t0, t1) in zip(self.changes[flip], self.bounds, strict=True):
+        return self._r(self._sums(offsets_us, flip), flip)
+
+    def _sums(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
+        """What r is computed from (K, 6, offsets): sums over cells of the change a, the net events
+        b, a², b² and ab, and the number of events."""
+        sums = np.zeros((len(self.bounds), 6, len(offsets_us)))
+        for k, (change, (t0, t1)) in enumerate(zip(self.changes[flip], self.bounds, strict=True)):
             known = np.isfinite(change)
             forget(self.events.x, self.events.y, self.events.t, self.events.p)
             near = self.events.slice(int(t0 + offsets_us.min()), int(t1 + offsets_us.max()))
@@ -58,10 +67,14 @@ class Steps:
             for i, (first, last) in enumerate(edges.T):
                 sign = np.bincount(code[first:last], minlength=2 * len(change)).reshape(-1, 2)
                 b = (sign[:, 1] - sign[:, 0])[known].astype(np.float64)
-                sums[:, i] += (
+                sums[k, :, i] = (
                     sum_a, b.sum(), sum_aa, (b * b).sum(), (a * b).sum(), last - first)
-        a, b, aa, bb, ab, count = sums
-        cells = max(int(np.isfinite(self.changes[flip]).sum()), 1)
+        return sums
+
+    def _r(self, sums: np.ndarray, flip: str = "", kept: slice = WHOLE) -> np.ndarray:
+        """r of the kept steps, given the sums of all."""
+        a, b, aa, bb, ab, count = sums[kept].sum(0)
+        cells = max(int(np.isfinite(self.changes[flip][kept]).sum()), 1)
         power = (aa - a**2 / cells) * (bb - b**2 / cells)
         enough = (count >= LEAST_EVENTS) & (cells >= LEAST_CELLS) & (power > 0)
         r = (ab - a * b / cells) / np.sqrt(np.where(enough, power, 1.0))
@@ -77,19 +90,40 @@ class Steps:
         cells = int(np.isfinite(self.changes[""]).sum())
         return cells >= SURE_CELLS and len(self.events.slice(first, last)) >= SURE_EVENTS
 
-    def part(self, number: int, of: int) -> Steps:
-        """One of `of` parts of the steps, in time."""
-        edges = np.linspace(0, len(self.bounds), of + 1).astype(int)
-        kept = slice(edges[number], edges[number + 1])
-        return dataclasses.replace(self, bounds=self.bounds[kept], changes={
-            flip: change[kept] for flip, change in self.changes.items()})
+    def parts(self, of: int) -> list[slice]:
+        """At most `of` equal parts of the steps, in time, none empty."""
+        edges = np.linspace(0, len(self.bounds), of + 1).astype(int).tolist()
+        return [slice(a, b) for a, b in itertools.pairwise(edges) if a < b]
 
-    def sweep(self) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets of the frames' clock in us, and r at each."""
-        reach = min(SWEEP_INTERVALS * self.interval_us, SWEEP_US)
-        count = int(reach // SWEEP_STEP_US)
-        offsets = SWEEP_STEP_US * np.arange(-count, count + 1)
-        return offsets, self.correlations(offsets)
+    def backwards(self) -> Steps:
+        """The steps as if the last frame came first."""
+        return dataclasses.replace(
+            self, changes={flip: -change[::-1] for flip, change in self.changes.items()})
+
+    @functools.cached_property
+    def offsets_us(self) -> np.ndarray:
+        """Offsets of the frames' clock that are tried, in us."""
+        count = int(min(SWEEP_INTERVALS * self.interval_us, SWEEP_US) // SWEEP_STEP_US)
+        return SWEEP_STEP_US * np.arange(-count, count + 1)
+
+    @functools.cached_property
+    def _swept(self) -> np.ndarray:
+        return self._sums(self.offsets_us)
+
+    def sweep(self, kept: slice = WHOLE) -> np.ndarray:
+        """r of the kept steps at each of `offsets_us`."""
+        return self._r(self._swept, kept=kept)
+
+    def peak(self, r: np.ndarray) -> tuple[int, float]:
+        """The offset in us of the largest r (interpolated by a parabola, without the events'
+        latency), and that r. r: as of `sweep`, not NaN everywhere."""
+        i = int(np.nanargmax(r))
+        if 0 < i < len(r) - 1 and np.isfinite(r[i - 1:i + 2]).all():
+            left, top, right = r[i - 1:i + 2]
+            bend = left - 2 * top + right
+            shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
+            return round(float(self.offsets_us[i] + shift * SWEEP_STEP_US)) - LATENCY_US, float(top)
+        return int(self.offsets_us[i]) - LATENCY_US, float(r[i])
 
 
 def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLIPS) -> Steps | None:

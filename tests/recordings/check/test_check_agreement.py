@@ -94,6 +94,10 @@ def timed(r: Recording, factor: float) -> Recording:
         r, frame_times=first + np.rint((r.frame_times - first) * factor).astype(np.int64))
 
 
+def backwards(r: Recording) -> Recording:
+    return dataclasses.replace(r, frames=r.frames[::-1])
+
+
 def by_name(r: Recording) -> Recording:
     """Frames in the order 1, 10, 11, 2, 3, ..."""
     return dataclasses.replace(r, frames=r.frames[sorted(range(len(r.frames)), key=str)])
@@ -103,7 +107,9 @@ def by_name(r: Recording) -> Recording:
     (turned_midway, "EV024", "error", "but not around"),
     (lambda r: timed(r, 0.7), "EV024", "error", "--frames-fps"),
     (lambda r: timed(r, 0.9), "EV024", "warning", "--frames-fps"),
+    (lambda r: timed(r, 0.95), "EV024", "warning", "5."),
     (lambda r: timed(r, 2.0), "EV024", "error", "--frames-fps"),
+    (backwards, "EV024", "error", "reverse order"),
     (by_name, "EV024", "error", "out of order"),
     (transposed, "EV029", "error", "rows and columns of the frames swapped"),
     (lambda r: transposed(r, 1), "EV029", "error", "mirrored in the"),
