@@ -4,39 +4,38 @@
 
 The recordings of `experiments.evaluate`, refined with the true 1000 frames/s video in place of
 frames 25 ms apart: what remains for theta is the counts' own noise. It is no bound: it starts from
-the camera alone, and `estimate_camera` goes on to regress each pixel. The same method on two other
-paths says what the path is worth: ours (optical flow), and frames that fade into each other. Of a
-pixel's theta: its regression on the path; of eta: that every noise event is known as such (Poisson,
-all pixels and all of the time), and beside it, what separating noise from signal gives with the
-true video and those thresholds. Every figure is printed beside that of `estimate_camera` and as
-their ratio, by number of signal events and by speed.
+the camera alone, and `estimate_camera` goes on to regress each pixel. The same method on other
+paths says what the path is worth: ours (optical flow), flow in straight lines, and frames that fade
+into each other. Of a pixel's theta: its regression on the path; of eta: that every noise event is
+known as such (Poisson, all pixels and all of the time), and beside it, what separating noise from
+signal gives with the true video and those thresholds. Every figure is printed beside that of
+`estimate_camera` and as their ratio, by number of signal events and by speed.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import operator
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from evflow import Summary, estimate_camera, finish
+from evflow import estimate_camera, finish
 from evflow.estimation.pooled import pool_recording
-from evflow.estimation.refine import Chunk, pixel_posterior, refine_summary, refinement_chunks
+from evflow.estimation.refine import refinement_chunks
 from evflow.recordings.windows import plan_windows
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
-from experiments.shared.known_video import blended_path, known_path, noise_on_video
+from experiments.shared.known_video import noise_on_video, paths_between, refined
 from experiments.shared.many import Setup, study
 from experiments.shared.protocols import ENOUGH, protocols
 from experiments.shared.video_strata import mean, strata
 
 NAMES = ("theta_on", "theta_off")
 HEADS = ("protocol", "figure, stratum", "recordings", "ours", "true video", "ratio",
-         "same method: flow", "fade")
+         "same method: flow", "straight", "fade")
+PATHS = ("path", "straight", "blended")
 FAR = 20.0  # times the network's std
 
 
@@ -61,13 +60,11 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     stats, _ = pool_recording(params, recording)
     start, std = finish(params, stats)
     unsure = jax.tree.map(lambda s: FAR * s, std)  # what is known must not hold it back
-    known = [known_path(hidden, c, i) for c, i in zip(chunks, starts, strict=False)]
-    blended = [blended_path(hidden, c, i) for c, i in zip(chunks, starts, strict=False)]
-    paths = {kind: refined(along, start, unsure) for kind, along in (
-        ("known", known), ("path", chunks), ("blended", blended))}
+    along = paths_between(hidden, chunks, starts)
+    paths = {kind: refined(between, start, unsure) for kind, between in along.items()}
     best = paths["known"][0]
     found = estimate_camera(recording, params)
-    rates = noise_on_video(params, known, best, start)
+    rates = noise_on_video(params, along["known"], best, start)
     signal, counts = hidden.signal_events(), recording.events.count_map()
     exposure = 1e-6 * recording.events.duration_us * counts[0].size
     result = {"speed": float(np.mean(np.concatenate([c.motion_px for c in chunks])))}
@@ -92,13 +89,6 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, float] 
     return result
 
 
-def refined(chunks: list[Chunk], start: Summary, unsure: Summary) -> tuple[Summary, np.ndarray]:
-    """The camera, and its thresholds by pixel (2, H, W), as these paths have it."""
-    best = refine_summary(chunks, start, unsure).summary
-    return best, pixel_posterior(
-        functools.reduce(operator.add, (c.evidence for c in chunks)), best)[0]
-
-
 def main(options: Options) -> dict[str, Any]:
     begin(options, "true_video")
     estimator(options.weights, "summary")
@@ -110,7 +100,7 @@ def main(options: Options) -> dict[str, Any]:
             score, setup, [protocol] * sequences, options.workers, name))
     conclude(options, "true_video", result, markdown(HEADS, (
         (name, k, f"{v['recordings']}", f"{v['ours']:.4f}", f"{v['known']:.4f}",
-         f"{v['ratio']:.2f}", *(f"{v[p]:.4f}" if p in v else "" for p in ("path", "blended")))
+         f"{v['ratio']:.2f}", *(f"{v[p]:.4f}" if p in v else "" for p in PATHS))
         for name, found in result.items() for k, v in found.items())))
     return result
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
+import operator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from evflow.camera import Summary
-from evflow.estimation.refine import Chunk
+from evflow.estimation.refine import Chunk, pixel_posterior, refine_summary
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.pixels import evidence_of
 from evflow.estimation.refine.sightings import sight
@@ -17,6 +20,24 @@ from evflow.estimation.refine.signal import separated_noise_rates
 from evflow.light.log_maps import lin_log
 from evflow.simulator.between import intervals
 from experiments.shared.cameras import Hidden
+
+
+def paths_between(
+    hidden: Hidden, chunks: list[Chunk], starts: Iterable[int]
+) -> dict[str, list[Chunk]]:
+    """The chunks, whose first frames are `starts`, with each kind of path between their frames."""
+    others = {"known": known_path, "straight": straight_path, "blended": blended_path}
+    firsts = list(starts)
+    return {"path": chunks} | {
+        kind: [path(hidden, c, i) for c, i in zip(chunks, firsts, strict=False)]
+        for kind, path in others.items()}
+
+
+def refined(chunks: list[Chunk], start: Summary, unsure: Summary) -> tuple[Summary, np.ndarray]:
+    """The camera, and its thresholds by pixel (2, H, W), as these paths have it."""
+    best = refine_summary(chunks, start, unsure).summary
+    return best, pixel_posterior(
+        functools.reduce(operator.add, (c.evidence for c in chunks)), best)[0]
 
 
 def known_path(hidden: Hidden, chunk: Chunk, first: int) -> Chunk:

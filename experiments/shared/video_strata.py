@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.shared.protocols import ENOUGH
 
-KINDS = ("ours", "path", "blended", "known")
+KINDS = ("ours", "path", "straight", "blended", "known")
 EDGES = {"signal": (200, 1000, 5000, np.inf), "speed": (0, 2, 6, np.inf)}
 
 
