@@ -119,6 +119,8 @@ def with_frames(
 def _reworded(text: str) -> str:
     """Next to a recording, --time-unit is the events', and --fps that of a video to be written."""
     text = text.replace(" with --frames (simulate: --time-unit)", "")
+    text = text.replace("they give no events, and a double step after; --repeated drop leaves them "
+                        "out.", "an estimate leaves them out.")
     return text.replace("--time-unit", "--timestamps-unit").replace("--fps", "--frames-fps")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from evflow.estimation.bench.levels import Bench, Level, Step
 from evflow.report.figures import INK, SIDES, svg
+from evflow.report.page import short
 from evflow.report.plots import robust_range
 
 AXES = {"DN": "light [DN of 255]", "lux": "illuminance [lux]", "light": "light [as given]"}
@@ -147,7 +148,7 @@ def _light_axis(axis: Any, bench: Bench, levels: list[Level]) -> None:
     if light and min(light) > 0 and max(light) > 5 * min(light):
         axis.set_xscale("log")
         ticks = light if len(light) <= 6 else light[:: -(-len(light) // 6)]
-        axis.set_xticks(ticks, [f"{v:.3g}" for v in ticks])
+        axis.set_xticks(ticks, [short(v) for v in ticks])
         axis.set_xticks([], minor=True)
     for edge in ("left", "bottom"):
         axis.spines[edge].set_color(INK)

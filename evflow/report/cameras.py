@@ -20,9 +20,9 @@ LABELS = {
     "cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz/pixel]",
     "shot_hz": "shot noise [Hz, dark]"}
 COLOURS = ("#444b57", "#d98200")
-NOTE = ("Apart: the difference in standard deviations; above 3 they differ. r: over the "
-        "pixels of the maps; two cameras of one type have none, the same camera at other biases "
-        "has.")
+NOTE = ("Apart: the difference in standard deviations; above 3 they differ. r: "
+        "correlation of the maps, about 0 for two cameras of one type, high for one camera at two "
+        "settings.")
 
 
 def describe_cameras(numbers: dict[str, Any], names: tuple[str, str]) -> str:

@@ -147,6 +147,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:,.{min(decimals, 6)}f}".replace("-", "−")
 
 
+def short(value: float) -> str:
+    """Three significant digits without zeros at the end or an exponent: "5", "1,500"."""
+    return number(value) if abs(value) >= 1000 else f"{value:.3g}"
+
+
 def plural(count: int, noun: str) -> str:
     """"1 window", "2 windows"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"

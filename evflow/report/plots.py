@@ -236,7 +236,8 @@ def _contrast_axis(axis: Any, name: str) -> None:
     if name.startswith("theta"):
         axis.set_title("")
         upper = axis.secondary_xaxis("top", functions=(
-            lambda theta: 100 * np.expm1(theta), lambda percent: np.log1p(percent / 100)))
+            lambda theta: 100 * np.expm1(theta),
+            lambda percent: np.log1p(np.maximum(percent, -99) / 100)))
         upper.set_xlabel(f"{SYMBOLS[name]}, contrast [%]")
         upper.xaxis.set_major_locator(_few_ticks())
 

@@ -8,7 +8,7 @@ import math
 from evflow.camera import Summary
 from evflow.estimation.bench.levels import Bench
 from evflow.estimation.result import CameraEstimate
-from evflow.report.page import number, plural, spread
+from evflow.report.page import number, plural, short, spread
 
 LABELS = {
     "theta_on": "threshold ON", "theta_off": "threshold OFF", "eta_on": "noise ON (Hz/pixel)",
@@ -40,9 +40,10 @@ def by_light(bench: Bench) -> list[str]:
     """Noise at each illuminance, and latency by kind of step, a line each."""
     unit = {"DN": " DN", "lux": " lux", "light": ""}[bench.unit]
     levels = bench.levels if bench.unit == "lux" and len(bench.levels) > 1 else ()
-    return [*(f"{f'noise at {level.light:g}{unit}':22} ON {spread(level.eta_on, level.eta_on_std)}"
-              f", OFF {spread(level.eta_off, level.eta_off_std)} Hz/pixel" for level in levels),
-            *(f"{f'latency to {v.light:.3g}{unit}':22} {100 * math.expm1(v.change):+.0f} %: "
+    return [*(f"{f'noise at {short(level.light)}{unit}':22} "
+              f"ON {spread(level.eta_on, level.eta_on_std)}, "
+              f"OFF {spread(level.eta_off, level.eta_off_std)} Hz/pixel" for level in levels),
+            *(f"{f'latency to {short(v.light)}{unit}':22} {100 * math.expm1(v.change):+.0f} %: "
               f"{_ms(v.seconds, v.std_s)} ms, jitter {1e3 * v.jitter_s:.3g} ms, "
               f"{v.responded:.0%} of the pixels" for v in bench.latency)]
 

@@ -152,7 +152,7 @@ def _notes(
         notes.append(Note("pixels.unsure", f"{valid.mean():.0%} of the pixels sent enough events "
                           "to be measured: take more steps, or larger ones."))
     if hot.any():
-        notes.append(Note("pixels.hot", f"{hot.sum()} hot pixels: they fire while nothing "
+        notes.append(Note("pixels.hot", f"hot pixels ({hot.sum()}): they fire while nothing "
                           "changes."))
     return tuple(notes)
 

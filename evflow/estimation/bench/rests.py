@@ -37,7 +37,9 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
     """
     if len(recording.frames) < 4:
         raise EvflowDataError("EV011", f"the recording has {len(recording.frames)} frames.",
-                              "Record frames too; in Python, rests_us and light take their place.")
+                              "They show when the light rests: record them too, or pass --frames. "
+                              "In Python, calibrate_step of evflow.estimation.bench.calibration "
+                              "takes rests_us and light instead.")
     found = _rests(np.array([
         _level(recording.frame_dn(i)) for i in range(len(recording.frames))]))
     if len(found) < 2:

@@ -121,5 +121,6 @@ def leftovers(timeless: int, triggers: int) -> tuple[Note, ...]:
         notes.append(Note("events.timeless", f"{timeless:,} events before the first time or row "
                           "word were left out: the file begins in the middle of the stream"))
     if triggers:
-        notes.append(Note("events.unread", f"{triggers:,} external triggers were not read"))
+        notes.append(Note("events.unread", f"external triggers ({triggers:,}) are "
+                          "no events: evflow estimate --protocol step --triggers uses them"))
     return tuple(notes)

@@ -29,7 +29,8 @@ def test_words_beside_the_events(tmp_path: Path) -> None:
     got = read_recording(path)
     equal(got.events, events)
     assert got.notes[0].text.startswith("2 events before the first time")
-    assert got.notes[1] == Note("events.unread", "1 external triggers were not read")
+    assert got.notes[1] == Note("events.unread", "external triggers (1) are no events: "
+                                "evflow estimate --protocol step --triggers uses them")
     path.write_bytes(sound[:header] + early)  # and no time word at all
     assert len(read_recording(path).events) == 0
 

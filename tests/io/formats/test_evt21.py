@@ -44,7 +44,8 @@ def test_bits_by_hand(tmp_path: Path) -> None:
     assert listed(found.events) == [(x, 100, 197, 1) for x in (64, 71, 95)]
     assert found.events.size == (320, 320)
     assert found.notes[0].text.startswith("2 events before the first time")
-    assert found.notes[1] == Note("events.unread", "1 external triggers were not read")
+    assert found.notes[1] == Note("events.unread", "external triggers (1) are no events: "
+                                  "evflow estimate --protocol step --triggers uses them")
 
 
 def test_size_by_the_name_of_the_sensor(tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ def test_any_order_of_words(
     notes = " ".join(texts(got.notes))
     assert (f"{lost:,} events before the first time or row word" in notes) == (lost > 0)
     triggers = sum(w >> 12 == 10 for w in words)
-    assert f"{triggers} external triggers" in notes
+    assert f"external triggers ({triggers:,})" in notes
 
 
 def test_new_high_word_starts_at_low_zero(tmp_path: Path) -> None:
