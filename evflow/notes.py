@@ -59,6 +59,7 @@ NOTES: dict[str, str] = {
     "frames.unused": "frames were left out",
     "frames.white": "the radiance that counts as white",
     "levels.few": "all light steps have the same size",
+    "levels.lux": "the light meter's readings do not fit the frames",
     "maps.raised": "impossible values were raised to the smallest possible one",
     "std.none": "the weights estimate no error",
     "theta.joined": "the thresholds come from another estimate of this camera",

@@ -18,7 +18,13 @@ import numpy as np
 from evflow.camera import THETA_MIN, Camera, Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.latency import measured_latency
-from evflow.estimation.bench.levels import Unit, few_sizes, light_of_rests, measured_bench
+from evflow.estimation.bench.levels import (
+    Unit,
+    few_sizes,
+    light_of_rests,
+    lux_notes,
+    measured_bench,
+)
 from evflow.estimation.bench.rests import check_steps, find_rests
 from evflow.estimation.bench.steps import (
     camera_rate,
@@ -186,8 +192,11 @@ def _steps(
     if light is None:
         check_steps(levels)
     unit: Unit = "DN" if light is None else "light"
+    doubts = []
     if lux:
-        unit, light = "lux", light_of_rests(np.median(levels, (1, 2)), lux)
+        seen = np.median(levels, (1, 2))
+        unit, light = "lux", light_of_rests(seen, lux)
+        doubts = lux_notes(seen, lux)
         levels = _levels(recording, spans, light)
     settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
     counts = [events.slice(before[1], after).count_map()
@@ -200,7 +209,7 @@ def _steps(
     shown = (np.asarray(light, np.float64) if light is not None else
              np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))
     return Steps(levels, np.array(counts, np.float64), np.array(seconds), rests, spans, quiet,
-                 shown, unit, tuple(_restless(busiest)))
+                 shown, unit, (*_restless(busiest), *doubts))
 
 
 def _restless(rest: Events) -> list[Note]:

@@ -25,6 +25,7 @@ Span = tuple[int, int]
 SAME = 0.05  # log units: tolerance of one level, and of one size of steps
 WAY = (0.5, 0.9)  # shares of a step in log units between which its duration is measured
 BANDWIDTH = float(np.log(5.0)) / (2.0 * np.pi)  # of a first-order low-pass: cutoff times duration
+UNLIKE = 2.0  # ratio of two ratios of lux to frames, above which one of them is doubtful
 LARGE = 3.0  # thresholds: the duration of smaller steps is not measured
 APART, EVEN = 0.87, 0.08  # ratio of distinct sizes at most; tolerance of a ratio
 SHORT = 0.05  # quantile of a pixel's intervals
@@ -106,6 +107,22 @@ def light_of_rests(logs: np.ndarray, lux: tuple[float, ...]) -> list[float]:
             "EV020", f"{len(lux)} values of lux ({', '.join(f'{v:g}' for v in lux)}), but the "
             f"frames rest at {levels} levels.", "Give one of each level, the darkest first.")
     return [lux[i] for i in which]
+
+
+def lux_notes(logs: np.ndarray, lux: tuple[float, ...]) -> list[Note]:
+    """A note if lux of the levels rises elsewhere than the frames' log intensity at the rests (R,):
+    by more than `UNLIKE` times as much between two neighbours than between two others."""
+    which = level_of(logs)
+    seen = np.diff([logs[which == level].mean() for level in range(len(lux))])
+    given = np.diff(np.log(lux))
+    pace = given / seen
+    if len(seen) < 2 or pace.max() <= UNLIKE * pace.min():
+        return []
+    k = int(np.argmax(np.abs(np.log(pace / np.median(pace)))))
+    return [Note("levels.lux", f"from {lux[k]:g} to {lux[k + 1]:g} lux light becomes "
+                 f"{np.exp(given[k]):.3g} times as bright, in the frames {np.exp(seen[k]):.3g} "
+                 "times, unlike between other levels: a wrong number, or saturated frames? "
+                 "Thresholds follow from the lux.")]
 
 
 def measured_levels(

@@ -8,7 +8,7 @@ from helpers.benches import CYCLES, SHAPE, STAIRS, bench, cameras
 
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
-from evflow.estimation.bench.levels import _dead_time, few_sizes
+from evflow.estimation.bench.levels import _dead_time, few_sizes, lux_notes
 from evflow.types import Events
 
 
@@ -53,6 +53,16 @@ def test_how_long_steps_last() -> None:
 def test_steps_of_one_size_are_told(levels: list[float], few: bool) -> None:
     changes = np.diff(np.log(levels))
     assert [note.code for note in few_sizes(changes)] == ["levels.few"] * few
+
+
+@pytest.mark.parametrize(("lux", "said"), [
+    ((12, 17, 31, 68), []), ((12, 17, 31, 680), ["from 31 to 680 lux"]),
+    ((1.2, 17, 31, 68), ["from 1.2 to 17 lux"]), ((12**2.2, 17**2.2, 31**2.2, 68**2.2), [])])
+def test_a_wrong_reading_of_the_light_meter_is_noted(
+    lux: tuple[float, ...], said: list[str]
+) -> None:
+    notes = lux_notes(np.log([55, 40, 220, 100, 40]), lux)
+    assert [note.text.partition(" light")[0] for note in notes] == said
 
 
 @pytest.mark.parametrize(("small_us", "measured"), [(1000, True), (1500, False)])
