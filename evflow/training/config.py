@@ -174,7 +174,7 @@ class TrainConfig:
         for name, value, good, rule in (
             ("parts", self.parts, bool(self.parts) and set(self.parts) <= set(PARTS),
              f"some of {PARTS}"),
-            ("steps", self.steps, self.steps >= 0, ">= 0"),
+            ("steps", self.steps, self.steps > 0, "at least 1"),
             ("sensors", models, models > 0 and models % group == 0,
              "as many as the cameras, or a multiple"),
             ("cameras", self.cameras, self.cameras > 0 and self.cameras % group == 0,

@@ -173,7 +173,7 @@ def test_unknown_preset() -> None:
 
 
 @pytest.mark.parametrize("change", [
-    {"parts": ("summary", "foo")}, {"parts": ()}, {"steps": -5}, {"cameras": 0}, {"cameras": 5},
+    {"parts": ("summary", "foo")}, {"parts": ()}, {"steps": 0}, {"cameras": 0}, {"cameras": 5},
     {"sensors": configs.TrainConfig.sensors[:3]}, {"sensors": ()}, {"steps_per_window": 10},
     {"block": (4, 16)}, {"block": (8, 80)}, {"sequences": 15}, {"sequences": 300}],
     ids=str)
