@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 from helpers.figures import cells, mean, numbers, span, values, wrong
@@ -95,16 +95,18 @@ def others() -> dict[str, Figures]:
 
 
 def true_video() -> dict[str, Figures]:
-    def errors(protocol: str) -> Figures:
-        return [mean("true_video", rf"{protocol}\|theta_\w+, all", column) for column in (3, 4)]
+    ways = (3, 6, 7, 8, 4)  # ours; without fusion on our path, a straight one, a fade; true video
 
-    fired = [mean("true_video", r"0.15\|theta_\w+ of pixels that fired, all", k) for k in (4, 3)]
-    return {"threshold of the camera, mismatch .03": errors("0.03"),
-            "the same with v2e's time slots": errors("0.03 v2e"),
-            "the same at mismatch .15": errors("0.15"),
-            "thresholds of pixels with events": fired[::-1],
-            "η independent of θ": [mean("true_video", r"0.03 free noise\|eta_\w+, all", column)
-                                   for column in (3, 4)]}
+    def errors(rows: str, columns: Sequence[int] = ways) -> Figures:
+        return [mean("true_video", rows, column) for column in columns]
+
+    return {"threshold of the camera, mismatch .03": errors(r"0.03\|theta_\w+, all"),
+            "the same, recordings of": errors(r"0.03\|theta_\w+, speed 6-inf"),
+            "the same with v2e's time slots": errors(r"0.03 v2e\|theta_\w+, all"),
+            "the same at mismatch .15": errors(r"0.15\|theta_\w+, all"),
+            "thresholds of pixels with events": errors(
+                r"0.15\|theta_\w+ of pixels that fired, all"),
+            "η independent of θ": errors(r"0.03 free noise\|eta_\w+, all", (3, 4))}
 
 
 def curves() -> dict[str, Figures]:
