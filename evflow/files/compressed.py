@@ -72,9 +72,9 @@ def most_bytes(data: bytes) -> int:
 
 def _zstd(data: bytes, at: int) -> tuple[int, int]:
     """(offset of the end of the frame whose magic is before `at`, upper bound on its bytes)."""
-    told = data[at]
-    single, checksum = told >> 5 & 1, told >> 2 & 1
-    dictionary, content = (0, 1, 2, 4)[told & 3], (single, 2, 4, 8)[told >> 6]
+    flags = data[at]
+    single, checksum = flags >> 5 & 1, flags >> 2 & 1
+    dictionary, content = (0, 1, 2, 4)[flags & 3], (single, 2, 4, 8)[flags >> 6]
     at += 1 + (1 - single) + dictionary + content
     total = last = 0
     while not last and at < len(data):
@@ -86,8 +86,8 @@ def _zstd(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _lz4(data: bytes, at: int) -> tuple[int, int]:
-    told, block = data[at], 1 << 8 + 2 * (data[at + 1] >> 4 & 7)  # 64 KiB to 4 MiB
-    per_block, content, checksum, dictionary = (told >> shift & 1 for shift in (4, 3, 2, 0))
+    flags, block = data[at], 1 << 8 + 2 * (data[at + 1] >> 4 & 7)  # 64 KiB to 4 MiB
+    per_block, content, checksum, dictionary = (flags >> shift & 1 for shift in (4, 3, 2, 0))
     at += 3 + 8 * content + 4 * dictionary
     total = 0
     while size := struct.unpack_from("<I", data, at)[0]:

@@ -133,16 +133,16 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
         raise EvflowDataError(
             "EV020", f"a path was expected, not {type(path).__name__}.",
             "For events without frames: Recording.of_events(events).")
-    told = Hints.parse(hints)
+    parsed = Hints.parse(hints)
     path = Path(path)
     found = find_format(path)
     try:
         with naming(path), watched() as written:
-            recording = found.read(path, told)
-            _check_named(recording, told)
+            recording = found.read(path, parsed)
+            _check_named(recording, parsed)
             events = recording.events
             check_seconds(events.t, events.size, written.unit)
-            recording = _doubted(recording, found.NAME, told, written)
+            recording = _doubted(recording, found.NAME, parsed, written)
     except MemoryError as e:
         raise EvflowDataError(
             "EV009", f"{path} asks for more memory than there is.",
@@ -269,11 +269,11 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
     return WRITERS[WRITTEN[suffix] if format is None else format]
 
 
-def _doubted(recording: Recording, format: str, told: Hints, written: Written) -> Recording:
+def _doubted(recording: Recording, format: str, parsed: Hints, written: Written) -> Recording:
     """The recording, with a note if its times are doubtful; EV023 if the user must decide."""
     said = coarse(recording.events.t, written)
     found = doubt(recording.events, recording.frame_times, format, written.unit) if (
-        told.time_unit == "auto") else None
+        parsed.time_unit == "auto") else None
     if found is not None:
         note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
     elif said:
@@ -283,15 +283,15 @@ def _doubted(recording: Recording, format: str, told: Hints, written: Written) -
     return dataclasses.replace(recording, notes=(*recording.notes, note))
 
 
-def _check_named(recording: Recording, told: Hints) -> None:
+def _check_named(recording: Recording, parsed: Hints) -> None:
     """Raise EV020 if an image or event stream was named but the file has only one, or none."""
-    if told.events_topic is not None and all(n.code != "sensor.camera" for n in recording.notes):
+    if parsed.events_topic is not None and all(n.code != "sensor.camera" for n in recording.notes):
         raise EvflowDataError(
-            "EV020", f"events_topic={told.events_topic!r}, but there are no several streams of "
+            "EV020", f"events_topic={parsed.events_topic!r}, but there are no several streams of "
             "events.", "Leave it out (--events-topic).")
-    if told.frames_topic is not None and all(n.code != "frames.stream" for n in recording.notes):
+    if parsed.frames_topic is not None and all(n.code != "frames.stream" for n in recording.notes):
         raise EvflowDataError(
-            "EV020", f"frames_topic={told.frames_topic!r}, but the file has no images.",
+            "EV020", f"frames_topic={parsed.frames_topic!r}, but the file has no images.",
             "Leave it out (--frames-topic); --frames takes images from elsewhere.")
 
 

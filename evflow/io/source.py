@@ -34,31 +34,31 @@ def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
     recording without frames), EV016 (not found), EV020 (unknown hint; no times), and what the
     readers raise.
     """
-    told, path = FrameHints.parse(hints), existing(path)
+    asked, path = FrameHints.parse(hints), existing(path)
     with naming(path):
-        return _open(path, told)
+        return _open(path, asked)
 
 
-def _open(path: Path, told: FrameHints) -> FrameSource:
+def _open(path: Path, asked: FrameHints) -> FrameSource:
     if is_stack(path):
-        stack = open_stack(path, told)
-        told, notes = _responding(told, "linear", "numbers of a stack")
-        return _source(stack.size, len(stack.times_us), lambda: stack.images(told.partial), told,
+        stack = open_stack(path, asked)
+        asked, notes = _responding(asked, "linear", "numbers of a stack")
+        return _source(stack.size, len(stack.times_us), lambda: stack.images(asked.partial), asked,
                        [*stack.notes, *notes])
     if (count := pages(path)) > 1:
-        found = open_pages(path, count, told)
+        found = open_pages(path, count, asked)
         usual = ("srgb", "8-bit images") if found.first.dtype == np.uint8 else (
             "linear", "images of more than 8 bits")
-        told, notes = _responding(told, *usual)
-        return _source(found.first.shape[1::-1], count, found.images, told, [*found.notes, *notes])
-    if told.picture and path.suffix.lower() in SUFFIXES:
-        return _of_images(ImageFolder((path,), np.zeros(1, np.int64), ()), told)
+        asked, notes = _responding(asked, *usual)
+        return _source(found.first.shape[1::-1], count, found.images, asked, [*found.notes, *notes])
+    if asked.picture and path.suffix.lower() in SUFFIXES:
+        return _of_images(ImageFolder((path,), np.zeros(1, np.int64), ()), asked)
     if not _is_recording(path):
-        if told.frames_topic is not None:
+        if asked.frames_topic is not None:
             raise EvflowDataError("EV020", f"{path} is not a recording with image streams.",
                                   "Leave out frames_topic (--frames-topic).", where=path)
-        return _folder(path, told) if path.is_dir() else _video(path, told)
-    return _recording(path, told)
+        return _folder(path, asked) if path.is_dir() else _video(path, asked)
+    return _recording(path, asked)
 
 
 def _is_recording(path: Path) -> bool:
@@ -71,85 +71,85 @@ def _is_recording(path: Path) -> bool:
     return True
 
 
-def _folder(path: Path, told: FrameHints) -> FrameSource:
-    folder = open_folder(path, told)
+def _folder(path: Path, asked: FrameHints) -> FrameSource:
+    folder = open_folder(path, asked)
     if (count := pages(folder.files[0])) > 1:
         raise EvflowDataError(
             "EV008", f"{folder.files[0]} holds {count:,} pages, not one image.",
             f"Pass the file itself{'' if len(folder.files) == 1 else ', one by one'}, or a folder "
             "with one image a file.", where=path)
-    return _of_images(folder, told)
+    return _of_images(folder, asked)
 
 
-def _of_images(folder: ImageFolder, told: FrameHints) -> FrameSource:
+def _of_images(folder: ImageFolder, asked: FrameHints) -> FrameSource:
     first = next(folder.images()).pixels
     size = first.shape[1], first.shape[0]
-    raw = told.bayer is not None or (first.ndim == 2 and told.colour != "luma")
-    told, notes = _responding(
-        told, *(("linear", "pixels of a raw mosaic") if raw else
+    raw = asked.bayer is not None or (first.ndim == 2 and asked.colour != "luma")
+    asked, notes = _responding(
+        asked, *(("linear", "pixels of a raw mosaic") if raw else
                 ("linear", "images made from events") if folder.notes and any(
                     note.code == "frames.made" for note in folder.notes) else
                 ("srgb", "8-bit images") if first.dtype == np.uint8 else
                 ("linear", "images of more than 8 bits")))
     if folder.files[0].suffix.lower() in RADIANCE:
-        white, said = values.white_of_radiance(first, told.full_scale)
-        told = dataclasses.replace(told, full_scale=white, clip=True)
+        white, said = values.white_of_radiance(first, asked.full_scale)
+        asked = dataclasses.replace(asked, full_scale=white, clip=True)
         notes = (*notes, said)
-    return _source(size, len(folder.files), folder.images, told, [*folder.notes, *notes])
+    return _source(size, len(folder.files), folder.images, asked, [*folder.notes, *notes])
 
 
-def _video(path: Path, told: FrameHints) -> FrameSource:
+def _video(path: Path, asked: FrameHints) -> FrameSource:
     from evflow.io.images.video import open_video
 
-    video = open_video(path, told)
-    told, notes = _responding(told, *(("srgb", "videos") if told.bayer is None else
+    video = open_video(path, asked)
+    asked, notes = _responding(asked, *(("srgb", "videos") if asked.bayer is None else
                                       ("linear", "pixels of a raw mosaic")))
     video.notes.extend(notes)
-    return _source(video.size, video.claimed, video.images, told, video.notes)
+    return _source(video.size, video.claimed, video.images, asked, video.notes)
 
 
-def _recording(path: Path, told: FrameHints) -> FrameSource:
-    if told.fps is not None or told.timestamps is not None:
+def _recording(path: Path, asked: FrameHints) -> FrameSource:
+    if asked.fps is not None or asked.timestamps is not None:
         raise EvflowDataError(
             "EV020", f"{path} is a recording, whose frames have their own times.",
             "Leave out --fps and --timestamps, or pass only its images.", where=path)
     # Only the frames of the recording are used, so the order of its events does not matter.
-    recording = read_recording(path, time_unit=told.time_unit, partial=told.partial,
-                               start_s=told.start_s, stop_s=told.stop_s, late="drop",
-                               frames_topic=told.frames_topic, colour=told.colour)
+    recording = read_recording(path, time_unit=asked.time_unit, partial=asked.partial,
+                               start_s=asked.start_s, stop_s=asked.stop_s, late="drop",
+                               frames_topic=asked.frames_topic, colour=asked.colour)
     if not recording.has_frames:
         raise EvflowDataError(
             "EV011", f"{path} has events but no frames{why_no_frames(recording.notes)}.",
             "Simulate a recording with frames, or a video.", where=path)
-    white = told.full_scale or recording.full_scale
-    told = dataclasses.replace(told, full_scale=white, start_s=None, stop_s=None)
-    told, notes = _responding(told, "linear", "a recording's own frames")
+    white = asked.full_scale or recording.full_scale
+    asked = dataclasses.replace(asked, full_scale=white, start_s=None, stop_s=None)
+    asked, notes = _responding(asked, "linear", "a recording's own frames")
 
     def images() -> Iterator[Image]:
         for i, t in enumerate(recording.frame_times.tolist()):
             yield Image(recording.frames[i], t, f"frame {i} of {path}")
 
     return dataclasses.replace(
-        _source(recording.events.size, len(recording.frames), images, told,
+        _source(recording.events.size, len(recording.frames), images, asked,
                 [*(n for n in recording.notes if n.code != "events.late"), *notes]),
         recorded=True)
 
 
-def _responding(told: FrameHints, usual: str, what: str) -> tuple[FrameHints, tuple[Note, ...]]:
+def _responding(asked: FrameHints, usual: str, what: str) -> tuple[FrameHints, tuple[Note, ...]]:
     """The hints with the response chosen if it was "auto", and the note that says so."""
-    if told.response != "auto":
-        return told, ()
+    if asked.response != "auto":
+        return asked, ()
     said = {"srgb": "converted to light by the sRGB curve, the usual encoding of {} "
                     "(--response linear: they are already linear)",
             "linear": "assumed to be linear in light, as usual for {} (--response srgb: they are "
                       "encoded like videos)"}[usual].format(what)
-    return (dataclasses.replace(told, response=usual),
+    return (dataclasses.replace(asked, response=usual),
             (Note("frames.response", f"frames were {said}."),))
 
 
-def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:
+def _between(images: Iterator[Image], asked: FrameHints) -> Iterator[Image]:
     """The images from start_s to stop_s after the first; EV001 if there is none."""
-    start, stop = (None if s is None else 1e6 * s for s in (told.start_s, told.stop_s))
+    start, stop = (None if s is None else 1e6 * s for s in (asked.start_s, asked.stop_s))
     first = last = None
     count = 0
     for image in images:
@@ -162,18 +162,18 @@ def _between(images: Iterator[Image], told: FrameHints) -> Iterator[Image]:
             yield image
     if not count and first is not None and last is not None:
         raise EvflowDataError(
-            "EV001", f"no frame between {told.start_s or 0:g} s and "
-            f"{'the end' if told.stop_s is None else f'{told.stop_s:g} s'} from the first.",
+            "EV001", f"no frame between {asked.start_s or 0:g} s and "
+            f"{'the end' if asked.stop_s is None else f'{asked.stop_s:g} s'} from the first.",
             f"The frames read cover 0 to {(last - first) / 1e6:.3f} s.")
 
 
-def _source(size: tuple[int, int], count: int, images: Any, told: FrameHints,
+def _source(size: tuple[int, int], count: int, images: Any, asked: FrameHints,
             notes: list[Note]) -> FrameSource:
     def shown() -> Frames:
-        return converted(_between(images(), told), told, notes)
+        return converted(_between(images(), asked), asked, notes)
 
     def frames() -> Frames:
-        if told.repeated == "drop":
+        if asked.repeated == "drop":
             yield from repeats.dropped(shown, notes)
             return
         runs = repeats.Runs()

@@ -62,9 +62,10 @@ def hot_pixels(
     own = OWN_SHARE * seconds * events / np.maximum(seconds_quiet, 1e-9)
     usual = _median_around(counts)
     stands_out = (counts - _most_of_others(counts, hot) >= own) & (counts > TWICE * usual)
-    told = _around(seconds_quiet) >= QUIET_NEAR * seconds_quiet  # whether neighbours can show rest
+    # Whether neighbours can show rest.
+    comparable = _around(seconds_quiet) >= QUIET_NEAR * seconds_quiet
     return hot & ((usual <= _restless(rate_hz * seconds)) | stands_out
-                  | (lasting & told & (at_rest | (fired >= MANY_FIRED))))
+                  | (lasting & comparable & (at_rest | (fired >= MANY_FIRED))))
 
 
 def _restless(noise: Any) -> Any:

@@ -77,7 +77,7 @@ def _counts(part: Events, begin: int, length: int) -> np.ndarray:
 def _joining(parts: list[Events], hz: float) -> float:
     """The share of places on the sensor, among those with enough events, whose light flickers at
     this frequency in phase with the others."""
-    joined, told = 0, 0
+    joined, counted = 0, 0
     for part in parts:
         turn = np.where(part.p, 1.0, -1.0) * np.exp(-2j * np.pi * hz / 1e6 * part.t)
         width, height = part.size
@@ -90,5 +90,5 @@ def _joining(parts: list[Events], hz: float) -> float:
         whole = sums.sum() / max(abs(sums.sum()), 1e-12)
         along = (sums * np.conj(whole)).real[enough]
         joined += int(np.sum(along > DEPTH / 2 * count[enough]))
-        told += int(enough.sum())
-    return joined / max(told, 1)
+        counted += int(enough.sum())
+    return joined / max(counted, 1)

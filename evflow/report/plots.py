@@ -173,7 +173,7 @@ def camera_maps(found: CameraEstimate, path: str | os.PathLike) -> None:
 
 
 class _Page:
-    """A figure of width x height inches whose axes stand where they are told to, in inches."""
+    """A figure of width x height inches whose axes are placed in inches."""
 
     def __init__(self, width: float, height: float) -> None:
         self.figure, self.size = new_figure(width, height, layout=None), (width, height)

@@ -48,14 +48,14 @@ LABELS = {"measured": "the camera as measured", "v2e": "v2e", "esim": "ESIM",
 
 @dataclasses.dataclass(frozen=True)
 class Tried:
-    """name: from LABELS; constants: its best; untold: those that the recording does not determine;
-    numbers: "counts_r" and "space_time_r", recorded against simulated, and the same for two
-    simulations, "counts_ceiling" and "space_time_ceiling"; "intervals" (distance in decades);
+    """name: from LABELS; constants: its best; undetermined: those that the recording
+    leaves open; numbers: "counts_r" and "space_time_r", recorded against simulated, and the same
+    for two simulations, "counts_ceiling" and "space_time_ceiling"; "intervals" (in decades);
     "events_on" and "events_off" (simulated over recorded); distance: from `distance`."""
 
     name: str
     constants: dict[str, float]
-    untold: tuple[str, ...]
+    undetermined: tuple[str, ...]
     numbers: dict[str, float | None]
     distance: float
 
@@ -142,10 +142,10 @@ def which_simulator(
             ("voltmeter", voltmeter(level), IDEAL, dataclasses.asdict(circuit),
              constants.undetermined))
     made = []
-    for name, (camera, model), sight, values, untold in rows:
+    for name, (camera, model), sight, values, undetermined in rows:
         numbers = likeness(tried, *(tried.simulated(k, camera, model, sight)
                                     for k in jax.random.split(key)))
-        made.append(Tried(name, {k: float(v) for k, v in values.items()}, untold, numbers,
+        made.append(Tried(name, {k: float(v) for k, v in values.items()}, undetermined, numbers,
                           distance(numbers)))
     return tuple(sorted(made, key=lambda one: one.distance))
 
@@ -259,7 +259,7 @@ def verdict(tried: Sequence[Tried], why_not: str = "") -> str:
 
 def as_dicts(tried: Sequence[Tried]) -> list[dict[str, Any]]:
     """JSON-ready values."""
-    return [{**dataclasses.asdict(one), "untold": list(one.untold)} for one in tried]
+    return [{**dataclasses.asdict(one), "undetermined": list(one.undetermined)} for one in tried]
 
 
 def simulators_panel(tried: Sequence[Tried], why_not: str) -> Panel:
@@ -270,7 +270,8 @@ def simulators_panel(tried: Sequence[Tried], why_not: str) -> Panel:
     rows = [[LABELS[t.name], *(number(t.numbers[n], 3) for n in t.numbers), number(t.distance, 3)]
             for t in tried]
     constants = [[LABELS[t.name], ", ".join(
-        f"{k} {'unknown' if k in t.untold else format(v, '.3g')}" for k, v in t.constants.items())]
+        f"{k} {'unknown' if k in t.undetermined else format(v, '.3g')}"
+        for k, v in t.constants.items())]
                  for t in tried]
     return Panel("simulators", title, paragraph(
         f"{verdict(tried)} Constants are those of the first half, thresholds scaled to its number "

@@ -56,7 +56,7 @@ def test_the_nearest_is_named_and_those_that_are_alike() -> None:
     panel = simulators_panel(rows, "")
     assert "k3 unknown" in panel.body
     assert panel.body.index("DVS-Voltmeter") < panel.body.index("as measured")
-    assert as_dicts(rows)[0]["untold"] == ["k3"]
+    assert as_dicts(rows)[0]["undetermined"] == ["k3"]
     assert "no second half" in simulators_panel((), "there is no second half.").body
     assert "no second half" in verdict((), "there is no second half.")
 

@@ -70,8 +70,8 @@ What v2e cannot represent
 
 def export(maps: Maps, s: Settings) -> Export:
     """Scalars for the command line, a script for the maps."""
-    told, on = bool(s.leak_hz or s.shot_hz), s.eta_on
-    if told:
+    separate, on = bool(s.leak_hz or s.shot_hz), s.eta_on
+    if separate:
         leak, on = s.leak_hz, s.eta_on - s.leak_seen
         shot = s.shot_hz or (on + s.eta_off) / GREY
     else:
@@ -84,7 +84,7 @@ def export(maps: Maps, s: Settings) -> Export:
         f"--cutoff_hz {s.cutoff_hz:.1f} --leak_rate_hz {leak:.4f} --shot_noise_rate_hz {shot:.4f} "
         f"--refractory_period {s.dead_s:.6f} --dvs_h5 events.h5")
     excess = (
-        "the noise\n  that is not leak, as measured" if told else
+        "the noise\n  that is not leak, as measured" if separate else
         "the OFF noise (measured {eta_off:.4f} Hz); what\n  ON has more of it ({eta_on:.4f} Hz) is "
         "--leak_rate_hz, a regular drift" if leak else
         "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))

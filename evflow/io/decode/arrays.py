@@ -126,7 +126,7 @@ def all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
 
 def in_us(chunks: Iterable[Chunk], unit: str) -> Iterator[Chunk]:
     """Convert chunks whose times are in that unit, integer or not, to us."""
-    told = Hints(time_unit=unit)
+    as_given = Hints(time_unit=unit)
     for chunk in chunks:
         written.seen(chunk.t, unit)
-        yield chunk._replace(t=told.microseconds(chunk.t, unit))
+        yield chunk._replace(t=as_given.microseconds(chunk.t, unit))

@@ -60,8 +60,8 @@ class Gathering:
         return self._unsorted(chunk, t) if self.lateness else self._sorted(chunk, t)
 
     def _times(self, chunk: Chunk) -> np.ndarray:
-        if chunk.t.dtype.kind == "f" and not (told := np.abs(chunk.t) < 2.0**63).all():
-            raise self._odd(chunk, "t", int(np.argmin(told)))
+        if chunk.t.dtype.kind == "f" and not (fits := np.abs(chunk.t) < 2.0**63).all():
+            raise self._odd(chunk, "t", int(np.argmin(fits)))
         unit = self.native if self.hints.time_unit == "auto" else self.hints.time_unit
         written.seen(chunk.t, unit)
         t = self.hints.microseconds(chunk.t, self.native, self.offset)

@@ -92,8 +92,8 @@ def _in_group(
 def _unit(f: Any, name: str, data: Any) -> str:
     """The unit of times from their attributes, else their name, else the file."""
     for key in ("unit", "units"):
-        if isinstance(told := columns.text(data.attrs.get(key)), str) and told:
-            return written_unit(f"[{told}]")
+        if isinstance(written := columns.text(data.attrs.get(key)), str) and written:
+            return written_unit(f"[{written}]")
     unit = written_unit(name)
     return told_unit(f) if unit == "auto" else unit
 

@@ -1,4 +1,4 @@
-"""Images that a file holds beside its events under names of its own, and their times: told by
+"""Images that a file holds beside its events under names of its own, and their times: recognised by
 shapes and names.
 
 Images are arrays (T, H, W), or (T, H, W, C) with 1, 3 or 4 channels in R, G, B. Their times are an

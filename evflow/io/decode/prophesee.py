@@ -54,13 +54,13 @@ class Header:
     def size(self) -> tuple[Size | None, tuple[Note, ...]]:
         """(width, height) or None, and a note if it was inferred from the sensor's name."""
         layout = self.fields.get("format", "").lower()
-        told = dict(re.findall(r"(width|height)=(\d{1,5})\b", layout))
-        told = {key: self.fields[key] for key in ("width", "height") if key in self.fields} | told
+        given = dict(re.findall(r"(width|height)=(\d{1,5})\b", layout))
+        given = {key: self.fields[key] for key in ("width", "height") if key in self.fields} | given
         pair = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.fields.get("geometry", ""))
         if pair:
             return (int(pair[1]), int(pair[2])), ()
-        if len(told) == 2 and all(map(SIDE.fullmatch, told.values())):
-            return (int(told["width"]), int(told["height"])), ()
+        if len(given) == 2 and all(map(SIDE.fullmatch, given.values())):
+            return (int(given["width"]), int(given["height"])), ()
         for key in ("sensor_name", "plugin_name", "generation", "sensor_generation"):
             name = self.fields.get(key, "").strip().lower()
             for pattern, size in SENSORS:

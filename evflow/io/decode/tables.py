@@ -165,15 +165,15 @@ def with_frames(
     recording; clock: on frames; events: their name, as in `choose`. Faulty images never prevent
     reading the events: see `streams.events_alone`.
     """
-    stored, span, told = found
-    notes = (*notes, *told)
+    stored, span, added = found
+    notes = (*notes, *added)
     several = (images,) if isinstance(images, Images) else images
     chosen = choose([image.stream for image in several], hints, stored.size, events)
     if chosen.stream is None:
         return Recording.of_events(stored, (*notes, *chosen.notes))
     with events_alone():
         stamps, decode = next(i for i in several if i.stream is chosen.stream).load()
-        times, told = beside_events(stamps, path, native, hints, stored)
+        times, added = beside_events(stamps, path, native, hints, stored)
         order, _ = in_order(times, hints)
         check_times(times if order is None else times[order], "frame times", strict=True)
         within = np.flatnonzero((times >= span[0]) & (times < span[1]))
@@ -182,7 +182,7 @@ def with_frames(
         for image, time in zip(decode(keep), times[keep], strict=True) if len(within) else ():
             if span[0] <= time < span[1]:
                 stack.append(image, time)
-        return stack.beside(stored, hints, (*clock, *notes, *told, *chosen.notes))
+        return stack.beside(stored, hints, (*clock, *notes, *added, *chosen.notes))
 
 
 def stored_frames(data: Any, keep: slice) -> Iterator[np.ndarray]:

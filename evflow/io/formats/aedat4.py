@@ -59,7 +59,7 @@ def read(path: Path, hints: Hints) -> Recording:
             "Record the events too, or pass the file that contains them.", where=path)
     frames = {i: s for i, s in streams.items() if s["type"] == "frame"}
     names = stream_names(header.outputs, {*frames, *events})
-    camera, told = hints.camera([names[i] for i in sorted(events)])
+    camera, more = hints.camera([names[i] for i in sorted(events)])
     source = next(i for i in events if names[i] == camera)
     info = streams[source]
     size = hints.size or (info["width"], info["height"])
@@ -70,7 +70,7 @@ def read(path: Path, hints: Hints) -> Recording:
     with _before(path, damage) as sound:
         reading = _Reading(sound, starts, damage, Aside(path, hints, size), source, taken)
         return reading.aside.collect(
-            reading.chunks(), lambda: (*told, *chosen.notes, *reading.notes()))
+            reading.chunks(), lambda: (*more, *chosen.notes, *reading.notes()))
 
 
 def triggers(path: Path) -> np.ndarray:
@@ -80,9 +80,9 @@ def triggers(path: Path) -> np.ndarray:
     with _before(path, _packets(path, header.packets, header.table)[1]) as sound:
         decoder = iter(_decoder(sound))
         while packet := _next(decoder):
-            told = packet.get("triggers")
-            if told is not None:
-                found.append(told["t"][np.isin(told["source"], EXTERNAL)].astype(np.int64))
+            triggers = packet.get("triggers")
+            if triggers is not None:
+                found.append(triggers["t"][np.isin(triggers["source"], EXTERNAL)].astype(np.int64))
     return np.concatenate(found)
 
 

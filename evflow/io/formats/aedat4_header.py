@@ -33,8 +33,9 @@ def stream_names(outputs: dict[str, dict[str, str]], streams: Iterable[int]) -> 
     """Names of the streams for users: "accumulator/frames", or "1" if names are not unique."""
     names: dict[int, str] = {}
     for i in sorted(streams):
-        told = outputs.get(str(i), {})
-        parts = [told[key] for key in ("originalModuleName", "originalOutputName") if told.get(key)]
+        output = outputs.get(str(i), {})
+        keys = "originalModuleName", "originalOutputName"
+        parts = [output[key] for key in keys if output.get(key)]
         name = "/".join(parts) or str(i)
         names[i] = f"{name}/{i}" if name in names.values() else name
     return names
@@ -103,8 +104,8 @@ def _outputs(text: bytes) -> dict[str, dict[str, str]]:
 
     def written(words: str) -> None:
         if key and len(nodes) > 2 and nodes[-3] == "outInfo":
-            told = found.setdefault(nodes[-2], {})
-            told[key] = told.get(key, "") + words
+            output = found.setdefault(nodes[-2], {})
+            output[key] = output.get(key, "") + words
 
     def refuse(*_: object) -> None:
         raise ValueError("its description defines entities")

@@ -95,10 +95,10 @@ def _size(
     f: Any, images: Size | None, columns: dict[str, Any]
 ) -> tuple[Size | None, tuple[Note, ...]]:
     """Size of the sensor: that of the images, unless sensor_resolution differs in either order."""
-    told = np.asarray(f.attrs.get("sensor_resolution", ())).ravel()
-    if len(told) < 2 or told.dtype.kind not in "iuf" or not (told[:2] > 0).all():
+    stated = np.asarray(f.attrs.get("sensor_resolution", ())).ravel()
+    if len(stated) < 2 or stated.dtype.kind not in "iuf" or not (stated[:2] > 0).all():
         return images, ()
-    height, width = (int(v) for v in told[:2])
+    height, width = (int(v) for v in stated[:2])
     if images in ((width, height), (height, width)):
         return images, ()
     if height <= width:  # the usual case: events cannot contradict it, so columns are read once

@@ -79,15 +79,15 @@ def _image_size(path: Path) -> Size | None:
 def _size(path: Path, images: Size | None) -> Size | None:
     """Size of the sensor from metadata.json, in whichever order fits the images; else theirs."""
     try:
-        told = _told_size(path)
+        declared = _declared_size(path)
     except EvflowDataError:
         if images is None:
             raise
         return images
-    return images if told is None or images == told[::-1] else told
+    return images if declared is None or images == declared[::-1] else declared
 
 
-def _told_size(path: Path) -> Size | None:
+def _declared_size(path: Path) -> Size | None:
     file = path / "metadata.json"
     if not is_there(file) or file.stat().st_size > 1 << 20:
         return None

@@ -36,7 +36,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises EV008 (another encoding) and what `stream.collect` raises."""
-    header, encoding, told = prophesee.raw(path)
+    header, encoding, more = prophesee.raw(path)
     if encoding != "EVT2":
         raise EvflowDataError(
             "EV008", f"{path} is Prophesee RAW of encoding {encoding}; supported are EVT2, "
@@ -46,7 +46,7 @@ def read(path: Path, hints: Hints) -> Recording:
     decoder = Decoder()
     source = words(path, header.start, f"{header.order}u4")
     return collect(path, decoder.chunks(source), hints, size,
-                   lambda: (*notes, *told, *decoder.notes()))
+                   lambda: (*notes, *more, *decoder.notes()))
 
 
 def triggers(path: Path) -> np.ndarray:

@@ -41,11 +41,11 @@ def read(path: Path, hints: Hints) -> Recording:
     """Raises what `stream.collect` raises."""
     header, _, guessed = prophesee.raw(path)
     size, notes = header.size()
-    swapped, told = _halves_swapped(path, header)
+    swapped, more = _halves_swapped(path, header)
     decoder = Decoder()
     source = _whole(words(path, header.start, f"{header.order}u8"), swapped)
     return collect(path, decoder.chunks(source), hints, size,
-                   lambda: (*notes, *guessed, *told, *decoder.notes()))
+                   lambda: (*notes, *guessed, *more, *decoder.notes()))
 
 
 def triggers(path: Path) -> np.ndarray:

@@ -47,12 +47,12 @@ def sniff(path: Path, head: bytes) -> bool:
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises what `stream.collect` raises."""
-    header, _, told = prophesee.raw(path)
+    header, _, more = prophesee.raw(path)
     size, notes = header.size()
     decoder = Decoder()
     source = words(path, header.start, f"{header.order}u2")
     return collect(path, decoder.chunks(source), hints, size,
-                   lambda: (*notes, *told, *decoder.notes()))
+                   lambda: (*notes, *more, *decoder.notes()))
 
 
 def triggers(path: Path) -> np.ndarray:

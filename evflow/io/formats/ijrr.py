@@ -99,20 +99,20 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
     indexed = name == EVENTS and is_there(root / IMAGES)
     seen = _size(root, hints) if indexed else None
     with (root / name).open("rb") as f:
-        chunks, native, told = plain_text.events(path, f, hints)
-        size = told.size or seen
+        chunks, native, layout = plain_text.events(path, f, hints)
+        size = layout.size or seen
         found = gather(path, _some(path, chunks, hints, size), hints, size, native)
     if not indexed:
         beside = unread_images(root) if isinstance(root, Path) and name == EVENTS and not (
             hints.no_frames) else ()
-        return Recording.of_events(found.events, (*told.notes, *found.notes, *beside))
+        return Recording.of_events(found.events, (*layout.notes, *found.notes, *beside))
 
     def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
         seconds, names = _read_index(root / IMAGES)
         return seconds, lambda keep: (_image(root, n) for n in names[keep])
 
     images = tables.Images(ImageStream(IMAGES, seen), load)
-    return tables.with_frames(path, found, hints, images, "s", told.notes, (CLOCK,))
+    return tables.with_frames(path, found, hints, images, "s", layout.notes, (CLOCK,))
 
 
 def _size(root: Root, hints: Hints) -> Size | None:

@@ -40,7 +40,7 @@ def read(path: Path, hints: Hints) -> Recording:
             raise EvflowDataError(
                 "EV008", f"{path}: /davis holds {sorted(davis)} without events.",
                 "If this is MVSEC's ground truth: events are in the file *_data.hdf5.", where=path)
-        side, told = hints.camera(sides)
+        side, more = hints.camera(sides)
         camera = davis[side]
         data = tables.dataset(path, camera, "events", (None, 4))
 
@@ -50,7 +50,7 @@ def read(path: Path, hints: Hints) -> Recording:
 
         chunks = tables.blocks(len(data), rows, tables.stored_rows(data))
         found = gather(path, chunks, hints, SIZE, "s")
-        notes = told or (Note("sensor.camera", f"the {side} camera was read"),)
+        notes = more or (Note("sensor.camera", f"the {side} camera was read"),)
         if "image_raw" not in camera:
             return Recording.of_events(found.events, (*notes, *found.notes))
         images = tables.dataset_images(path, camera, "image_raw", "image_raw_ts")

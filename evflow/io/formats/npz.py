@@ -129,12 +129,12 @@ def _with_frames(
     if chosen.stream is None:
         return Recording.of_events(events, notes)
     with events_alone():
-        times, told = beside_events(found["frame_times"].whole(), path, "us", hints, events)
+        times, more = beside_events(found["frame_times"].whole(), path, "us", hints, events)
         frames = found["frames"].spooled()
         order, late = in_order(times, hints)
         if order is not None and len(frames) == len(times):
             frames, times = frames[order], times[order]
-        return cut(Recording(events, frames, times, (*notes, *told, *late)), span)
+        return cut(Recording(events, frames, times, (*notes, *more, *late)), span)
 
 
 def _events(

@@ -102,7 +102,7 @@ def layout(head: bytes) -> Layout | None:
     names some of the columns but does not identify all."""
     rows: list[list[float]] = []
     headers: list[str] = []
-    told, said, odd, byte, begin = "", "", b"", 0, 0
+    heading, said, odd, byte, begin = "", "", b"", 0, 0
     if text.is_binary(head) or head.startswith(OTHERS):
         return None
     if b"\r" in head.strip() and b"\n" not in head:
@@ -114,10 +114,10 @@ def layout(head: bytes) -> Layout | None:
         byte += len(line)
         if not comment and (found := COMMA.match(line.strip())):
             raise _commas(found[0])
-        header = not (rows or told) and not any(
+        header = not (rows or heading) and not any(
             map(text.is_float, _fields(words.replace('"', " "))))
         if not rows and (comment or header):
-            told = words if words and not comment else told  # it must name what there is
+            heading = words if words and not comment else heading  # it must name what there is
             headers += [words] if _order(words) else []
             begin, said = byte, f"{said}\n{words}"
         elif fields:
@@ -125,9 +125,9 @@ def layout(head: bytes) -> Layout | None:
                 odd = b"" if _told(fields, headers) else line
                 break  # damage, which `text.events` locates
             rows.append(list(map(float, fields)))
-    if told and not headers and sum(map(bool, map(columns.meaning, _fields(told)))) >= 2:
+    if heading and not headers and sum(map(bool, map(columns.meaning, _fields(heading)))) >= 2:
         raise EvflowDataError(
-            "EV008", f"its header is {told[:80]!r}: which columns are t, x, y and p?",
+            "EV008", f"its header is {heading[:80]!r}: which columns are t, x, y and p?",
             "Name four columns t, x, y, p (timestamp, polarity, row, col are known too).")
     if headers and odd and not rows:
         raise EvflowDataError(
@@ -136,7 +136,7 @@ def layout(head: bytes) -> Layout | None:
             "1, or a word (true, false, on, off, pos, neg).")
     default = Layout("", "whole" if TOOL.search(said) else "auto", begin,
                      columns.written_size(said))
-    return _laid_out(headers, rows, bool(told), default)
+    return _laid_out(headers, rows, bool(heading), default)
 
 
 def _told(fields: list[bytes], headers: list[str]) -> bool:
@@ -155,10 +155,10 @@ def _commas(seen: bytes) -> EvflowDataError:
 
 
 def _laid_out(
-    headers: list[str], rows: list[list[float]], told: bool, default: Layout
+    headers: list[str], rows: list[list[float]], heading: bool, default: Layout
 ) -> Layout | None:
-    """The layout by the last header that fits the rows, else by the rows; told: a line of its own,
-    not a comment, names the columns; default: what the header says about the rest."""
+    """The layout by the last header that fits the rows, else by the rows; heading: a line
+    of its own, not a comment, names the columns; default: what the header says about the rest."""
     for words in reversed(headers):
         order = _order(words)
         if rows and len(rows[0]) == len(order) + 1 and _counts([row[0] for row in rows]):
@@ -171,7 +171,7 @@ def _laid_out(
         unit = written_unit(words)
         return default._replace(order=order, notes=notes, unit=unit if unit != "auto" else
                                 _unit(order, default))
-    order = columns.order_of(np.array(rows)) if rows and len(rows[0]) == 4 and not told else ""
+    order = columns.order_of(np.array(rows)) if rows and len(rows[0]) == 4 and not heading else ""
     if order and default.unit == "whole" and len(rows) < columns.TELLING and (
             {row[2] for row in rows} <= columns.POLARITIES):
         order = columns.PROPHESEE  # few values say little, but the tool uses this order
@@ -208,8 +208,8 @@ def _order(words: str) -> str:
     chosen = columns.by_name(fields)
     if not chosen or len(fields) > MOST or len(set(fields)) < len(fields):
         return ""
-    told = {name: column for column, name in chosen.items()}
-    return "".join(told.get(name, "-") for name in fields)
+    heading = {name: column for column, name in chosen.items()}
+    return "".join(heading.get(name, "-") for name in fields)
 
 
 def _counts(column: list[float]) -> bool:

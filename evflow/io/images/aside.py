@@ -65,7 +65,7 @@ class Aside:
         if not self.stack.times:
             return self.stack.beside(found.events, self.hints, said)
         with events_alone():
-            times, told = beside_events(
+            times, more = beside_events(
                 np.array(self.stack.times), self.path, "us", self.hints, found.events)
-            said = (MID_EXPOSURE, *said, *told)
+            said = (MID_EXPOSURE, *said, *more)
             return cut(self.stack.at(times, found.events, self.hints, said), found.span)

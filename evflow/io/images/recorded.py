@@ -78,10 +78,10 @@ class FrameStack:
             notes = (*notes, seen_note(self.seen, self.colour))
         elif self.colour:
             notes = (*notes, CONVERTED)
-        order, told = in_order(times, hints)
+        order, more = in_order(times, hints)
         if order is not None:
             frames, times = frames[order], times[order]
-        return Recording(events, frames, times, (*notes, *told))
+        return Recording(events, frames, times, (*notes, *more))
 
 
 def in_order(times: np.ndarray, hints: Hints) -> tuple[np.ndarray | None, tuple[Note, ...]]:

@@ -75,8 +75,8 @@ def choose(
     if not nearest:
         return Chosen(None, _left(streams, why, None))
     best = min(nearest, key=lambda s: ("raw" not in _own(s.name, events), s.name))
-    told = _left(streams, why, best) if len(streams) > 1 else ()
-    return Chosen(best, (*told, *best.notes))
+    unused = _left(streams, why, best) if len(streams) > 1 else ()
+    return Chosen(best, (*unused, *best.notes))
 
 
 @contextlib.contextmanager

@@ -147,17 +147,17 @@ def beside_events(
     unless another unit makes their span agree with the events'. Fractions in a unit of integers
     indicate the unit that allows them. Raises as `to_us`.
     """
-    told = hints.time_unit
+    asked = hints.time_unit
     odd = times.dtype.kind == "f" and native != "s"
-    usual = told == "auto" and not odd
+    usual = asked == "auto" and not odd
     if usual or times.ndim != 1 or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
         return hints.microseconds(times, native), ()
-    units = [native, *UNITS_US] if told == "auto" else [told, native]
+    units = [native, *UNITS_US] if asked == "auto" else [asked, native]
     unit = shared_unit(times, events.t, units)
-    if unit is None and told == "auto":
+    if unit is None and asked == "auto":
         return to_us(times, where)
     unit = unit or usual_unit(times, units)
-    notes = () if unit == told else (
+    notes = () if unit == asked else (
         Note("frames.unit", f"frame times of {where} were read in {unit}."),)
     return Hints(time_unit=unit).microseconds(times, unit), notes
 

@@ -95,10 +95,10 @@ def _scaled(
     _check_finite(pixels, where)
     low, high = float(pixels.min()), float(pixels.max())
     floats = pixels.dtype == np.float32
-    told = meaning(pixels) if (floats and full_scale is None and not bright) or low < 0 else None
-    if told:
+    meant = meaning(pixels) if (floats and full_scale is None and not bright) or low < 0 else None
+    if meant:
         raise EvflowDataError("EV003", f"{where} spans {low:g}..{high:g}, with white at "
-                              f"{white:g}: {told.what}?", told.fix, where=where)
+                              f"{white:g}: {meant.what}?", meant.fix, where=where)
     if high > white * 1.001:
         likely = high if floats else likely_white(high)
         raise EvflowDataError(

@@ -69,8 +69,8 @@ class Video:
             raise cut_off(self.path, count, self.claimed, REST)
         if self.times_us is not None and count < len(self.times_us) and not self.hints.partial:
             raise self._miscounted(f"{count:,}")
-        told = clock.notes() + ([_still(self.path, count)] if still and count > 1 else [])
-        self.notes.extend(note for note in told if note not in self.notes)
+        more = clock.notes() + ([_still(self.path, count)] if still and count > 1 else [])
+        self.notes.extend(note for note in more if note not in self.notes)
 
     def _name(self, index: int) -> str:
         return f"frame {index} of {self.path}"
@@ -174,8 +174,8 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
             _check_bytes(path)
     times, notes = None, list(hdr_note(path))
     if hints.timestamps is not None:
-        times, _, told = read_times(Path(hints.timestamps), hints.time_unit)
-        notes += told
+        times, _, more = read_times(Path(hints.timestamps), hints.time_unit)
+        notes += more
     if not (rate and 0 < rate < 1e6) and times is None and hints.fps is None:
         raise EvflowDataError("EV020", f"{path} states no frame rate ({rate:g}).", "Pass --fps.",
                               where=path)

@@ -51,8 +51,8 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
     first, guessed = bag.sized(bag.first(topic, kind), topic, hints)
     notes += guessed
     found = decoded(bag.path, first, bag.packets(topic, kind))
-    events, span, told = gather(bag.path, found.chunks, hints, first.size, found.native)
-    notes += (*found.notes(), *told)
+    events, span, more = gather(bag.path, found.chunks, hints, first.size, found.native)
+    notes += (*found.notes(), *more)
     with events_alone():
         images = bag.image_streams(hints)
         own_clock = first.encoding in OTHER_CLOCK
