@@ -42,9 +42,13 @@ class Train(TrainOptions):
     """
 
     def run(self) -> None:
+        from evflow.process import devices
         from evflow.training.run import train_network
 
         train_network(self)
+        if devices.is_main():
+            print(f"written to {self.out}/: metrics.jsonl, and weights.safetensors for evflow "
+                  "estimate --weights")
 
 
 def with_configuration(arguments: Sequence[str]) -> type[Train]:

@@ -76,6 +76,7 @@ def test_it_runs_from_any_folder(installed: Path, tmp_path: Path) -> None:
                   package=installed)
     assert trained.returncode == 0, trained.stderr
     assert (tmp_path / "run/weights.safetensors").is_file()
+    assert "written to run/: " in trained.stdout
 
 
 def parsed(*words: str, preset: str = "debug") -> TrainConfig:
