@@ -81,7 +81,8 @@ class Estimate(Compiling, Reading):
     against illuminance; step: one value per level, darkest first, instead of the frames' ratios."""
     triggers: Annotated[Path | None, value("FILE")] = None
     """With --protocol step: times of the light's edges, for latency: one time per line, on the
-    events' clock, or the recording itself (trigger events of Prophesee RAW or AEDAT 4)."""
+    events' clock, or the recording itself (trigger events of Prophesee RAW, AEDAT 4, or
+    evt3 in a ROS bag)."""
     thresholds: Annotated[Path | None, value("FILE")] = None
     """With --protocol static: take the thresholds, which a scene at rest does not show, from this
     camera.npz; the result has its thresholds and the measured noise."""
@@ -266,7 +267,8 @@ class Estimate(Compiling, Reading):
         from evflow.io.triggers import read_triggers
 
         if self.protocol == "step":
-            triggers = read_triggers(self.triggers, recording.events) if self.triggers else None
+            triggers = None if self.triggers is None else read_triggers(
+                self.triggers, recording.events, self.events_topic)
             return Measured(calibrate_step(recording, lux=self.lux, triggers_us=triggers)), {}
         found = estimate_noise(recording, lux=self.lux[0] if self.lux else None)
         if self.more:

@@ -13,6 +13,7 @@ from evflow.io.decode import prophesee
 from evflow.io.decode.text import HEAD
 from evflow.io.decode.units import UNITS_US, shared_unit
 from evflow.io.formats import aedat4, evt2, evt3, evt21
+from evflow.io.formats.ros import ros1, ros2
 from evflow.io.images.frames import existing
 from evflow.types import Events
 
@@ -20,20 +21,18 @@ MAX_BYTES = 1 << 26  # of text: some four million instants
 READERS = {"EVT2": evt2.triggers, "EVT2.1": evt21.triggers, "EVT3": evt3.triggers,
            "aedat4": aedat4.triggers}
 EXPECTED = ("Expected a text file with one time per line, on the clock of the events, or Prophesee "
-            "RAW or AEDAT 4 with trigger events.")
+            "RAW, AEDAT 4 or a ROS bag (evt3) with trigger events.")
 
 
-def read_triggers(path: Path, events: Events) -> np.ndarray:
-    """Times (N,) int64 us: edges of external signals in Prophesee RAW and AEDAT 4, or the first
-    number of each line of a text file, in the unit in which they lie within the events' span.
+def read_triggers(path: Path, events: Events, topic: str | None = None) -> np.ndarray:
+    """Times (N,) int64 us: edges of external signals in a recording, or the first number of each
+    line of a text file, in the unit in which they lie within the events' span.
 
-    Raises EV001 (none), EV008 (neither), EV012 (outside the events in any unit), EV016.
+    topic: whose events' triggers to read from a bag of several cameras. Raises EV001 (none), EV008
+    (neither), EV012 (outside the events in any unit), EV016.
     """
-    with open(existing(path), "rb") as opened:
-        head = opened.read(HEAD)
-    known = "aedat4" if aedat4.sniff(path, head) else prophesee.sniffed(path, head)
-    if known:
-        found = READERS[known](path) if known in READERS else np.zeros(0, np.int64)
+    found = _recorded(path, topic)
+    if found is not None:
         if not len(found):
             raise EvflowDataError("EV001", f"{path} holds no trigger events.", EXPECTED, where=path)
         return found
@@ -47,6 +46,21 @@ def read_triggers(path: Path, events: Events) -> np.ndarray:
             f"events, {events.t[0]} to {events.t[-1]} us, in any unit.",
             "Give them on the clock of the events.", where=path)
     return np.rint(times * UNITS_US[unit]).astype(np.int64)
+
+
+def _recorded(path: Path, topic: str | None) -> np.ndarray | None:
+    """Times of the triggers in a recording; None for files of other kinds."""
+    head = b""
+    if not existing(path).is_dir():
+        with open(path, "rb") as opened:
+            head = opened.read(HEAD)
+    for bag in (ros1, ros2):
+        if bag.sniff(path, head):
+            return bag.triggers(path, topic)
+    known = "aedat4" if aedat4.sniff(path, head) else prophesee.sniffed(path, head)
+    if not known:
+        return None
+    return READERS[known](path) if known in READERS else np.zeros(0, np.int64)
 
 
 def _first_numbers(path: Path) -> list[float]:

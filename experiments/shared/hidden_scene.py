@@ -12,6 +12,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.scenes import SceneConfig, make_bank, render, sample_scene
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import unzip, upsample
+from evflow.simulator.photoreceptor import as_measured, seen_frames
 
 FPS, FRAME_EVERY = 1000, 25  # rendered frames per second; one in 25 is given to the estimator
 
@@ -42,10 +43,11 @@ def hidden_camera(
 
 
 def simulate_again(recording: Recording, found: CameraEstimate, seed: int) -> Events:
-    """The recording's frames, interpolated to <= .5 px of motion, seen by the estimated camera."""
+    """The recording's frames, interpolated to <= .5 px of motion, seen by the estimated camera
+    with its circuit, in the light that it was measured to see."""
     pairs = ((recording.frame_dn(i), int(t)) for i, t in enumerate(recording.frame_times)
              if recording.events.t[0] - 1000 <= t <= recording.events.t[-1] + 1000)
-    frames, times = unzip(upsample(pairs))
-    model = SensorModel(noise_resets_memory=True)
+    seen_by, model = as_measured(found.sensor, found.optics)
+    frames, times = unzip(seen_frames(upsample(pairs), seen_by))
     key = jax.random.key(seed + 1)
     return Events.concatenate(list(simulate_stream(key, frames, times, found.camera, model=model)))

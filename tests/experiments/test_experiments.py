@@ -42,6 +42,7 @@ def test_quickstart_draws_truth_beside_estimate(
     text = capsys.readouterr().out
     assert "truth" in text
     assert "threshold ON" in text
+    assert 0.7 < result["rate_remade"]["on"] / result["rate_recorded"]["on"] < 1.4
     page = cv2.imread(str(tmp_path / "quickstart.png"))
     assert page is not None
     assert min(page.shape[:2]) > 600

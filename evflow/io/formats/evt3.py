@@ -58,9 +58,14 @@ def read(path: Path, hints: Hints) -> Recording:
 def triggers(path: Path) -> np.ndarray:
     """Times (N,) int64 us of the trigger words, for rising and falling edges."""
     header = prophesee.raw(path)[0]
+    return trigger_times(words(path, header.start, f"{header.order}u2"))
+
+
+def trigger_times(source: Iterator[tuple[int, np.ndarray]]) -> np.ndarray:
+    """The same of words (position, uint16), until the first damage."""
     decoder, found = Decoder(), [np.zeros(0, np.int64)]
     with contextlib.suppress(Damage):
-        for _, table in words(path, header.start, f"{header.order}u2"):
+        for _, table in source:
             kind = table >> 12
             asked = kind == TRIGGER
             found.append(decoder.times(table, kind, np.cumsum(asked, dtype=np.int32),

@@ -11,21 +11,25 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.bags import (
+    PACKET,
     array_messages,
     as_sent,
+    header,
     holds,
     image_messages,
     needs_rosbags,
     packet_messages,
     write,
 )
-from helpers.recordings import damage, equal, make, refused
+from helpers.recordings import SIZE, damage, equal, make, refused
 from helpers.streams import survives
 
+from evflow.errors import EvflowDataError
 from evflow.io import read_events, read_recording
 from evflow.io.decode.stream import Damage
 from evflow.io.formats.ros import libcaer_words
 from evflow.io.formats.ros.messages import Packet
+from evflow.io.triggers import read_triggers
 from evflow.notes import Note
 
 
@@ -161,3 +165,22 @@ def test_real_event_camera_msgs(data_file: Callable[[str], Path]) -> None:
     np.testing.assert_array_equal(got.y, other.y)
     np.testing.assert_array_equal(got.p, other.p)
     np.testing.assert_array_equal(got.t - got.t[0], other.t - other.t[0])
+
+
+@needs_rosbags
+@pytest.mark.parametrize(("encoding", "words"), [("evt3", True), ("evt3", False), ("mono", False)])
+def test_triggers_beside_the_events(tmp_path: Path, encoding: str, words: bool) -> None:
+    events = make().events
+    edge = int(as_sent(events, "evt3").t[-1]) + 4100  # on the sensor's clock
+    ns = int(events.t[-1]) * 1000 + 4_100_000
+    messages = packet_messages(events, encoding)
+    if words:
+        data = struct.pack("<3H", 0x8000 | (edge >> 12) & 0xFFF, 0x6000 | edge & 0xFFF, 0xA001)
+        messages.append(("/cam/events", PACKET, ns, header(ns) + struct.pack(
+            "<2I2QI", SIZE[1], SIZE[0], 9, 0, 4) + b"evt3" + b"\0" + struct.pack("<I", 6) + data))
+    path = write(tmp_path / "a.bag", messages)
+    if words:
+        assert read_triggers(path, events, "/cam/events").tolist() == [edge]
+    else:
+        with pytest.raises(EvflowDataError, match="holds no trigger events"):
+            read_triggers(path, events)

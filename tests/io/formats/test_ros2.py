@@ -13,8 +13,10 @@ from helpers.bags2 import SUFFIX, Store
 from helpers.recordings import SIZE, damage, equal, make, refused
 from helpers.streams import survives
 
+from evflow.errors import EvflowDataError
 from evflow.io import read_events, read_recording
 from evflow.io.formats.ros.messages import Message
+from evflow.io.triggers import read_triggers
 from evflow.types import Events
 
 
@@ -43,6 +45,8 @@ def test_event_packets(tmp_path: Path, encoding: str) -> None:
     path = store.write(tmp_path / "bag", {
         "/cam/events": store.packets(want, encoding), "/cam/image_raw": store.images(make())},
         "MCAP")
+    with pytest.raises(EvflowDataError, match="holds no trigger events"):
+        read_triggers(path, want)
     got = read_recording(path)
     equal(got.events, as_sent(want, encoding))
     assert got.has_frames == encoding.startswith("libcaer")

@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
@@ -26,7 +28,7 @@ from evflow.io.formats.ros.messages import (
     Message,
     Packet,
 )
-from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded
+from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded, triggers
 from evflow.io.hints import Hints
 from evflow.io.images import encodings
 from evflow.io.images.pictures import claimed_size
@@ -66,6 +68,16 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
             return Recording.of_events(events, notes)
         stack = bag.stack(chosen.stream.name, events.size, hints, None if own_clock else span)
         return stack.beside(events, hints, (bag.clock(chosen.stream.name), *notes))
+
+
+def triggers_of(bag: Bag, topic: str | None) -> np.ndarray:
+    """Times (N,) int64 us of the trigger words beside the events of a topic, by default the first.
+    Raises as `read_bag`."""
+    topics = dict(bag.topics(EVENT_TYPES))
+    if not topics:
+        return np.zeros(0, np.int64)
+    chosen = Hints(events_topic=topic).camera(list(topics))[0]
+    return triggers(bag.first(chosen, topics[chosen]), bag.packets(chosen, topics[chosen]))
 
 
 class Bag:

@@ -49,6 +49,12 @@ def decoded(path: Path, first: Packet, packets: Iterable[Packet]) -> Decoded:
     return Decoded(_counted(known[first.encoding](packets)), "ns")
 
 
+def triggers(first: Packet, packets: Iterable[Packet]) -> np.ndarray:
+    """Times (N,) int64 us of the trigger words; none in encodings that have no such words."""
+    return (evt3.trigger_times(_words(packets)) if first.encoding == "evt3"
+            else np.zeros(0, np.int64))
+
+
 def _counted(parts: Iterable[tuple[np.ndarray, ...]]) -> Iterator[Chunk]:
     """Merge the events of several messages into chunks: a single message may hold only two."""
     done = count = 0

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from evflow.files import compressed
 from evflow.files.bounded import BoundedPath
 from evflow.files.limits import RATIO
-from evflow.io.formats.ros.bag import Bag, read_bag
+from evflow.io.formats.ros.bag import Bag, read_bag, triggers_of
 from evflow.io.hints import Hints
 from evflow.types import Recording
 
@@ -26,8 +28,18 @@ def sniff(path: Path, head: bytes) -> bool:
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises EV010 (no `rosbags`) and what `read_bag` raises."""
-    with Bag(path, _open, aligned=False, mend="rosbag reindex") as bag:
+    with _bag(path) as bag:
         return read_bag(bag, hints)
+
+
+def triggers(path: Path, topic: str | None) -> np.ndarray:
+    """Times (N,) int64 us of external signals beside the events of a topic; raises as `read`."""
+    with _bag(path) as bag:
+        return triggers_of(bag, topic)
+
+
+def _bag(path: Path) -> Bag:
+    return Bag(path, _open, aligned=False, mend="rosbag reindex")
 
 
 def _open(path: Path) -> Any:

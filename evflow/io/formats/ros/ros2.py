@@ -13,12 +13,14 @@ from collections.abc import Collection, Iterator
 from pathlib import Path, PurePath
 from typing import IO, NamedTuple
 
+import numpy as np
+
 from evflow.errors import EvflowDataError
 from evflow.files.compressed import ZSTD, decoder_of, unpack
 from evflow.files.limits import FREE, RATIO
 from evflow.files.regular import is_there
 from evflow.io.formats.ros import database, mcap
-from evflow.io.formats.ros.bag import Bag, read_bag
+from evflow.io.formats.ros.bag import Bag, read_bag, triggers_of
 from evflow.io.formats.ros.database import Database
 from evflow.io.formats.ros.mcap import Mcap
 from evflow.io.hints import Hints
@@ -44,8 +46,18 @@ def sniff(path: Path, head: bytes) -> bool:
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises EV010 (no `rosbags`, for compressed bags) and what `read_bag` raises."""
-    with Bag(path, Reader, aligned=True, mend="ros2 bag reindex") as bag:
+    with _bag(path) as bag:
         return read_bag(bag, hints)
+
+
+def triggers(path: Path, topic: str | None) -> np.ndarray:
+    """Times (N,) int64 us of external signals beside the events of a topic; raises as `read`."""
+    with _bag(path) as bag:
+        return triggers_of(bag, topic)
+
+
+def _bag(path: Path) -> Bag:
+    return Bag(path, Reader, aligned=True, mend="ros2 bag reindex")
 
 
 class Connection(NamedTuple):
