@@ -60,8 +60,7 @@ class Estimate(Compiling, Reading):
     """A recording with frames; without frames only the noise of a static scene can be measured."""
     more: Annotated[tuple[Path, ...], tyro.conf.Positional,
                     tyro.conf.arg(metavar="[MORE ...]")] = ()
-    """With --protocol static: recordings of the same camera at rest in other light, with one --lux
-    value for each."""
+    """With --protocol static: recordings at rest in other light, with one --lux value for each."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for camera.npz, camera.json, the pictures and report.html."""
     protocol: Literal["motion", "step", "static"] = "motion"
@@ -78,11 +77,11 @@ class Estimate(Compiling, Reading):
     camera from what was read (a second Ctrl-C ends)."""
     lux: Annotated[tuple[float, ...], value("LUX ...")] = ()
     """Illuminance from a light meter. static: one value per recording, in the same order, for noise
-    against illuminance; step: one value per level, darkest first, instead of the frames' ratios."""
+    against illuminance; step: one value per level, darkest first, instead of the frames' ratios;
+    without frames one per rest between the --triggers, in order of time."""
     triggers: Annotated[Path | None, value("FILE")] = None
-    """With --protocol step: times of the light's edges, for latency: one time per line, on the
-    events' clock, or the recording itself (trigger events of Prophesee RAW, AEDAT 4, or
-    evt3 in a ROS bag)."""
+    """With --protocol step: times of the light's edges, for latency: one per line, on the events'
+    clock, or the recording itself (triggers of Prophesee RAW, AEDAT 4, or evt3 in a ROS bag)."""
     thresholds: Annotated[Path | None, value("FILE")] = None
     """With --protocol static: take the thresholds, which a scene at rest does not show, from this
     camera.npz; the result has its thresholds and the measured noise."""
@@ -166,9 +165,9 @@ class Estimate(Compiling, Reading):
         """Raise EV020 if --lux or a second recording does not fit the protocol."""
         count = 1 + len(self.more)
         if (self.more and self.protocol != "static") or (self.lux and self.protocol == "motion"):
-            what = f"{count} recordings" if self.more else "--lux"
             raise EvflowDataError(
-                "EV020", f"{what} with --protocol {self.protocol}.",
+                "EV020", f"{'--lux' if not self.more else f'{count} recordings'} with --protocol "
+                f"{self.protocol}.",
                 "Noise against illuminance needs --protocol static and one --lux per recording"
                 f"{', or --protocol step with a single recording' if not self.more else ''}.")
         if not all(0 < v < math.inf for v in self.lux):
@@ -272,9 +271,8 @@ class Estimate(Compiling, Reading):
             return Measured(calibrate_step(recording, lux=self.lux, triggers_us=triggers)), {}
         found = estimate_noise(recording, lux=self.lux[0] if self.lux else None)
         if self.more:
-            others = []
-            for path, lux in zip(self.more, self.lux[1:], strict=True):
-                others.append(estimate_noise(self._recorded(path)[0], lux=lux))
+            others = [estimate_noise(self._recorded(path)[0], lux=lux)
+                      for path, lux in zip(self.more, self.lux[1:], strict=True)]
             found = noise_over_light([found, *others])
         facts = {"recordings": [str(p) for p in (self.recording, *self.more)]} if self.more else {}
         found = with_thresholds(found, self.thresholds) if self.thresholds else found

@@ -25,7 +25,7 @@ from evflow.estimation.bench.levels import (
     lux_notes,
     measured_bench,
 )
-from evflow.estimation.bench.rests import check_steps, find_rests
+from evflow.estimation.bench.rests import check_steps, find_rests, rests_between
 from evflow.estimation.bench.steps import (
     camera_rate,
     camera_wide,
@@ -98,7 +98,8 @@ def calibrate_step(
         rests_us: (begin, end) of each rest in us; by default detected in the frames.
         light: of the screen at each rest, in any linear unit (lux, cd/m²); by default the mean of
             the frames.
-        lux: instead of light, that of each distinct level, darkest first.
+        lux: instead of light, that of each distinct level, darkest first; of a recording without
+            frames that of each rest between the triggers, in order of time.
         triggers_us: times of the light's edges, for the latency of the pixels.
         fresh: whether the memory is at the light of the first rest, as in a simulation; that of a
             running camera may be anywhere.
@@ -109,7 +110,12 @@ def calibrate_step(
             step), EV017 (fewer than two rests in the frames, or no screen that steps), EV020, EV021
             (polarities swapped).
     """
+    metered = bool(lux) and rests_us is None and not recording.has_frames
+    if metered and triggers_us is not None and lux:
+        rests_us = rests_between(np.asarray(triggers_us), recording.events, len(lux))
+        light, lux = lux, None
     steps = _steps(recording, rests_us, light, tuple(lux or ()))
+    steps = dataclasses.replace(steps, unit="lux") if metered else steps
     _check_polarity(steps)
     rest = steps.rest
     hz, kept = camera_rate(rest, steps.rest_s)

@@ -13,7 +13,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import lin_log
 from evflow.recordings.stillness import smooth
-from evflow.types import Recording
+from evflow.types import Events, Recording
 
 STILL = 0.01  # log units between two frames: the screen rests
 LEAST_STEP = 0.1  # log units between two rests
@@ -21,6 +21,7 @@ MOVING, MOST_MOVING = 0.1, 0.1  # log units against the median pixel; share of p
 LEAST_TOGETHER = 0.5  # share of pixels that step by half to twice the median pixel's change
 LOOKED, ROWS = 400, 32  # frames, and rows of them, that are checked
 LEAST_RESTS, LEAST_RESTING = 3, 0.7  # rests of a bench, and share of its frames in them
+EDGE_US = 50_000  # longest edge of the light after its trigger
 FILL_THE_VIEW = ("Steps of light need a screen, or a card, that fills the view, all of it at one "
                  "level and then at another. For a scene that moves leave --protocol out.")
 
@@ -37,9 +38,9 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
     """
     if len(recording.frames) < 4:
         raise EvflowDataError("EV011", f"the recording has {len(recording.frames)} frames.",
-                              "They show when the light rests: record them too, or pass --frames. "
-                              "In Python, calibrate_step of evflow.estimation.bench.calibration "
-                              "takes rests_us and light instead.")
+                              "They show when the light rests: record them too, or pass --frames; "
+                              "or give its edges, --triggers FILE, and the light of each rest, "
+                              "--lux.")
     found = _rests(np.array([
         _level(recording.frame_dn(i)) for i in range(len(recording.frames))]))
     if len(found) < 2:
@@ -70,6 +71,23 @@ def steps_of_light(recording: Recording) -> int:
         return 0
     moves = max(_moving(smooth(some[first]), some[last]) for first, last in found) > MOST_MOVING
     return 0 if moves else len(found) - 1
+
+
+def rests_between(edges_us: np.ndarray, events: Events, count: int) -> list[tuple[int, int]]:
+    """The rests (begin, end) in us between the light's edges (N,), which last up to `EDGE_US`;
+    edges closer together are one. Raises EV020 if there are not `count`."""
+    last = int(events.t[-1])
+    edges = np.unique(edges_us)
+    edges = edges[edges < last]
+    edges = edges[np.diff(edges, prepend=-np.inf) > EDGE_US].tolist()
+    first = min([int(events.t[0]), *(e - EDGE_US for e in edges)])
+    last = max([last, *(e + 2 * EDGE_US for e in edges)])
+    if count != len(edges) + 1:
+        raise EvflowDataError(
+            "EV020", f"{count} values of lux, {len(edges)} edges of light until the last event.",
+            f"Without frames, give the light of each of the {len(edges) + 1} rests, in order of "
+            "time.")
+    return list(zip([first, *(e + EDGE_US for e in edges)], [*edges, last], strict=True))
 
 
 def _rests(level: np.ndarray) -> list[tuple[int, int]]:

@@ -147,7 +147,7 @@ def test_what_is_no_bench_is_refused() -> None:
     empty = Events(none, none, none, none, (SHAPE[1], SHAPE[0]))
     cases = {
         "EV001": lambda: calibrate_step(Recording.of_events(empty)),
-        "EV011": lambda: calibrate_step(Recording.of_events(recording.events)),
+        "EV011": lambda: calibrate_step(Recording.of_events(recording.events), lux=[1, 2]),
         "EV017": lambda: calibrate_step(bench(cameras(0.03, "eq12"), [100, 105])),
         "EV020": lambda: calibrate_step(recording, rests_us=[(0, 10), (5, 20)], light=[1, 2]),
     }
@@ -335,3 +335,21 @@ def test_noise_and_thresholds_join_in_one_camera(
     capsys.readouterr()
     assert main([*base, str(tmp_path / "no"), "--thresholds", str(alone)]) == 2
     assert "EV020" in capsys.readouterr().err
+
+
+def test_triggers_and_light_of_each_rest_take_the_place_of_frames() -> None:
+    """With both edges of a pulse at each step, and one after the events."""
+    camera = cameras(0.05)
+    recording = bench(camera, STAIRS)
+    alone = Recording.of_events(recording.events)
+    edges = 1000 * (100 + 120 * np.arange(len(STAIRS) - 1))
+    triggers = [*edges, *(edges + 500), recording.events.t[-1] + 5]
+    found = calibrate_step(alone, lux=[0.3 * v for v in STAIRS], triggers_us=triggers, fresh=True)
+    seen = calibrate_step(recording, fresh=True)
+    for name in ("theta_on", "theta_off"):
+        assert float(getattr(found.summary, name)) == pytest.approx(
+            float(getattr(seen.summary, name)), rel=0.01)
+    assert found.bench is not None
+    assert (found.bench.unit, found.bench.levels[0].light) == ("lux", pytest.approx(7.5))
+    with pytest.raises(EvflowDataError, match=r"EV020.*10 edges of light.*each of the 11 rests"):
+        calibrate_step(alone, lux=[1, 2], triggers_us=triggers)
