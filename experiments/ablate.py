@@ -6,9 +6,10 @@
 
 Nothing of the camera is handed over: the paper's network sees one pixel's window, ours (in
 `networks`) what it makes of the window itself. Cameras, scenes and noise are the paper's (Eq. 12).
-Each variant has the learning rate, of RATES, at which it is best with a seed and held-out cameras
-of their own; then all are trained with the same seeds on the same scenes, and scored on cameras
-that neither saw. The table states how large a difference to the first variant so many seeds show.
+Each variant has the learning rate, of `variants.RATES`, at which it is best with a seed and
+held-out cameras of their own: the middle three are tried, then the next one as long as it is
+better. Then all are trained with the same seeds on the same scenes, and scored on cameras that
+neither saw. The table states how large a difference to the first variant so many seeds show.
 
 Weights of the first seed are kept beside the table: `see_better --estimators` asks what networks
 see that are trained on what they estimate (Tables VII and IX).
@@ -22,7 +23,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import numpy as np
 import tyro
 
 from evflow.process.devices import compiled_quickly
@@ -33,9 +33,8 @@ from experiments.shared.ablate_pages import CONSTANT, draw, table
 from experiments.shared.ablated import Study, base_config, chosen
 from experiments.shared.common import at_least, begin, conclude, run_script, slug
 from experiments.shared.kept import resumed
-from experiments.shared.variants import NAMES, Row
+from experiments.shared.variants import Row
 
-RATES = (0.3, 1.0, 3.0)  # times the preset's, 1e-3 (flow 5e-4)
 TUNED, TUNING, HELD = 7_000_029, 8_100_037, 8_000_009  # seeds: tuning's own, its cameras, the score
 
 
@@ -98,15 +97,12 @@ def compared(name: str, config: TrainConfig, banks: Any, seeds: list[int], optio
         return resumed(options.rows, of, [f"{name}, seed {s}, rate {r:g}" for s, r in jobs], made,
                        name)
 
-    rates = RATES[1:2] if options.preset == "debug" else RATES
-    tuned = rows([(TUNED + options.seed, rate) for rate in rates], TUNING)
-    rate = rates[int(np.argmin([sum(loss(row)) for row in tuned]))]
+    def tuned(rate: float) -> float:
+        row, = rows([(TUNED + options.seed, rate)], TUNING)
+        return variants.error_of(row)
+
+    rate = 1.0 if options.preset == "debug" else variants.best_rate(tuned)
     return {"rate": rate, "seeds": rows([(seed, rate) for seed in seeds], HELD)}
-
-
-def loss(row: Row) -> list[float]:
-    """What a rate is chosen by: errors of the sequence; one that diverged is never chosen."""
-    return [np.nan_to_num(row[f"sequence/{name}"], nan=np.inf) for name in NAMES]
 
 
 if __name__ == "__main__":

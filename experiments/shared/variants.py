@@ -29,6 +29,7 @@ from evflow.training.step import init_state, make_run_step, optimiser
 
 Array = jax.Array
 Row = dict[str, Any]
+RATES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # times the preset's, 1e-3 (flow 5e-4)
 NAMES = ("theta_on", "theta_off", "eta_on", "eta_off")
 
 
@@ -109,6 +110,23 @@ def score(errors: Callable[..., dict[str, Array]], net: Any, seed: int, batches:
     rows = [jax.device_get(errors(key, net)) for key in keys]
     return {k: float((np.median if k == "events" else np.mean)([r[k] for r in rows]))
             for k in rows[0]}
+
+
+def error_of(row: Row) -> float:
+    """What a rate is chosen by, the errors of the sequence; one that diverged is never chosen."""
+    return float(sum(np.nan_to_num(row[f"sequence/{name}"], nan=np.inf) for name in NAMES))
+
+
+def best_rate(error: Callable[[float], float]) -> float:
+    """The rate of the least error, of RATES; from the middle outwards, until none beyond the best
+    is left to try."""
+    tried = {i: error(RATES[i]) for i in range(len(RATES) // 2 - 1, len(RATES) // 2 + 2)}
+    while True:
+        best = min(tried, key=lambda i: tried[i])
+        beyond = {best - 1, best + 1} & set(range(len(RATES))) - set(tried)
+        if not beyond:
+            return RATES[best]
+        tried |= {i: error(RATES[i]) for i in beyond}
 
 
 def constant_row(config: TrainConfig, bank: TextureBank, held: TextureBank, seeds: tuple[int, int],

@@ -49,7 +49,21 @@ def row(theta: float, **more: float) -> variants.Row:
 
 
 def test_a_rate_at_which_training_diverged_is_not_taken() -> None:
-    assert sum(ablate.loss(row(0.2))) < sum(ablate.loss(row(np.nan)))
+    assert variants.error_of(row(0.2)) < variants.error_of(row(np.nan))
+
+
+@pytest.mark.parametrize("best", variants.RATES)
+def test_the_best_rate_lies_between_worse_ones(best: float) -> None:
+    tried: list[float] = []
+
+    def error(rate: float) -> float:
+        tried.append(rate)
+        return abs(np.log(rate / best))
+
+    assert variants.best_rate(error) == best
+    at = variants.RATES.index(best)
+    assert set(variants.RATES[max(at - 1, 0):at + 2]) <= set(tried)
+    assert len(tried) == len(set(tried))
 
 
 def test_the_table_says_what_so_many_seeds_show(tmp_path: Path) -> None:
