@@ -141,8 +141,7 @@ def look(
         advance()
     seen = State(
         state.params, state.eyes, stats, n_events, n_shown, read=(stretch,),
-        windows=len(stretch.windows),
-        seconds=1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
+        windows=len(stretch.windows), seconds=1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
     if not stretch.run:
         return seen
     give_back()
@@ -259,8 +258,7 @@ def _at_mean_light(
 ) -> tuple[Summary, Summary]:
     """The summary with noise rates at the recording's mean light."""
     eta, error = (np.array([float(s.eta_on), float(s.eta_off)]) for s in (summary, std))
-    eta, error = at_mean_light(
-        eta, error, quiet.light, leak.rate_hz, quiet.factor, SIGNAL_ERROR)
+    eta, error = at_mean_light(eta, error, quiet.light, leak.rate_hz, quiet.factor, SIGNAL_ERROR)
     names = ("eta_on", "eta_off")
     return (dataclasses.replace(summary, **dict(zip(names, map(jnp.float32, eta), strict=True))),
             dataclasses.replace(std, **dict(zip(names, map(jnp.float32, error), strict=True))))
