@@ -152,12 +152,15 @@ def test_regression_finds_each_pixels_thresholds(
     np.testing.assert_allclose(wide, 0.08, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("share", "least", "most"), [(1.0, 0.84, 0.88), (0.3, 0.99, 1.01)])
+@pytest.mark.parametrize(("share", "low", "least", "most"), [
+    (1.0, False, 0.84, 0.88), (0.8, False, 0.84, 0.91), (0.8, True, 0.81, 0.88),
+    (0.2, False, 0.94, 0.96)])
 def test_contrast_that_the_path_lacks_is_made_up_for(
-    share: float, least: float, most: float
+    share: float, low: bool, least: float, most: float
 ) -> None:
-    """A path of .86 of the contrast, known events in a share of the pixels: the thresholds are
-    those of the summary where most pixels tell, else of the path."""
+    """A path of .86 of the contrast, known events in a share of the pixels, any or those of low
+    thresholds: where most pixels have events the thresholds are those of the summary, else those
+    of a path of the usual contrast."""
     rng = np.random.default_rng(0)
     shape = (30, 40)
     true = 0.25 + 0.05 * rng.standard_normal((2, *shape))
@@ -165,7 +168,8 @@ def test_contrast_that_the_path_lacks_is_made_up_for(
     y = 0.86 * (true[0] * a - true[1] * b) + 0.02 * rng.standard_normal(a.shape)
     a, b, y = (v - v.mean(0) for v in (a, -b, y))
     sums = [(u * v).sum(0) for u, v in ((a, a), (a, b), (b, b), (a, y), (b, y), (y, y))]
-    heard = rng.random(shape) < share
+    rank = true.mean(0) if low else rng.random(shape)
+    heard = rank <= np.quantile(rank, share)
     evidence = dataclasses.replace(
         PixelEvidence.nothing(shape), equations=np.stack([*sums, np.full(shape, 60.0)]) * heard)
     theta, std = pixel_posterior(
