@@ -22,8 +22,9 @@ from evflow.types import Window
 Array = jax.Array
 
 # Of log noise rates: what signal that looks like noise adds to their error where nothing of a
-# recording is quiet, and the quiet share that halves it. Measured on 30 recordings of 10 s.
-UNQUIET, QUIET_HALF = 0.3, 0.03
+# long recording is quiet, the quiet share that halves it (30 recordings of 10 s), and the noise
+# events that do: with few of them, a rate leans on the network's and on Eq. 12.
+UNQUIET, QUIET_HALF, EVENTS_HALF = 0.3, 0.03, 300.0
 SLOW_ERROR = 0.15  # relative error of the network's thresholds if pixels are not ideal
 
 
@@ -79,13 +80,16 @@ def with_rates(
     return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)
 
 
-def with_unquiet_error(summary: Summary, std: Summary, share: np.ndarray) -> Summary:
-    """The std, that of noise rates larger the smaller the share (2,) of the pixels and time in
-    which nothing but noise comes: what else is taken for noise does not average out."""
-    added = UNQUIET * QUIET_HALF / (QUIET_HALF + share)
-    on, off = (jnp.hypot(getattr(std, name), jnp.float32(a) * getattr(summary, name))
-               for name, a in zip(("eta_on", "eta_off"), added, strict=True))
-    return dataclasses.replace(std, eta_on=on, eta_off=off)
+def with_unquiet_error(
+    summary: Summary, std: Summary, share: np.ndarray, pixel_s: float
+) -> Summary:
+    """The std, that of noise rates larger the smaller the share (2,) of the recording's pixel_s
+    seconds in which nothing but noise comes: what else is taken for noise does not average out."""
+    rate, error = (np.array([s.eta_on, s.eta_off], np.float64) for s in (summary, std))
+    events = rate * pixel_s
+    added = UNQUIET * QUIET_HALF / (QUIET_HALF + share) * events / (events + EVENTS_HALF)
+    on, off = np.hypot(error, added * rate).astype(np.float32)
+    return dataclasses.replace(std, eta_on=jnp.asarray(on), eta_off=jnp.asarray(off))
 
 
 def refined(

@@ -111,7 +111,7 @@ class Quiet:
     """What quiet pixels did: maps (2, 2, H, W), ON and OFF, events and seconds; light: the same by
     the light that they saw, of `by_light`; waits: for an event; falling: (2, H, W) the seconds
     times what `noise_factor` was of the pixel's light; factor: its mean over pixels and time;
-    share: (2,) of all pixels and time, hot pixels aside."""
+    share: (2,) of pixel_s, the seconds of all pixels but hot ones."""
 
     maps: np.ndarray
     light: np.ndarray
@@ -119,6 +119,7 @@ class Quiet:
     falling: np.ndarray
     factor: float
     share: np.ndarray
+    pixel_s: float
 
     def at_mean_light(self) -> np.ndarray:
         """The maps, with seconds in which as much noise comes at the mean light as came in theirs,
@@ -151,5 +152,6 @@ def quiet_times(
         factor += window.window_s * float(share.mean())
         seconds += window.window_s
         waits.add(window.events, (window.t0_us, window.t1_us), calm(*place))
-    share = total[:, 1][:, ~hot].sum(1) / (seconds * max(1, int((~hot).sum())))
-    return Quiet(total, light, waits.table(), falling, factor / seconds, share)
+    pixel_s = seconds * max(1, int((~hot).sum()))
+    share = total[:, 1][:, ~hot].sum(1) / pixel_s
+    return Quiet(total, light, waits.table(), falling, factor / seconds, share, pixel_s)

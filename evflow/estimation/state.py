@@ -229,7 +229,7 @@ def estimate(
         std = doubted(doubt, refined.signs, summary, std)
     stage("noise rates and maps")
     quiet = quiet_times(_counted(_windows(state.read), advance), summary, hot, eyes.seen_by)
-    std = maps.with_unquiet_error(summary, std, quiet.share)
+    std = maps.with_unquiet_error(summary, std, quiet.share, quiet.pixel_s)
     leak = measured_leak(quiet.waits)
     shot = measured_shot(quiet.light, leak.rate_hz, scatter(quiet.maps, hot), SIGNAL_ERROR)
     sent = quiet.maps
