@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
+from evflow.camera import Summary
+from evflow.estimation.maps import with_unquiet_error
 from evflow.estimation.pixel_noise import _shapes, pixel_rates, quiet_time, threshold_law
 
 SHAPE = (96, 128)
@@ -148,3 +151,17 @@ def test_signal_of_the_lowest_thresholds_alone_is_no_law() -> None:
     quiet = quiet_counts(rates, 1.0)
     assert quiet[:, 0].sum() > 200
     np.testing.assert_array_equal(threshold_law(quiet, theta, NONE_HOT), 1.0)
+
+
+def test_rates_are_less_certain_where_little_is_quiet_and_noise_events_are_many() -> None:
+    summary, std = (Summary(*(jnp.float32(v) for v in values)) for values in (
+        (0.3, 0.3, 0.1, 0.1, 0.01, 0.01), (0.02, 0.02, 0.01, 0.01, 0.01, 0.01)))
+
+    def of(share: float, pixel_s: float) -> Summary:
+        return with_unquiet_error(summary, std, np.full(2, share), pixel_s)
+
+    assert float(of(0.0, 1e9).eta_on) == pytest.approx(np.hypot(0.01, 0.3 * 0.1), rel=1e-5)
+    assert float(of(0.03, 3000.0).eta_off) == pytest.approx(
+        np.hypot(0.01, 0.1 * 0.3 / 2 / 2), rel=1e-5)
+    assert float(of(1.0, 10.0).eta_on) == pytest.approx(0.01, rel=0.01)
+    assert of(0.0, 1e9).theta_on == std.theta_on
