@@ -84,6 +84,14 @@ def agree(vote: bool) -> bool:
     return bool(np.any(multihost_utils.process_allgather(np.asarray(vote))))
 
 
+def leave_together() -> None:
+    """End this process's part in the run, once all others end theirs: JAX takes a process that ends
+    before them for dead, and ends them. Nothing runs on several processes afterwards."""
+    if jax.process_count() > 1:
+        agree(True)
+        jax.distributed.shutdown()  # now, as a process that a signal ends runs nothing at its exit
+
+
 class Votes:
     """`agree` for a loop that keeps the devices busy, without waiting for their work.
 

@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import jax
 
 from evflow.errors import EvflowDataError
-from evflow.process.devices import Votes, is_main
+from evflow.process.devices import Votes, agree, is_main
 from evflow.process.signals import stop_requests
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.config import as_dict
@@ -36,7 +36,7 @@ Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
 @dataclass(frozen=True)
 class Ended(Generic[State]):
     """Result of a run: its last state, the mean metrics of its last hundred steps, and a message if
-    a signal stopped this process."""
+    a signal to any process stopped it."""
 
     state: State
     figures: Metrics
@@ -85,7 +85,7 @@ def train(
         raise EvflowDataError("EV007", f"{lost}.", f"Checkpoints before it are in {options.out}; "
                               "train at a lower rate.")
     stopped = (f"stopped after step {int(state.step)} of {config.steps}; a checkpoint is saved, "
-               "and the same command goes on." if requests else "")
+               "and the same command goes on." if agree(bool(requests)) else "")
     return Ended(state, log.figures, stopped)
 
 

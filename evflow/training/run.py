@@ -24,7 +24,8 @@ from evflow.training.step import TrainState, init_state, make_run_step, optimise
 
 def train_network(options: TrainOptions) -> Metrics:
     """Train the network and write weights.safetensors; returns the mean metrics of its last hundred
-    steps. On a signal it writes the weights of the last step and raises KeyboardInterrupt."""
+    steps. On a signal to any process all of them stop, after the weights of the last step are
+    written, and raise KeyboardInterrupt."""
     devices.initialise(options.coordinator, options.processes, options.process_id)
     mesh = devices.make_mesh()
     config, small = configuration(options, mesh.size), options.preset == "debug"
@@ -47,7 +48,7 @@ def train_network(options: TrainOptions) -> Metrics:
             **provenance()}
     if devices.is_main():
         save_weights(options.out / "weights.safetensors", ended.state.average, card, overwrite=True)
-    devices.agree(True)  # leave together: jax takes a process that ends alone for dead
+    devices.leave_together()
     if ended.stopped:
         raise KeyboardInterrupt(
             f"{ended.stopped} {options.out / 'weights.safetensors'} is of that step.")

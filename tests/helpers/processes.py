@@ -43,11 +43,11 @@ class Processes:
         """python ARGS until it ends well."""
         self.end_well(self.start(*args, devices=devices))
 
-    def end_well(self, *processes: subprocess.Popen[str]) -> None:
+    def end_well(self, *processes: subprocess.Popen[str], code: int = 0) -> None:
         for process in processes:
-            code = process.wait(PATIENCE_S)
+            found = process.wait(PATIENCE_S)
             output = self.folder / f"output{self._all.index(process)}.txt"
-            assert code == 0, output.read_text()[-3000:]
+            assert found == code, output.read_text()[-3000:]
 
     def stop(self) -> None:
         for process in self._all:

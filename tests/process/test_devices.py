@@ -23,6 +23,7 @@ from helpers.processes import PATIENCE_S, TESTS, Processes, free_port
 from evflow.errors import EvflowDataError
 from evflow.network.weights import load_weights
 from evflow.process import devices
+from evflow.process.terminal import INTERRUPTED
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.log import Log
 from evflow.training.options import TrainOptions
@@ -220,7 +221,7 @@ def test_sigterm_to_one_process_saves_and_stops_all(processes: Processes) -> Non
                             "--process-id", i, devices=2) for i in range(2)]
     wait_for(lambda: len(steps_logged(out)) >= 3, both)
     both[1].send_signal(signal.SIGTERM)
-    processes.end_well(*both)
+    processes.end_well(*both, code=INTERRUPTED)
     with Checkpoints(out) as checkpoints:
         assert checkpoints.latest == len(steps_logged(out)) >= 3
     goes_on_alone(processes, out)
