@@ -44,13 +44,15 @@ COMMANDS: dict[str, type] = {
 
 def offered(arguments: Sequence[str] = ()) -> Any:
     """The type that tyro parses: one of the commands by its name. The options of `train` are built
-    only when `train` is called. Raises EV020 for options that the called command lacks."""
+    only when `train` is called, and help flows only where it is shown, as both take time. Raises
+    EV020 for options that the called command lacks."""
     found, verb = dict(COMMANDS), next(iter(arguments), "")
     if verb == "train":
         found["train"] = with_configuration(arguments)
     if verb in found:
         check_options(verb, found[verb], arguments[1:])
-        found[verb] = flowing(found[verb])
+        if {"-h", "--help"} & set(arguments):
+            found[verb] = flowing(found[verb])
     named = tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in found.items())
     return Union[named]  # noqa: UP007 - built at run time
 
