@@ -147,9 +147,9 @@ def quiet_times(
         shown = 255.0 / (255.0 + max(seen_by.offset_dn, 0.0))
         dn = 0.5 * shown * (seen[0].astype(np.float32) + seen[1])
         light += by_light(found, dn, hot)
-        share = np.asarray(noise_factor(normalised_intensity(np.clip(dn, 0.0, 255.0))))
-        falling += found[:, 1] * share
-        factor += window.window_s * float(share.mean())
+        of_light = np.asarray(noise_factor(normalised_intensity(np.clip(dn, 0.0, 255.0))))
+        falling += found[:, 1] * of_light
+        factor += window.window_s * float(of_light.mean())
         seconds += window.window_s
         waits.add(window.events, (window.t0_us, window.t1_us), calm(*place))
     pixel_s = seconds * max(1, int((~hot).sum()))

@@ -110,12 +110,13 @@ def calibrate_step(
             step), EV017 (fewer than two rests in the frames, or no screen that steps), EV020, EV021
             (polarities swapped).
     """
-    metered = bool(lux) and rests_us is None and not recording.has_frames
-    if metered and triggers_us is not None and lux:
+    metered = False
+    if lux and triggers_us is not None and rests_us is None and not recording.has_frames:
         rests_us = rests_between(np.asarray(triggers_us), recording.events, len(lux))
-        light, lux = lux, None
+        metered, light, lux = True, lux, None
     steps = _steps(recording, rests_us, light, tuple(lux or ()))
-    steps = dataclasses.replace(steps, unit="lux") if metered else steps
+    if metered:
+        steps = dataclasses.replace(steps, unit="lux")
     _check_polarity(steps)
     rest = steps.rest
     hz, kept = camera_rate(rest, steps.rest_s)
