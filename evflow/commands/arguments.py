@@ -88,7 +88,7 @@ def _instead(verb: str, typed: str, name: str, known: set[str]) -> str:
     if verb == "simulate" and name in V2E:
         return f"v2e's {typed} is {V2E[name]} here."
     names = sorted(option.lstrip("-") for option in known)
-    near = [k for k in names if k.startswith(f"{name}-") or name.startswith(f"{k}-")]
+    near = [k for k in names if f"-{name}-" in f"-{k}-" or name.startswith(f"{k}-")]
     near = near or difflib.get_close_matches(name, names, n=1)
     return f"Did you mean {' or '.join(f'--{k}' for k in near)}?" if near else ""
 

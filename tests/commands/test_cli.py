@@ -111,6 +111,7 @@ def test_usage_errors_exit_2() -> None:
      "--pos_thres is --theta-on here. v2e's --dvs346 is --sensor-size davis346 here."),
     ("simulate r.mp4 -o r.h5 --sensr=v2e", "no option --sensr. Did you mean --sensor?"),
     ("render r.h5 -o r.png --slow-motion 3", "Did you mean --slow?"),
+    ("render r.h5 -o r.mp4 --events 9", "Did you mean --events-topic or --window-events?"),
     ("estimate r.h5 -out cam", "no option -out. Did you mean --out?"),
     ("train --presett debug --loss.flow 1", "Did you mean --preset?"),
     ("convert a.h5 b.h5 --pos_thres -3", "no option --pos_thres. evflow convert --help"),
