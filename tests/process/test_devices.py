@@ -187,6 +187,7 @@ def test_no_device_sees_the_whole_batch(probes: dict[str, Path], topology: str) 
 # A run that stops, moves and goes on.
 
 TRAIN = ("-m", "experiments.train", "--preset", "debug", "--scenes", 4)
+ONE_STEP = ("--max-seconds", 0.1)  # less than the first takes, with its compilation
 QUICK = (*TRAIN, "--parts", "summary", "--steps", 5000)  # half the compilation; ends by a signal
 
 
@@ -209,7 +210,7 @@ def goes_on_alone(processes: Processes, out: Path) -> None:
     with Checkpoints(out) as checkpoints:
         latest = checkpoints.latest
     assert latest is not None
-    processes.run(*QUICK, "--out", out, "--resume", "must", "--max-seconds", 0.001)
+    processes.run(*QUICK, "--out", out, "--resume", "must", *ONE_STEP)
     assert steps_logged(out) == list(range(1, latest + 2))
 
 
@@ -248,12 +249,11 @@ def test_a_dead_process_ends_the_run(processes: Processes, victim: int) -> None:
 def test_resume_is_exact_on_as_many_devices_and_close_on_others(processes: Processes) -> None:
     weights: dict[str, Arrays] = {}
     three = (*TRAIN, "--steps", 3)
-    one_step = ("--max-seconds", 0.001)
     for first, then in ((4, 4), (4, 1), (1, 4)):
         out = processes.folder / f"from{first}to{then}"
         start = processes.folder / f"start{first}"
         if not start.exists():
-            processes.run(*three, "--out", start, *one_step, devices=first)
+            processes.run(*three, "--out", start, *ONE_STEP, devices=first)
             assert steps_logged(start) == [1]
         shutil.copytree(start, out)
         processes.run(*three, "--out", out, "--resume", "must", devices=then)
