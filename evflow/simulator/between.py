@@ -142,7 +142,7 @@ class Interval:
     def _reach(self) -> tuple[int, int]:
         """Largest displacement (x, y) in pixels at any fraction of the interval."""
         def largest(moved: np.ndarray) -> np.ndarray:
-            return np.abs(moved).max((0, 1))
+            return np.array([cv2.norm(one, cv2.NORM_INF) for one in cv2.split(moved)])
 
         bent = sum(largest(bend) for bend in self.bends or ())
         x, y = np.maximum(largest(self.motion.there), largest(self.motion.back)) + bent
