@@ -90,10 +90,10 @@ def measured(scene: Scene, frames: int, seed: int) -> dict[str, Any]:
     truth, swept = simulated(iter(film)), shown.swept(frames, size)
     given = [(np.clip(np.rint(frame), 0, 255).astype(np.uint8), t) for frame, t in film[::dense]]
     whole = [(frame.astype(np.float32), t) for frame, t in given]
-    told = [interval.motion.failed > FAILED for interval in intervals(whole)]
+    noted = [interval.motion.failed > FAILED for interval in intervals(whole)]
     ways = {**WAYS, "evflow": upsample}
     return {"motion": motion, "picture": picture, "speed": speed, "size": f"{size[0]}x{size[1]}",
-            "told": float(np.mean(told)),
+            "noted": float(np.mean(noted)),
             **{name: scores(simulated(way(given)), truth, swept) for name, way in ways.items()}}
 
 

@@ -1,7 +1,7 @@
 """Thresholds of the compared systems on the same recordings (paper, Table III).
 
     python -m experiments.compare_systems --preset debug
-    python -m experiments.compare_systems --preset full --data data/recordings
+    python -m experiments.compare_systems --preset full --data data/recordings --rows rows.json
 
 The held-out recordings of `experiments.evaluate` (64x64, 8-bit frames every 25 ms), .2 s as there
 and 1 s, at both mismatches: the first `sequences` of them with 200 signal events of each polarity.
@@ -10,8 +10,8 @@ six of them; in debug for 20 iterations), `estimate_camera` and its parts by the
 network, the flow, the summary in every pixel, and the paper's flow), the constant .3, and MATCH
 with the true 1000 frames/s video (no method that sees the frames alone can do as well). Scored per
 polarity: `mae_sequence` (map against the sequence's value: the paper's footnote 1), `mae_pixel`
-(map against each pixel's own), and |median - θ|. What a system cannot tell counts with the value
-it gives; `told` is the share of recordings where it told both.
+(map against each pixel's own), and |median - θ|. What a system cannot determine counts with
+the value it gives; `determined` is the share of recordings where it determined both.
 
 Real recordings have no truth: each system sees the first half of the frames, and its thresholds
 foretell the changes between the frames of the second half, beside a regression on those changes
@@ -23,7 +23,6 @@ not rank. Writes compare_systems.json, .md and .png.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,12 +30,12 @@ from evflow import load_weights, read_recording
 from evflow.baselines import SYSTEMS, Lgan, System
 from evflow.errors import EvflowDataError
 from evflow.report import plots
-from experiments.shared.cameras import Hidden, Protocol
+from experiments.shared.cameras import Protocol
 from experiments.shared.common import begin, run_script, write_result, write_text
 from experiments.shared.compared import averages, picture, table
-from experiments.shared.fits import score
-from experiments.shared.many import Setup, scores
-from experiments.shared.protocols import ENOUGH, protocols
+from experiments.shared.fits import all_scores
+from experiments.shared.many import Setup
+from experiments.shared.protocols import protocols
 from experiments.shared.second_half import held_out
 
 REAL = ("newton_cradle_davis346.aedat4", "ijrr_slider_depth")
@@ -55,9 +54,11 @@ class Options:
     """Recordings per row (default: the preset's)."""
     data: Path | None = None
     """Folder with the real recordings; left out without it."""
+    rows: Path | None = None
+    """Where the scores of each recording are kept, to resume an interrupted run from."""
 
 
-def rows(options: Options) -> dict[str, Protocol]:
+def protocols_of(options: Options) -> dict[str, Protocol]:
     """Protocols by name: those of `evaluate` at both mismatches, and the same for a second."""
     known = protocols()
     found = {f"{m}, .2 s": known[m] for m in ("0.03", "0.15")}
@@ -74,26 +75,17 @@ def systems_of(options: Options) -> dict[str, System]:
     return SYSTEMS | {"lgan": Lgan(iterations=20)}
 
 
-def lively(_params: Any, hidden: Hidden, _protocol: Protocol) -> Hidden | None:
-    """A recording with enough events of both polarities."""
-    return hidden if (hidden.signal_events() >= ENOUGH).all() else None
-
-
 def main(options: Options) -> dict[str, Any]:
     begin(options, "compare_systems")
     plots.require()
     if options.data is not None and not options.data.is_dir():
         raise EvflowDataError("EV016", f"there is no folder {options.data}.", "Check --data.")
     count = options.sequences or {"debug": 3, "full": 30}[options.preset]
-    setup, params = Setup(options.weights, options.seed), load_weights(options.weights)
-    systems = systems_of(options)
+    params, systems = load_weights(options.weights), systems_of(options)
     result: dict[str, Any] = {"simulated": {}, "real": {}}
-    for name, protocol in rows(options).items():
-        jobs = [(i, protocol) for i in range(4 * count)]
-        drawn = (h for h in scores(lively, setup, jobs, 1, f"mismatch {name}") if h is not None)
-        result["simulated"][name] = averages([
-            score(params, hidden, {n: s for n, s in systems.items() if i < s.most_recordings})
-            for i, hidden in enumerate(itertools.islice(drawn, count))])
+    for name, protocol in protocols_of(options).items():
+        result["simulated"][name] = averages(all_scores(
+            Setup(options.weights, options.seed), systems, (name, protocol), count, options.rows))
     if options.data is not None:
         for name in REAL:
             try:

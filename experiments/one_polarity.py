@@ -54,11 +54,11 @@ def drawn(rng: np.random.Generator, case: str) -> Protocol:
 
 
 def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, float] | None:
-    """Relative error and error in std of the polarity that tells something, whether the other is
-    said to be undetermined; None where neither tells anything."""
-    told = int(protocol.fade < 1)
-    name, other = (("on", "off"), ("off", "on"))[told]
-    if hidden.signal_events()[told] < ENOUGH:
+    """Relative error and error in std of the polarity with signal, whether the other is
+    said to be undetermined; None where neither has any."""
+    seen = int(protocol.fade < 1)
+    name, other = (("on", "off"), ("off", "on"))[seen]
+    if hidden.signal_events()[seen] < ENOUGH:
         return None
     try:
         found = estimate_camera(hidden.recording, params)

@@ -78,7 +78,7 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> list[Row] | None:
 def fused_summary(
     params: Any, chunks: list[Chunk], summary: Summary, std: Summary
 ) -> tuple[Summary, Summary]:
-    """What is known of the camera and its std before noise is told from signal."""
+    """What is known of the camera and its std before noise is distinguished from signal."""
     (net,) = params.values()
     steps = refine_summary(chunks, summary, std)
     y, y_std = fused(net["fusion"], jnp.asarray(steps.features), unsquash_summary(steps.summary))

@@ -23,7 +23,7 @@ PASSED, FAILED = 0, 1  # exit codes of pytest; others are of runs that broke
 
 @dataclasses.dataclass(frozen=True)
 class Mutation:
-    """file: in evflow/; old: its text, which stands there once; tests: what pytest is told."""
+    """file: in evflow/; old: its text, which stands there once; tests: arguments of pytest."""
 
     name: str
     file: str

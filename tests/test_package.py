@@ -86,8 +86,8 @@ def test_what_functions_take_give_and_refuse_is_documented(name: str, function: 
     raised = {c.args[0].value for c in ast.walk(tree)
               if isinstance(c, ast.Call) and getattr(c.func, "id", "") == "EvflowDataError"
               and isinstance(c.args[0], ast.Constant)}
-    told = set(re.findall(r"EV\d{3}", parts.get("Raises", "")))
-    assert raised <= told <= set(CODES)
+    named = set(re.findall(r"EV\d{3}", parts.get("Raises", "")))
+    assert raised <= named <= set(CODES)
     if "Raises" in parts:
         assert parts["Raises"].strip().startswith("EvflowDataError: ")
 
@@ -96,9 +96,9 @@ def test_attributes_of_public_classes_are_documented() -> None:
     for name in evflow.__all__:
         found = getattr(evflow, name)
         if dataclasses.is_dataclass(found):
-            told = re.findall(r"^    (\w+): \S", sections(inspect.getdoc(found) or "").get(
+            named = re.findall(r"^    (\w+): \S", sections(inspect.getdoc(found) or "").get(
                 "Attributes", ""), re.M)
-            assert told == [field.name for field in dataclasses.fields(found)], name
+            assert named == [field.name for field in dataclasses.fields(found)], name
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))

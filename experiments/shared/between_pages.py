@@ -30,9 +30,9 @@ def table(rows: list[dict[str, Any]]) -> str:
                           f"{m['swept']:.2f}" if "swept" in m else "",
                           f"{m['least']:.2f}–{m['most']:.2f}",
                           f"{m['at_rate']:.1f} / {m['at_double']:.1f}", f"{m['r']:.3f}",
-                          f"{np.mean([row['told'] for row in same]):.0%}" * (way == "evflow")))
+                          f"{np.mean([row['noted'] for row in same]):.0%}" * (way == "evflow")))
     return markdown(("motion", "size", "per frame", "between", "events", "at the edge",
-                     "rate by phase", "comb, % at 1x / 2x", "r of counts", "told"), lines)
+                     "rate by phase", "comb, % at 1x / 2x", "r of counts", "noted"), lines)
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:

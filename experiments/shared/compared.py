@@ -27,7 +27,7 @@ def averages(found: list[dict[str, Any]]) -> dict[str, Any]:
                                     / np.sqrt(len(mine))) for p in POLARITIES}
         # A median: the first recording compiles.
         one["seconds"] = float(np.median([r["seconds"] for r in mine]))
-        one["told"] = float(np.mean([r["told"] for r in mine]))
+        one["determined"] = float(np.mean([r["determined"] for r in mine]))
         result[name] = one | {"recordings": len(mine)}
     return result
 
@@ -35,7 +35,7 @@ def averages(found: list[dict[str, Any]]) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> str:
     """Markdown: a table of the simulated recordings, one of each real recording."""
     lines = ["| recordings | system | \\|median - θ\\| ON | OFF | mae_sequence ON | OFF | "
-             "mae_pixel ON | OFF | bias ON | OFF | told | s | paper ON | OFF |",
+             "mae_pixel ON | OFF | bias ON | OFF | determined | s | paper ON | OFF |",
              "|" + "---|" * 14]
     for protocol, systems in result["simulated"].items():
         for name, r in systems.items():
@@ -43,7 +43,7 @@ def table(result: dict[str, Any]) -> str:
             cells = [f"{r[f'median/{p}']:.3f} ± {r[f'error/{p}']:.3f}" for p in POLARITIES]
             cells += [f"{r[f'{m}/{p}']:.3f}" for m in METRICS[:2] for p in POLARITIES]
             cells += [f"{r[f'signed/{p}']:+.3f}" for p in POLARITIES]
-            cells += [f"{r['told']:.0%}", f"{r['seconds']:.2f}"]
+            cells += [f"{r['determined']:.0%}", f"{r['seconds']:.2f}"]
             cells += [f"{x:.3f}" for x in paper] if paper else ["", ""]
             lines.append(f"| {protocol} ({r['recordings']}) | {name} | {' | '.join(cells)} |")
     for recording, systems in result["real"].items():

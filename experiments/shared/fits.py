@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +13,13 @@ import numpy as np
 from evflow import Recording, estimate_camera
 from evflow.baselines import Fitted, Match, System
 from evflow.camera import Camera
+from evflow.network.weights import weights_hash
 from experiments.shared import alone
-from experiments.shared.cameras import Hidden
+from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.compared import CONSTANT, KNOWN, OURS, POLARITIES
+from experiments.shared.kept import Row, resumed
+from experiments.shared.many import Setup, made
+from experiments.shared.protocols import ENOUGH
 
 
 def all_fits(params: Any, recording: Recording, systems: dict[str, System]) -> dict[str, Fitted]:
@@ -49,7 +56,7 @@ def score(params: Any, hidden: Hidden, systems: dict[str, System]) -> dict[str, 
     fits[KNOWN] = Match("given", start="fresh").fit(dense)
     result: dict[str, Any] = {"signal": hidden.signal_events().tolist()}
     for name, fit in fits.items():
-        row: dict[str, Any] = {"seconds": fit.seconds, "told": bool(fit.found.all())}
+        row: dict[str, Any] = {"seconds": fit.seconds, "determined": bool(fit.found.all())}
         for i, polarity in enumerate(POLARITIES):
             seen = np.asarray(getattr(fit.camera, f"theta_{polarity}"))
             pixels = np.asarray(getattr(hidden.camera, f"theta_{polarity}"))
@@ -60,3 +67,24 @@ def score(params: Any, hidden: Hidden, systems: dict[str, System]) -> dict[str, 
                     f"signed/{polarity}": float(fit.theta[i] - true)}
         result[name] = row
     return result
+
+
+def all_scores(setup: Setup, systems: dict[str, System], protocol: tuple[str, Protocol],
+               count: int, path: Path | None) -> list[Row]:
+    """Scores of every system on the first `count` recordings of a protocol (with its name) that
+    have enough events. path: where they are kept, to go on from when interrupted."""
+    name, drawn = protocol
+
+    def scored(left: list[int]) -> Iterator[Row]:
+        found = made(lively, setup, [(i, drawn) for i in range(4 * count)], 1)
+        for i, one in enumerate(itertools.islice((f for f in found if f is not None), count)):
+            if i in left:
+                yield score(*one, {n: s for n, s in systems.items() if i < s.most_recordings})
+
+    of = [weights_hash(setup.weights), setup.seed, *map(repr, systems.values())]
+    return resumed(path, of, [f"{name}, {i}" for i in range(count)], scored, f"mismatch {name}")
+
+
+def lively(params: Any, hidden: Hidden, _protocol: Protocol) -> tuple[Any, Hidden] | None:
+    """The weights and the recording, if it has enough events of both polarities."""
+    return (params, hidden) if (hidden.signal_events() >= ENOUGH).all() else None

@@ -47,7 +47,7 @@ def histograms(path: Path, params: Any, key: jax.Array) -> dict[str, Any]:
     dn = np.minimum(np.array(list(HISTOGRAMS.values())) / LUX_PER_DN, 255.0)
     shares["v2e"] = np.stack([v2e_noise(1.0, dn, nominal=1.0)] * 2, -1)
     shares["evolt"] = np.stack(voltmeter_noise(dn), -1)
-    result: dict[str, Any] = {"told": []}
+    result: dict[str, Any] = {"notes": []}
     for i, name in enumerate(HISTOGRAMS):
         pair = [read_noise_histogram(path, f"{side}_{name}") for side in ("pos", "neg")]
         camera = with_noise_histogram(
@@ -58,9 +58,9 @@ def histograms(path: Path, params: Any, key: jax.Array) -> dict[str, Any]:
         try:
             found = estimate_camera(Recording.of_events(events), params)
             shares["ours, maps"][i] = [found.camera.eta_on.mean(), found.camera.eta_off.mean()]
-            result["told"].append(f"{name}: {found.hot.sum()} hot pixels")
+            result["notes"].append(f"{name}: {found.hot.sum()} hot pixels")
         except EvflowDataError as error:
-            result["told"].append(f"{name}: {error}")
+            result["notes"].append(f"{name}: {error}")
     total = {k: np.sum(v) for k, v in shares.items()} | {"ours, maps": shares["measured"].sum()}
     shares = {k: np.asarray(v) / total[k] for k, v in shares.items()}
     return result | {"lux": list(HISTOGRAMS.values()), "shares": shares, "distance": {

@@ -23,8 +23,8 @@ NOTE = ("v2e: r of the bench, rate as 1 / θ about θ = .2; evolt: the published
 
 def table(result: dict[str, Any]) -> str:
     """Markdown: errors of all systems beside the paper's, ours cell by cell, measured data."""
-    lines = ["| sensor | scene (cells x seeds) | system | \\|η - truth\\| ON [Hz] | OFF | told | "
-             "paper CeleX5 ON, OFF | paper DAVIS346 |", "|" + "---|" * 8]
+    lines = ["| sensor | scene (cells x seeds) | system | \\|η - truth\\| ON [Hz] | OFF | "
+             "answered | paper CeleX5 ON, OFF | paper DAVIS346 |", "|" + "---|" * 8]
     for sensor, scenes in result["simulated"].items():
         for scene, one in scenes.items():
             count = f"{len(one['scp']) * len(one['lux'])} x {len(one['rates']['truth'])}"
@@ -33,7 +33,7 @@ def table(result: dict[str, Any]) -> str:
                          for camera in ("CeleX5", "DAVIS346")]
                 lines.append(f"| {sensor} | {scene} ({count}) | {name} | " + " | ".join(
                     f"{row[side][0]:.4f} ± {row[side][1]:.4f}" for side, _ in SIDES)
-                    + f" | {row['told']:.0%} | {' | '.join(paper)} |")
+                    + f" | {row['answered']:.0%} | {' | '.join(paper)} |")
     lines += ["", NOTE, "", "| ours - truth, ON / OFF [mHz] (truth) | " + " | ".join(
         f"{x} lx" for x in LUX) + " | inside 1, 2 std |", "|" + "---|" * (len(LUX) + 2)]
     for sensor, scenes in result["simulated"].items():
@@ -51,7 +51,7 @@ def table(result: dict[str, Any]) -> str:
             f"{x:g} lx" for x in shape["lux"]) + " | distance |", "|" + "---|" * 5]
         lines += [f"| {name} | " + " | ".join(f"{on:.4f} / {off:.4f}" for on, off in v)
                   + f" | {shape['distance'][name]:.3f} |" for name, v in shape["shares"].items()]
-        lines += ["", *(f"Ours at {line}" for line in shape["told"])]
+        lines += ["", *(f"Ours at {line}" for line in shape["notes"])]
     if rows := real.get("noise_static_dvxplorer640"):
         lines += ["", "| DVXplorer at rest | η ON [Hz] | η OFF |", "|---|---|---|"]
         lines += [f"| {name} | {v[0]:.4f} | {v[1]:.4f} |" for name, v in rows.items()]

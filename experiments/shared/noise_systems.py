@@ -34,11 +34,11 @@ def closed_forms(theta: np.ndarray, dn: float, bench: np.ndarray) -> Rates:
 
 
 def scored(rates: Rates, name: str) -> dict[str, Any]:
-    """Mean |η - truth| over the cells, ON and OFF, with its 95 % interval over seeds; "told" is the
-    share of cells with an answer (only these are scored)."""
+    """Mean |η - truth| over the cells, ON and OFF, with its 95 % interval over seeds; "answered" is
+    the share of cells with an answer (only these are scored)."""
     error = np.abs(rates[name] - rates["truth"])
     answered = np.isfinite(error).all(-1)
     means = np.array([e[t].mean(0) for e, t in zip(error, answered, strict=True) if t.any()])
     nothing = (float("nan"), 0.0)
-    return {"told": float(answered.mean()), **{
+    return {"answered": float(answered.mean()), **{
         side: mean_ci(means[:, i]) if len(means) else nothing for i, (side, _) in enumerate(SIDES)}}

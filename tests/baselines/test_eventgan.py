@@ -91,7 +91,7 @@ def test_true_flow_costs_less_than_none() -> None:
 
 def test_flow_that_varies_is_not_held_back_by_its_smoothness() -> None:
     """Half of the image moves: smoothness is of flow in sides of the frame, as published. In
-    pixels it outweighed the frames, and the flow network told one vector for all."""
+    pixels it outweighed the frames, and the flow network gave one vector for all."""
     rng = np.random.default_rng(1)
     wide = rng.normal(size=(60, 60))
     for _ in range(3):

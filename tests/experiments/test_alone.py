@@ -49,7 +49,7 @@ def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:
     assert f"| {alone.FLOW} |" not in text
     first = text.splitlines()[2].split(" | ")
     assert first[3] == "–"  # no network pools
-    assert first[-1].startswith("–")  # no interval was told
+    assert first[-1].startswith("–")  # no interval was given
 
 
 @pytest.mark.parametrize(("error", "width", "within"), [(0.1, 0.2, 1.0), (-0.3, 0.2, 0.0)])

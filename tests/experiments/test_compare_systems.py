@@ -34,7 +34,8 @@ def test_halves_share_a_frame_and_no_event() -> None:
 
 @pytest.mark.slow
 def test_every_system_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    result = compare_systems.main(Options(out=tmp_path, sequences=1))
+    rows = tmp_path / "rows.json"
+    result = compare_systems.main(Options(out=tmp_path, sequences=1, rows=rows))
     text = capsys.readouterr().out
     for systems in result["simulated"].values():
         assert set(systems) == {*SYSTEMS, OURS, CONSTANT, KNOWN, alone.PAPER_FLOW, alone.FLOW,
@@ -49,3 +50,4 @@ def test_every_system_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     saved = json.loads((tmp_path / "compare_systems.json").read_text())
     assert saved["config"]["systems"]["match"] == repr(SYSTEMS["match"])
     assert cv2.imread(str(tmp_path / "compare_systems.png")) is not None
+    assert compare_systems.main(Options(out=tmp_path / "2", sequences=1, rows=rows)) == result

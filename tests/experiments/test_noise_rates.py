@@ -85,11 +85,11 @@ def test_scores_leave_out_what_is_not_told() -> None:
     seen[..., 1] = 0.3
     seen[0, 0], seen[2] = np.nan, 0.7
     row = noise_systems.scored({"truth": truth, "a": seen, "b": truth * np.nan}, "a")
-    assert row["told"] == pytest.approx(5 / 6)
+    assert row["answered"] == pytest.approx(5 / 6)
     assert row["ON"][0] == pytest.approx(0.3)  # .1, .1, .7
     assert row["OFF"][0] == pytest.approx((0.3 + 0.3 + 0.7) / 3)
     assert row["ON"][1] == pytest.approx(4.3027 * np.sqrt(0.12) / np.sqrt(3), rel=1e-3)
-    assert noise_systems.scored({"truth": truth, "b": truth * np.nan}, "b")["told"] == 0.0
+    assert noise_systems.scored({"truth": truth, "b": truth * np.nan}, "b")["answered"] == 0.0
 
 
 def small(monkeypatch: pytest.MonkeyPatch, scenes: tuple[str, ...]) -> None:

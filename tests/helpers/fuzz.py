@@ -1,7 +1,7 @@
 """Damaged files, read one by one in a process of its own, and what came of each.
 
 `Bench` keeps that process: it makes the sample, damages it, reads it under a limit of time and
-memory, and says how it went; where it dies or hangs it is started again. A case is told by its
+memory, and says how it went; where it dies or hangs it is started again. A case is named by its
 kind, seed and index alone, so that any of them can be run again.
 """
 

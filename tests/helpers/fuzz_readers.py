@@ -68,38 +68,39 @@ def options(arguments: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def earlier(told: argparse.Namespace) -> dict[str, Tally]:
+def earlier(asked: argparse.Namespace) -> dict[str, Tally]:
     """What the file at --out holds already."""
-    if not told.out.exists():
+    if not asked.out.exists():
         return {}
-    data = json.loads(told.out.read_text())
-    if (data["seed"], data["first"]) != (told.seed, told.first):
-        raise SystemExit(f"{told.out} is of --seed {data['seed']} --first {data['first']}.")
+    data = json.loads(asked.out.read_text())
+    if (data["seed"], data["first"]) != (asked.seed, asked.first):
+        raise SystemExit(f"{asked.out} is of --seed {data['seed']} --first {data['first']}.")
     return {kind: Tally(**{**record, "verdicts": collections.Counter(record["verdicts"])})
             for kind, record in data["formats"].items()}
 
 
-def save(told: argparse.Namespace, tallies: dict[str, Tally]) -> None:
-    record = {"seed": told.seed, "first": told.first, "limit_s": LIMIT_S,
+def save(asked: argparse.Namespace, tallies: dict[str, Tally]) -> None:
+    record = {"seed": asked.seed, "first": asked.first, "limit_s": LIMIT_S,
               "memory": f"{FREE:,} bytes + {RATIO} x the file's size",
               "formats": {kind: tally.record() for kind, tally in tallies.items()}}
-    with atomic_write(told.out, overwrite=True) as temporary:
+    with atomic_write(asked.out, overwrite=True) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n")
 
 
-def fuzz(told: argparse.Namespace, tallies: dict[str, Tally]) -> None:
+def fuzz(asked: argparse.Namespace, tallies: dict[str, Tally]) -> None:
     """Run the cases that are missing, in turns, until there are enough or the time is over."""
-    end = time.monotonic() + 60 * told.minutes
-    total, done = told.cases * len(told.formats), sum(tallies[k].cases for k in told.formats)
+    end = time.monotonic() + 60 * asked.minutes
+    total, done = asked.cases * len(asked.formats), sum(tallies[k].cases for k in asked.formats)
     with tempfile.TemporaryDirectory() as folder, Bench(Path(folder)) as bench, \
             bar("cases") as show:
-        while open_kinds := [k for k in told.formats if tallies[k].cases < told.cases]:
+        while open_kinds := [k for k in asked.formats if tallies[k].cases < asked.cases]:
             for kind in open_kinds:
-                for _ in range(min(SHARE, told.cases - tallies[kind].cases)):
-                    tallies[kind].add(bench.run(kind, told.seed, told.first + tallies[kind].cases))
+                for _ in range(min(SHARE, asked.cases - tallies[kind].cases)):
+                    case = asked.first + tallies[kind].cases
+                    tallies[kind].add(bench.run(kind, asked.seed, case))
                     done += 1
                     show(done, total)
-                save(told, tallies)
+                save(asked, tallies)
                 if time.monotonic() > end:
                     return
 
@@ -119,16 +120,16 @@ def table(tallies: dict[str, Tally]) -> Table:
 
 
 def main() -> int:
-    told = options()
-    tallies = earlier(told)
-    tallies |= {kind: Tally() for kind in told.formats if kind not in tallies}
+    asked = options()
+    tallies = earlier(asked)
+    tallies |= {kind: Tally() for kind in asked.formats if kind not in tallies}
     with stoppable():
         try:
-            fuzz(told, tallies)
+            fuzz(asked, tallies)
         finally:
-            save(told, tallies)
-    Console(width=160).print(table({kind: tallies[kind] for kind in told.formats}))
-    return int(any(tallies[kind].bad for kind in told.formats))
+            save(asked, tallies)
+    Console(width=160).print(table({kind: tallies[kind] for kind in asked.formats}))
+    return int(any(tallies[kind].bad for kind in asked.formats))
 
 
 if __name__ == "__main__":

@@ -118,7 +118,7 @@ def test_scripts_end_with_one_line(
     def left(code: int) -> None:
         raise SystemExit(code)
 
-    def told() -> None:
+    def ended() -> None:
         raise KeyboardInterrupt("stopped after step 3.")
 
     def wrong() -> None:
@@ -127,7 +127,7 @@ def test_scripts_end_with_one_line(
     monkeypatch.setattr(common, "leave", left)
     for work, code, line in (
         (lambda: signal.raise_signal(signal.SIGTERM), INTERRUPTED, "interrupted; no half-"),
-        (told, INTERRUPTED, "stopped after step 3."), (wrong, "EV001 empty input: nothing.", ""),
+        (ended, INTERRUPTED, "stopped after step 3."), (wrong, "EV001 empty input: nothing.", ""),
         (lambda: 1, 1, ""), (lambda: {"figure": 2.0}, 0, ""),
     ):
         with pytest.raises(SystemExit) as end:

@@ -182,14 +182,14 @@ def test_it_is_simulated_as_the_command_simulates_it(
 
     monkeypatch.setattr(resimulate, "simulate_stream", watched)
     resimulate.resimulate(recording, found, (0, 2), 0)
-    told = Pixels(camera=path)
-    behind = told.model()
+    made = Pixels(camera=path)
+    behind = made.model()
     assert models == [behind, behind]
     assert (behind.leak_hz, behind.shot_hz, behind.refractory_s, behind.cutoff_hz) == (
         0.1, 1.5, 2e-3, 0.0)
     assert behind.eta_is_all
-    assert told.seen_by(recorded=True).cutoff_hz == pytest.approx(40.0)
-    assert not told.seen_by(recorded=True).by_light
+    assert made.seen_by(recorded=True).cutoff_hz == pytest.approx(40.0)
+    assert not made.seen_by(recorded=True).by_light
     added = Pixels(camera=path, shot_hz=2.0).model()
     assert (added.leak_hz, added.shot_hz, added.eta_is_all) == (0.0, 2.0, False)
     assert Pixels(camera=path, sensor="v2e").model().leak_hz == 0.01
@@ -279,9 +279,9 @@ def test_r_is_held_against_what_is_possible() -> None:
 
 def test_motion_that_is_lost_comes_before_all_other_reasons() -> None:
     ceiling = {"on": 1.0, "off": 1.0}
-    told, lost = (judge_stream(stream(0.7, 0.9), "on", "re-simulated", ceiling, gone)[0].advice
+    clocked, lost = (judge_stream(stream(0.7, 0.9), "on", "re-simulated", ceiling, gone)[0].advice
                   for gone in (False, True))
-    assert "clocks" in told
+    assert "clocks" in clocked
     assert "higher frame rate, comes first" in lost
 
 

@@ -112,9 +112,9 @@ def numbers_of(rate: float, own: float, around: float) -> dict[str, Any]:
     ((3.0, 3.0, 1.0), ["Too many", "slowly (medians: of a pixel 30.00 against 10.00 ms): look"]),
     ((1.0, 3.0, 0.3), ["otherwise (medians"]), ((1.0, 1.0, 1.0), [])])
 def test_each_advice_is_given_once(ratios: tuple[float, float, float], said: list[str]) -> None:
-    told = advice(judge_streams(numbers_of(*ratios)))
-    assert len(told) == len(said)
-    for words, expected in zip(told, said, strict=True):
+    found = advice(judge_streams(numbers_of(*ratios)))
+    assert len(found) == len(said)
+    for words, expected in zip(found, said, strict=True):
         assert expected in words
 
 
@@ -271,7 +271,7 @@ def test_names_that_are_not_utf8_are_written(tmp_path: Path) -> None:
     assert "fl\\udcff.h5" in (tmp_path / "page.html").read_text("utf-8")
 
 
-def test_swapped_polarity_is_told() -> None:
+def test_swapped_polarity_is_named() -> None:
     """Counts per pixel are the same, and so are all times."""
     events = edge()
     numbers = evflow.compare(events, dataclasses.replace(events, p=~events.p))

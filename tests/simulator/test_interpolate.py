@@ -108,16 +108,16 @@ def test_given_frames_come_out_unchanged_and_still_scenes_stay_short() -> None:
 
 
 def test_tells_at_the_end_where_motion_is_too_fast() -> None:
-    told: list[Note] = []
+    noted: list[Note] = []
     pairs = [(shifted(6.0 * i), 40_000 * i) for i in range(3)]
-    out = list(upsample(pairs, max_motion_px=0.04, warn=told.append))
+    out = list(upsample(pairs, max_motion_px=0.04, warn=noted.append))
     assert abs(len(out) - 2 * MAX_STEPS) <= 2
-    note, = told
+    note, = noted
     assert note.code == "frames.fast"
     assert str(MAX_STEPS) in note.text
     assert "in 2 of 2 intervals" in note.text
-    list(upsample(pairs, warn=told.append))
-    assert len(told) == 1
+    list(upsample(pairs, warn=noted.append))
+    assert len(noted) == 1
 
 
 def test_two_frames_ahead_are_enough_and_few_more_are_read() -> None:
@@ -333,21 +333,21 @@ FOLDED = np.where(np.arange(SIZE) < SIZE * 0.6, shifted(5.0), shifted(0)[::-1])
     (shifted(0)[::-1].copy(), "frames.cut"), (shifted(4).T.copy(), "frames.cut")])
 def test_flow_that_fails_is_told_with_its_share(second: np.ndarray, code: str) -> None:
     """Unrelated pictures, whole or in part; not what moves, gets darker or stays."""
-    told: list[Note] = []
-    list(upsample([(shifted(0), 0), (second, 40_000)], max_motion_px=9.0, warn=told.append))
-    assert [note.code for note in told] == [code] * bool(code)
+    noted: list[Note] = []
+    list(upsample([(shifted(0), 0), (second, 40_000)], max_motion_px=9.0, warn=noted.append))
+    assert [note.code for note in noted] == [code] * bool(code)
     assert all(re.search(r"0( us.*)? and 40000 us|at 0 us .* at 40000 us", note.text)
-               for note in told)
-    assert all(re.search(r"in \d\d% of the pixels", note.text) for note in told
+               for note in noted)
+    assert all(re.search(r"in \d\d% of the pixels", note.text) for note in noted
                if code == "frames.flow")
 
 
 def test_nothing_is_warped_across_a_cut() -> None:
     """A shot is filled up as it would be alone, and fades into the next."""
     shots = [[shifted(4.0 * i) for i in range(3)], [shifted(6.0 * i).T.copy() for i in range(3)]]
-    told: list[Note] = []
+    noted: list[Note] = []
     film = [(frame, 10_000 * i) for i, frame in enumerate(shots[0] + shots[1])]
-    made = list(upsample(film, warn=told.append))
+    made = list(upsample(film, warn=noted.append))
     assert [t for _, t in made if 20_000 < t < 30_000] == []
     before = [pair for pair in made if pair[1] <= 20_000]
     for (frame, t), (alone, t_alone) in zip(before, upsample(film[:3]), strict=True):
@@ -356,7 +356,7 @@ def test_nothing_is_warped_across_a_cut() -> None:
     for t, frame in ((t, frame) for frame, t in made if 30_000 < t < 50_000):
         truth = shifted(6.0 * (t - 30_000) / 10_000).T
         assert np.abs(frame - truth)[INNER].mean() < 2.0
-    note, = told
+    note, = noted
     assert note.code == "frames.cut"
     assert re.search("at 20000 us .* at 30000 us", note.text)
     cut = list(intervals(film))[2]

@@ -1,4 +1,4 @@
-"""Training data: what the network is told is what happened."""
+"""Training data: the true values given to the network are those that happened."""
 
 from __future__ import annotations
 

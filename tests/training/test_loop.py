@@ -62,12 +62,12 @@ def test_it_goes_on_where_it_stopped(tmp_path: Path) -> None:
     straight = train(lambda: (advance, start()), Plan(), given(tmp_path / "a"))
     assert int(straight.completed().step) == 7
 
-    def told_to_stop(state: Walk) -> Stepped:
+    def stopped_early(state: Walk) -> Stepped:
         if int(state.step) == 4:
             os.kill(os.getpid(), signal.SIGTERM)
         return advance(state)
 
-    ended = train(lambda: (told_to_stop, start()), Plan(), given(tmp_path / "b"))
+    ended = train(lambda: (stopped_early, start()), Plan(), given(tmp_path / "b"))
     with pytest.raises(KeyboardInterrupt, match=r"stopped after step 5 of 7.*goes on"):
         ended.completed()
     assert int(ended.state.step) == 5
@@ -138,12 +138,12 @@ def test_the_next_step_is_on_its_way_before_metrics_are_fetched(tmp_path: Path) 
             order.append(f"fetch {self.step}")
             return 0.0
 
-    def told(state: Walk) -> Stepped:
+    def step(state: Walk) -> Stepped:
         state, _ = advance(state)
         order.append(f"step {state.step}")
         return state, {"loss": Metric(int(state.step))}
 
-    train(lambda: (told, start()), Plan(steps=5), given(tmp_path))
+    train(lambda: (step, start()), Plan(steps=5), given(tmp_path))
     # A checkpoint waits for its metrics: what diverged is not saved.
     assert order == ["step 1", "step 2", "fetch 1", "step 3", "fetch 2", "fetch 3", "step 4",
                      "step 5", "fetch 4", "fetch 5"]
