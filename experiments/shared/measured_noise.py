@@ -48,12 +48,13 @@ def histograms(path: Path, params: Any, key: jax.Array) -> dict[str, Any]:
     shares["v2e"] = np.stack([v2e_noise(1.0, dn, nominal=1.0)] * 2, -1)
     shares["evolt"] = np.stack(voltmeter_noise(dn), -1)
     result: dict[str, Any] = {"notes": []}
+    grey = np.full((64, 64), 128.0, np.float32)  # the rates are those measured, whatever is shown
     for i, name in enumerate(HISTOGRAMS):
         pair = [read_noise_histogram(path, f"{side}_{name}") for side in ("pos", "neg")]
         camera = with_noise_histogram(
             jax.random.fold_in(key, i), Camera.constant((64, 64)), pair[0], pair[1])
         times = 250_000 * np.arange(4 * HISTOGRAM_S + 1)
-        events = simulate(key, np.full((len(times), 64, 64), dn[i], np.float32), times, camera)
+        events = simulate(key, np.stack([grey] * len(times)), times, camera)
         shares["measured"][i] = [h.rates().mean() for h in pair]
         try:
             found = estimate_camera(Recording.of_events(events), params)

@@ -33,6 +33,11 @@ CHANGES: dict[str, dict[str, Any]] = {
     "dark light 24 DN": {"dark_dn": 24.0},
     **{f"dead time {ms} ms": {"model": SensorModel(refractory_s=ms * 1e-3)} for ms in (1, 5)},
     "leak .3 Hz": {"model": SensorModel(leak_hz=0.3, leak_jitter=0.1, noise_resets_memory=True)},
+    "leak .3 Hz, 10 s, background at rest": {
+        "model": SensorModel(leak_hz=0.3, leak_jitter=0.1, noise_resets_memory=True),
+        "intervals": 250,
+        "scene": dataclasses.replace(BASE.scene, resting_fraction=1.0,
+                                     foreground_probability=1.0)},
     "shot noise 5 Hz": {"model": SensorModel(shot_hz=5.0, noise_resets_memory=True)},
     "shot noise 1 Hz, mismatch .15": {
         "model": SensorModel(shot_hz=1.0, noise_resets_memory=True),

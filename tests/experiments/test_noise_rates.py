@@ -92,6 +92,20 @@ def test_scores_leave_out_what_is_not_told() -> None:
     assert noise_systems.scored({"truth": truth, "b": truth * np.nan}, "b")["answered"] == 0.0
 
 
+def test_measured_histograms_are_shared_out(
+    data_file: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three lights, the darkest of them a hundredth of a DN."""
+    monkeypatch.setattr(measured_noise, "HISTOGRAM_S", 2)
+    found = measured_noise.histograms(
+        data_file("data/recordings/iebcs_noise_hist/noise_cumhist.npz"), None, KEY)
+    assert found["lux"] == [0.1, 161.0, 3000.0]
+    for shares in found["shares"].values():
+        assert np.shape(shares) == (3, 2)
+        assert np.nansum(shares) == pytest.approx(1.0, abs=0.3)
+    assert found["distance"]["measured"] == 0.0
+
+
 def small(monkeypatch: pytest.MonkeyPatch, scenes: tuple[str, ...]) -> None:
     monkeypatch.setattr(noise_rates, "SCENES", scenes)
     monkeypatch.setattr(Options, "grid", lambda *_: ([0, 5], [0, 3, 7]))
