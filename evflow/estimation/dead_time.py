@@ -16,6 +16,7 @@ from evflow.types import Events
 
 MOST_EVENTS = 2_000_000  # examined; of a longer recording, those of a subset of the pixels
 BLOCK = 1 << 20  # events at a time: they may be memory-mapped
+BEGINNING = 16_000_000  # events of a long recording from which it is measured
 SHORTEST_US, LONGEST_US = 20.0, 50_000.0
 STEP = 1.03  # ratio of successive candidates
 ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # relative ranges with many, few intervals
@@ -79,3 +80,10 @@ def own_intervals(events: Events) -> np.ndarray:
     order = np.argsort(pixel, kind="stable")
     pixel, t = pixel[order], t[order]
     return np.diff(t)[np.diff(pixel) == 0]
+
+
+def first_events(events: Events) -> Events:
+    """The first BEGINNING events."""
+    if len(events) <= BEGINNING:
+        return events
+    return events.slice(int(events.t[0]), int(events.t[BEGINNING]))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from evflow.estimation.refine import PixelEvidence
-from evflow.estimation.refine.receptor_search import LACKING, LEAST_KEPT
+from evflow.estimation.refine.receptor_result import LACKING, LEAST_KEPT
 from evflow.notes import Note
 
 Array = np.ndarray

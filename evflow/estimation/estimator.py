@@ -6,11 +6,13 @@ from typing import Literal
 
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent
+from evflow.estimation.finish import estimate
+from evflow.estimation.front_end import find_front_end
 from evflow.estimation.pipeline import check_options
 from evflow.estimation.refine import Stretch, cut
 from evflow.estimation.refine.stretches import most_simulated, spread
 from evflow.estimation.result import CameraEstimate
-from evflow.estimation.state import State, add, estimate, looked_through, thinned
+from evflow.estimation.state import State, add, thinned
 from evflow.network import api
 from evflow.network.weights import load_weights
 from evflow.notes import Note
@@ -115,7 +117,7 @@ class CameraEstimator:
     def _begin(self) -> None:
         """Measure the stretches collected so far."""
         waited, self._waiting = self._waiting, ()
-        state = State(self._params, looked_through(waited, measured=self._pixel == "measured"))
+        state = State(self._params, find_front_end(waited, measured=self._pixel == "measured"))
         most = most_simulated(waited[0].recording.events.size)
         simulated = spread([len(s.run) for s in waited], most)
         for i, stretch in enumerate(waited):

@@ -10,12 +10,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from evflow.estimation.dead_time import dead_time
+from evflow.estimation.dead_time import dead_time, first_events
+from evflow.estimation.finish import estimate
+from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
-from evflow.estimation.refine.path import STEPS, receptor_places
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.photoreceptor import receptor_places
 from evflow.estimation.refine.stretches import spread
 from evflow.estimation.result import CameraEstimate
-from evflow.estimation.state import Eyes, State, add, estimate, first_events
+from evflow.estimation.state import State, add
 from evflow.simulator.photoreceptor import IDEAL
 
 
@@ -65,24 +68,24 @@ def divided(stretches: Sequence[Stretch]) -> Division | None:
 
 def _on_its_own(first: First) -> State:
     """The state with photoreceptor and dead time as measured on the first part itself."""
-    state, eyes = first.state, first.state.eyes
+    state, front_end = first.state, first.state.front_end
     runs, searched = ([(s.recording, s.run) for s in part] for part in (state.read, first.searched))
-    found = eyes.found
+    found = front_end.found
     if found is not None and receptor_places(runs) != receptor_places(searched):
-        found = find_photoreceptor(runs, eyes.noise_dn)
+        found = find_photoreceptor(runs, front_end.noise_dn)
     seen_by = found.seen if found is not None and found.needed else IDEAL
     events = state.read[0].recording.events
     end = int(state.read[0].recording.frame_times[first.rest[0]])
-    own = Eyes(seen_by, eyes.noise_dn, found,
-               dead_time(first_events(events.slice(int(events.t[0]), end))))
+    own = FrontEnd(seen_by, front_end.noise_dn, found,
+                   dead_time(first_events(events.slice(int(events.t[0]), end))))
     simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
-    if seen_by != eyes.seen_by:
+    if seen_by != front_end.seen_by:
         state = State(state.params, own)
         for i, stretch in enumerate(first.state.read):
             state = add(state, stretch, simulate=i in simulated)
     elif not state.chunks:
         stretch = state.read[simulated[0]]
         place = stretch.recording, stretch.run
-        chunk = make_chunk(*place, STEPS, seen_by, eyes.noise_dn, first=stretch.first)
+        chunk = make_chunk(*place, STEPS, seen_by, front_end.noise_dn, first=stretch.first)
         state = dataclasses.replace(state, chunks=(simulated_part(chunk, place, seen_by),))
-    return dataclasses.replace(state, eyes=own)
+    return dataclasses.replace(state, front_end=own)

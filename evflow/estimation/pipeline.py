@@ -23,11 +23,13 @@ from evflow import io
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent
+from evflow.estimation.finish import Stage, estimate
+from evflow.estimation.front_end import find_front_end
 from evflow.estimation.halves import First, divided
 from evflow.estimation.reading import BATCH, BUDGETS, EFFORTS, Effort, Order, gain, ordered
 from evflow.estimation.refine import Stretch, cut, pixel_posterior
 from evflow.estimation.result import CameraEstimate
-from evflow.estimation.state import Stage, State, add, estimate, glance, look, looked_through
+from evflow.estimation.state import State, add, read_stretch, summary_so_far
 from evflow.estimation.static import estimate_noise
 from evflow.estimation.unpooled import WINDOW_US, estimate_unpooled
 from evflow.files.spool import SOME, on_disk
@@ -127,16 +129,16 @@ def measure(
     used = [stretches[i] for i in sorted(order.numbers)]
     release(recording)
     stage("looking for the photoreceptor")
-    state = State(params, looked_through(used, measured=pixel == "measured"))
-    steps = Steps(used, progress)
+    state = State(params, find_front_end(used, measured=pixel == "measured"))
+    counter = ProgressCounter(used, progress)
     stage("reading stretches")
     division = divided(stretches)
-    state, early, extent = _read(state, stretches, order, effort, until, steps,
+    state, early, extent = _read(state, stretches, order, effort, until, counter,
                                  division.first if division else range(0))
     repeated = [note for note in recording.notes if note.code == "frames.repeated"]
     found = estimate(state, extent=extent, before=left_out(recording, plan), after=repeated,
-                     advance=steps.advance, stage=stage)
-    steps.finish()
+                     advance=counter.advance, stage=stage)
+    counter.finish()
     first = First(early, tuple(used), division.rest) if division and early.read else None
     return Measured(found, first)
 
@@ -162,7 +164,7 @@ def read_whole(recording: Recording, params: api.Params) -> State:
     plan = plan_windows(recording)
     iter_windows(recording, plan=plan)
     stretches = cut(recording, plan)
-    state = State(params, looked_through(stretches, measured=True))
+    state = State(params, find_front_end(stretches, measured=True))
     simulated = ordered(stretches, "full").simulated
     for i, stretch in enumerate(stretches):
         state = add(state, stretch, simulate=i in simulated)
@@ -176,7 +178,7 @@ def check_options(**options: tuple[str, Sequence[str]]) -> None:
             raise EvflowDataError("EV020", f"{name}={value!r}.", f"Choose from {tuple(known)}.")
 
 
-class Steps:
+class ProgressCounter:
     """Counts finished work for `progress`: windows and stretches that are read, and windows that
     are read again; if reading stops early, the rest is counted at once."""
 
@@ -198,7 +200,7 @@ class Steps:
 
 def _read(
     state: State, stretches: Sequence[Stretch], order: Order, effort: Effort,
-    until: Until | None, steps: Steps, first: range,
+    until: Until | None, counter: ProgressCounter, first: range,
 ) -> tuple[State, State, Extent]:
     """The state after the ordered stretches, the state after those of the first part, and how much
     was read."""
@@ -207,12 +209,12 @@ def _read(
     read: list[int] = []
     ended = False
     for i in order.numbers:
-        seen = look(state, stretches[i], simulate=i in order.simulated, every=order.every,
-                    advance=steps.advance)
-        state, early = state + seen, early + seen if i in first else early
-        del seen  # maps of the whole sensor
+        one = read_stretch(state, stretches[i], simulate=i in order.simulated,
+                           every=order.every, advance=counter.advance)
+        state, early = state + one, early + one if i in first else early
+        del one  # maps of the whole sensor
         read.append(i)
-        ended = until is not None and until(*glance(state))
+        ended = until is not None and until(*summary_so_far(state))
         if ended:
             break
         if partial and state.evidence is not None and len(read) % BATCH == 0:
@@ -231,4 +233,4 @@ def _read(
 def _variance(state: State) -> float:
     """Median variance of the pixels' thresholds so far."""
     assert state.evidence is not None
-    return float(np.median(pixel_posterior(state.evidence, glance(state)[0])[1] ** 2))
+    return float(np.median(pixel_posterior(state.evidence, summary_so_far(state)[0])[1] ** 2))

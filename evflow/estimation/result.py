@@ -16,7 +16,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.estimation.bench.levels import Bench
 from evflow.estimation.drift import Third
 from evflow.estimation.extent import EVERYTHING, Extent
-from evflow.estimation.refine.receptor_search import Found
+from evflow.estimation.refine.receptor_result import Found
 from evflow.notes import Note, as_dicts
 
 THRESHOLDS = ("theta_on", "theta_off")  # possible entries of `undetermined`

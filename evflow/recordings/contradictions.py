@@ -27,32 +27,32 @@ STEP, STEP_SPREAD = 0.08, 9.0  # log units; median deviations of an interval's m
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rests:
+class Residuals:
     """For each interval that the events cover, arrays (K,): its number, the correlation of change
     and net events, and the rms and mean of the residual in log units."""
 
     interval: Array
     correlation: Array
-    rest: Array
-    shift: Array
+    rms: Array
+    mean: Array
 
 
 def contradicted(recording: Recording, start_us: int, stop_us: int) -> tuple[list[int], list[int]]:
     """Frames that the events contradict, and intervals i (frame i to i + 1) in which the whole
     frame changes without events; start_us, stop_us: the time that the events cover."""
-    found = _rests(recording, start_us, stop_us)
+    found = _residuals(recording, start_us, stop_us)
     if found is None or np.median(found.correlation) < FOLLOWS:
         return [], []
     strange = ((found.correlation < LITTLE * np.median(found.correlation))
-               & (found.rest > MUCH * np.median(found.rest)))
+               & (found.rms > MUCH * np.median(found.rms)))
     at = found.interval
     frames = [int(i) for i in at[1:][strange[1:] & strange[:-1] & (np.diff(at) == 1)]]
-    away = np.abs(found.shift - np.median(found.shift))
+    away = np.abs(found.mean - np.median(found.mean))
     steps = at[(away > max(STEP, STEP_SPREAD * float(np.median(away)))) & ~strange]
     return frames, [int(i) for i in steps]
 
 
-def _rests(recording: Recording, start_us: int, stop_us: int) -> Rests | None:
+def _residuals(recording: Recording, start_us: int, stop_us: int) -> Residuals | None:
     times = recording.frame_times
     covered = np.flatnonzero((times[:-1] >= start_us) & (times[1:] <= stop_us))
     if len(covered) < LEAST_INTERVALS:
@@ -71,9 +71,9 @@ def _rests(recording: Recording, start_us: int, stop_us: int) -> Rests | None:
     if np.linalg.matrix_rank(usual[1:, 1:]) < 2:
         return None
     away = np.array([1.0, *-np.linalg.solve(usual[1:, 1:], usual[1:, 0])])
-    rest = np.sqrt(np.maximum(np.einsum("i,kij,j->k", away, covariance, away), 0.0))
+    rms = np.sqrt(np.maximum(np.einsum("i,kij,j->k", away, covariance, away), 0.0))
     # A frame that hides what the others show is as suspect as one that shows something else.
-    return Rests(covered, correlation, np.where(shown, rest, np.inf),
+    return Residuals(covered, correlation, np.where(shown, rms, np.inf),
                  np.where(shown, mean @ away, np.median(mean @ away)))
 
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.estimation.finish import Stage
 from evflow.estimation.halves import First
 from evflow.estimation.pipeline import Progress
 from evflow.estimation.result import CameraEstimate
-from evflow.estimation.state import Stage
 from evflow.network.weights import load_weights, weights_hash
 from evflow.notes import texts
 from evflow.process.provenance import one_line, sha256

@@ -6,10 +6,10 @@ from typing import Any
 
 from evflow import Recording, finish
 from evflow.camera import Summary
+from evflow.estimation.finish import refine
 from evflow.estimation.pipeline import read_whole
 from evflow.estimation.pooled import pool_recording
 from evflow.estimation.refine import Chunk, refinement_chunks
-from evflow.estimation.state import refine
 from evflow.recordings.windows import plan_windows
 
 COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier than a Gaussian's

@@ -13,10 +13,11 @@ from helpers.networks import hidden
 from evflow import CameraEstimator, Recording, estimate_camera
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
+from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.halves import divided
-from evflow.estimation.refine import cut, make_chunk, path
+from evflow.estimation.refine import chunk, cut, make_chunk, path
 from evflow.estimation.refine import stretches as cutting
-from evflow.estimation.state import Eyes, State, thinned
+from evflow.estimation.state import State, thinned
 from evflow.recordings.windows import plan_windows
 from evflow.types import Events
 
@@ -67,7 +68,7 @@ def test_what_cannot_be_added_leaves_what_was() -> None:
 
 
 def test_what_is_kept_does_not_grow() -> None:
-    state = State({}, Eyes(), chunks=tuple(range(8)), read=tuple(range(32)))
+    state = State({}, FrontEnd(), chunks=tuple(range(8)), read=tuple(range(32)))
     less = thinned(state, 8, 32)
     assert less.chunks == (0, 2, 4, 6)
     assert less.read == tuple(range(0, 32, 2))
@@ -122,8 +123,9 @@ def test_a_large_sensor_goes_band_by_band_as_a_small_one_at_once(
 ) -> None:
     recording = film(0.2)
     whole = make_chunk(recording, range(2), steps=4)
-    monkeypatch.setattr(path, "LARGE", 100)
-    monkeypatch.setattr(path, "BAND", 200)
+    for module in (chunk, path):
+        monkeypatch.setattr(module, "LARGE", 100)
+        monkeypatch.setattr(module, "BAND", 200)
     parts = make_chunk(recording, range(2), steps=4)
     np.testing.assert_allclose(parts.path, whole.path, rtol=1e-6)
     for name in ("equations", "bounds", "start"):

@@ -2,12 +2,13 @@
 
     recording --> stretches, read one after the other    stretches.py
     frames --optical flow--> path (fine log frames)      path.py
+    path + recorded events --> Chunk                     chunk.py
     recorded events, simulated events --> Trace          trace.py
     Trace + path --> Moments, additive                   moments.py
     recorded against simulated Moments --> the summary   fit.py
     the same of one polarity alone --> its threshold     alone.py
     recorded events on the path --> each pixel's theta   pixels.py
-    recorded events on the path --> photoreceptor, offset of the frames   receptor_search.py
+    recorded events on the path --> photoreceptor, offset of the frames   photoreceptor.py
     recorded events of quiet pixels --> noise rates      noise.py
     events, random points --> rates of noise beside signal   points.py, signal.py
 
@@ -17,18 +18,17 @@ after its first event, when its memory is known: nothing depends on what precede
 """
 
 from evflow.estimation.refine.alone import high_threshold_explains, refine_alone
-from evflow.estimation.refine.denoise import frame_noise
-from evflow.estimation.refine.fit import Refined, fused, refine_summary
-from evflow.estimation.refine.path import (
+from evflow.estimation.refine.chunk import (
     Chunk,
-    find_photoreceptor,
     make_chunk,
-    receptor_sample,
     refinement_chunks,
     simulated_part,
 )
+from evflow.estimation.refine.denoise import frame_noise
+from evflow.estimation.refine.fit import Refined, fused, refine_summary
+from evflow.estimation.refine.photoreceptor import find_photoreceptor, receptor_sample
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
-from evflow.estimation.refine.receptor_search import Found
+from evflow.estimation.refine.receptor_result import Found
 from evflow.estimation.refine.stretches import Stretch, cut, plan_runs
 
 __all__ = [

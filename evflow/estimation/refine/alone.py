@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import Summary
+from evflow.estimation.refine.chunk import Chunk
 from evflow.estimation.refine.fit import EMPTY, MODEL_ERROR, Fit, balance_residual, square_residual
 from evflow.estimation.refine.moments import DEAD, Moments
 from evflow.estimation.refine.noise import STRATA
-from evflow.estimation.refine.path import Chunk
 from evflow.estimation.refine.trace import FRESH
 
 Array = np.ndarray

@@ -17,7 +17,7 @@ import numpy as np
 
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
-from evflow.estimation.refine.receptor_search import Found
+from evflow.estimation.refine.receptor_result import Found
 
 Array = np.ndarray
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
+from evflow.estimation.refine.chunk import Chunk
 from evflow.estimation.refine.moments import Moments, measure
 from evflow.estimation.refine.noise import (
     combined_rate,
@@ -29,7 +30,7 @@ from evflow.estimation.refine.noise import (
     tied_rates,
     with_tie,
 )
-from evflow.estimation.refine.path import STEPS, Chunk
+from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.signal import separated_noise_rates
 from evflow.estimation.refine.trace import FRESH, RUNNING, Draws, draw, trace_of_camera
 from evflow.light.log_maps import lin_log_inverse, noise_factor, normalised_intensity

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from evflow.camera import noise_of_threshold
-from evflow.estimation.refine.path import Chunk
+from evflow.estimation.refine.chunk import Chunk
 
 ANY = 1e9  # log units: no limit
 

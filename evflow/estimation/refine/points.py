@@ -15,7 +15,7 @@ import itertools
 import cv2
 import numpy as np
 
-from evflow.estimation.refine.path import Chunk
+from evflow.estimation.refine.chunk import Chunk
 from evflow.estimation.refine.sightings import Sightings
 
 Array = np.ndarray

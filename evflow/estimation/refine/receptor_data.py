@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from evflow.estimation.refine.net_changes import Changes, changes, joined, offset_by_changes
-from evflow.estimation.refine.receptor_noise import noise_rates
 from evflow.estimation.refine.sightings import Sightings, counts_so_far, path_weights
 from evflow.estimation.refine.smear import smeared
+from evflow.estimation.refine.still_noise import noise_rates
 
 Array = jax.Array
 

@@ -15,7 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from evflow.estimation.refine.path import STEPS, Chunk
+from evflow.estimation.refine.chunk import Chunk
+from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.points import Points, chunk_points
 
 Array = np.ndarray

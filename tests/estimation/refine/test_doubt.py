@@ -11,7 +11,7 @@ import pytest
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine.doubt import LENIENT, NAMES, doubted, relative_error, signs
-from evflow.estimation.refine.receptor_search import Found
+from evflow.estimation.refine.receptor_result import Found
 from evflow.simulator.photoreceptor import Photoreceptor
 from experiments.shared import doubt_fit
 

@@ -7,9 +7,10 @@ import pytest
 
 from evflow.estimation.refine import receptor_noise
 from evflow.estimation.refine.receptor_data import Sample
-from evflow.estimation.refine.receptor_noise import noise_rates, split_at_noise
+from evflow.estimation.refine.receptor_noise import split_at_noise
 from evflow.estimation.refine.receptor_profile import along_offset
 from evflow.estimation.refine.sightings import sight
+from evflow.estimation.refine.still_noise import noise_rates
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 from evflow.types import Events
 

@@ -15,6 +15,7 @@ from jax.scipy.stats import norm
 
 from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior, Summary
+from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.reading import ordered
 from evflow.estimation.refine import (
     cut,
@@ -37,7 +38,7 @@ from evflow.estimation.refine.trace import (
     trace_of_camera,
     trace_of_events,
 )
-from evflow.estimation.state import Eyes, State, add_path
+from evflow.estimation.state import State, add_path
 from evflow.light.log_maps import lin_log
 from evflow.recordings import plan_windows
 from evflow.recordings.faulty_pixels import hot_pixels
@@ -243,7 +244,7 @@ def surveyed(recording: Recording, pairs: Sequence[tuple[int, int]]) -> State:
     """All stretches of a recording, read in order."""
     parts = cut(recording, WindowPlan(tuple(pairs), ()))
     simulated = ordered(parts, "full").simulated
-    state = State({}, Eyes())
+    state = State({}, FrontEnd())
     for i, stretch in enumerate(parts):
         state = add_path(state, stretch, simulate=i in simulated)
     return state

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from evflow.camera import noise_of_threshold
+from evflow.estimation.refine.chunk import Chunk
 from evflow.estimation.refine.noise import (
     STRATA,
     combined_rate,
@@ -18,7 +19,6 @@ from evflow.estimation.refine.noise import (
     tied_rates,
     with_tie,
 )
-from evflow.estimation.refine.path import Chunk
 from evflow.estimation.refine.pixels import PixelEvidence
 from evflow.estimation.refine.sightings import sight
 from evflow.estimation.refine.trace import Trace

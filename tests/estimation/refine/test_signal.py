@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine import points as points_module
-from evflow.estimation.refine.path import Chunk
+from evflow.estimation.refine.chunk import Chunk
 from evflow.estimation.refine.pixels import PixelEvidence
 from evflow.estimation.refine.points import (
     BOXES,

@@ -1,0 +1,144 @@
+"""From everything that was read (`State`) to the camera: refinement, noise rates, maps, notes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.camera import Summary
+from evflow.camera.sensors import SensorModel
+from evflow.estimation import drift, maps
+from evflow.estimation.extent import EVERYTHING, Extent
+from evflow.estimation.front_end import FrontEnd
+from evflow.estimation.leak import Leak, measured_leak
+from evflow.estimation.one_polarity import undetermined, without
+from evflow.estimation.pooled import Quiet, need_shown, quiet_times
+from evflow.estimation.refine import Chunk
+from evflow.estimation.refine.doubt import doubted, signs
+from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
+from evflow.estimation.result import CameraEstimate
+from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
+from evflow.estimation.state import Advance, State, summary_so_far, windows_of
+from evflow.files.spool import forget
+from evflow.notes import Note
+from evflow.recordings.check.contents import VALID_EVENTS
+from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels
+from evflow.types import Window
+
+Array = np.ndarray
+Stage = Callable[[str], None]
+SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual signal
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refined:
+    """hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera, before
+    refine/doubt.py; signs: the input of that, None if nothing was searched for on the path."""
+
+    hot: Array
+    chunks: tuple[Chunk, ...]
+    summary: Summary
+    std: Summary
+    signs: Array | None = None
+
+
+def refine(state: State) -> Refined:
+    """The camera's summary by simulation and regression, if there is a path between frames."""
+    summary, std = summary_so_far(state)
+    hot = np.zeros(np.shape(state.n_events), bool)
+    if state.evidence is None or state.quiet is None:
+        return Refined(hot, state.chunks, summary, std)
+    found = state.front_end.found
+    hot = hot_pixels(
+        state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
+        state.n_events, state.seconds)
+    chunks = tuple(_without_hot(c, hot) for c in state.chunks)
+    summary, std = maps.refined(state.params, list(chunks), summary, std)
+    forget(*(c.path for c in chunks))
+    if found is None:
+        return Refined(hot, chunks, summary, std)
+    if not state.front_end.seen_by.ideal:
+        std = maps.widened(summary, std, found)
+    return Refined(hot, chunks, summary, std, signs(found, state.front_end.noise_dn, summary, std))
+
+
+def estimate(
+    state: State, *, extent: Extent | None = None, before: Sequence[Note] = (),
+    after: Sequence[Note] = (), advance: Advance = lambda: None, stage: Stage = lambda _: None,
+) -> CameraEstimate:
+    """The camera, from all that was read. extent: how much was read; before, after: notes on
+    reading, placed around its own; advance() is called after every window that is read again,
+    stage() with the name of each stage."""
+    assert state.stats is not None
+    need_shown(state.n_events, state.n_shown)
+    stage("refining")
+    front_end, stats = state.front_end, state.stats
+    n_events = state.n_events.astype(np.uint32)
+    refined = refine(state)
+    hot, summary, std = refined.hot, refined.summary, refined.std
+    dead = dead_pixels(n_events)
+    doubt = next(iter(state.params.values())).get("doubt")
+    if lacking := undetermined(stats, summary):
+        summary, std = without(lacking, list(refined.chunks), summary, std)
+    elif doubt is not None and refined.signs is not None:
+        std = doubted(doubt, refined.signs, summary, std)
+    stage("noise rates and maps")
+    quiet = quiet_times(_counted(windows_of(state.read), advance), summary, hot, front_end.seen_by)
+    std = maps.with_unquiet_error(summary, std, quiet.share, quiet.pixel_s)
+    leak = measured_leak(quiet.waits)
+    shot = measured_shot(quiet.light, leak.rate_hz, scatter(quiet.maps, hot), SIGNAL_ERROR)
+    sent = quiet.maps
+    if shot.falls:
+        sent = quiet.at_mean_light()
+        summary, std = _at_mean_light(summary, std, quiet, leak)
+    if state.evidence is not None:
+        camera, error = maps.by_regression(state.evidence, summary, std)
+    else:
+        again = _counted(windows_of(state.read), advance)
+        camera, error = maps.by_flow(state.params, again, summary, std)
+    camera, error = maps.with_rates(camera, error, sent, hot, summary, std)
+    extent, thirds = extent or EVERYTHING, drift.thirds(state.parts)
+    return CameraEstimate(
+        camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
+        state.windows,
+        (*before, *camera_notes(stats, lacking, n_events, summary, hot, dead),
+         *receptor_notes(front_end.found), *noise_notes(shot), *after, *extent.notes(),
+         *drift.notes(thirds)),
+        tuple(f"theta_{name}" for name in lacking), **_measured(front_end, leak, shot),
+        extent=extent, thirds=thirds)
+
+
+def _at_mean_light(
+    summary: Summary, std: Summary, quiet: Quiet, leak: Leak
+) -> tuple[Summary, Summary]:
+    """The summary with noise rates at the recording's mean light."""
+    eta, error = (np.array([float(s.eta_on), float(s.eta_off)]) for s in (summary, std))
+    eta, error = at_mean_light(eta, error, quiet.light, leak.rate_hz, quiet.factor, SIGNAL_ERROR)
+    names = ("eta_on", "eta_off")
+    return (dataclasses.replace(summary, **dict(zip(names, map(jnp.float32, eta), strict=True))),
+            dataclasses.replace(std, **dict(zip(names, map(jnp.float32, error), strict=True))))
+
+
+def _measured(front_end: FrontEnd, leak: Leak, shot: Shot) -> dict[str, Any]:
+    """The fields of a CameraEstimate that are not per pixel."""
+    found, dead = front_end.found, front_end.dead
+    sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
+    sensor, std = measured_noise(sensor, std, leak, shot)
+    fields = {"sensor": dataclasses.replace(sensor, refractory_s=dead.seconds),
+              "sensor_std": {**std, "refractory_s": dead.std_s}}
+    return {**fields, "optics": found.optics, "receptor": found} if found else fields
+
+
+def _without_hot(chunk: Chunk, hot: Array) -> Chunk:
+    return dataclasses.replace(chunk, bright=chunk.bright & ~hot[chunk.box])
+
+
+def _counted(windows: Iterator[Window], advance: Advance) -> Iterator[Window]:
+    """The windows; advance() is called after each."""
+    for window in windows:
+        yield window
+        advance()

@@ -1,0 +1,41 @@
+"""The front end of a camera's pixels: how they see what the frames show, and their dead time.
+
+It is measured before anything else is read, on a few stretches, as all evidence depends on it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from evflow.estimation.dead_time import DeadTime, dead_time, first_events
+from evflow.estimation.refine import Found, Stretch, find_photoreceptor, frame_noise
+from evflow.estimation.refine.path import Films
+from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FrontEnd:
+    """seen_by: how the pixels see what the frames show; noise_dn: the frames' noise in DN; found:
+    the search for the photoreceptor, None if there was none; dead: the dead time; films: of
+    stretches that are still to be read."""
+
+    seen_by: Photoreceptor = IDEAL
+    noise_dn: float = 0.0
+    found: Found | None = None
+    dead: DeadTime = dataclasses.field(default_factory=DeadTime)
+    films: Films = dataclasses.field(default_factory=dict)
+
+
+def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
+    """Measure the front end on some stretches of a recording. measured: False assumes ideal
+    pixels."""
+    dead = dead_time(first_events(max((s.recording.events for s in stretches), key=len)))
+    runs = [(s.recording, s.run) for s in stretches if s.run]
+    if not runs:
+        return FrontEnd(dead=dead)
+    noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
+    films: Films = {}
+    found = find_photoreceptor(runs, noise_dn, films) if measured else None
+    return FrontEnd(found.seen if found is not None and found.needed else IDEAL, noise_dn, found,
+                dead, films)

@@ -1,0 +1,67 @@
+"""The photoreceptor of a camera and the offset and delay of its frames, from a few stretches of its
+recording: their paths, their events, and the search (receptor_search.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from evflow.estimation.refine.path import STEPS, Films, Place, as_seen, interpolated, of_place
+from evflow.estimation.refine.readouts import without_readouts
+from evflow.estimation.refine.receptor_data import Sample, sample
+from evflow.estimation.refine.receptor_result import Found
+from evflow.estimation.refine.receptor_search import find
+from evflow.estimation.refine.sightings import Sightings, sight
+from evflow.estimation.refine.stretches import LARGE, most_simulated, spread
+from evflow.process.memory import give_back
+from evflow.recordings.bunches import bunch
+from evflow.simulator.photoreceptor import IDEAL
+
+STRETCHES = 3  # used in the search
+
+
+def receptor_places(places: Sequence[Place]) -> list[Place]:
+    """At most STRETCHES of the places, evenly spread, for the search for the photoreceptor."""
+    if not places:
+        return []
+    longest = spread([len(run) for _, run in places], most_simulated(places[0][0].events.size))
+    chosen = np.unique(np.linspace(0, len(longest) - 1, min(STRETCHES, len(longest))).round())
+    return [places[longest[k]] for k in chosen.astype(int)]
+
+
+def receptor_sample(
+    places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None
+) -> Sample | None:
+    """Pixels and events for the search for the photoreceptor.
+
+    Args:
+        places: runs of frame intervals, of which `receptor_places` are used.
+        noise_dn: std of the frames' noise.
+        films: cache that receives the interpolated runs, if these are few and small.
+
+    Returns:
+        The sample; None with too few events.
+    """
+    def parts() -> Iterator[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]]:
+        for recording, run in receptor_places(places):
+            film = interpolated(recording, run, STEPS, noise_dn)
+            s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
+            s, disturbed = without_readouts(s, film.times_us, bunch(recording))
+            if films is not None and len(places) <= STRETCHES and film.dn[0].size <= LARGE:
+                films[of_place(recording, run)] = film
+            yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s, disturbed
+            del film, s, disturbed
+            give_back()
+
+    return sample(parts())
+
+
+def find_photoreceptor(
+    places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None
+) -> Found | None:
+    """The photoreceptor of a camera and the offset and delay of its frames; None with too few
+    events. Arguments as of `receptor_sample`."""
+    data = receptor_sample(places, noise_dn, films)
+    return find(data) if data is not None else None
