@@ -5,7 +5,7 @@
     python -m experiments.ablate networks --preset full --rows networks.json
 
 Nothing of the camera is handed over: the paper's network sees one pixel's window, ours (in
-`networks`) what it makes of the window itself. Cameras, scenes and noise are the paper's (Eq. 12).
+`networks`) its own estimate from the window. Cameras, scenes and noise are the paper's (Eq. 12).
 Each variant has the learning rate, of `variants.RATES`, at which it is best with a seed and
 held-out cameras of their own: the middle three are tried, then the next one as long as it is
 better. Then all are trained with the same seeds on the same scenes, and scored on cameras that

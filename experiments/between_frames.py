@@ -9,7 +9,7 @@ simulated by the camera that sees the dense video. Columns: share of the dense e
 range over pictures, and where an object's edge goes; rate by the phase of a frame over the dense
 one, least and most of 16 (1 is no comb); amplitude at the frame rate and its double, in per cent of
 the mean rate, that the dense events lack; correlation of counts per pixel; share of the intervals
-whose flow a note tells of. Writes between_frames.json, .md and .png.
+whose flow a note reports as lost or wrong. Writes between_frames.json, .md and .png.
 """
 
 from __future__ import annotations

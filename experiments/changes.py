@@ -4,7 +4,7 @@
     python -m experiments.changes --recording ijrr/boxes_6dof --span-s 5 20   # IJRR, whole
 
 First, on windows of simulated scenes as in training, the mean absolute error of the change up to
-each of a window's 16 parts, by the encoder, by what the frames alone say (a straight line) and by
+each of a window's 16 parts, by the encoder, by the frames alone (a straight line) and by
 the events alone at the camera's thresholds. Then whole recordings, real and simulated, where the
 asynchronous Kalman filter, the complementary filter and plain integration join in; what each
 protocol gives away is in change_systems.py. Errors are in natural-log units and in the paper's

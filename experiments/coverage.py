@@ -5,7 +5,7 @@
 
 Cameras, scenes and sensors of the whole training distribution, none of them seen in training; with
 --photos also scenes of the photographs that training shows. Longer recordings than in training,
-and pixels whose noise differs more, have to be asked for.
+and pixels whose noise differs more, are options.
 An interval of probability p should hold the truth in a share p of the cases: for the camera's
 summary over recordings, and for the maps over pixels. Draws the calibration curve.
 """
@@ -45,7 +45,7 @@ class Options(StudyOptions):
 
 
 def drawn(rng: np.random.Generator, options: Options) -> Protocol:
-    """A protocol of the training distribution, but for what the options say."""
+    """A protocol of the training distribution, except where the options differ."""
     protocol = draw_protocol(rng)
     if options.intervals is not None:
         protocol = dataclasses.replace(protocol, intervals=options.intervals)

@@ -56,7 +56,7 @@ def by_whom(params: Any, hidden: Hidden, found: CameraEstimate) -> dict[str, flo
     nominal = np.array([float(getattr(hidden.nominal, name)) for name in names])
     fired = np.tile(hidden.recording.events.count_map() > 0, (2, 1, 1))
     return {f"{who}: {metric}/{name}": float(value)
-            for who, maps in alone.said(params, hidden.recording, found).items()
+            for who, maps in alone.estimated_maps(params, hidden.recording, found).items()
             for metric, values in alone.errors(maps, truth, nominal, fired).items()
             for name, value in zip(names, values, strict=True)}
 

@@ -10,7 +10,7 @@ format: IJRR, MVSEC, HQF, EVIMO2v2 (flow alone: its event cameras have no frames
 are those of `CUTS` (shared/recorded.py), by the sequence's name; files called NAME_cut have
 theirs already. Without --data: synthetic cameras behind three circuits that no training simulates
 (shared/targets.py), and, where the environment variable EVFLOW_DATA names a folder with them,
-two real recordings and two slices of rotations, whose flow the gyroscope tells.
+two real recordings and two slices of rotations, whose flow follows from the gyroscope.
 
 Images are scored linear and in the log domain, log(1 + 255 I) / log 256; flow of real recordings by
 FWL. Writes evaluate_network.json, .md and .png.

@@ -102,8 +102,8 @@ def table(result: dict[str, Any]) -> str:
         cells = (" / ".join(f"{row[kind][n]:.3f}" for n in THETAS)
                  for kind in ("truth", "seen", "made"))
         lines.append(f"| {row['camera']} | {' | '.join(cells)} |")
-    said = ", ".join(f"{k} {v:.3f}" for k, v in result.items() if k != "cameras")
-    return "\n".join((*lines, "", said))
+    figures = ", ".join(f"{k} {v:.3f}" for k, v in result.items() if k != "cameras")
+    return "\n".join((*lines, "", figures))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Recordings of which one polarity tells nothing: is the other's threshold, with its interval?
+"""Thresholds and their intervals where one polarity has no signal, for the other polarity.
 
     python -m experiments.one_polarity --preset debug
     python -m experiments.one_polarity --preset full --workers 2
 
 Still scenes whose brightness only rises or only falls, by a factor of 1.5 to 5; moving scenes with
-OFF switched off by its threshold, or left out of the recording. Scored is the polarity that tells
-something: the error of its threshold and how often the intervals hold the truth, of threshold and
-noise rate. Not in the paper, whose recordings tell both.
+OFF switched off by its threshold, or left out of the recording. Scored is the polarity with
+signal: the error of its threshold and how often the intervals hold the truth, of threshold and
+noise rate. Not in the paper, whose recordings have signal of both.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HEADS = ("case", "recordings", "said to be undetermined", "θ of the other: erro
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options(StudyOptions):
-    """Measure thresholds and intervals where one polarity tells nothing."""
+    """Measure thresholds and intervals where one polarity has no signal."""
 
     out: Path = Path("out/one_polarity")
     seed: int = 7_000_051

@@ -79,7 +79,7 @@ def measured(options: Options, names: Sequence[str], count: int) -> dict[str, li
 
 
 def halves(path: Path) -> list[str] | None:
-    """A real recording's cells; None where its halves tell nothing."""
+    """A real recording's cells; None where its halves determine nothing."""
     recording = read_recording(path)
     runs = plan_runs(recording, plan_windows(recording).pairs)
     cuts = [run[k:k + max(2, len(run) // 2)] for run in runs for k in (0, len(run) // 2)]

@@ -1,4 +1,4 @@
-"""Train the network that tells noise from signal, everything else frozen.
+"""Train the network that separates noise from signal, everything else frozen.
 
     python -m experiments.tell_apart fused.safetensors --out default.safetensors
 
@@ -37,7 +37,7 @@ HELD_OUT = 5  # every n-th recording
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train the network that tells noise from signal."""
+    """Train the network that separates noise from signal."""
 
     weights: tyro.conf.Positional[Path]
     out: Path

@@ -1,4 +1,4 @@
-"""Train EventGAN (paper, Tables V and VI) on simulated windows, and measure what it makes.
+"""Train EventGAN (paper, Tables V and VI) on simulated windows, and score the events it generates.
 
     python -m experiments.train_eventgan --preset small --out runs/eventgan --max-seconds 1200
 

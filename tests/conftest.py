@@ -19,28 +19,28 @@ from helpers.compilation import compile_quickly, optimise_often_run, remember
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 compile_quickly(os.environ)
 remember(os.environ)
-# To look through what JAX has traced for what nobody needs, every 700 new objects, takes 4 % of the
-# time.
+# Python's default, a garbage collection per 700 new objects, takes 4 % of the time: JAX traces make
+# many objects, hardly any of them garbage.
 gc.set_threshold(20_000, 20, 20)
-# Arrays of megabytes come and go: were each a mapping of its own, the system would fill it with
-# zeros every time, which takes longer than many a program runs.
+# Arrays of megabytes come and go. By default each is a mapping of its own, which the system fills
+# with zeros: that takes longer than many programs run. So freed memory is kept.
 LIBC: Any = None
 with contextlib.suppress(AttributeError, OSError, TypeError):  # libraries other than glibc
     LIBC = ctypes.CDLL(None)
     for setting, megabytes in ((-3, 64), (-1, 256)):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
         LIBC.mallopt(setting, megabytes << 20)
-# Of memory, that compiled programs may fill before they are forgotten: a fifth for each of two.
+# Memory of a worker above which its compiled programs are dropped: a fifth of the machine's.
 MOST_MB = max(2500, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 5_000_000)
 
 
-# A shell lets what it starts in the background ignore Ctrl-C, and so would every child.
+# Jobs that a shell starts in the background ignore Ctrl-C, and so would all their children.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """A file's tests share fixtures and compiled programs, so that one worker runs them all."""
+    """One worker runs all tests of a file, as they share fixtures and compiled programs."""
     from xdist.scheduler import LoadFileScheduling
 
     return LoadFileScheduling(config, log)
@@ -53,7 +53,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _bounded_memory() -> Iterator[None]:
-    """Thousands of compiled programs take gigabytes a process, on a machine that runs two."""
+    """Drop compiled programs above MOST_MB: thousands of them take gigabytes per process."""
     yield
     status = Path("/proc/self/status")
     resident = status.read_text().split("VmRSS:")[1].split()[0] if status.exists() else 0

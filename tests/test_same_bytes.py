@@ -1,11 +1,11 @@
-"""The same keys give the same bytes: hashes of what simulation, estimate, training step and data
-set make. Rounding differs between processors and versions of XLA, so hashes are kept for each;
+"""The same keys give the same bytes: hashes of a simulation, an estimate, a training step and a
+data set. Rounding differs between processors and versions of XLA, so hashes are kept for each;
 on another machine the test skips and says how to add it:
 
     python tests/test_same_bytes.py
 
-Once of programs that are compiled quickly, as those of the other tests; and, slow, of programs
-compiled as users compile them.
+They are compared for programs compiled quickly, as in the other tests, and, marked slow, for
+programs compiled as users compile them.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ class Match(System):
             theta = from_grid(scene, key, sigmas[len(sigmas) // 2], fresh)
             for sigma in sigmas:
                 theta, excess = newton(scene, key, theta, sigma, fresh)
-                fits.append((unlikeliness(scene, excess), sigma, fresh, theta, excess[ROOTS]))
+                fits.append((chi_square(scene, excess), sigma, fresh, theta, excess[ROOTS]))
         _, sigma, fresh, theta, excess = min(fits, key=lambda fit: fit[0])
         found = (np.abs(excess) < MATCHED) & (scene.seen[COUNTS] > 0)
         return constant((height, width), theta, found, f"mismatch {sigma:g}",
@@ -69,7 +69,7 @@ class Match(System):
                         eta=(float(scene.eta[0]), float(scene.eta[1])))
 
 
-def unlikeliness(scene: Scene, excess: np.ndarray) -> float:
+def chi_square(scene: Scene, excess: np.ndarray) -> float:
     """Chi-square of all statistics, with variances of counts and model."""
     variance = MODEL_ERROR**2 + 1.0 / (scene.seen[[COUNTS, ROOTS, ACTIVE]] + 1.0)
     return float((excess**2 / variance).sum())

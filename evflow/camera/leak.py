@@ -8,7 +8,7 @@ STEPS = 8  # fixed-point iterations, each of which at least halves the error
 LEAST = 1e-4  # of a leak period that other events interrupt
 
 
-def beside_leak(eta_on: Any, eta_off: Any, leak_hz: Any, resets: bool = True) -> Any:
+def without_leak(eta_on: Any, eta_off: Any, leak_hz: Any, resets: bool = True) -> Any:
     """ON noise (NumPy or JAX arrays, Hz) without its leak, which alone would fire every 1 / leak_hz
     seconds. resets: other events reset the memory, so that many of them leave little leak to be
     seen."""

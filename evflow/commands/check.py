@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from evflow.commands.options import Reading, own_first, tell
+from evflow.commands.options import Reading, own_first, print_notes
 from evflow.errors import EvflowDataError
 
 
@@ -37,7 +37,7 @@ class Check(Reading):
             report, what = Report((Finding.of(error),)), str(self.recording)
         else:
             report, what = check(recording), repr(recording)
-            tell(recording, beside=report)
+            print_notes(recording, beside=report)
         report = report.strict() if self.strict else report
         print(report.to_json() if self.json else f"{what}\n{report}")
         if report.errors:

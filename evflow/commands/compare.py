@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from evflow.commands.options import Reading, note_idle, own_first, tell, value, write_json
+from evflow.commands.options import Reading, note_idle, own_first, print_notes, value, write_json
 from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_absent, need_folder
 from evflow.errors import EvflowDataError
@@ -49,11 +49,11 @@ class Compare(Reading):
     def _streams(self) -> tuple[Events, Events]:
         """Both streams. A time range refers to REAL; if SYNTHETIC shares its clock the same times
         are used, otherwise the same number of seconds from its own first event."""
-        real = tell(self.read(self.real, with_frames=False)).events
+        real = print_notes(self.read(self.real, with_frames=False)).events
         if (self.start is None and self.stop is None) or not len(real):
-            return real, tell(self.read(self.synthetic, with_frames=False)).events
+            return real, print_notes(self.read(self.synthetic, with_frames=False)).events
         whole = dataclasses.replace(self, start=None, stop=None)
-        same = tell(whole.read(self.synthetic, with_frames=False)).events.slice(
+        same = print_notes(whole.read(self.synthetic, with_frames=False)).events.slice(
             int(real.t[0]), int(real.t[-1]) + 1)
         return real, same if len(same) else self.read(self.synthetic, with_frames=False).events
 

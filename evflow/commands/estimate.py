@@ -19,8 +19,8 @@ from evflow.commands.options import (
     Reading,
     check_finite,
     own_first,
+    print_notes,
     refuse,
-    tell,
     value,
     write_json,
 )
@@ -31,7 +31,7 @@ from evflow.notes import Note, as_dicts
 
 if TYPE_CHECKING:
     from evflow.camera import Summary
-    from evflow.estimation.halves import First
+    from evflow.estimation.halves import FirstPart
     from evflow.estimation.pipeline import Measured
     from evflow.estimation.result import CameraEstimate
     from evflow.recordings.check import Report
@@ -156,9 +156,9 @@ class Estimate(Compiling, Reading):
             facts |= {key: tested[key] for key in ("grade", "verdict", "simulators", "nearest")
                       if key in tested}
             write_json(out / "camera.json", facts)
-        said = [f"verdict: {tested['grade']}", *tested["verdict"], *(
+        lines = [f"verdict: {tested['grade']}", *tested["verdict"], *(
             [tested["nearest"]] if self.simulators else [])] if tested else []
-        print(json.dumps(facts, indent=2) if self.json else "\n".join([words, *said]))
+        print(json.dumps(facts, indent=2) if self.json else "\n".join([words, *lines]))
         print(f"written to {self.out}/", file=sys.stderr)
 
     def _check_light(self) -> None:
@@ -191,7 +191,7 @@ class Estimate(Compiling, Reading):
                 recording = self.read(path)
             progress(0, 1, "checking")
             report = check(recording)
-        tell(recording, beside=report)
+        print_notes(recording, beside=report)
         if self.checks:
             report.raise_if_failed()
         stepping = self.protocol == "motion" and self._stepping(recording)
@@ -279,7 +279,7 @@ class Estimate(Compiling, Reading):
         return Measured(found), facts
 
     def _report(
-        self, out: Path, found: CameraEstimate, recording: Recording, first: First | None,
+        self, out: Path, found: CameraEstimate, recording: Recording, first: FirstPart | None,
         checked: Report,
     ) -> dict[str, Any]:
         """Write report.html and return its numbers."""

@@ -58,8 +58,8 @@ class Flow(Windowed):
         scores = FlowScores(recording.events, edges, truth)
         with bar("flow") as progress:
             flows = window_flows(trained, recording.events, edges)
-            said = self._film(_watched(flows, scores, len(edges) - 1, progress), recording, edges,
-                              full_px)
+            described = self._film(_watched(flows, scores, len(edges) - 1, progress), recording,
+                                   edges, full_px)
         result = scores.result()
         notes = list(recording.notes)
         if truth is not None and result.get("aee") is None:
@@ -71,7 +71,7 @@ class Flow(Windowed):
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         print(json.dumps(facts) if self.json else "\n".join(
-            (f"{said}, full colour at {full_px:.1f} px a window -> {self.out}",
+            (f"{described}, full colour at {full_px:.1f} px a window -> {self.out}",
              *_described(result))))
 
     def _check(self) -> None:
@@ -157,7 +157,7 @@ def _described(result: dict[str, Any]) -> list[str]:
     """The scores as a line of text."""
     names = {"fwl": "FWL", "rsat": "RSAT", "aee": "AEE [px]", "outlier_percent": "outliers [%]",
              "fwl_truth": "FWL of the truth"}
-    numbers = [f"{said} {result[name]:.3f}" for name, said in names.items()
+    numbers = [f"{label} {result[name]:.3f}" for name, label in names.items()
                if result.get(name) is not None]
     if not numbers:
         return []

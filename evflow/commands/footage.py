@@ -71,7 +71,7 @@ class Footage:
 
     def source(self, path: Path) -> FrameSource:
         """The frames; EV020 if options contradict each other."""
-        from evflow.io.images.laying import laid, slowed
+        from evflow.io.images.cropping import cropped, slowed
         from evflow.io.images.saccades import swept
         from evflow.io.source import open_frames
 
@@ -85,5 +85,6 @@ class Footage:
             source = swept(source, self.saccades, crop=self.crop, resize=self.resize,
                            sensor_size=self.sensor_size)
         else:
-            source = laid(source, crop=self.crop, resize=self.resize, sensor_size=self.sensor_size)
+            source = cropped(source, crop=self.crop, resize=self.resize,
+                             sensor_size=self.sensor_size)
         return source if self.slow_motion is None else slowed(source, self.slow_motion)

@@ -183,7 +183,7 @@ def note_idle(options: Reading, why: str) -> None:
         print(f"note: {idle} without effect: {why}.", file=sys.stderr)
 
 
-def tell(recording: Recording, beside: object = "") -> Recording:
+def print_notes(recording: Recording, beside: object = "") -> Recording:
     """The recording, after printing its notes to stderr, for commands that do not print them with
     their own. beside: other output, whose sentences are not repeated."""
     for note in recording.notes:

@@ -69,8 +69,8 @@ class Reconstruct(Windowed):
                 trained.network, trained.params, recording.events, times, **trained.how,
                 hold=True)
             images = _watched(images, recording, scores, amid, len(times), progress)
-            said = (self._folder(images, times) if kind == "" else
-                    self._film(images, times, recording))
+            described = (self._folder(images, times) if kind == "" else
+                         self._film(images, times, recording))
         result = scores.result() if scores else None
         facts = {"out": str(self.out), "weights": self.weights, "weights_sha256": trained.sha256,
                  "images": len(times),
@@ -78,7 +78,7 @@ class Reconstruct(Windowed):
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         print(json.dumps(facts) if self.json else "\n".join(
-            (f"{said} -> {self.out}", *_described(result))))
+            (f"{described} -> {self.out}", *_described(result))))
 
     def _kind(self) -> str:
         """The extension of a film, "" for a folder; EV020 for anything else."""

@@ -10,7 +10,15 @@ from typing import Annotated, Literal
 
 import tyro
 
-from evflow.commands.options import Reading, check_finite, note_idle, own_first, refuse, tell, value
+from evflow.commands.options import (
+    Reading,
+    check_finite,
+    note_idle,
+    own_first,
+    print_notes,
+    refuse,
+    value,
+)
 from evflow.commands.writing import need_absent
 from evflow.notes import as_dicts
 
@@ -71,15 +79,16 @@ class Render(Reading):
         seen = self.over_frames or kind == ".png"
         if not seen:
             note_idle(self, "the film shows no frames without --over-frames")
-        recording = tell(self.read(self.recording, with_frames=seen))
+        recording = print_notes(self.read(self.recording, with_frames=seen))
         if kind == ".png":
-            said = write_sheet(self.out, recording, film, at_s=self.at, overwrite=self.overwrite)
+            described = write_sheet(self.out, recording, film, at_s=self.at,
+                                    overwrite=self.overwrite)
         else:
             with bar("rendering") as progress:
-                said = write_film(self.out, recording, film, overwrite=self.overwrite,
-                                  progress=progress)
+                described = write_film(self.out, recording, film, overwrite=self.overwrite,
+                                       progress=progress)
         if self.json:
-            print(json.dumps({"out": str(self.out), "said": said,
+            print(json.dumps({"out": str(self.out), "said": described,
                               "notes": as_dicts(recording.notes)}))
         else:
-            print(f"{said} -> {self.out}", file=sys.stderr)
+            print(f"{described} -> {self.out}", file=sys.stderr)

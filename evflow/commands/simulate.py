@@ -205,13 +205,13 @@ def _fitting(
     a note says once."""
     floats, whole = np.dtype(np.float32), np.dtype(np.uint8)
     rounds = bool(writer.refuses(floats)) and not writer.refuses(whole)
-    said = Note("frames.depth", f"frames were rounded to 8 bits, which is what {writer.NAME} holds")
+    note = Note("frames.depth", f"frames were rounded to 8 bits, which is what {writer.NAME} holds")
 
     def fitting(frames: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not rounds or frames.dtype != floats:
             return frames, times
-        if said not in notes:
-            notes.append(said)
+        if note not in notes:
+            notes.append(note)
         return np.rint(frames).astype(whole), times
 
     return fitting
@@ -225,9 +225,9 @@ def _filmed(events: Path, film: Path, overwrite: bool) -> str:
     recording = io.read_recording(events)
     slow = max(1.0, PREVIEW_S * 1e6 / max(1, recording.events.duration_us))
     rate = Film()
-    said = write_film(film, recording, dataclasses.replace(
+    described = write_film(film, recording, dataclasses.replace(
         rate, slow=slow, window_us=max(1, round(rate.window_us / slow))), overwrite=overwrite)
-    return f"{said}, {slow:.3g} times slower than life" if slow > 1 else said
+    return f"{described}, {slow:.3g} times slower than life" if slow > 1 else described
 
 
 def _recorded(

@@ -22,18 +22,16 @@ class DatasetConfig:
     """A set of sequences of hidden cameras that watch moving scenes.
 
     train, test: number of sequences; those for testing share no texture or photograph with those
-    for
-        training.
+        for training.
     width, height: of the sensor, pixels. seconds: of every sequence, rounded to whole frame
         intervals.
     render_hz: rate of frames that the simulator sees (the paper: 1000 per second); frame_hz: rate
-    of
-        frames that are kept, between which flow and intensity changes are given; divides render_hz.
+        of frames that are kept, between which flow and intensity changes are given; divides
+        render_hz.
     lead_s: how long the camera has been running when the sequence begins.
     frame_noise_dn: standard deviation of the frames' noise before rounding to 8 bits.
     prior, model, scene: cameras, the pixel circuit, and the scenes, in which something always
-    moves,
-        as in the paper; the mismatch ranges from v2e's default to the paper's.
+        moves, as in the paper; the mismatch ranges from v2e's default to the paper's.
     textures, photos: number drawn for each sequence, whose layers are chosen among them;
         texture_px, cutout_px: their sizes in texels.
     """

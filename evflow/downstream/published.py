@@ -108,8 +108,8 @@ def to_params(network: Network, arrays: Arrays) -> Params:
             found[path] = value
             own[path] = next(p + name for p in ("", *PREFIXES) if p + name in arrays)
     if missing := sorted(expected.keys() - found.keys()):
-        said = ", ".join(f"{path} ({published(network, path)})" for path in missing[:3])
-        raise EvflowDataError("EV018", f"the weights of {_called(network)} lack {said}.")
+        listed = ", ".join(f"{path} ({published(network, path)})" for path in missing[:3])
+        raise EvflowDataError("EV018", f"the weights of {_called(network)} lack {listed}.")
     params: Params = {}
     for path, value in found.items():
         if expected.get(path) != value.shape:

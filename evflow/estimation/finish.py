@@ -15,7 +15,7 @@ from evflow.estimation import drift, maps
 from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.leak import Leak, measured_leak
-from evflow.estimation.one_polarity import undetermined, without
+from evflow.estimation.one_polarity import undetermined, with_prior
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
 from evflow.estimation.refine.doubt import doubted, signs
@@ -35,7 +35,7 @@ SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Refined:
+class RefinedSummary:
     """hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera, before
     refine/doubt.py; signs: the input of that, None if nothing was searched for on the path."""
 
@@ -46,12 +46,12 @@ class Refined:
     signs: Array | None = None
 
 
-def refine(state: State) -> Refined:
+def refine(state: State) -> RefinedSummary:
     """The camera's summary by simulation and regression, if there is a path between frames."""
     summary, std = summary_so_far(state)
     hot = np.zeros(np.shape(state.n_events), bool)
     if state.evidence is None or state.quiet is None:
-        return Refined(hot, state.chunks, summary, std)
+        return RefinedSummary(hot, state.chunks, summary, std)
     found = state.front_end.found
     hot = hot_pixels(
         state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
@@ -60,10 +60,11 @@ def refine(state: State) -> Refined:
     summary, std = maps.refined(state.params, list(chunks), summary, std)
     forget(*(c.path for c in chunks))
     if found is None:
-        return Refined(hot, chunks, summary, std)
+        return RefinedSummary(hot, chunks, summary, std)
     if not state.front_end.seen_by.ideal:
         std = maps.widened(summary, std, found)
-    return Refined(hot, chunks, summary, std, signs(found, state.front_end.noise_dn, summary, std))
+    return RefinedSummary(hot, chunks, summary, std,
+                          signs(found, state.front_end.noise_dn, summary, std))
 
 
 def estimate(
@@ -83,7 +84,7 @@ def estimate(
     dead = dead_pixels(n_events)
     doubt = next(iter(state.params.values())).get("doubt")
     if lacking := undetermined(stats, summary):
-        summary, std = without(lacking, list(refined.chunks), summary, std)
+        summary, std = with_prior(lacking, list(refined.chunks), summary, std)
     elif doubt is not None and refined.signs is not None:
         std = doubted(doubt, refined.signs, summary, std)
     stage("noise rates and maps")

@@ -32,7 +32,7 @@ class Division:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class First:
+class FirstPart:
     """What an estimate computed from a recording's first part. state: the sums over what was read
     of it; searched: the stretches in which its photoreceptor was looked for; rest: (first, last)
     frame of the rest."""
@@ -66,7 +66,7 @@ def divided(stretches: Sequence[Stretch]) -> Division | None:
     return Division(range(group[0], cut), (stretches[cut].run[0], end))
 
 
-def _on_its_own(first: First) -> State:
+def _on_its_own(first: FirstPart) -> State:
     """The state with photoreceptor and dead time as measured on the first part itself."""
     state, front_end = first.state, first.state.front_end
     runs, searched = ([(s.recording, s.run) for s in part] for part in (state.read, first.searched))

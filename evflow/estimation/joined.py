@@ -56,11 +56,11 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
     def scalars(numbers: dict[str, float]) -> dict[str, jnp.ndarray]:
         return {name: jnp.float32(number) for name, number in numbers.items()}
 
-    said = Note("theta.joined", f"the thresholds come from {path}.")
+    note = Note("theta.joined", f"the thresholds come from {path}.")
     return dataclasses.replace(
         found, camera=dataclasses.replace(found.camera, **maps),
         std=dataclasses.replace(found.std, **errors),
         summary=dataclasses.replace(found.summary, **scalars(values)),
         summary_std=dataclasses.replace(found.summary_std, **scalars(value_errors)),
         valid=valid & ~found.hot, undetermined=(), sensor=sensor, optics=optics,
-        notes=(*(n for n in found.notes if n.code not in ("scene.static", "frames.none")), said))
+        notes=(*(n for n in found.notes if n.code not in ("scene.static", "frames.none")), note))

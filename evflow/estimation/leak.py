@@ -60,7 +60,7 @@ def measured_leak(waits: Waits) -> Leak:
     leaked = seconds * np.stack([_hazards(*point, others)[used] for point in grid])
     likely, expected = _likelihood(leaked, on, off)
     best = int(np.argmax(likely))
-    strange = _strangeness(expected[:, best], on, off)
+    strange = _overdispersion(expected[:, best], on, off)
     none = _likelihood(np.zeros((1, len(on))), on, off)[0][0]
     total = special.logsumexp(likely / strange)
     events = float(leaked[best].sum())
@@ -116,7 +116,7 @@ def _likelihood(leaked: Array, on: Array, off: Array) -> tuple[Array, Array]:
     return likely.sum(1) + prior, np.stack([expected, m])
 
 
-def _strangeness(expected: Array, on: Array, off: Array) -> float:
+def _overdispersion(expected: Array, on: Array, off: Array) -> float:
     """Overdispersion: how much more the events scatter around the expected ones (2, K) than Poisson
     counts; at least 1."""
     many = expected.min(0) > 5.0

@@ -37,8 +37,8 @@ def by_flow(
     for window in windows:
         voxels, dlogI, given = window_inputs(window)
         y, s = api.estimate_y(params, voxels, dlogI, summary=summary, **given)
-        said = evidence(y, s, jnp.asarray(exposed(window.frame0, window.frame1)))
-        found = said if found is None else found + said
+        more = evidence(y, s, jnp.asarray(exposed(window.frame0, window.frame1)))
+        found = more if found is None else found + more
     assert found is not None  # iter_windows raises EV017 rather than yield nothing
     y6 = unsquash_summary(summary)[None, None]
     relative = [getattr(summary_std, n) / getattr(summary, n) for n in PARAMETERS]

@@ -30,7 +30,7 @@ def undetermined(stats: Stats, summary: Summary) -> tuple[str, ...]:
     return tuple(found)
 
 
-def without(
+def with_prior(
     names: tuple[str, ...], chunks: list[Chunk], summary: Summary, std: Summary
 ) -> tuple[Summary, Summary]:
     """The summary and its std with the prior's thresholds for undetermined polarities. Re-estimates

@@ -25,7 +25,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent
 from evflow.estimation.finish import Stage, estimate
 from evflow.estimation.front_end import find_front_end
-from evflow.estimation.halves import First, divided
+from evflow.estimation.halves import FirstPart, divided
 from evflow.estimation.reading import BATCH, BUDGETS, EFFORTS, Effort, Order, gain, ordered
 from evflow.estimation.refine import Stretch, cut, pixel_posterior
 from evflow.estimation.result import CameraEstimate
@@ -93,7 +93,7 @@ class Measured:
     the rest; None if nothing was read of it, or the recording is too short to divide."""
 
     found: CameraEstimate
-    first: First | None = None
+    first: FirstPart | None = None
 
 
 def measure(
@@ -139,7 +139,7 @@ def measure(
     found = estimate(state, extent=extent, before=left_out(recording, plan), after=repeated,
                      advance=counter.advance, stage=stage)
     counter.finish()
-    first = First(early, tuple(used), division.rest) if division and early.read else None
+    first = FirstPart(early, tuple(used), division.rest) if division and early.read else None
     return Measured(found, first)
 
 

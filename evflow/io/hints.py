@@ -1,4 +1,4 @@
-"""What a user may tell a reader about a file, and how every reader follows it.
+"""Hints: what a user knows about a file, and how every reader applies it.
 
 `stream.gather` passes what a reader parses through `microseconds`, `on`, `sensor` and `span_us`, so
 units, polarity, size and time range mean the same for every format.
@@ -41,7 +41,7 @@ def known(given: Mapping[str, Any], fields_of: type, who: str) -> Mapping[str, A
     return given
 
 
-class Told(TypedDict, total=False):
+class HintArguments(TypedDict, total=False):
     """The keyword arguments from which `Hints` are made."""
 
     start_s: float | None
@@ -69,15 +69,13 @@ class Hints:
         swaps ON and OFF.
     size: (width, height), overrides what the file says.
     partial: of a damaged or truncated file, read what lies before the damage; of HDF5 and npz,
-    which
-        are sound or not as a whole, only what lies before a time that goes back.
+        which are sound or not as a whole, only what lies before a time that goes back.
     drop_outside: leave out events outside the sensor instead of refusing them.
     frames_topic: which of several image streams holds the frames (see `streams`).
     no_frames: read only the events.
     late: what to do with times that go back: "stop" refuses them, or with `partial` ends the
-    reading
-        there; "drop" leaves out the fewest events such that the rest are ordered; "sort" sorts them
-        in; "join" appends one clock to the other.
+        reading there; "drop" leaves out the fewest events such that the rest are ordered; "sort"
+        sorts them in; "join" appends one clock to the other.
     events_topic: which of several event streams (cameras) to read.
     colour: what a pixel sees of colour frames: "luma", or a Bayer pattern: one colour of that
         mosaic, as in a colour sensor's events. Raw mosaics then stay as they are.

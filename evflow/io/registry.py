@@ -46,7 +46,7 @@ from evflow.io.formats import (
 from evflow.io.formats.ros import ros1, ros2
 from evflow.io.formats.write_aedat2 import Aedat2Writer
 from evflow.io.formats.write_aedat4 import Aedat4Writer
-from evflow.io.hints import Hints, Told
+from evflow.io.hints import HintArguments, Hints
 from evflow.io.writer import EventWriter, copy
 from evflow.notes import Note
 from evflow.types import Events, Recording
@@ -102,7 +102,7 @@ def find_format(path: str | os.PathLike) -> Format:
         "`t x y p`, decimal points, and a header if the order differs.", where=path)
 
 
-def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
+def read_recording(path: str | os.PathLike, **hints: Unpack[HintArguments]) -> Recording:
     """Read events and frames from a file or folder; its format is recognised by its content.
 
     Args:
@@ -153,7 +153,7 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[Told]) -> Recording:
     return recording
 
 
-def read_events(path: str | os.PathLike, **hints: Unpack[Told]) -> Events:
+def read_events(path: str | os.PathLike, **hints: Unpack[HintArguments]) -> Events:
     """Read the events of a file or folder, without its frames.
 
     Args:
@@ -271,13 +271,13 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
 
 def _doubted(recording: Recording, format: str, parsed: Hints, written: Written) -> Recording:
     """The recording, with a note if its times are doubtful; EV023 if the user must decide."""
-    said = coarse(recording.events.t, written)
+    coarseness = coarse(recording.events.t, written)
     found = doubt(recording.events, recording.frame_times, format, written.unit) if (
         parsed.time_unit == "auto") else None
     if found is not None:
         note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
-    elif said:
-        note = Note("events.coarse", said)
+    elif coarseness:
+        note = Note("events.coarse", coarseness)
     else:
         return recording
     return dataclasses.replace(recording, notes=(*recording.notes, note))

@@ -92,9 +92,9 @@ def _of_images(folder: ImageFolder, asked: FrameHints) -> FrameSource:
                 ("srgb", "8-bit images") if first.dtype == np.uint8 else
                 ("linear", "images of more than 8 bits")))
     if folder.files[0].suffix.lower() in RADIANCE:
-        white, said = values.white_of_radiance(first, asked.full_scale)
+        white, note = values.white_of_radiance(first, asked.full_scale)
         asked = dataclasses.replace(asked, full_scale=white, clip=True)
-        notes = (*notes, said)
+        notes = (*notes, note)
     return _source(size, len(folder.files), folder.images, asked, [*folder.notes, *notes])
 
 
@@ -139,12 +139,12 @@ def _responding(asked: FrameHints, usual: str, what: str) -> tuple[FrameHints, t
     """The hints with the response chosen if it was "auto", and the note that says so."""
     if asked.response != "auto":
         return asked, ()
-    said = {"srgb": "converted to light by the sRGB curve, the usual encoding of {} "
-                    "(--response linear: they are already linear)",
-            "linear": "assumed to be linear in light, as usual for {} (--response srgb: they are "
-                      "encoded like videos)"}[usual].format(what)
+    applied = {"srgb": "converted to light by the sRGB curve, the usual encoding of {} "
+                       "(--response linear: they are already linear)",
+               "linear": "assumed to be linear in light, as usual for {} (--response srgb: they "
+                         "are encoded like videos)"}[usual].format(what)
     return (dataclasses.replace(asked, response=usual),
-            (Note("frames.response", f"frames were {said}."),))
+            (Note("frames.response", f"frames were {applied}."),))
 
 
 def _between(images: Iterator[Image], asked: FrameHints) -> Iterator[Image]:

@@ -1,4 +1,4 @@
-"""The camera's summary: additive statistics of all pixels, and what they say of the camera."""
+"""The camera's summary: additive statistics of all pixels, and the estimate from their sums."""
 
 from __future__ import annotations
 

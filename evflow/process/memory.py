@@ -35,10 +35,10 @@ def keep() -> None:
     """Let the allocator keep up to KEPT bytes of freed arrays until the process ends: otherwise
     work that makes arrays of the same sizes again and again waits for the system to clear them.
     Does nothing without glibc."""
-    tell = _of_c("mallopt")
-    if tell is not None:
-        tell(MAP_ABOVE, LARGEST)
-        tell(TRIM_ABOVE, KEPT)
+    mallopt = _of_c("mallopt")
+    if mallopt is not None:
+        mallopt(MAP_ABOVE, LARGEST)
+        mallopt(TRIM_ABOVE, KEPT)
 
 
 @functools.cache

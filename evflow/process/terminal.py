@@ -69,15 +69,15 @@ def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[R
     with Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as live:
         task = live.add_task(title, total=None)
 
-        said = title
+        label = title
 
         def report(done: int, total: int, title: str | None = None) -> None:
-            nonlocal said
-            said = title or said
-            live.update(task, completed=done, total=total, description=said)
+            nonlocal label
+            label = title or label
+            live.update(task, completed=done, total=total, description=label)
 
         def compiling(begins: bool) -> None:
-            live.update(task, description=f"{said} (compiling)" if begins else said)
+            live.update(task, description=f"{label} (compiling)" if begins else label)
 
         with announced(compiling) if compiles and not live.disable else contextlib.nullcontext():
             yield report

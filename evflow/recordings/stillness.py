@@ -44,19 +44,19 @@ def unlike_noise(events: Events, hot: np.ndarray) -> str:
     if events.duration_us < LEAST_US or len(events) < LEAST_EVENTS:
         return (f"there are only {len(events):,} events in {events.duration_us / 1e6:.3f} s, too "
                 "few to decide.")
-    excess = company(events, hot)
+    excess = coincidence_excess(events, hot)
     if excess > MOVING:
         return (f"the scene moves ({excess:.2f} pairs of nearby events per event beyond chance; "
                 f"noise has at most {MOVING}).")
     share = float(hot.mean())
-    if share > MOST_SCATTERED or (share > MOST_HOT and gathered(hot)):
+    if share > MOST_SCATTERED or (share > MOST_HOT and clustered(hot)):
         return (f"{share:.1%} of the pixels are far busier than the others, more than the "
                 f"{MOST_HOT:.0%} that can be faults if adjacent and the {MOST_SCATTERED:.0%} if "
                 "scattered: flickering light, or something small that moves?")
     return ""
 
 
-def gathered(hot: np.ndarray) -> bool:
+def clustered(hot: np.ndarray) -> bool:
     """Whether hot (H, W) pixels are adjacent more often than pixels picked at random."""
     pairs = int((hot[1:] & hot[:-1]).sum() + (hot[:, 1:] & hot[:, :-1]).sum())
     chance = float(hot.mean()) ** 2 * (hot[1:].size + hot[:, 1:].size)
@@ -68,7 +68,7 @@ def smooth(frame: np.ndarray) -> np.ndarray:
     return np.log(np.maximum(cv2.blur(frame, (SMOOTH, SMOOTH)), DARK_DN))
 
 
-def company(events: Events, hot: np.ndarray) -> float:
+def coincidence_excess(events: Events, hot: np.ndarray) -> float:
     """Pairs of events of one polarity, from different pixels of a cell and within a time bin, in
     excess of independent noise, per event; hot (H, W) pixels are left out."""
     events = events.slice(int(events.t[0]), int(events.t[min(len(events), MOST_EVENTS) - 1]) + 1)

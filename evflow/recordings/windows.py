@@ -2,8 +2,7 @@
 
 A window runs from one frame to the first that is at least `min_us` later; the next begins where it
 ends. Only windows covered by the events are used, and none across a gap in them or a dropped or
-faulty
-frame: there the path of brightness is unknown for too long, or wrong.
+faulty frame: there the path of brightness is unknown for too long, or wrong.
 """
 
 from __future__ import annotations

@@ -69,15 +69,15 @@ def write_bench_report(
         EvflowDataError: EV010 (matplotlib is missing), EV013 (exists), EV019 (cannot be written).
     """
     require()
-    grade, said = verdict(found)
-    panels = [_summary(found, grade, said), map_panel(found)]
+    grade, sentences = verdict(found)
+    panels = [_summary(found, grade, sentences), map_panel(found)]
     if thetas := _thetas(found):
         panels.append(_contrast(found, thetas))
     if found.bench:
         panels += _by_light(found, found.bench, thetas)
     panels += [scatter_panel(found), fault_panel(found), _facts(recording, source)]
     name = source.recordings[0].name if source.recordings else "an event camera"
-    numbers = {"grade": grade, "verdict": said}
+    numbers = {"grade": grade, "verdict": sentences}
     page.write_page(path, f"Camera on a bench: {name}", repr(recording), panels,
                     {**numbers, **found.as_dict()}, overwrite=overwrite)
     return numbers
@@ -86,35 +86,35 @@ def write_bench_report(
 def verdict(found: CameraEstimate) -> tuple[Grade, list[str]]:
     """How good the measurement is, and sentences that say why."""
     grades: list[Grade] = ["good"]
-    said = []
+    sentences = []
     for side in ("on", "off"):
         name = side.upper()
         theta, error, eta, eta_error = (float(getattr(s, n)) for n in (
             f"theta_{side}", f"eta_{side}") for s in (found.summary, found.summary_std))
         if known(found, side):
             grades.append(graded(error / theta, ERROR))
-            said.append(f"θ {name} is known to {error / theta:.1%}.")
+            sentences.append(f"θ {name} is known to {error / theta:.1%}.")
         elif found.windows:
             grades.append("poor")
-            said.append(f"θ {name} is undetermined: no step sends {name} events.")
+            sentences.append(f"θ {name} is undetermined: no step sends {name} events.")
         if not found.windows:
             few = eta < eta_error * np.sqrt(FEW_NOISE)
             grades.append("fair" if few else "good")
-            said.append(f"Few {name} noise events: their rate is known to "
+            sentences.append(f"Few {name} noise events: their rate is known to "
                         f"{number(eta_error, 2)} Hz per pixel. Record longer to reduce this error."
                         if few else f"η {name} is known to {eta_error / eta:.1%}.")
     grades += [GRAVE[note.code] for note in found.notes if note.code in GRAVE]
     if found.hot.mean() > HOT:
         grades.append("fair")
-        said.append(f"{found.hot.mean():.1%} of the pixels are hot.")
-    return max(grades, key=GRADES.index), said
+        sentences.append(f"{found.hot.mean():.1%} of the pixels are hot.")
+    return max(grades, key=GRADES.index), sentences
 
 
-def _summary(found: CameraEstimate, grade: Grade, said: list[str]) -> Panel:
+def _summary(found: CameraEstimate, grade: Grade, sentences: list[str]) -> Panel:
     heads = {"good": "Measured well.", "fair": "Measured, with room for improvement.",
              "poor": "Not measured well enough."}
     body = (f'<div class="verdict {grade}"><strong class="grade">{heads[grade]}</strong>'
-            f"{paragraph(' '.join([_from(found), *said]))}</div>")
+            f"{paragraph(' '.join([_from(found), *sentences]))}</div>")
     rows = []
     for side in ("on", "off"):
         name = side.upper()

@@ -17,7 +17,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.estimation.finish import Stage
-from evflow.estimation.halves import First
+from evflow.estimation.halves import FirstPart
 from evflow.estimation.pipeline import Progress
 from evflow.estimation.result import CameraEstimate
 from evflow.network.weights import load_weights, weights_hash
@@ -84,7 +84,7 @@ def write_report(
     path: str | os.PathLike, found: CameraEstimate, recording: Recording, *,
     weights: str | os.PathLike = "default", source: str | os.PathLike | None = None,
     command: str = "", min_window_us: int = 40_000, seed: int = 0, overwrite: bool = False,
-    progress: Progress | None = None, simulators: bool = False, first: First | None = None,
+    progress: Progress | None = None, simulators: bool = False, first: FirstPart | None = None,
     checked: Report | None = None, stage: Stage = lambda _: None,
 ) -> dict[str, Any]:
     """Write a self-contained HTML report on an estimated camera, and return its numbers.
@@ -161,7 +161,7 @@ def write_report(
 
 def gather(
     found: CameraEstimate, recording: Recording, weights: str | os.PathLike, min_window_us: int,
-    seed: int, step: Callable[[], None], first: First | None = None,
+    seed: int, step: Callable[[], None], first: FirstPart | None = None,
     stage: Stage = lambda _: None,
 ) -> Evidence:
     """Put the estimate to the test; step() is called twice."""
@@ -284,10 +284,10 @@ def _assumptions(
     coded = {"Weights", "Recording", "Command"}
     rows = [[page.text(k), f"<code>{page.text(v)}</code>" if k in coded else page.text(v)]
             for k, v in facts.items()]
-    said = texts((*found.notes, *(finding.note() for finding in report.findings)))
+    sentences = texts((*found.notes, *(finding.note() for finding in report.findings)))
     return Panel("assumptions", "What was assumed, and where it comes from",
                  table(["", ""], rows, numeric=False) + "<h3>Warnings</h3>"
-                 + (bullets(said) if said else paragraph("None.", "note")))
+                 + (bullets(sentences) if sentences else paragraph("None.", "note")))
 
 
 def _agreement(recording: Recording) -> str:

@@ -35,8 +35,8 @@ def receptor_panel(found: CameraEstimate, held_out_shares: tuple[float, float] |
     shares = [["all that was read", *(number(v, 3) for v in receptor.explained)]]
     if held_out_shares is not None:
         shares.append(["second half, by the first", *(number(v, 3) for v in held_out_shares)])
-    said = ("The estimate assumes pixels with these constants." if receptor.needed else
-            "An ideal pixel is as probable: the estimate assumes one.")
+    conclusion = ("The estimate assumes pixels with these constants." if receptor.needed else
+                  "An ideal pixel is as probable: the estimate assumes one.")
     return Panel("receptor", TITLE, grid([
         figure(drawn, "Line: offset and delay as measured. Dashed: an ideal pixel and ideal "
                "frames. Red: the measured cutoff."),
@@ -44,4 +44,4 @@ def receptor_panel(found: CameraEstimate, held_out_shares: tuple[float, float] |
         + table(["variance explained", "ideal pixel", "as measured"], shares)], 22)
         + paragraph("At each event a pixel stores the brightness it sees. Thresholds and events "
                     "explain a share of that brightness along the frames, which is larger the "
-                    f"better the photoreceptor is described. {said}", "note"))
+                    f"better the photoreceptor is described. {conclusion}", "note"))

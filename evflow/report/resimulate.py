@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.estimation.halves import First
+from evflow.estimation.halves import FirstPart
 from evflow.estimation.pipeline import estimate_camera
 from evflow.estimation.refine import frame_noise, receptor_sample
 from evflow.estimation.refine.receptor_search import explained
@@ -177,7 +177,7 @@ def busiest_instant(events: Events, span_us: tuple[int, int], length_us: int = I
 
 def held_out(
     recording: Recording, params: Any, runs: list[Run], min_window_us: int, seed: int,
-    first: First | None = None, pictures: Pictures | None = None,
+    first: FirstPart | None = None, pictures: Pictures | None = None,
 ) -> tuple[CameraEstimate, Trial, tuple[float, float] | None]:
     """An estimate from the first part of a recording, tested on the rest, and `held_out_shares`
     there. first: what an estimate computed; without it, the first part is the last LEARNT_SECONDS

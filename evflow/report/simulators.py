@@ -222,14 +222,14 @@ def likeness(film: Film, made: Events, again: Events) -> dict[str, float | None]
     if not len(made) or not len(again):
         return {"counts_r": None, "counts_ceiling": 1.0, "space_time_r": None,
                 "space_time_ceiling": 1.0, "intervals": None, "events_on": 0.0, "events_off": 0.0}
-    said = compare(film.real, made, span_us=film.span_us)
-    ratio = said["rate_hz"]["ratio"]
+    scores = compare(film.real, made, span_us=film.span_us)
+    ratio = scores["rate_hz"]["ratio"]
     maps = (e.count_map().sum(0).ravel() for e in (made, again))
-    return {"counts_r": said["counts"]["r"]["both"],
+    return {"counts_r": scores["counts"]["r"]["both"],
             "counts_ceiling": float(np.corrcoef(*maps)[0, 1]),
-            "space_time_r": said["space_time_r"],
+            "space_time_r": scores["space_time_r"],
             "space_time_ceiling": space_time_r(made, again, *film.span_us),
-            "intervals": said["intervals"]["wasserstein_decades"],
+            "intervals": scores["intervals"]["wasserstein_decades"],
             "events_on": ratio["on"], "events_off": ratio["off"]}
 
 

@@ -122,7 +122,7 @@ def write_comparison(
     labels: Names, facts: dict[str, str], overwrite: bool = False,
 ) -> None:
     """compare.html: the verdict and what it rests on. numbers: of `compare(real, synthetic)`;
-    labels: what the streams are called in the title; facts: what is said of the files.
+    labels: what the streams are called in the title; facts: rows on the files.
 
     Raises EV010 (no matplotlib), EV013 (exists), EV019 (cannot be written).
     """

@@ -53,11 +53,11 @@ def write_video(
         made = aside(path, f"part{kind}")  # OpenCV tells the kind of film by the ending
         stack.callback(remove, made)
         if kind == ".gif":
-            said = _write_gif(made, pictures, count, fps)
+            how = _write_gif(made, pictures, count, fps)
         else:
-            said = _write_film(made, pictures, count, fps, "mjpeg" if kind == ".avi" else codec)
+            how = _write_film(made, pictures, count, fps, "mjpeg" if kind == ".avi" else codec)
         os.replace(made, temporary)
-    return f"{count} pictures, {count / fps:.1f} s, {said}"
+    return f"{count} pictures, {count / fps:.1f} s, {how}"
 
 
 def check_within(bounds: tuple[float, float], name: str, value: float | None) -> None:

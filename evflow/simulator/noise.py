@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.shares import beside_leak
+from evflow.camera.leak import without_leak
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import Values, noise_factor
 from evflow.simulator.constants import Constants
@@ -187,7 +187,7 @@ def _but_leak(model: Constants, camera: Camera) -> tuple[Array, Array]:
     on, off = camera.eta_on, camera.eta_off
     if not model.eta_is_all or model.leak_hz is None:
         return on, off
-    return beside_leak(on, off, model.leak_hz, model.noise_resets_memory), off
+    return without_leak(on, off, model.leak_hz, model.noise_resets_memory), off
 
 
 def nominal_thresholds(model: Constants, camera: Camera) -> Array:

@@ -70,7 +70,7 @@ def windows(
     return found
 
 
-def said(
+def estimated_maps(
     params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
 ) -> dict[str, Maps]:
     """Maps by ESTIMATORS.
@@ -93,13 +93,12 @@ def said(
 
     paper = paper_weights() if pools(params) else params
     short = min(min_window_us, WINDOW_US)
-    said = {PAPER_WINDOW: windows(paper, recording, short, None),
-            PAPER_FLOW: [flow(paper)]}
+    by_paper = {PAPER_WINDOW: windows(paper, recording, short, None), PAPER_FLOW: [flow(paper)]}
     if not pools(params):
-        return said
+        return by_paper
     shape = recording.events.size[::-1]
     known, _ = finish(params, pool_recording(params, recording, min_window_us)[0])
-    return said | {
+    return by_paper | {
         WINDOW: windows(params, recording, min_window_us, known), FLOW: [flow(params)],
         NETWORK: [everywhere(known, shape)], SUMMARY: [everywhere(found.summary, shape)],
         WHOLE: [stacked(found.camera)]}
@@ -108,10 +107,10 @@ def said(
 def fitted(
     params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
 ) -> dict[str, Fitted]:
-    """The estimators of `said` with one map (without the whole estimate) as compared systems;
-    their thresholds are the medians of the maps."""
+    """The estimators of `estimated_maps` with one map (without the whole estimate) as compared
+    systems; their thresholds are the medians of the maps."""
     rows = {}
-    for name, maps in said(params, recording, found, min_window_us).items():
+    for name, maps in estimated_maps(params, recording, found, min_window_us).items():
         if name in (PAPER_FLOW, FLOW, NETWORK, SUMMARY):
             camera = Camera(*(jnp.asarray(m, jnp.float32) for m in maps[0]))
             rows[name] = Fitted(camera, np.stack([found.valid] * 2),

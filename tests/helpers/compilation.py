@@ -19,8 +19,8 @@ from typing import Any
 TESTS = Path(__file__).parents[1]
 OPTIMISED = "EVFLOW_TESTS_OPTIMISED"
 UNOPTIMISED = "JAX_DISABLE_MOST_OPTIMIZATIONS"
-# Beside that, no operation says where in the source it stands; and of the two ways of parting
-# programs between devices, of which nearly all have one, the quicker is taken.
+# Also without source locations in the programs, and with the partitioner that compiles faster:
+# nearly all programs run on one device.
 SETTINGS = {UNOPTIMISED: "1", "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0",
             "JAX_USE_SHARDY_PARTITIONER": "0"}
 # Other versions of XLA may not know these flags, and end a process that is given an unknown one.
@@ -28,7 +28,7 @@ FLAGS_OF = "0.10."
 FLAGS = ("--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
          "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true")
 
-# Programs, by module, that one estimate runs dozens of times: longer than they compile.
+# Programs, by module, that an estimate runs dozens of times: longer than they take to compile.
 OFTEN = {"evflow.estimation.refine.receptor_regression": ("_sums", "_slopes")}
 
 
@@ -79,8 +79,8 @@ def optimise_often_run() -> None:
 
 
 def remember(environment: MutableMapping[str, str]) -> None:
-    """What one worker, process or run has compiled no other need compile: kept in the user's cache
-    folder, unless the environment names another or that one cannot be written."""
+    """Share compiled programs between workers, processes and runs, in the user's cache folder. Does
+    nothing if that cannot be written; settings in the environment come first."""
     folder = Path(environment.get("XDG_CACHE_HOME") or "~/.cache") / "evflow" / "jax-tests"
     try:
         folder = folder.expanduser()

@@ -1,4 +1,4 @@
-"""Small networks and seen scenes for the tests of the learned rooms."""
+"""Small networks and simulated recordings for the tests of networks, training and estimation."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def random_params(config: ModelConfig, name: str = "default") -> Params:
 
 
 def drawn(shapes: Any, scale: float) -> Any:
-    """Arrays of these shapes, by NumPy: to compile a draw for each takes ten seconds. Weights
-    N(0, 1 / fan-in) but for last layers of the flow, which like all else lie `scale` N(0, 1)
-    about 0, and norms about 1."""
+    """Random arrays of these shapes, by NumPy, as compiling a draw for each takes ten seconds.
+    Weights are N(0, 1 / fan-in), norms N(1, scale^2), the flow's last layers and all else
+    N(0, scale^2)."""
     rng = np.random.default_rng(1)
 
     def one(path: Any, leaf: Any) -> jax.Array:
@@ -72,8 +72,8 @@ def seen(shape: tuple[int, int] = (12, 10), frames: int = 17) -> tuple[Any, Any,
 
 @cache
 def hidden(seed: int, ms: int = 280) -> tuple[Recording, Camera]:
-    """A camera with thresholds .15-.4 watches a lively scene; frames every 40 ms, the
-    first at 20 ms: events cover all six windows."""
+    """A lively scene, recorded by a camera with thresholds .15-.4; and that camera. Frames every
+    40 ms, the first at 20 ms, so that events cover all six windows."""
     k_bank, k_scene, k_nominal, k_pixels, k_events = jax.random.split(jax.random.key(seed), 5)
     scenes = SceneConfig(speed_px_s=(60.0, 200.0), static_fraction=0.0, contrast=(0.6, 1.0))
     scene = sample_scene(k_scene, make_bank(k_bank, 8, photos=False), scenes, SHAPE)

@@ -22,7 +22,7 @@ import evflow
 from evflow import io
 from evflow.errors import EvflowDataError
 from evflow.io import DsecWriter, read_events, read_recording, write_events
-from evflow.io.hints import Hints, Told
+from evflow.io.hints import HintArguments, Hints
 from evflow.io.registry import find_format
 from evflow.recordings.windows import iter_windows
 from evflow.types import Events, Recording
@@ -280,5 +280,5 @@ def test_reading_imports_neither_jax_nor_optional_packages(sources: dict[str, Pa
 
 
 def test_the_typed_hints_are_those_that_readers_know() -> None:
-    fields, told = typing.get_type_hints(Hints), typing.get_type_hints(Told)
+    fields, told = typing.get_type_hints(Hints), typing.get_type_hints(HintArguments)
     assert told == {f.name: fields[f.name] for f in dataclasses.fields(Hints) if f.init}

@@ -15,8 +15,8 @@ import pytest
 from helpers.videos import by_pixel
 
 from evflow.camera import Camera, CameraPrior
+from evflow.camera.leak import without_leak
 from evflow.camera.sensors import SensorModel
-from evflow.camera.shares import beside_leak
 from evflow.simulator import simulate
 from evflow.simulator.constants import Constants
 from evflow.simulator.noise import (
@@ -160,7 +160,7 @@ def test_leak_is_a_part_of_eta_that_is_all_noise() -> None:
     on, off = still(model, (12.0, 6.0), 4.0).count_map().reshape(2, -1).mean(1) / 4.0
     assert on == pytest.approx(12.0, rel=0.03)  # of which leak is 4 Hz: the others reset it
     assert off == pytest.approx(6.0, rel=0.02)
-    alone = beside_leak(np.float64(12.0), np.float64(6.0), 8.0)
+    alone = without_leak(np.float64(12.0), np.float64(6.0), 8.0)
     assert 12.0 - alone == pytest.approx((alone + 6.0) / np.expm1((alone + 6.0) / 8.0), rel=1e-3)
 
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from evflow.camera.leak import without_leak
 from evflow.camera.sensors import SensorModel
-from evflow.camera.shares import beside_leak
 
 Maps = Mapping[str, np.ndarray]
 PACE = (128 + 20) / 275  # cutoff at 128 DN over that at 255 DN, for a low-pass that follows light
@@ -91,7 +91,7 @@ class Settings:
     def leak_seen(self) -> float:
         """ON noise that is leak, in Hz."""
         on, off = np.float64(self.eta_on), np.float64(self.eta_off)
-        return float(on - beside_leak(on, off, self.leak_hz)) if self.leak_hz else 0.0
+        return float(on - without_leak(on, off, self.leak_hz)) if self.leak_hz else 0.0
 
     @property
     def circuit(self) -> str:

@@ -37,7 +37,7 @@ from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.light.log_maps import lin_log, lin_log_inverse
 from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
-from evflow.recordings.stillness import LEAST_EVENTS, MOVING, company
+from evflow.recordings.stillness import LEAST_EVENTS, MOVING, coincidence_excess
 from evflow.types import Events, Recording
 
 Span = tuple[int, int]
@@ -221,12 +221,13 @@ def _steps(
 
 def _restless(rest: Events) -> list[Note]:
     """A note if the events of a rest are not noise alone."""
-    if len(rest) < LEAST_EVENTS or company(rest, hot_at_rest(rest.count_map().sum(0))) <= MOVING:
+    hot = hot_at_rest(rest.count_map().sum(0))
+    if len(rest) < LEAST_EVENTS or coincidence_excess(rest, hot) <= MOVING:
         return []
     return [Note(
-        "scene.restless", "events come in company while the frames rest: a light that flickers or "
-        "still settles, or a camera that regulates its exposure? Then noise rates, and thresholds, "
-        "are wrong.")]
+        "scene.restless", "neighbouring pixels fire together while the frames rest: a light that "
+        "flickers or still settles, or a camera that regulates its exposure? Then noise rates, and "
+        "thresholds, are wrong.")]
 
 
 def _levels(

@@ -53,9 +53,9 @@ def since_start(s: Sightings, weight: Array) -> Array:
         change = s.path - s.frames[0, s.pixel]
         out[:4, s.pixel[s.first]] = [
             np.bincount(group, weight * v) for v in (np.ones_like(on), on, off, change)]
-    said = np.zeros(s.frames.shape, bool)
-    said[s.interval + 1, s.pixel] = True
-    early = s.seen & ~np.maximum.accumulate(said, 0)
+    fired = np.zeros(s.frames.shape, bool)
+    fired[s.interval + 1, s.pixel] = True
+    early = s.seen & ~np.maximum.accumulate(fired, 0)
     change = np.where(early, s.frames - s.frames[:1], 0.0)
     out[4:] = change.max(0), -change.min(0)
     out[:, ~s.seen[0]] = np.array([0.0, 0.0, 0.0, 0.0, NOTHING, NOTHING])[:, None]

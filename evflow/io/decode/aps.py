@@ -107,17 +107,17 @@ class Aps:
         self._clear()
 
     def notes(self) -> tuple[Note, ...]:
-        said = []
+        notes = []
         if self.dark:
-            said.append(Note("frames.dark", f"{self.dark:,} frame values below their "
+            notes.append(Note("frames.dark", f"{self.dark:,} frame values below their "
                              "reset are 0"))
         if self.incomplete:
-            said.append(Note("frames.unused", f"{self.incomplete:,} frames with missing samples "
+            notes.append(Note("frames.unused", f"{self.incomplete:,} frames with missing samples "
                              "were left out"))
         if self.outside:
-            said.append(Note("events.unread", f"{self.outside:,} APS samples outside the sensor "
+            notes.append(Note("events.unread", f"{self.outside:,} APS samples outside the sensor "
                              "were left out"))
-        return tuple(said)
+        return tuple(notes)
 
 
 class _Reads:

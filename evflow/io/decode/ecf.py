@@ -1,10 +1,9 @@
 """ECF, the lossless compression of Prophesee's HDF5 files (HDF5 filter 0x8ECF), undone with NumPy.
 
 A block, little-endian: u32, the number of events << 2 | form; u64, the start time; then runs of
-equal
-times: bytes step << 4 | count. A count of 15 means that the count follows as u16. A step of 15 is
-no
-run: its count is the next nibble of a long step, lowest first. Then, depending on the form:
+equal times: bytes step << 4 | count. A count of 15 means that the count follows as u16. A step of
+15 is no run: its count is the next nibble of a long step, lowest first. Then, depending on the
+form:
 2: y, x and polarity as 24 bits, y << 12 | x << 1 | p, four events in three u32.
 1: runs of y, and x and polarity as 12 bits, x << 1 | p, four events in three u16.
 0: runs of y, x with neighbours, runs of polarity.

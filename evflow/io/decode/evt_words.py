@@ -25,7 +25,7 @@ def fitting(data: bytes, order: str = "<") -> list[str]:
     return [name for name, fit in zip(NAMES, fits, strict=True) if fit]
 
 
-def said(declared: str, read: str) -> str:
+def encoding_note(declared: str, read: str) -> str:
     """What to say about words that are read in another encoding than the header declares."""
     return (f"the header says {declared}, but the words are those of {read} and were read as such"
             if declared else f"the header names no encoding: the words are those of {read}")

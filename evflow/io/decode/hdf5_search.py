@@ -95,10 +95,10 @@ def _unit(f: Any, name: str, data: Any) -> str:
         if isinstance(written := columns.text(data.attrs.get(key)), str) and written:
             return written_unit(f"[{written}]")
     unit = written_unit(name)
-    return told_unit(f) if unit == "auto" else unit
+    return declared_unit(f) if unit == "auto" else unit
 
 
-def told_unit(f: Any) -> str:
+def declared_unit(f: Any) -> str:
     """The unit that the file states for all times; "auto" if it does not."""
     stated = np.asarray(f.attrs.get("timestamp_scale_ms", 0)).ravel()
     if len(stated) != 1 or stated.dtype.kind not in "iuf":
@@ -106,7 +106,7 @@ def told_unit(f: Any) -> str:
     return next((unit for ms, unit in SCALES_MS.items() if abs(stated[0] / ms - 1) < 1e-6), "auto")
 
 
-def told_offset(hints: Hints, *places: Any) -> int:
+def declared_offset(hints: Hints, *places: Any) -> int:
     """What to add to all times, in us: the first t_offset among the data sets and attributes of
     these groups; 0 if there is none."""
     for place in places:
@@ -116,7 +116,7 @@ def told_offset(hints: Hints, *places: Any) -> int:
     return 0
 
 
-def told_size(f: Any, group: Any) -> Size | None:
+def declared_size(f: Any, group: Any) -> Size | None:
     """(width, height) from attributes or data sets of the group, its `calib`, or the groups it lies
     in."""
     calib = group.get("calib")

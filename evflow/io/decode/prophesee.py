@@ -126,4 +126,4 @@ def raw(path: Path) -> tuple[Header, str, tuple[Note, ...]]:
     if encoding == header.encoding:
         return header, encoding, ()
     return header, encoding, (Note(
-        "events.layout", evt_words.said(header.encoding, encoding)),)
+        "events.layout", evt_words.encoding_note(header.encoding, encoding)),)

@@ -126,7 +126,7 @@ def shared_unit(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | Non
     return best if shared(best) > 0 else None
 
 
-def spoken_for(
+def likeliest_unit(
     n: int, span: float, pixels: float, first: float = 0.0,
     units: Sequence[str] = tuple(UNITS_US),
 ) -> tuple[str, str]:
@@ -162,7 +162,7 @@ def check_text_seconds(t: np.ndarray, where: object, pixels: float) -> None:
             "EV003", f"{where}: all times are whole seconds, dates since 1970: their decimals were "
             "lost when they were written.", DIGITS, where=where)
     units = ("ms", "us", "ns") if whole else ("ms", "us")
-    unit, why = spoken_for(len(t), last - float(np.nanmin(t)), pixels, float(t[0]), units)
+    unit, why = likeliest_unit(len(t), last - float(np.nanmin(t)), pixels, float(t[0]), units)
     seen = (f"all times are integers ({t[0]:.0f}, ...), not seconds" if whole else
             f"{last:.6f} s is not a time since 1970")
     raise EvflowDataError("EV003", f"{where}: {seen}; {why}.",
@@ -183,7 +183,8 @@ def check_seconds(t_us: np.ndarray, size: Size, read_in: str | None) -> None:
     if t_us[0] == t_us[-1]:
         return
     first, last = int(t_us[0]) // S_US, int(t_us[-1]) // S_US
-    unit, why = spoken_for(len(t_us), last - first, size[0] * size[1], first, ("ms", "us", "ns"))
+    unit, why = likeliest_unit(
+        len(t_us), last - first, size[0] * size[1], first, ("ms", "us", "ns"))
     raise EvflowDataError(
         "EV023", f"all {len(t_us):,} event times are whole seconds, {first} to {last}: no event "
         f"camera has so coarse a clock; {why}.", f"Pass --time-unit {unit} (time_unit={unit!r}).")

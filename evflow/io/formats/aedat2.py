@@ -138,6 +138,6 @@ class Decoder:
                 self.sample_clock.unwrap(t[pixels]), bits & 1023)
 
     def notes(self) -> tuple[Note, ...]:
-        said = tuple(Note("events.unread", f"{n:,} {name} were not read")
+        notes = tuple(Note("events.unread", f"{n:,} {name} were not read")
                      for name, n in self.skipped.items() if n)
-        return (*(self.aps.notes() if self.aps else ()), *said)
+        return (*(self.aps.notes() if self.aps else ()), *notes)

@@ -194,12 +194,12 @@ class _Reading:
                               (packet.overflow << 31) + (begin + end) // 2, (x, y))
 
     def notes(self) -> tuple[Note, ...]:
-        said = [Note("events.unread", f"{n:,} {name} were not read")
+        notes = [Note("events.unread", f"{n:,} {name} were not read")
                 for name, n in self.left.items() if n]
         if self.mosaic and self.aside.hints.colour == "luma":
-            said.append(Note("frames.raw", "frames are the raw mosaic of a colour sensor, as its "
+            notes.append(Note("frames.raw", "frames are the raw mosaic of a colour sensor, as its "
                              "events are: --bayer RGGB would convert them to luma"))
-        return tuple(said)
+        return tuple(notes)
 
 
 def _times(t: np.ndarray, overflow: np.ndarray | int) -> np.ndarray:

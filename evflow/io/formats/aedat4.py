@@ -124,7 +124,7 @@ class _Reading:
         found: list[np.ndarray] = []
         count = byte = 0
         try:
-            with warnings.catch_warnings(record=True) as said:
+            with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
                 while count < tables.ROWS and not self.aside.done:
                     byte = next(self.places)
@@ -138,7 +138,7 @@ class _Reading:
                         self.aside.follow(found[-1]["t"])
                     elif "frame" in packet and packet["stream_id"] in self.taken:
                         self._take(packet["frame"])
-            self.warned |= {str(w.message) for w in said}
+            self.warned |= {str(w.message) for w in caught}
         except (KeyboardInterrupt, SystemExit, EvflowDataError):
             raise
         except BaseException as e:  # a Rust panic derives from BaseException
@@ -153,8 +153,8 @@ class _Reading:
                           (frame.get("offset_x", 0), frame.get("offset_y", 0)))
 
     def notes(self) -> tuple[Note, ...]:
-        return tuple(Note("events.unread", f"the decoder left something out: {said}")
-                     for said in sorted(self.warned))
+        return tuple(Note("events.unread", f"the decoder left something out: {text}")
+                     for text in sorted(self.warned))
 
 
 @contextlib.contextmanager

@@ -23,10 +23,10 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import MAGIC, Hdf5Writer, plausible
 from evflow.io.decode.hdf5_search import (
+    declared_offset,
+    declared_size,
+    declared_unit,
     images_beside,
-    told_offset,
-    told_size,
-    told_unit,
 )
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
@@ -73,12 +73,12 @@ def read(path: Path, hints: Hints) -> Recording:
     with tables.opened(path) as f:
         columns = _columns(path, f)
         if hints.time_unit == "auto":
-            hints = dataclasses.replace(hints, time_unit=told_unit(f))
+            hints = dataclasses.replace(hints, time_unit=declared_unit(f))
         size, assumed = _size(f)
         if assumed and hints.size is None:
             notes += (assumed,)
         offset = (hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else
-                  told_offset(hints, f["events"], f))
+                  declared_offset(hints, f["events"], f))
         found = gather(path, _chunks(columns, hints), hints, size, "us", offset)
         if not {"frames", "frame_times"} <= set(f) or len(getattr(f["frames"], "keys", list)()):
             return images_beside(path, f, found, hints, "events/t", notes)
@@ -90,7 +90,7 @@ def _size(f: Any) -> tuple[Size | None, Note | None]:
     """Size of the sensor, None if unknown; and a note on what was assumed."""
     if "width" in f.attrs and "height" in f.attrs:
         return (int(f.attrs["width"]), int(f.attrs["height"])), None
-    if size := told_size(f, f["events"]):  # RVT: events/width, events/height
+    if size := declared_size(f, f["events"]):  # RVT: events/width, events/height
         return size, None
     if "ms_to_idx" in f and "t_offset" in f:
         return DSEC_SIZE, Note(

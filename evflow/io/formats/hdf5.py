@@ -2,8 +2,8 @@
 p}, calib/resolution), e2calib and other flat files, compound data sets. See `hdf5_search`.
 
 Times are us if they are integers and seconds if they have fractions, unless a name or an attribute
-gives the unit; a t_offset is added. Images beside the events are its frames where names tell their
-times.
+gives the unit; a t_offset is added. Images beside the events are its frames if their times can be
+found by name.
 """
 
 from __future__ import annotations
@@ -39,6 +39,6 @@ def read(path: Path, hints: Hints) -> Recording:
                 where=path)
         name, notes = hints.camera([table.name for _, table in found])
         group, table = next(pair for pair in found if pair[1].name == name)
-        size = hdf5_search.told_size(f, group)
-        gathered = table.gather(path, hints, size, hdf5_search.told_offset(hints, group))
+        size = hdf5_search.declared_size(f, group)
+        gathered = table.gather(path, hints, size, hdf5_search.declared_offset(hints, group))
         return hdf5_search.images_beside(path, f, gathered, hints, name, notes)

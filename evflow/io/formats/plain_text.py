@@ -102,7 +102,7 @@ def layout(head: bytes) -> Layout | None:
     names some of the columns but does not identify all."""
     rows: list[list[float]] = []
     headers: list[str] = []
-    heading, said, odd, byte, begin = "", "", b"", 0, 0
+    heading, comments, odd, byte, begin = "", "", b"", 0, 0
     if text.is_binary(head) or head.startswith(OTHERS):
         return None
     if b"\r" in head.strip() and b"\n" not in head:
@@ -119,10 +119,10 @@ def layout(head: bytes) -> Layout | None:
         if not rows and (comment or header):
             heading = words if words and not comment else heading  # it must name what there is
             headers += [words] if _order(words) else []
-            begin, said = byte, f"{said}\n{words}"
+            begin, comments = byte, f"{comments}\n{words}"
         elif fields:
             if not all(map(text.is_number, fields)) or (rows and len(fields) != len(rows[0])):
-                odd = b"" if _told(fields, headers) else line
+                odd = b"" if _are_data(fields, headers) else line
                 break  # damage, which `text.events` locates
             rows.append(list(map(float, fields)))
     if heading and not headers and sum(map(bool, map(columns.meaning, _fields(heading)))) >= 2:
@@ -134,12 +134,12 @@ def layout(head: bytes) -> Layout | None:
             "EV008", f"after its header {headers[-1][:80]!r} comes {odd.strip()[:60]!r}.",
             "Lines must be numbers: t in seconds or integer microseconds, polarity 0 and 1, -1 and "
             "1, or a word (true, false, on, off, pos, neg).")
-    default = Layout("", "whole" if TOOL.search(said) else "auto", begin,
-                     columns.written_size(said))
+    default = Layout("", "whole" if TOOL.search(comments) else "auto", begin,
+                     columns.written_size(comments))
     return _laid_out(headers, rows, bool(heading), default)
 
 
-def _told(fields: list[bytes], headers: list[str]) -> bool:
+def _are_data(fields: list[bytes], headers: list[str]) -> bool:
     """Whether the fields that the last header names are numbers (NaN included)."""
     order = _order(headers[-1]) if headers else ""
     return all(text.is_float(field) for field, name in zip(fields, order, strict=False)

@@ -61,11 +61,11 @@ class Aside:
         if self.last >= found.span[1]:
             with contextlib.suppress(Damage):
                 collections.deque(chunks, 0)
-        said = (*found.notes, *notes())
+        collected = (*found.notes, *notes())
         if not self.stack.times:
-            return self.stack.beside(found.events, self.hints, said)
+            return self.stack.beside(found.events, self.hints, collected)
         with events_alone():
             times, more = beside_events(
                 np.array(self.stack.times), self.path, "us", self.hints, found.events)
-            said = (MID_EXPOSURE, *said, *more)
-            return cut(self.stack.at(times, found.events, self.hints, said), found.span)
+            collected = (MID_EXPOSURE, *collected, *more)
+            return cut(self.stack.at(times, found.events, self.hints, collected), found.span)

@@ -22,7 +22,7 @@ Array = np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
-class Lay:
+class Cropping:
     """The part of a frame that is used, and the size to which it is scaled."""
 
     left: int
@@ -36,30 +36,33 @@ class Lay:
         return np.ascontiguousarray(part) if self.used == self.size else scaled(part, self.size)
 
 
-def laid(
+def cropped(
     source: FrameSource, *, crop: str | None = None, resize: str | None = None,
     sensor_size: str | None = None,
 ) -> FrameSource:
     """The source with its frames cropped ("WxH" from the middle, or "WxH+X+Y") and then scaled
     ("WxH"); or scaled and cropped to fill a sensor (a name, or "WxH"). Raises EV020 if the crop
     does not fit, or if a raw mosaic would be scaled."""
-    lay = lay_of(source.size, crop, resize, sensor_size)
-    if lay == Lay(0, 0, source.size, source.size):
+    cropping = cropping_of(source.size, crop, resize, sensor_size)
+    if cropping == Cropping(0, 0, source.size, source.size):
         return source
-    note = Note("frames.laid", f"of {source.size[0]}x{source.size[1]} pixels, "
-                f"{lay.used[0]}x{lay.used[1]} from column {lay.left}, row {lay.top} are mapped to "
-                f"{lay.size[0]}x{lay.size[1]} sensor pixels.")
+    used, size = cropping.used, cropping.size
+    note = Note("frames.laid", f"of {source.size[0]}x{source.size[1]} pixels, {used[0]}x{used[1]} "
+                f"from column {cropping.left}, row {cropping.top} are mapped to "
+                f"{size[0]}x{size[1]} sensor pixels.")
 
     def frames() -> Frames:
         for frame, time in source.open():
-            check_mosaic(lay, frame, source.notes)
-            yield lay(frame), time
+            check_mosaic(cropping, frame, source.notes)
+            yield cropping(frame), time
 
     source.notes.append(note)
-    return dataclasses.replace(source, size=lay.size, open=frames)
+    return dataclasses.replace(source, size=cropping.size, open=frames)
 
 
-def lay_of(size: Size, crop: str | None, resize: str | None, sensor_size: str | None) -> Lay:
+def cropping_of(
+    size: Size, crop: str | None, resize: str | None, sensor_size: str | None
+) -> Cropping:
     """Which part of frames of this size (width, height) is mapped to how many pixels; EV020."""
     left, top, *used = (0, 0, *size) if crop is None else _part(crop, size)
     if resize is not None and sensor_size is not None:
@@ -67,18 +70,18 @@ def lay_of(size: Size, crop: str | None, resize: str | None, sensor_size: str | 
                               "two sizes.", "Give only one of them.")
     if sensor_size is None:
         wanted = (used[0], used[1]) if resize is None else _size(resize, "--resize")
-        return Lay(left, top, (used[0], used[1]), wanted)
+        return Cropping(left, top, (used[0], used[1]), wanted)
     wanted = _sensor(sensor_size)
     ratio = min(used[0] / wanted[0], used[1] / wanted[1])  # the largest part with its aspect ratio
     part = [max(1, min(n, round(ratio * w))) for n, w in zip(used, wanted, strict=True)]
-    return Lay(left + (used[0] - part[0]) // 2, top + (used[1] - part[1]) // 2,
+    return Cropping(left + (used[0] - part[0]) // 2, top + (used[1] - part[1]) // 2,
                (part[0], part[1]), wanted)
 
 
-def check_mosaic(lay: Lay, frame: Array, notes: list[Note]) -> None:
+def check_mosaic(cropping: Cropping, frame: Array, notes: list[Note]) -> None:
     """Raise EV020 if a raw mosaic would be scaled, or cut within a cell."""
     raw = any(note.code == "frames.raw" for note in notes) and frame.ndim == 2
-    if raw and (lay.used != lay.size or lay.left % 2 or lay.top % 2):
+    if raw and (cropping.used != cropping.size or cropping.left % 2 or cropping.top % 2):
         raise EvflowDataError(
             "EV020", "a raw mosaic cannot be scaled, nor cropped from an odd column or row.",
             "Crop from an even one, or convert it to luma: --bayer instead of --colour.")

@@ -151,10 +151,10 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
         peak = max(peak, int(image.pixels.max(initial=0))) if depth == np.uint16 else peak
         if first is None:
             first = frame, depth
-            said = {note.code for note in notes}  # may include the response already
-            said |= {"frames.linearised"} if "frames.response" in said else set()
+            codes = {note.code for note in notes}  # may include the response already
+            codes |= {"frames.linearised"} if "frames.response" in codes else set()
             notes += [n for n in _seen_first(image, frame, hints) if n not in notes and not (
-                n.code in ("frames.linearised", "frames.raw") and n.code in said)]
+                n.code in ("frames.linearised", "frames.raw") and n.code in codes)]
         elif image.time_us <= last:
             raise EvflowDataError(
                 "EV004", f"{image.where} is at {image.time_us} us, the previous frame at {last} "

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.images.cropping import check_mosaic, cropping_of, scaled
 from evflow.io.images.frames import Frames, FrameSource
-from evflow.io.images.laying import check_mosaic, lay_of, scaled
 from evflow.notes import Note
 
 Array = np.ndarray
@@ -32,7 +32,7 @@ def swept(
     source: FrameSource, side_px: float, *, crop: str | None = None, resize: str | None = None,
     sensor_size: str | None = None,
 ) -> FrameSource:
-    """The video for a source with one frame; other arguments as in `laying.laid`. Raises EV020
+    """The video for a source with one frame; other arguments as in `cropping.cropped`. Raises EV020
     (several frames, a side out of range, or a raw mosaic)."""
     if not STEP_PX <= side_px <= LONGEST_PX:
         raise EvflowDataError("EV020", f"--saccades {side_px:g}.",
@@ -40,15 +40,16 @@ def swept(
     if source.count != 1:
         raise EvflowDataError("EV020", f"--saccades over {source.count or 'several'} frames.",
                               "It needs a single picture: a video has its own motion.")
-    lay, path = lay_of(source.size, crop, resize, sensor_size), saccades(side_px)
+    cropping, path = cropping_of(source.size, crop, resize, sensor_size), saccades(side_px)
 
     def frames() -> Frames:
         (picture, _), = source.open()
-        check_mosaic(lay, picture, source.notes)
+        check_mosaic(cropping, picture, source.notes)
         if any(note.code == "frames.raw" for note in source.notes):
             raise EvflowDataError("EV020", "a raw mosaic cannot be shifted.",
                                   "Convert it to luma: --bayer instead of --colour.")
-        seen = dataclasses.replace(lay, size=(FINE * lay.size[0], FINE * lay.size[1]))
+        width, height = cropping.size
+        seen = dataclasses.replace(cropping, size=(FINE * width, FINE * height))
         fine = seen(picture).astype(np.float32)
         for (x, y), time in zip(path.at_px, path.times_us.tolist(), strict=True):
             yield _shifted(fine, FINE * x, FINE * y), time
@@ -57,7 +58,7 @@ def swept(
         "frames.swept", f"the picture is seen during three saccades of {SACCADE_US / 1e3:g} ms "
         f"along a triangle with sides of {side_px:g} px, {len(path.times_us)} frames; beyond its "
         "edges it is mirrored."))
-    return dataclasses.replace(source, size=lay.size, count=len(path.times_us), open=frames)
+    return dataclasses.replace(source, size=cropping.size, count=len(path.times_us), open=frames)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

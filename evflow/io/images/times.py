@@ -192,8 +192,8 @@ def _rows(path: Path) -> tuple[list[list[str]], list[str], str]:
         content, _, comment = line.partition("#")
         fields = _fields(content)
         if not fields or (not rows and not any(map(is_float, fields))):
-            said = comment if not fields else content  # a comment or the header
-            words, header = f"{words} {said}", header if rows else _fields(said)
+            header_text = comment if not fields else content  # a comment or the header
+            words, header = f"{words} {header_text}", header if rows else _fields(header_text)
             continue
         if rows and len(fields) != len(rows[0]):
             raise EvflowDataError(

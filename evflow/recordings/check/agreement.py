@@ -24,7 +24,7 @@ from evflow.recordings.check.steps import (
     displacement,
     frame_steps,
 )
-from evflow.recordings.stillness import MOVING, company
+from evflow.recordings.stillness import MOVING, coincidence_excess
 from evflow.types import Recording
 
 INVERTED = -0.2  # correlation below which polarity is inverted
@@ -127,7 +127,7 @@ def _frozen(recording: Recording, steps: Steps) -> list[Finding]:
     still = all(not np.nan_to_num(change).any() for change in steps.changes[""])
     if not still or np.isnan(steps.changes[""]).all() or len(events) < LEAST_EVENTS:
         return []
-    if company(events, np.zeros(events.size[::-1], bool)) <= MOVING:
+    if coincidence_excess(events, np.zeros(events.size[::-1], bool)) <= MOVING:
         return []
     return [Finding(
         "EV034", "error", f"all frames that were examined ({len(steps.bounds) + 1}) are alike, but "

@@ -19,12 +19,12 @@ JUMP_US = 10_000_000  # a jump is longer than this, and longer than the rest of 
 def clocks(recording: Recording) -> list[Finding]:
     """EV023 (unit), EV025 (gaps), EV026 (jump), EV030 (dropped frames)."""
     wrong = misread(recording.events, recording.frame_times)
-    said = [note.text for note in recording.notes if note.code == "events.unit"]
+    reported = [note.text for note in recording.notes if note.code == "events.unit"]
     if wrong is None:
         return [*_gaps(recording), *_dropped(recording)]
     severity: Severity = "error" if wrong.certain else "warning"
-    if said:  # reported by the reader, which knows the unit it used
-        return [Finding("EV023", severity, f"{said[0]}.")]
+    if reported:  # reported by the reader, which knows the unit it used
+        return [Finding("EV023", severity, f"{reported[0]}.")]
     return [Finding("EV023", severity, wrong.seen, f"Pass --time-unit {wrong.unit}.")]
 
 

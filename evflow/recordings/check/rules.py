@@ -9,7 +9,7 @@ from typing import Unpack
 from evflow import io
 from evflow.checks import need
 from evflow.errors import EvflowDataError
-from evflow.io.hints import Told
+from evflow.io.hints import HintArguments
 from evflow.recordings.check.agreement import agreement
 from evflow.recordings.check.clocks import bunches, clocks, flickers
 from evflow.recordings.check.contents import contents, repeated
@@ -20,7 +20,9 @@ from evflow.recordings.windows import check_overlap, iter_windows
 from evflow.types import Recording, release
 
 
-def check(recording_or_path: Recording | str | os.PathLike, **hints: Unpack[Told]) -> Report:
+def check(
+    recording_or_path: Recording | str | os.PathLike, **hints: Unpack[HintArguments]
+) -> Report:
     """Look for common faults of a recording before any estimate.
 
     Without frames, the rules that need only events are applied. Faults of the data are findings,

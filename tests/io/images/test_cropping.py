@@ -1,4 +1,4 @@
-"""Frames laid on a sensor, slow motion, and saccades over one picture."""
+"""Frames cropped and scaled to a sensor, slow motion, and saccades over one picture."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from helpers.videos import code_of
 
+from evflow.io.images.cropping import cropped, cropping_of, slowed
 from evflow.io.images.frames import FrameSource
-from evflow.io.images.laying import laid, lay_of, slowed
 from evflow.io.images.saccades import saccades, swept
 from evflow.io.source import open_frames
 
@@ -41,20 +41,21 @@ FRAMES = np.random.default_rng(0).integers(0, 256, (2, 12, 20), np.uint8)
 def test_a_new_pixel_collects_the_light_of_its_area(
     options: dict[str, str], expected: np.ndarray
 ) -> None:
-    made = laid(source(FRAMES), **options)
+    made = cropped(source(FRAMES), **options)
     np.testing.assert_allclose(all_of(made), expected, rtol=1e-5)
     assert len(made.notes) == (expected.shape != FRAMES.shape)
     colour = np.stack([FRAMES, 255 - FRAMES, FRAMES // 2], -1)
-    np.testing.assert_allclose(all_of(laid(source(colour), **options))[..., 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        all_of(cropped(source(colour), **options))[..., 0], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("name", "size"), [
     ("davis346", (346, 260)), ("DAVIS 240", (240, 180)), ("dvs128", (128, 128)),
     ("evk4", (1280, 720)), ("GenX320", (320, 320)), ("100x50", (100, 50))])
 def test_sensors_by_name(name: str, size: tuple[int, int]) -> None:
-    lay = lay_of((1920, 1080), None, None, name)
-    assert lay.size == size
-    (width, height), (x, y) = lay.used, (lay.left, lay.top)
+    cropping = cropping_of((1920, 1080), None, None, name)
+    assert cropping.size == size
+    (width, height), (x, y) = cropping.used, (cropping.left, cropping.top)
     assert abs(width / height - size[0] / size[1]) < 0.01  # nothing is squeezed
     assert width == 1920 or height == 1080  # and all is used that can be
     assert abs(2 * x + width - 1920) <= 1
@@ -65,7 +66,7 @@ def test_sensors_by_name(name: str, size: tuple[int, int]) -> None:
     {"crop": "21x5"}, {"crop": "8x6+13+0"}, {"crop": "8"}, {"crop": "0x4"}, {"resize": "8x"},
     {"resize": "8x4", "sensor_size": "dvs128"}, {"sensor_size": "davis"}, {"resize": "0x0"}])
 def test_what_is_no_part_of_the_frames(options: dict[str, str]) -> None:
-    assert code_of(lambda: laid(source(FRAMES), **options)) == "EV020"
+    assert code_of(lambda: cropped(source(FRAMES), **options)) == "EV020"
 
 
 def test_slow_motion_divides_the_times() -> None:

@@ -12,7 +12,7 @@ from helpers.networks import hidden
 
 from evflow import Events, Recording, check, estimate_camera, read_recording
 from evflow.errors import EvflowDataError
-from evflow.recordings.stillness import company, gathered, stands_still
+from evflow.recordings.stillness import clustered, coincidence_excess, stands_still
 
 SIZE = (64, 48)
 SECONDS = 20.0
@@ -107,9 +107,9 @@ def test_a_moving_scene_is_refused() -> None:
 def test_company_is_what_independent_noise_lacks() -> None:
     for rate in (0.05, 1.0, 10.0):
         recording, _, hot = static(rate, rate, seed=1)
-        assert abs(company(recording.events, hot)) < 0.02
+        assert abs(coincidence_excess(recording.events, hot)) < 0.02
     moving = hidden(14, 600)[0].events
-    assert company(moving, np.zeros((48, 64), bool)) > 1.0
+    assert coincidence_excess(moving, np.zeros((48, 64), bool)) > 1.0
 
 
 def test_many_hot_pixels_are_faults_where_they_are_scattered() -> None:
@@ -124,7 +124,7 @@ def test_many_hot_pixels_are_faults_where_they_are_scattered() -> None:
 def test_a_lamp_that_flickers_is_no_fault() -> None:
     lamp = np.zeros((48, 64), bool)
     lamp[20:26, 30:36] = True
-    assert gathered(lamp)
+    assert clustered(lamp)
     events = static(hot=0)[0].events
     y, x = np.nonzero(lamp)
     rng = np.random.default_rng(3)

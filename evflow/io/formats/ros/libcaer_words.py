@@ -37,8 +37,8 @@ class Decoder:
                          "message")
         if not len(words):
             return (np.empty(0, np.int64),) * 4
-        time = (_told(kind == HIGH, value, 0) << 12) | _told(kind == LOW, value, 0)
-        x = _told(kind == COLUMN, value & PLACE, self.x)
+        time = (_latest(kind == HIGH, value, 0) << 12) | _latest(kind == LOW, value, 0)
+        x = _latest(kind == COLUMN, value & PLACE, self.x)
         base, on = self._bases(kind, value)
         vectors = np.flatnonzero(kind == VECTOR)
         which, bit = np.nonzero((value[vectors, None] >> np.arange(ROWS)) & 1)
@@ -55,13 +55,13 @@ class Decoder:
         """Row of bit 0 and polarity of each vector word (undefined at other words)."""
         is_base = kind == BASE
         advanced = ROWS * np.cumsum(kind == VECTOR)
-        base = _told(is_base, (value & PLACE) - advanced, self.base) + advanced
-        on = _told(is_base, value & ON, ON * self.on) != 0
+        base = _latest(is_base, (value & PLACE) - advanced, self.base) + advanced
+        on = _latest(is_base, value & ON, ON * self.on) != 0
         self.base, self.on = int(base[-1]), bool(on[-1])
         return base - ROWS, on
 
 
-def _told(tells: np.ndarray, values: np.ndarray, before: int) -> np.ndarray:
-    """For each word, the value of the last word for which `tells` holds; `before` if none."""
-    marks = np.flatnonzero(tells)
+def _latest(sets: np.ndarray, values: np.ndarray, before: int) -> np.ndarray:
+    """For each word, the value of the last word for which `sets` holds; `before` if none."""
+    marks = np.flatnonzero(sets)
     return hold(before, values[marks], marks, len(values))

@@ -52,9 +52,9 @@ class Mcap:
         self._loose = tuple(array.array("Q") for _ in range(3))  # outside of chunks: time, place
         self._chunks: list[Chunk] = []
         try:
-            said = self._scan()
+            stated = self._scan()
             check_expansion(sum(chunk.size for chunk in self._chunks), self._total, path)
-            counted = said if said is not None and self._described(said) else self._counted()
+            counted = stated if stated is not None and self._described(stated) else self._counted()
         except BaseException:
             self.close()
             raise
@@ -115,7 +115,7 @@ class Mcap:
         if self._take(0, len(MAGIC)) != MAGIC or self._take(
                 self._total - len(MAGIC), len(MAGIC)) != MAGIC:
             raise ValueError("it lacks MCAP's first or last bytes")
-        at, end, said, chunks = len(MAGIC), self._total - len(MAGIC), None, 0
+        at, end, stated, chunks = len(MAGIC), self._total - len(MAGIC), None, 0
         while at < end:
             kind, size = struct.unpack("<BQ", self._take(at, 9))
             at += 9
@@ -128,13 +128,13 @@ class Mcap:
             elif kind == CHUNK:
                 self._chunks.append(self._chunk(at, size))
             elif kind == STATISTICS:
-                said, chunks = _statistics(self._take(at, size))
+                stated, chunks = _statistics(self._take(at, size))
             elif kind in (HEADER, SCHEMA, CHANNEL):
                 self._describe(kind, self._take(at, size))
             at += size
-        if said is not None and chunks != len(self._chunks):
+        if stated is not None and chunks != len(self._chunks):
             raise ValueError(f"it has {len(self._chunks)} of {chunks} chunks")
-        return said
+        return stated
 
     def _describe(self, kind: int, body: bytes) -> None:
         if kind == HEADER and _text(body, 0)[0] != "ros2":
