@@ -15,8 +15,9 @@ from typing import Protocol, Unpack
 from evflow.checks import Size, need
 from evflow.errors import EvflowDataError, naming
 from evflow.files.regular import need_regular
+from evflow.io.decode.misread import doubt
 from evflow.io.decode.text import HEAD
-from evflow.io.decode.units import check_seconds, doubt
+from evflow.io.decode.units import check_seconds
 from evflow.io.decode.written import Written, coarse, watched
 from evflow.io.formats import (
     aedat2,

@@ -15,6 +15,7 @@ from evflow.checks import COLUMNS, RESET_US, Size
 from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
 from evflow.io.decode import late, written
+from evflow.io.decode.causes import why_no_polarity, why_outside
 from evflow.io.decode.chunk import Chunk
 from evflow.io.decode.units import UNITS_US
 from evflow.io.hints import Hints, dropped, within
@@ -143,7 +144,7 @@ class Gathering:
         value = getattr(chunk, name)[i]
         code = "EV007" if not np.isfinite(value) else "EV006" if name == "p" else "EV003"
         fix = {"t": "Times must be seconds or integers: export the file again.",
-               "p": _of_polarity(chunk.p)}
+               "p": why_no_polarity(chunk.p)}
         place = self._place(chunk, i) + self.so_far(chunk, i)
         return EvflowDataError(
             code, f"{self.path}: {name} is {value} at {place}",
@@ -178,7 +179,7 @@ class Gathering:
         return EvflowDataError(
             "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "
             f"{width}x{height}, at {spot}{self.so_far()}",
-            _outside(chunk.x, chunk.y, (width, height)) + self.sound_part(),
+            why_outside(chunk.x, chunk.y, (width, height)) + self.sound_part(),
             where=self.path)
 
     def _turns(self, chunk: Chunk) -> tuple[int, ...]:
@@ -265,33 +266,6 @@ class Gathering:
             return x, y, t, on
         self.notes += self.lateness.notes()
         return x[order], y[order], t[order], on[order]
-
-
-def _of_polarity(p: np.ndarray) -> str:
-    """What values (N,) that are no polarity probably mean."""
-    fix = {(0, 255): "Is 255 ON? Write p > 0.",
-           (1, 255): "A -1 stored as unsigned reads as 255: p.astype(np.int8).",
-           (1, 2): "Does it count from 1, and is 2 ON? Write p - 1."}
-    values = tuple(np.unique(p[np.isfinite(p)])[:3].tolist())
-    return "Polarity must be 0 or 1, or -1 or 1. " + fix.get(
-        values, "Is it the right column, without the bits of other fields?")
-
-
-def _outside(x: np.ndarray, y: np.ndarray, size: Size) -> str:
-    """Why some of the events at x, y (N,) might lie outside the sensor."""
-    width, height = size
-    least, right, low = min(int(x.min()), int(y.min())), int(x.max()), int(y.max())
-    if least < 0:
-        return ("No pixel is below 0: were they undistorted or shifted? Use raw ones. In AEDAT 2 "
-                "the size is wrong: pass size=(width, height), --size WxH")
-    if least > 0 and right <= width and low <= height:
-        return ("Do coordinates start at 1, as in MATLAB? Subtract 1; if the sensor is larger, "
-                "pass size=(width, height), --size WxH")
-    if right < height and low < width:
-        return ("Height before width, or x and y swapped in the file? If the former, pass "
-                f"size=({height}, {width}), --size {height}x{width}")
-    return ("Wrong size? Pass size=(width, height), --size WxH; if the size is right, the file is "
-            "damaged: copy it again")
 
 
 def place(path: Path, unit: str, number: int) -> str:

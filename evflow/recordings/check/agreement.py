@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from evflow.io.decode.units import too_few
+from evflow.io.decode.misread import too_few
 from evflow.recordings.check.drift import backwards, drifting
 from evflow.recordings.check.findings import Finding
 from evflow.recordings.check.steps import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evflow.io.decode.units import misread
+from evflow.io.decode.misread import misread
 from evflow.recordings.bunches import bunch
 from evflow.recordings.check.findings import Finding, Severity
 from evflow.recordings.flicker import flicker

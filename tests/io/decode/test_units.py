@@ -10,9 +10,9 @@ from helpers.recordings import refused
 
 from evflow import check
 from evflow.io import read_recording
+from evflow.io.decode.misread import misread
 from evflow.io.decode.units import (
     UNITS_US,
-    misread,
     shared_unit,
     since_1970,
     usual_unit,
