@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
-from evflow.commands.arguments import check_options, check_rest, flowing
+from evflow.commands.arguments import check_options, check_rest, reflowed
 from evflow.commands.check import Check
 from evflow.commands.compare import Compare
 from evflow.commands.convert import Convert
@@ -42,9 +42,9 @@ COMMANDS: dict[str, type] = {
     "voxel": Voxel, "export": Export, "train": Train, "version": Version}
 
 
-def offered(arguments: Sequence[str] = ()) -> Any:
+def command_type(arguments: Sequence[str] = ()) -> Any:
     """The type that tyro parses: one of the commands by its name. The options of `train` are built
-    only when `train` is called, and help flows only where it is shown, as both take time. Raises
+    only when `train` is called, and help is reflowed only to be shown, as both take time. Raises
     EV020 for options that the called command lacks."""
     found, verb = dict(COMMANDS), next(iter(arguments), "")
     if verb == "train":
@@ -52,12 +52,12 @@ def offered(arguments: Sequence[str] = ()) -> Any:
     if verb in found:
         check_options(verb, found[verb], arguments[1:])
         if {"-h", "--help"} & set(arguments):
-            found[verb] = flowing(found[verb])
+            found[verb] = reflowed(found[verb])
     named = tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in found.items())
     return Union[named]  # noqa: UP007 - built at run time
 
 
-def understood(arguments: list[str]) -> list[str]:
+def in_parsing_order(arguments: list[str]) -> list[str]:
     """The arguments in the order the parser expects; raises EV020 for an unknown command."""
     first = arguments[0] if arguments else ""
     if first == "--version":
@@ -78,9 +78,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         early.interrupt_as_usual()
         with stoppable():
-            arguments = understood(sys.argv[1:] if argv is None else argv)
+            arguments = in_parsing_order(sys.argv[1:] if argv is None else argv)
             command, rest = tyro.cli(
-                offered(arguments), args=arguments, prog="evflow", return_unknown_args=True,
+                command_type(arguments), args=arguments, prog="evflow", return_unknown_args=True,
                 description="Measure an event camera from its recording; simulate any video as it "
                 "would see it.\n\nExample: evflow estimate flight.aedat4 -o cam/")
             check_rest(arguments[0], rest)

@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 
 import evflow as ef
-from evflow.cli import main, offered
+from evflow.cli import command_type, main
 from evflow.dataset.sequence import EventSequence
 from evflow.errors import CODES
 from evflow.io import write_recording
@@ -272,7 +272,7 @@ def test_options_exist(document: Path) -> None:
     known |= {f"--{name}" for name in (
         "pos_thres", "neg_thres", "sigma_thres", "cutoff_hz", "refractory_period", "leak_rate_hz",
         "shot_noise_rate_hz")}  # of v2e
-    commands = [typing.get_args(c)[0] for c in typing.get_args(offered())]
+    commands = [typing.get_args(c)[0] for c in typing.get_args(command_type())]
     scripts = (coverage, curves, evaluate, integrate, true_video, make_dataset, see_better, train,
                train_eventgan, train_network)
     for options in (*commands, *(script.Options for script in scripts)):

@@ -1,7 +1,7 @@
-"""What a command line is checked for before it is parsed, and how the options' help flows.
+"""Checks of a command line before it is parsed, and the paragraphs of its help.
 
-An option that a command lacks is refused with the nearest ones of that command, or with what stands
-here for an option of v2e.
+An unknown option is refused, with the nearest ones of that command, or with evflow's counterpart of
+an option of v2e.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ V2E = {  # options of v2e by another name here, in `evflow simulate`
     "disable-slomo": "--no-interpolate"}
 
 
-def flowing(command: type) -> type:
-    """The command with every option's help as one paragraph: the parser would break its lines
-    where the source does."""
+def reflowed(command: type) -> type:
+    """The command with every option's help as one paragraph, without the source's line breaks."""
     hints = typing.get_type_hints(command, include_extras=True)
     help_of = {name: text for cls in reversed(command.__mro__) for name, text in _help(cls)
                if not any(getattr(note, "help", None)

@@ -21,7 +21,7 @@ class WidePrior:
     """theta: range of the ON threshold, log-uniform or, if `uniform`, uniform; ratio: theta_off
     lies within this factor of it, either way, log-uniform. mismatch: range of the standard
     deviation over pixels, as a share of the threshold: an absolute one of .03 would make hot pixels
-    of half of those at .05. eta: range of the noise rates in Hz, uniform, apart per polarity."""
+    of half of those at .05. eta: range of the noise rates in Hz, uniform, separate per polarity."""
 
     theta: tuple[float, float] = (0.05, 1.0)
     ratio: float = 1.5

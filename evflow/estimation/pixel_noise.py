@@ -123,7 +123,7 @@ def quiet_time(
     still = _still(dlog, seen, seconds)
     found = []
     for own, rate in zip(counts, rates, strict=True):
-        near = _company(own, hot)
+        near = _near(own, hot)
         alone = still & (near < max(0.5, rate * seconds * AROUND**2))
         found.append([own * alone, seconds * alone])
     return np.array(found, np.float32)
@@ -133,10 +133,10 @@ def calm(
     counts: Array, dlog: Array, seen: Array, hot: Array, seconds: float, rates: Array
 ) -> Array:
     """(H, W) bool: pixels around which no more happens in a window than noise explains. Arguments
-    as for `quiet_time`, which takes those with less than usual: of many successive windows none
-    is."""
+    as for `quiet_time`, whose criterion (fewer events than the mean) is too strict for pixels that
+    must be calm in many successive windows."""
     expected = float(np.sum(rates)) * seconds * AROUND**2
-    near = _company(counts.sum(0), hot)
+    near = _near(counts.sum(0), hot)
     return _still(dlog, seen, seconds) & ~hot & (near < expected + CHANCE * np.sqrt(expected) + 1.5)
 
 
@@ -148,7 +148,7 @@ def _still(dlog: Array, seen: Array, seconds: float) -> Array:
     return np.asarray(still & (drift < DRIFT * seconds))
 
 
-def _company(own: Array, hot: Array) -> Array:
+def _near(own: Array, hot: Array) -> Array:
     """Events (H, W) around each pixel, without its own and those of hot ones."""
     others = np.where(hot, 0, own).astype(np.float32)
     return cv2.boxFilter(others, -1, (AROUND, AROUND), normalize=False,

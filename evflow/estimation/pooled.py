@@ -1,5 +1,4 @@
-"""What windows say: their statistics, which the network's summary is made of, and their quiet time.
-"""
+"""Sums over windows: the statistics from which the network makes the summary, and quiet time."""
 
 from __future__ import annotations
 
@@ -108,10 +107,12 @@ def _stats(params: api.Params, window: Window, seen_by: Photoreceptor) -> api.St
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Quiet:
-    """What quiet pixels did: maps (2, 2, H, W), ON and OFF, events and seconds; light: the same by
-    the light that they saw, of `by_light`; waits: for an event; falling: (2, H, W) the seconds
-    times what `noise_factor` was of the pixel's light; factor: its mean over pixels and time;
-    share: (2,) of pixel_s, the seconds of all pixels but hot ones."""
+    """Events and time of quiet pixels.
+
+    maps: (2, 2, H, W), ON and OFF, events and seconds; light: the same by the pixels' light, of
+    `by_light`; waits: for an event; falling: (2, H, W) seconds, each weighted by `noise_factor` of
+    the pixel's light then; factor: the mean of `noise_factor` over pixels and time; share: (2,) of
+    pixel_s, the seconds of all pixels but hot ones."""
 
     maps: np.ndarray
     light: np.ndarray
@@ -122,8 +123,8 @@ class Quiet:
     pixel_s: float
 
     def at_mean_light(self) -> np.ndarray:
-        """The maps, with seconds in which as much noise comes at the mean light as came in theirs,
-        if it falls with light."""
+        """The maps for noise that falls with light: seconds are replaced by those in which as much
+        noise would come at the mean light."""
         return np.stack([self.maps[:, 0], self.falling / self.factor], 1)
 
 

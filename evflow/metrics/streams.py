@@ -87,7 +87,7 @@ def compare(
         "net_r": _correlation(*(_net(side, t0, t1) for side in sides.values())),
         "space_time_r": space_time_r(sides["real"], sides["synthetic"], t0, t1),
         "active": _active(counts["real"].sum(0) > 0, counts["synthetic"].sum(0) > 0),
-        **_company(sides),
+        **_delays(sides),
     }
 
 
@@ -164,7 +164,7 @@ def _active(real: np.ndarray, synthetic: np.ndarray) -> dict[str, float | None]:
             "common": _ratio(float((real & synthetic).sum()), float((real | synthetic).sum()))}
 
 
-def _company(sides: dict[str, Events]) -> dict[str, Any]:
+def _delays(sides: dict[str, Events]) -> dict[str, Any]:
     """Intervals of events to those before at the same pixel and at its neighbours."""
     found = {name: _of_pixels(events) for name, events in sides.items()}
     around = {name: delays for name, (_, _, delays) in found.items()}

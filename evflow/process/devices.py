@@ -85,8 +85,8 @@ def agree(vote: bool) -> bool:
 
 
 def leave_together() -> None:
-    """End this process's part in the run, once all others end theirs: JAX takes a process that ends
-    before them for dead, and ends them. Nothing runs on several processes afterwards."""
+    """Leave the run together with all other processes: JAX takes a process that leaves early for
+    dead, and ends the others. Nothing runs on several processes afterwards."""
     if jax.process_count() > 1:
         agree(True)
         jax.distributed.shutdown()  # now, as a process that a signal ends runs nothing at its exit

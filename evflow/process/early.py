@@ -1,6 +1,6 @@
-"""What must happen before other modules load: settings that a process can only get at its start,
-and Ctrl-C during the second that loading takes, or while the process ends. Nothing has begun then,
-or all is done, so the process ends at once, without a traceback (some modules do not survive an
+"""What must happen before other modules load: settings that only work at the start of a process,
+and Ctrl-C during the second that loading takes or while the process ends. At these times there is
+no work to save, so the process ends at once, without a traceback (some modules do not survive an
 interrupted import).
 
 This is the first module of evflow to be loaded, so it loads nothing itself.
@@ -10,7 +10,7 @@ import gc
 import os
 import sys
 
-GARBAGE = 50_000  # new objects before Python searches for garbage
+GARBAGE = 50_000  # new objects before Python collects garbage
 
 
 def is_command() -> bool:
@@ -21,10 +21,10 @@ def is_command() -> bool:
 
 
 def save_time() -> None:
-    """Reduce overhead. NumPy's linear-algebra threads spin while they wait for each other, longer
-    than products of a few numbers take (the environment's own setting is respected); and Python
-    searches all objects for garbage after every 700 new ones, hundreds of times while modules load
-    and programs are traced; until `settle`, not at all."""
+    """Reduce overhead: one linear-algebra thread for NumPy, whose threads spin while they wait for
+    each other, longer than small products take (settings in the environment come first); and no
+    garbage collection until `settle`, which by default runs hundreds of times while modules load
+    and programs are traced."""
     if "OMP_NUM_THREADS" not in os.environ:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
@@ -32,7 +32,7 @@ def save_time() -> None:
 
 
 def settle() -> None:
-    """Search for garbage from here on, but not among what exists, which is modules above all."""
+    """Collect garbage from here on, but not among the objects that exist, mostly modules."""
     gc.freeze()
     gc.enable()
 

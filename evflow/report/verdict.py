@@ -49,7 +49,7 @@ ALIKE = {"good": "Alike.", "fair": "Alike in part.", "poor": "Not alike."}
 @dataclasses.dataclass(frozen=True)
 class Judged:
     """grade of one matter; about: "ON", "OFF", or "" for both; badness: how far from ideal, to
-    tell which is poorer; seen: a sentence; matter and short: row and entry of the table of
+    find the poorer one; seen: a sentence; matter and short: row and entry of the table of
     verdicts; advice: what to do, "" where nothing needs doing."""
 
     grade: Grade

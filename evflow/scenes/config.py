@@ -25,7 +25,7 @@ class SceneConfig:
     """The distribution of scenes.
 
     Attributes:
-        speed_px_s: speed of the background and of each foreground, drawn apart (log).
+        speed_px_s: speed of the background and of each foreground, drawn separately (log).
         foregrounds: how many cut-outs at most.
         foreground_probability: the chance of each cut-out.
         diameter_px: largest extent of a cut-out in a 64-pixel frame; scales with the shorter side.

@@ -2,7 +2,7 @@
 limit or a signal, on any number of devices and processes.
 
 A step is dispatched before the metrics of the one before are fetched: the device never waits for
-the host, but where a checkpoint is due (the next step takes the state's buffers).
+the host, except where a checkpoint is due (the next step takes the state's buffers).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import pytest
 from helpers.recordings import equal, make
 
 from evflow.camera import Camera
-from evflow.cli import main, offered
+from evflow.cli import command_type, main
 from evflow.commands.options import Reading
 from evflow.commands.writing import named
 from evflow.errors import EvflowDataError
@@ -155,7 +155,7 @@ def test_a_mosaic_becomes_luma(folder: Path, capsys: pytest.CaptureFixture[str])
 
 def test_own_options_come_first_in_the_help() -> None:
     inherited = [field.name for field in dataclasses.fields(Reading)]
-    commands = [typing.get_args(c)[0] for c in typing.get_args(offered())]
+    commands = [typing.get_args(c)[0] for c in typing.get_args(command_type())]
     reading = [c for c in commands if issubclass(c, Reading)]
     assert len(reading) >= 7
     for command in reading:

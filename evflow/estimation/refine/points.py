@@ -107,7 +107,7 @@ def _candidates(
 
 def _isolated(p: _Places, bright: Array, table: Array) -> Array:
     """(N,) bool: points of bright pixels with at most MOST_NEAR events of their polarity nearby."""
-    return bright.ravel()[p.pixel] & (_company(table, p, NEAR) - (p.event >= 0) <= MOST_NEAR)
+    return bright.ravel()[p.pixel] & (_events_near(table, p, NEAR) - (p.event >= 0) <= MOST_NEAR)
 
 
 def _cumulated(s: Sightings, length: int, steps: int) -> Array:
@@ -132,7 +132,7 @@ def _integral(counts: Array) -> Array:
     return np.pad(counts.cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
 
-def _company(table: Array, p: _Places, box: tuple[int, int]) -> Array:
+def _events_near(table: Array, p: _Places, box: tuple[int, int]) -> Array:
     """(N,) events of a table (T + 1, H + 1, W + 1) in the box around each point."""
     ends = []
     strides = (table.shape[1] * table.shape[2], table.shape[2], 1)
@@ -170,8 +170,8 @@ def surroundings(
     step, y, x = p.at
     columns = []
     for box in BOXES:
-        columns += [np.log1p(_company(table[side], p, box) - (p.event >= 0)),
-                    np.log1p(_company(table[1 - side], p, box))]
+        columns += [np.log1p(_events_near(table[side], p, box) - (p.event >= 0)),
+                    np.log1p(_events_near(table[1 - side], p, box))]
     for span in SPANS:
         begin, end = np.maximum(step - span, 0), np.minimum(step + 1 + span, len(path) - 1)
         climb = sign / unit * (path[end, y, x] - path[begin, y, x])
