@@ -28,12 +28,20 @@ def estimated(**given: Any) -> tuple[Any, Any]:
 
 def test_chunks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = estimated()
+    sizes: list[int] = []
+
+    def in_chunks(f: Any, rows: Any, size: int, plain: Any = chunks.in_chunks) -> Any:
+        sizes.append(size)
+        return plain(f, rows, size)
+
+    monkeypatch.setattr(chunks, "in_chunks", in_chunks)
     for name in ("SMALL", "LARGE", "HUGE"):
         monkeypatch.setattr(chunks, name, 32)
-    jax.clear_caches()  # the sizes are not among the arguments
+    inference._share.clear_cache()  # the sizes are not among the arguments
     for a, b in zip(whole, estimated(), strict=True):
         np.testing.assert_allclose(a, b, **close)
-    jax.clear_caches()
+    assert set(sizes) == {32}
+    inference._share.clear_cache()
 
 
 @pytest.mark.slow
