@@ -7,7 +7,6 @@ content, and by its extension if several formats claim it. Errors are `EvflowDat
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 from typing import Protocol, Unpack
@@ -15,10 +14,10 @@ from typing import Protocol, Unpack
 from evflow.checks import Size, need
 from evflow.errors import EvflowDataError, naming
 from evflow.files.regular import need_regular
-from evflow.io.decode.misread import doubt
+from evflow.io.decode.misread import with_doubts
 from evflow.io.decode.text import HEAD
 from evflow.io.decode.units import check_seconds
-from evflow.io.decode.written import Written, coarse, watched
+from evflow.io.decode.written import watched
 from evflow.io.formats import (
     aedat2,
     aedat3,
@@ -49,7 +48,6 @@ from evflow.io.formats.write_aedat2 import Aedat2Writer
 from evflow.io.formats.write_aedat4 import Aedat4Writer
 from evflow.io.hints import HintArguments, Hints
 from evflow.io.writer import EventWriter, copy
-from evflow.notes import Note
 from evflow.types import Events, Recording
 
 
@@ -143,7 +141,7 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[HintArguments]) -> R
             _check_named(recording, parsed)
             events = recording.events
             check_seconds(events.t, events.size, written.unit)
-            recording = _doubted(recording, found.NAME, parsed, written)
+            recording = with_doubts(recording, found.NAME, parsed, written)
     except MemoryError as e:
         raise EvflowDataError(
             "EV009", f"{path} asks for more memory than there is.",
@@ -270,26 +268,12 @@ def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventW
     return WRITERS[WRITTEN[suffix] if format is None else format]
 
 
-def _doubted(recording: Recording, format: str, parsed: Hints, written: Written) -> Recording:
-    """The recording, with a note if its times are doubtful; EV023 if the user must decide."""
-    coarseness = coarse(recording.events.t, written)
-    found = doubt(recording.events, recording.frame_times, format, written.unit) if (
-        parsed.time_unit == "auto") else None
-    if found is not None:
-        note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
-    elif coarseness:
-        note = Note("events.coarse", coarseness)
-    else:
-        return recording
-    return dataclasses.replace(recording, notes=(*recording.notes, note))
-
-
 def _check_named(recording: Recording, parsed: Hints) -> None:
     """Raise EV020 if an image or event stream was named but the file has only one, or none."""
     if parsed.events_topic is not None and all(n.code != "sensor.camera" for n in recording.notes):
         raise EvflowDataError(
-            "EV020", f"events_topic={parsed.events_topic!r}, but there are no several streams of "
-            "events.", "Leave it out (--events-topic).")
+            "EV020", f"events_topic={parsed.events_topic!r}, but the file does not have several "
+            "streams of events.", "Leave it out (--events-topic).")
     if parsed.frames_topic is not None and all(n.code != "frames.stream" for n in recording.notes):
         raise EvflowDataError(
             "EV020", f"frames_topic={parsed.frames_topic!r}, but the file has no images.",

@@ -6,13 +6,17 @@ by `recordings.check`. units.py infers the unit beforehand.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.io.decode.units import BLOCK, EPOCH_S, S_US, UNITS_US, all_on
-from evflow.types import Events
+from evflow.io.decode.written import Written, coarse
+from evflow.io.hints import Hints
+from evflow.notes import Note
+from evflow.types import Events, Recording
 
 UNITS = tuple(UNITS_US)  # each a thousandth of the previous one
 CERTAIN = (  # formats whose times come from the camera's own clock
@@ -71,6 +75,20 @@ def doubt(
             "EV023", found.seen, f"Pass --time-unit {found.unit}, or, if they are right, the unit "
             f"they are in ({read_in or 'us, s'}).")
     return found
+
+
+def with_doubts(recording: Recording, format: str, parsed: Hints, written: Written) -> Recording:
+    """The recording, with a note if its times are doubtful; EV023 if the user must decide."""
+    coarseness = coarse(recording.events.t, written)
+    found = doubt(recording.events, recording.frame_times, format, written.unit) if (
+        parsed.time_unit == "auto") else None
+    if found is not None:
+        note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
+    elif coarseness:
+        note = Note("events.coarse", coarseness)
+    else:
+        return recording
+    return dataclasses.replace(recording, notes=(*recording.notes, note))
 
 
 def misread(
