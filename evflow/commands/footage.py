@@ -49,6 +49,9 @@ class Footage:
     """How the frames encode light, which is what pixels see. auto: srgb for videos and 8-bit
     images; linear for arrays, deeper images and a recording's own frames. log: floats that are
     natural logarithms of light, relative to --full-scale."""
+    exposure_ms: Annotated[float | None, value("MS")] = None
+    """Exposure of the frames in the scene's time: the blur of what moves is taken out before others
+    are interpolated. By default what a recording says, none for videos."""
     background: Literal["black", "white"] = "black"
     """What transparent images are laid over."""
     crop: Annotated[str | None, value("WxH[+X+Y]")] = None
@@ -72,6 +75,7 @@ class Footage:
     def source(self, path: Path) -> FrameSource:
         """The frames; EV020 if options contradict each other."""
         from evflow.io.images.cropping import cropped, slowed
+        from evflow.io.images.recorded import exposed_note, in_us
         from evflow.io.images.saccades import swept
         from evflow.io.source import open_frames
 
@@ -87,4 +91,11 @@ class Footage:
         else:
             source = cropped(source, crop=self.crop, resize=self.resize,
                              sensor_size=self.sensor_size)
-        return source if self.slow_motion is None else slowed(source, self.slow_motion)
+        source = source if self.slow_motion is None else slowed(source, self.slow_motion)
+        if self.exposure_ms is None:
+            return source
+        exposure_us = in_us(self.exposure_ms)
+        source.notes[:] = [note for note in source.notes if note.code != "frames.exposure"]
+        if exposure_us:
+            source.notes.append(exposed_note(exposure_us, "as was given"))
+        return dataclasses.replace(source, exposure_us=exposure_us)

@@ -27,7 +27,8 @@ T = TypeVar("T")
 LARGEST = 1e13  # limit of any number: as ms since 1970 it is in 2286, and fits integer microseconds
 
 ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # for --frames
-CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer", "colour")  # for any frames
+CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer", "colour",
+           "exposure_ms")  # for any frames
 OWN = ("frames_topic", "no_frames")  # for the recording's own
 
 
@@ -102,6 +103,9 @@ class Reading:
     """Added to the frame times; auto finds the offset at which events and frames agree."""
     flip_frames: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirror the frames."""
+    exposure_ms: Annotated[float | None, value("MS")] = None
+    """Exposure of the frames, whose blur is taken out; by default what the file says, if it does;
+    0 = none."""
     response: Literal["linear", "gamma", "srgb"] = "linear"
     """How the frames encode light; gamma is 2.2. Thresholds refer to linear light."""
     bayer: Annotated[str | None, value("RGGB|BGGR|GRBG|GBRG")] = None
@@ -158,6 +162,8 @@ class Reading:
                 colour=self.colour)
         if self.flip_frames != "none":
             recording = adjust.flipped(recording, self.flip_frames)
+        if self.exposure_ms is not None:
+            recording = adjust.exposed(recording, self.exposure_ms)
         recording = adjust.linearised(recording, self.response)
         return _aligned(recording) if self.frames_offset_ms == "auto" else recording
 

@@ -128,7 +128,9 @@ class Simulate(Pixels, Footage, Compiling):
     def _check(self, writer: type[EventWriter]) -> None:
         """Raise EV013, EV020 before any long work."""
         if not self.interpolate:
-            refuse(self, ("max_motion_px",), "--no-interpolate adds no frames")
+            refuse(self, ("max_motion_px", "exposure_ms"), "--no-interpolate adds no frames")
+        if self.saccades is not None:
+            refuse(self, ("exposure_ms",), "a single picture has none")
         if self.labels and not writer.LABELS:
             refuse(self, ("labels",), f"{writer.NAME} cannot store them; dsec (.h5) and npz can")
         if self.preview is None:
@@ -157,7 +159,8 @@ class Simulate(Pixels, Footage, Compiling):
             video = _kept(video, self.colour, came)
         pairs = as_seen(
             video, self.colour, None if limit == 0 else lambda slow, pixel:
-            upsample(slow, max_motion_px=pixel * limit, warn=source.notes.append))
+            upsample(slow, max_motion_px=pixel * limit, exposure_us=source.exposure_us,
+                     warn=source.notes.append))
         for pair in seen_frames(_timed(pairs, shown_us), self.seen_by(source.recorded)):
             now = shown_us.popleft()
             yield pair, [came.popleft() for _ in range(len(came)) if came[0][1] <= now]

@@ -132,7 +132,7 @@ def _recording(path: Path, asked: FrameHints) -> FrameSource:
     return dataclasses.replace(
         _source(recording.events.size, len(recording.frames), images, asked,
                 [*(n for n in recording.notes if n.code != "events.late"), *notes]),
-        recorded=True)
+        recorded=True, exposure_us=recording.exposure_us)
 
 
 def _responding(asked: FrameHints, usual: str, what: str) -> tuple[FrameHints, tuple[Note, ...]]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.images.recorded import exposed_note, in_us
 from evflow.io.source import open_frames
 from evflow.light import response as light
 from evflow.light.colour import are_luma, as_seen, mosaic_luma, mosaic_note
@@ -67,6 +68,15 @@ def shifted(recording: Recording, offset_us: int) -> Recording:
     return _changed(recording, moved, frame_times=recording.frame_times + offset_us)
 
 
+def exposed(recording: Recording, exposure_ms: float) -> Recording:
+    """The recording with this exposure of its frames, whatever the file says; EV020 if it is
+    negative."""
+    exposure_us = in_us(exposure_ms)
+    notes = tuple(note for note in recording.notes if note.code != "frames.exposure")
+    said = (exposed_note(exposure_us, "as was given"),) if exposure_us else ()
+    return dataclasses.replace(recording, notes=(*notes, *said), exposure_us=exposure_us)
+
+
 def flipped(recording: Recording, side: str) -> Recording:
     """The recording with its frames mirrored: "horizontal", "vertical" or "both"; EV020."""
     if side not in light.FLIPS:
@@ -113,7 +123,8 @@ def with_frames(
             "unit pass --timestamps-unit.")
     notes = (*recording.notes, Note("frames.replaced", f"frames come from {path}"),
              *(Note(note.code, _reworded(note.text)) for note in source.notes))
-    return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes)
+    return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes,
+                     source.exposure_us)
 
 
 def _reworded(text: str) -> str:

@@ -115,7 +115,7 @@ class Pictures:
             return (p for p in self.kept if times[run[0]] <= p[1] <= times[run[1]])
         self.kept, self.seen, self.run = [], [], run
         frames = ((self.recording.frame_dn(i), int(times[i])) for i in range(run[0], run[1] + 1))
-        made = upsample(frames, tell=self.seen.append)
+        made = upsample(frames, exposure_us=self.recording.exposure_us, tell=self.seen.append)
         width, height = self.recording.events.size
         many = (run[1] - run[0]) * USUAL * 4 * width * height > MOST_KEPT
         return made if many else self._kept(made)
@@ -200,8 +200,11 @@ def _halved(recording: Recording, runs: list[Run]) -> tuple[Recording, Run]:
         raise EvflowDataError("EV017", f"the frames {first} to {last} cannot be halved.",
                               "Record longer.")
     begin = max(first, int(np.searchsorted(times, times[middle] - LEARNT_SECONDS * 1e6)))
-    return Recording(recording.events.slice(int(times[begin]), int(times[middle])),
-                     recording.frames[begin:middle + 1], times[begin:middle + 1]), (middle, last)
+    half = dataclasses.replace(
+        recording, events=recording.events.slice(int(times[begin]), int(times[middle])),
+        frames=recording.frames[begin:middle + 1], frame_times=times[begin:middle + 1],
+        notes=())
+    return half, (middle, last)
 
 
 def held_out_shares(

@@ -79,7 +79,8 @@ class Film:
         starts = np.arange(run[0], run[1] - n + 1)
         first = int(starts[np.argmax(before[starts + n] - before[starts])])
         pairs = ((recording.frame_dn(i), int(times[i])) for i in range(first, first + n + 1))
-        frames, instants = zip(*upsample(pairs), strict=True)
+        frames, instants = zip(
+            *upsample(pairs, exposure_us=recording.exposure_us), strict=True)
         span = int(times[first + (n > 1)]), int(times[first + n])
         return Film(np.stack([np.asarray(f, np.float32) for f in frames]), np.array(instants),
                     recording.events.slice(*span), span)

@@ -18,6 +18,7 @@ from evflow.errors import EvflowDataError
 from evflow.notes import Note
 from evflow.process.threads import ahead
 from evflow.simulator.between import intervals
+from evflow.simulator.exposure import unblurred
 
 MIN_SIDE = 12  # pixels on the longer side: smaller frames show no motion
 STEP_PX = 0.5  # of motion: at one pixel a step, fine textures lose 5 to 15 % of their events
@@ -29,24 +30,28 @@ FAILED = 0.3  # share of changing pixels with wrong flow: strong occlusion alone
 
 def upsample(
     pairs: Iterable[tuple[np.ndarray, int]], *, max_motion_px: float = STEP_PX,
-    warn: Callable[[Note], None] | None = None, tell: Callable[[Seen], None] = lambda _: None,
+    exposure_us: int = 0, warn: Callable[[Note], None] | None = None,
+    tell: Callable[[Seen], None] = lambda _: None,
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Insert frames so that motion between neighbours is at most about max_motion_px.
 
     Args:
         pairs: (frame (H, W) in DN 0..255, time in us).
         max_motion_px: motion between neighbouring frames of the output.
+        exposure_us: of the frames; the blur of what moves meanwhile is taken out.
         warn: receives notes at the end: motion that needs more than MAX_STEPS steps, failed
             optical flow, cuts.
         tell: receives measurements of each interval.
 
     Yields:
-        (float32 frame, time): the given frames unchanged, and frames at even times between them,
-        delayed by two input frames.
+        (float32 frame, time): the given frames, unchanged unless they have an exposure, and frames
+        at even times between them, delayed by two input frames (three with an exposure).
 
     Raises:
         EvflowDataError: EV002 (frames too small or of changing size), EV020.
     """
+    if exposure_us < 0:
+        raise EvflowDataError("EV020", f"exposure_us={exposure_us}.", "It must be >= 0.")
     if not max_motion_px > 0:
         raise EvflowDataError("EV020", f"max_motion_px={max_motion_px}.", "It must be > 0.")
     last: list[tuple[np.ndarray, int]] = []
@@ -57,7 +62,7 @@ def upsample(
             yield pair
 
     seen: list[Seen] = []
-    with ahead(intervals(watched()), AHEAD) as found:
+    with ahead(unblurred(intervals(watched()), exposure_us), AHEAD) as found:
         for number, interval in enumerate(found):
             wanted = math.ceil(interval.speed_px / max_motion_px)
             t0, t1 = interval.a.time, interval.b.time
@@ -69,6 +74,7 @@ def upsample(
             fractions = [(t - t0) / (t1 - t0) for t in times]
             if fractions:
                 yield from zip(interval.at(fractions), times, strict=True)
+            last[:] = [(interval.b.dn, t1)]
     yield from last
     if warn is not None:
         for note in notes_on(seen):

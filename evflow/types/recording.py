@@ -26,11 +26,13 @@ class Recording:
         frame_times: (T,) any integer dtype, microseconds, mid-exposure, strictly increasing; kept
             as int64.
         notes: what a reader assumed, left out or converted.
+        exposure_us: exposure time of the frames, the median if it changes; 0 if it is unknown.
 
     Raises:
         EvflowDataError: EV002 (shape, or colour), EV003 (dtype, or range of float frames), EV004
             (times do not increase), EV007 (NaN), EV015 (frames and events of different size),
-            EV020 (`events` is not an `Events`, or `notes` are not `Note`s).
+            EV020 (`events` is not an `Events`, `notes` are not `Note`s, or the exposure is
+            negative).
 
     Example:
         >>> recording = ef.Recording(events, frames, frame_times)
@@ -41,6 +43,7 @@ class Recording:
     frames: np.ndarray
     frame_times: np.ndarray
     notes: tuple[Note, ...] = ()
+    exposure_us: int = 0
 
     def __post_init__(self) -> None:
         need(self.events, Events, "events", "For a path: evflow.read_recording(path).")
@@ -54,6 +57,10 @@ class Recording:
         times = check_times(times, "frame_times", strict=True)
         for note in self.notes:
             need(note, Note, "a note", "For a sentence: evflow.notes.Note(code, sentence).")
+        if not 0 <= self.exposure_us < np.inf:
+            raise EvflowDataError("EV020", f"exposure_us={self.exposure_us}.",
+                                  "Give microseconds, >= 0; 0 if it is unknown.")
+        object.__setattr__(self, "exposure_us", int(self.exposure_us))
         object.__setattr__(self, "frames", read_only(frames))
         object.__setattr__(self, "frame_times", read_only(times))
 

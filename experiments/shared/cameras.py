@@ -32,7 +32,8 @@ class Protocol:
     brightness in the memory; else the camera has been running for 20 ms. fade: instead of moving,
     the scene's brightness is multiplied by this in all. off: whether OFF events come as they
     should, have a threshold that nothing reaches, or are sent but left out of the recording.
-    exposure_ms: over which a frame is the mean of the light; black_dn: added to the frames;
+    exposure_ms: over which a frame is the mean of the light, and exposure_known: whether the
+    recording says so; black_dn: added to the frames;
     dark_dn: added to the light that pixels see. exact: the model's low-pass is solved exactly
     between the video's frames; else it is v2e's step from frame to frame, which makes a pixel
     faster than its cutoff says: at 1000 frames/s, 40 Hz act as some 53."""
@@ -48,6 +49,7 @@ class Protocol:
     fade: float = 1.0
     off: Literal["sent", "unreached", "dropped"] = "sent"
     exposure_ms: int = 0
+    exposure_known: bool = False
     black_dn: float = 0.0
     dark_dn: float = 0.0
     exact: bool = False
@@ -135,8 +137,10 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
     shown = _exposed(frames, kept, protocol.exposure_ms) + np.float32(protocol.black_dn)
     gray = np.asarray(watch.recorded(k_noise, shown, protocol.frame_noise_dn), np.uint8)
     gain = watch.noise_gain(protocol.model, light, light[0])
-    return Hidden(Recording(events, gray, times[kept]), watch.with_noise(camera, gain),
-                  watch.with_noise(nominal, gain), frames, kept, labels)
+    exposure_us = 1000 * protocol.exposure_ms * protocol.exposure_known
+    recording = Recording(events, gray, times[kept], exposure_us=exposure_us)
+    return Hidden(recording, watch.with_noise(camera, gain), watch.with_noise(nominal, gain),
+                  frames, kept, labels)
 
 
 FRAME_MS = (10, 20, 25, 25, 33, 40)

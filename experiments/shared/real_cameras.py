@@ -28,6 +28,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second order, 100 Hz": {"model": SensorModel(
         photoreceptor=SecondOrder().at(100.0), noise_resets_memory=True)},
     **{f"exposed {ms} ms": {"exposure_ms": ms} for ms in (10, 20)},
+    **{f"exposed {ms} ms, known": {"exposure_ms": ms, "exposure_known": True} for ms in (10, 20)},
     **{f"frame noise {dn} DN": {"frame_noise_dn": dn} for dn in (1.0, 3.0)},
     **{f"black level {dn:+.0f} DN": {"black_dn": dn} for dn in (-8.0, 8.0, 16.0)},
     "dark light 24 DN": {"dark_dn": 24.0},

@@ -88,6 +88,26 @@ def test_a_sensor_s_size_and_slow_motion(
     assert {"frames.laid", "frames.slowed"} <= {note["code"] for note in facts["notes"]}
 
 
+def test_the_blur_of_an_exposure_is_taken_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a texture that moves by 8 px a frame, exposed for half of the frame interval, more events
+    come back than the blur leaves; at most what the sharp video makes."""
+    fine = drifting(81, (48, 64), speed=0.4)  # 20 pictures a frame
+    means = [fine[k:k + 11].mean(0) for k in range(5, 70, 20)]
+    counts = {}
+    for name, frames, options in (("blurred", means, ()), ("sharp", fine[10:76:20], ()),
+                                  ("mended", means, ("--exposure-ms", "20"))):
+        np.save(tmp_path / "v.npy", np.stack(frames).astype(np.float32))
+        events, facts = run(tmp_path / "v.npy", "--fps", "25", *options, capsys=capsys)
+        counts[name] = len(events)
+        codes = [note["code"] for note in facts["notes"]]
+        assert ("frames.exposure" in codes) == bool(options)
+    assert counts["blurred"] < 0.9 * counts["sharp"]
+    assert abs(counts["mended"] / counts["sharp"] - 1) < 0.3 * (
+        1 - counts["blurred"] / counts["sharp"])
+
+
 def test_a_picture_by_saccades(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each of the three moves is seen; at rest between them hardly anything is."""
     cv2.imwrite(str(tmp_path / "cat.png"), drifting(1, (24, 32))[0])

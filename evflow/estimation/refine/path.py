@@ -18,6 +18,7 @@ from evflow.light.log_maps import lin_log
 from evflow.recordings.glitches import exposed
 from evflow.recordings.region import bands
 from evflow.simulator.between import intervals
+from evflow.simulator.exposure import unblurred
 from evflow.simulator.motion import speed
 from evflow.simulator.photoreceptor import FAST, Photoreceptor, seen_path
 from evflow.types import Recording
@@ -52,14 +53,15 @@ def of_place(recording: Recording, run: Sequence[int]) -> tuple[int, ...]:
 def interpolated(
     recording: Recording, run: Sequence[int], steps: int = STEPS, noise_dn: float = 0.0
 ) -> Film:
-    """The frames of a run of intervals, denoised (std noise_dn), with `steps` - 1 frames
-    interpolated by optical flow in each interval."""
+    """The frames of a run of intervals, denoised (std noise_dn) and without the blur of their
+    exposure, with `steps` - 1 frames interpolated by optical flow in each interval."""
     frames = [recording.frame_dn(i) for i in [*run, run[-1] + 1]]
     times = recording.frame_times[run[0]:run[-1] + 2]
     clean = [denoised(frame, noise_dn) for frame in frames]
     dn, motion = np.empty((len(run) * steps + 1, *clean[0].shape), np.float32), []
-    dn[::steps] = clean
-    for k, interval in enumerate(intervals(zip(clean, times.tolist(), strict=True), jerk=False)):
+    moving = intervals(zip(clean, times.tolist(), strict=True), jerk=False)
+    for k, interval in enumerate(unblurred(moving, recording.exposure_us)):
+        dn[k * steps], dn[(k + 1) * steps] = interval.a.dn, interval.b.dn
         # not sharp: the fusion network was trained on this contrast; sharp frames bias thresholds
         between = interval.at(np.arange(1, steps) / steps, sharp=False)
         for row, picture in zip(dn[k * steps + 1:], between, strict=False):

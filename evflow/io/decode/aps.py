@@ -25,10 +25,10 @@ SURE = 8  # coordinate steps that show which coordinate is slower, and its direc
 
 class Aps:
     """Builds frames (H, W) float32 from samples, in parts of any length; the converter's full range
-    becomes 255. done(frame, its mid-exposure in us) is called for each complete frame.
+    becomes 255. done(frame, its mid-exposure, exposure_us=) is called for each complete frame.
     """
 
-    def __init__(self, size: Size, done: Callable[[np.ndarray, int], Any]) -> None:
+    def __init__(self, size: Size, done: Callable[..., Any]) -> None:
         self.size, self.done = size, done
         self.incomplete = self.dark = self.outside = 0
         self.slow, self.way, self.last = "", 0, NONE
@@ -101,7 +101,8 @@ class Aps:
             light = reset - signal
             self.dark += int((light < 0).sum())
             frame = np.maximum(light, 0).astype(np.float32) * np.float32(255 / WHITE)
-            self.done(frame, _middle(*self.reads))
+            begin, end = _exposure(*self.reads)
+            self.done(frame, round((begin + end) / 2), exposure_us=round(max(end - begin, 0)))
         elif max(counts):
             self.incomplete += 1
         self._clear()
@@ -142,8 +143,8 @@ class _Reads:
         return out
 
 
-def _middle(resets: _Reads, signals: _Reads) -> int:
-    """Mid-exposure: between the last reset and the first signal, or averaged over the columns."""
+def _exposure(resets: _Reads, signals: _Reads) -> tuple[float, float]:
+    """Begin and end: the last reset and the first signal, or means over the columns."""
     if resets.last <= signals.first:
-        return (resets.last + signals.first) // 2
-    return round((resets.total / resets.count + signals.total / signals.count) / 2)
+        return resets.last, signals.first
+    return resets.total / resets.count, signals.total / signals.count

@@ -189,9 +189,11 @@ class _Reading:
             self.mosaic |= channels == 1 and bool(info >> 4 & (7 if self.turned else 15))
             image = image[..., 0] if channels < 3 else image[..., 2::-1]  # R, G, B(, A)
             image = image[::-1] if self.turned else image
-            begin, end = stamps[2:] if 0 < stamps[2] <= stamps[3] else stamps[:2]
+            known = 0 < stamps[2] <= stamps[3]
+            begin, end = stamps[2:] if known else stamps[:2]
             self.aside.append(image.astype(np.float32) * np.float32(255 / 65535),
-                              (packet.overflow << 31) + (begin + end) // 2, (x, y))
+                              (packet.overflow << 31) + (begin + end) // 2, (x, y),
+                              end - begin if known else 0)
 
     def notes(self) -> tuple[Note, ...]:
         notes = [Note("events.unread", f"{n:,} {name} were not read")

@@ -150,7 +150,7 @@ class _Reading:
         pixels = frame["pixels"]  # colours come as R, G, B(, A)
         self.aside.append(pixels if pixels.ndim == 2 else pixels[..., 2::-1],
                           _mid_exposure(frame),
-                          (frame.get("offset_x", 0), frame.get("offset_y", 0)))
+                          (frame.get("offset_x", 0), frame.get("offset_y", 0)), _exposure(frame))
 
     def notes(self) -> tuple[Note, ...]:
         return tuple(Note("events.unread", f"the decoder left something out: {text}")
@@ -211,6 +211,12 @@ def _decoder(path: Path) -> Any:
     except BaseException as e:
         raise EvflowDataError(
             "EV009", f"{path} cannot be decoded ({e}).", "Copy it again.", where=path) from e
+
+
+def _exposure(frame: dict[str, Any]) -> int:
+    """How long it took (us), 0 if that is not stored."""
+    begin, end = frame["exposure_begin_t"], frame["exposure_end_t"]
+    return end - begin if 0 < begin <= end else 0
 
 
 def _mid_exposure(frame: dict[str, Any]) -> int:

@@ -35,10 +35,11 @@ class Aside:
         self.stack = FrameStack(path, size, hints.colour)
         self.last, self.stop, self.begun = 0, sys.maxsize, False
 
-    def append(self, image: np.ndarray, time_us: int, origin: tuple[int, int] = (0, 0)) -> None:
+    def append(self, image: np.ndarray, time_us: int, origin: tuple[int, int] = (0, 0),
+               exposure_us: int = 0) -> None:
         """Add a frame, as in `FrameStack`."""
         with events_alone():
-            self.stack.append(image, time_us, origin)
+            self.stack.append(image, time_us, origin, exposure_us)
 
     def follow(self, t: np.ndarray) -> None:
         """Note the time of events t (n,) us, if `stop_s` is set."""

@@ -117,7 +117,8 @@ def slowed(source: FrameSource, factor: float) -> FrameSource:
 
     source.notes.append(Note("frames.slowed", f"the video is {factor:g} times slower than life: "
                              "its times were divided by this factor."))
-    return dataclasses.replace(source, open=frames)
+    return dataclasses.replace(
+        source, open=frames, exposure_us=round(source.exposure_us / factor))
 
 
 def _part(text: str, size: Size) -> tuple[int, int, int, int]:

@@ -29,11 +29,14 @@ class FrameStack:
     def __init__(self, where: object, size: Size, seen: str = "luma") -> None:
         self.where, self.size, self.seen, self.colour = where, size, seen, False
         self.times: list[int] = []
+        self.exposures: list[int] = []
         self.left: collections.Counter[str] = collections.Counter()
         self._spool: Spool | None = None
 
-    def append(self, image: np.ndarray, time: int, origin: tuple[int, int] = (0, 0)) -> None:
-        """Add an image, its time, and the sensor pixel (x, y) of its top left corner.
+    def append(self, image: np.ndarray, time: int, origin: tuple[int, int] = (0, 0),
+               exposure_us: int = 0) -> None:
+        """Add an image, its time, the sensor pixel (x, y) of its top left corner, and its exposure
+        if it is known.
 
         Raises EV002 (no image), EV003 (the dtype changes), EV019 (disk full).
         """
@@ -58,6 +61,7 @@ class FrameStack:
         self._spool.append(grey.ravel())
         self.colour |= image.ndim == 3
         self.times.append(time)
+        self.exposures.append(exposure_us)
 
     def beside(self, events: Events, hints: Hints, notes: tuple[Note, ...]) -> Recording:
         """The recording of these events and all frames; raises as `Recording`."""
@@ -81,7 +85,24 @@ class FrameStack:
         order, more = in_order(times, hints)
         if order is not None:
             frames, times = frames[order], times[order]
-        return Recording(events, frames, times, (*notes, *more))
+        exposure_us = round(np.median(self.exposures))
+        if exposure_us:
+            more = (*more, exposed_note(exposure_us))
+        return Recording(events, frames, times, (*notes, *more), exposure_us)
+
+
+def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:
+    """That frames have an exposure, and what follows."""
+    return Note("frames.exposure", f"frames are exposed for {exposure_us / 1e3:g} ms, {said_by}: "
+                "estimate and simulate take out the blur (--exposure-ms 0: they leave it)")
+
+
+def in_us(exposure_ms: float) -> int:
+    """An exposure in us; EV020 if it is negative or not finite."""
+    if not 0 <= exposure_ms < np.inf:
+        raise EvflowDataError("EV020", f"an exposure of {exposure_ms} ms.",
+                              "Give milliseconds (--exposure-ms), 0 if it is to be ignored.")
+    return round(exposure_ms * 1e3)
 
 
 def in_order(times: np.ndarray, hints: Hints) -> tuple[np.ndarray | None, tuple[Note, ...]]:

@@ -130,8 +130,11 @@ def test_frames_of_a_davis(
     assert listed(got.events) == [(42, 25, t, 1) for t in (1000, 40_000, 90_000)]
     assert got.frame_times.tolist() == [2000 + middle, 52_000 + middle]
     np.testing.assert_allclose(got.frames, np.maximum(light, 0) * 255 / 1023, rtol=1e-6)
-    assert texts(got.notes) == ["frame times are mid-exposure",
-                                "1 frame values below their reset are 0"]
+    notes = texts(got.notes)
+    assert notes[0] == "frame times are mid-exposure"
+    assert "1 frame values below their reset are 0" in notes
+    assert got.exposure_us == (100 if rolling else 10_000 - 470)
+    assert f"exposed for {got.exposure_us / 1e3:g} ms" in notes[-2] + notes[-1]
     assert len(read_recording(path, size=SMALL, stop_s=0.02).frames) == 1
     assert not read_recording(path, size=SMALL, no_frames=True).has_frames
 

@@ -67,8 +67,11 @@ def test_frames_at_mid_exposure(tmp_path: Path) -> None:
     found = read_recording(path)
     assert found.frame_times.tolist() == [1500, 5000, 2**31 + 1500]
     np.testing.assert_allclose(found.frames, pixels * (255 / 65535), rtol=1e-6)
+    assert found.exposure_us == 1000
     assert texts(found.notes) == ["frame times are mid-exposure",
-                                  "1 frames marked as invalid were not read"]
+                                  "1 frames marked as invalid were not read",
+                                  "frames are exposed for 1 ms, as the file says: estimate and "
+                                  "simulate take out the blur (--exposure-ms 0: they leave it)"]
     assert read_recording(path, stop_s=0.001).frame_times.tolist() == [1500]
     alone = read_recording(path, no_frames=True)
     equal(alone.events, found.events)

@@ -73,12 +73,26 @@ def test_aedat4_frames_lie_at_mid_exposure(
     got = read_recording(path)
     equal(got.events, recording.events)
     assert (got.frame_times - T0).tolist() == [0, 20, 60]
+    assert got.exposure_us == 0  # most frames have none
     red = np.zeros((48, 64, 3), np.uint8)
     red[..., 0] = 255
     fake_aedat(monkeypatch, [packet_of(recording.events), frame_packet(T0, red)])
     got = read_recording(path)
     assert got.frames[0, 0, 0] == round(0.299 * 255)
     assert len(got.notes) == 2
+
+
+def test_aedat4_exposure_is_the_frames_median(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, recording = tmp_path / "a.aedat4", make()
+    path.write_bytes(AEDAT4)
+    fake_aedat(monkeypatch, [packet_of(recording.events), *(
+        frame_packet(T0, recording.frames[0], exposure_begin_t=t, exposure_end_t=t + length)
+        for t, length in ((T0, 8000), (T0 + 20_000, 8200), (T0 + 40_000, 12_000)))])
+    got = read_recording(path)
+    assert got.exposure_us == 8200
+    assert any("exposed for 8.2 ms, as the file says" in n.text for n in got.notes)
 
 
 @pytest.mark.parametrize(("old", "new"), [
