@@ -20,6 +20,7 @@ import tyro
 
 from evflow.errors import EvflowDataError
 
+LIKE = 0.65  # similarity of names (difflib) from which one is proposed for another
 V2E = {  # options of v2e by another name here, in `evflow simulate`
     "pos-thres": "--theta-on", "neg-thres": "--theta-off", "sigma-thres": "--mismatch",
     "refractory-period": "--refractory-s", "leak-rate-hz": "--leak-hz",
@@ -88,7 +89,7 @@ def _instead(verb: str, typed: str, name: str, known: set[str]) -> str:
         return f"v2e's {typed} is {V2E[name]} here."
     names = sorted(option.lstrip("-") for option in known)
     near = [k for k in names if f"-{name}-" in f"-{k}-" or name.startswith(f"{k}-")]
-    near = near or difflib.get_close_matches(name, names, n=1)
+    near = near or difflib.get_close_matches(name, names, n=1, cutoff=LIKE)
     return f"Did you mean {' or '.join(f'--{k}' for k in near)}?" if near else ""
 
 
