@@ -50,7 +50,8 @@ def _settle(config: Any, name: str, low: float, rule: str) -> None:
     require(config, name, np.ndim(value) == 0, "one number; jax.vmap takes several")
     if isinstance(value, jax.core.Tracer):
         return
-    require(config, name, bool(np.isfinite(value)) and value >= low, rule)
+    number = np.asarray(value).dtype.kind in "biuf"
+    require(config, name, number and bool(np.isfinite(value)) and value >= low, rule)
     object.__setattr__(config, name, float(value))
 
 

@@ -123,6 +123,12 @@ def test_voltmeter_voxels_are_those_of_its_events(camera: Camera) -> None:
     assert np.abs(direct - ours).sum() < 0.01 * len(events)
 
 
+@pytest.mark.parametrize("value", [None, "3", 1j, float("nan"), -0.1])
+def test_what_is_no_rate_is_refused(value: Any) -> None:
+    with pytest.raises(EvflowDataError, match="EV020.*leak_hz"):
+        SensorModel(leak_hz=value)
+
+
 @pytest.mark.parametrize("options", [
     {"kind": "dvs"}, {"kind": "esim", "leak_hz": 0.1}, {"kind": "esim", "timestamps": "v2e"},
     {"kind": "paper", "shot_hz": 1.0}, {"kind": "paper", "noise_resets_memory": True},
