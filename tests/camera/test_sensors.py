@@ -125,7 +125,7 @@ def test_voltmeter_voxels_are_those_of_its_events(camera: Camera) -> None:
 
 @pytest.mark.parametrize("value", [None, "3", 1j, float("nan"), -0.1])
 def test_what_is_no_rate_is_refused(value: Any) -> None:
-    with pytest.raises(EvflowDataError, match="EV020.*leak_hz"):
+    with pytest.raises(EvflowDataError, match=r"EV020.*leak_hz"):
         SensorModel(leak_hz=value)
 
 
