@@ -4,6 +4,7 @@ sensor."""
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -94,7 +95,8 @@ class Footage:
         source = source if self.slow_motion is None else slowed(source, self.slow_motion)
         if self.exposure_ms is None:
             return source
-        exposure_us = in_us(self.exposure_ms)
+        times = (time for _, time in itertools.islice(source.open(), 3 if self.exposure_ms else 0))
+        exposure_us = in_us(self.exposure_ms, times)
         source.notes[:] = [note for note in source.notes if note.code != "frames.exposure"]
         if exposure_us:
             source.notes.append(exposed_note(exposure_us, "as was given"))

@@ -70,8 +70,8 @@ def shifted(recording: Recording, offset_us: int) -> Recording:
 
 def exposed(recording: Recording, exposure_ms: float) -> Recording:
     """The recording with this exposure of its frames, whatever the file says; EV020 if it is
-    negative."""
-    exposure_us = in_us(exposure_ms)
+    negative or longer than the interval between frames."""
+    exposure_us = in_us(exposure_ms, recording.frame_times.tolist())
     notes = tuple(note for note in recording.notes if note.code != "frames.exposure")
     said = (exposed_note(exposure_us, "as was given"),) if exposure_us else ()
     return dataclasses.replace(recording, notes=(*notes, *said), exposure_us=exposure_us)

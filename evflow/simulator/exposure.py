@@ -32,7 +32,8 @@ def unblurred(found: Iterable[Interval], exposure_us: int) -> Iterator[Interval]
 
     Args:
         found: successive intervals, with the frames as recorded.
-        exposure_us: of each frame, around its time; 0 leaves the frames as they are.
+        exposure_us: of each frame, around its time, at most an interval; 0 leaves the frames as
+            they are.
 
     Yields:
         The intervals, each one later than it came, with the same motion.
@@ -62,7 +63,7 @@ def _sharp(
         return frame
     total = np.zeros_like(frame.dn)
     for sign, (side, begin) in ((-1, sides[0]), (1, sides[-1])):
-        share = 0.5 * exposure_us / (side.b.time - side.a.time)
+        share = min(0.5 * exposure_us / (side.b.time - side.a.time), 0.5)
         pictures = side.at([begin + sign * share * node for node in NODES])
         for weight, picture in zip(WEIGHTS, pictures, strict=True):
             total += weight * picture

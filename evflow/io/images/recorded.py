@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from evflow.io.hints import Hints
 from evflow.light.colour import CONVERTED, luma, mosaic, seen_note
 from evflow.notes import Note
 from evflow.types import Events, Recording
+
+LONGEST = 1.05  # an exposure lasts at most the interval between frames; times are rounded
 
 
 class FrameStack:
@@ -97,11 +100,17 @@ def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:
                 "estimate and simulate take out the blur (--exposure-ms 0: they leave it)")
 
 
-def in_us(exposure_ms: float) -> int:
-    """An exposure in us; EV020 if it is negative or not finite."""
-    if not 0 <= exposure_ms < np.inf:
-        raise EvflowDataError("EV020", f"an exposure of {exposure_ms} ms.",
-                              "Give milliseconds (--exposure-ms), 0 if it is to be ignored.")
+def in_us(exposure_ms: float, times_us: Iterable[int]) -> int:
+    """An exposure in us of frames at these times; EV020 if it is negative, or longer than the
+    interval between frames."""
+    gaps = np.diff(list(times_us))
+    length = float(np.median(gaps)) * 1e-3 if len(gaps) else np.inf
+    if not 0 <= exposure_ms < np.inf or exposure_ms > LONGEST * length:
+        raise EvflowDataError(
+            "EV020", f"an exposure of {exposure_ms:g} ms" + (
+                f", where frames are {length:g} ms apart." if exposure_ms > 0 else "."),
+            "Give milliseconds (--exposure-ms), at most the interval between frames; 0 if the "
+            "exposure is to be ignored.")
     return round(exposure_ms * 1e3)
 
 
