@@ -7,8 +7,9 @@ is, to first order, what the frame lacks of the light:
     sharp = frame * frame / mean of the interpolated frames over the exposure.
 
 One such step (the first of Gold's iteration, 1964) restores the contrast of what is longer than
-twice the blur; further ones amplify noise. A quotient, unlike a difference, keeps dark places dark, where events are most
-sensitive. Nothing changes where nothing moves, or where the optical flow is lost.
+twice the blur; further ones amplify noise. A quotient, unlike a difference, keeps dark places dark,
+where events are most sensitive. Nothing changes where nothing moves, or where the optical flow is
+lost.
 """
 
 from __future__ import annotations
