@@ -131,8 +131,9 @@ def test_windows_of_a_file_larger_than_memory(tmp_path: Path, kind: str) -> None
             capture_output=True, text=True, timeout=120)
         if fits:
             assert done.stdout.split() == [str(EVENTS)] * 2, done.stderr
-        else:  # a library may die of it instead of saying so
-            assert done.returncode < 0 or "memory" in done.stderr.lower()
+        else:  # a library may die of it instead of saying so; filters of HDF5 do not say why
+            said = done.stderr.lower()
+            assert done.returncode < 0 or "memory" in said or "filter returned failure" in said
             assert not done.stdout
 
 

@@ -86,8 +86,9 @@ class Database:
         """ValueError if values have types that a bag's have not, or are longer than the file."""
         odd, many = self._open.execute(
             "SELECT total(typeof(id) != 'integer' OR typeof(name) != 'text' OR typeof(type) != "
-            "'text' OR length(name) > ?1 OR length(type) > ?1 OR serialization_format != 'cdr'), "
-            "count(*) FROM topics", (LONGEST_NAME,)).fetchone()
+            "'text' OR length(name) > :most OR length(type) > :most OR "
+            "serialization_format != 'cdr'), count(*) FROM topics",
+            {"most": LONGEST_NAME}).fetchone()
         if odd or many > MOST_TOPICS:
             raise ValueError(f"{int(odd):,} of its {many:,} topics do not have the types of a bag")
         odd, longest, total = self._open.execute(
