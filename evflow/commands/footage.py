@@ -76,7 +76,7 @@ class Footage:
     def source(self, path: Path) -> FrameSource:
         """The frames; EV020 if options contradict each other."""
         from evflow.io.images.cropping import cropped, slowed
-        from evflow.io.images.recorded import exposed_note, in_us
+        from evflow.io.images.recorded import given_exposure
         from evflow.io.images.saccades import swept
         from evflow.io.source import open_frames
 
@@ -96,8 +96,5 @@ class Footage:
         if self.exposure_ms is None:
             return source
         times = (time for _, time in itertools.islice(source.open(), 3 if self.exposure_ms else 0))
-        exposure_us = in_us(self.exposure_ms, times)
-        source.notes[:] = [note for note in source.notes if note.code != "frames.exposure"]
-        if exposure_us:
-            source.notes.append(exposed_note(exposure_us, "as was given"))
+        exposure_us, source.notes[:] = given_exposure(self.exposure_ms, times, source.notes)
         return dataclasses.replace(source, exposure_us=exposure_us)

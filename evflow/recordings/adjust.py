@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.images.recorded import exposed_note, in_us
+from evflow.io.images.recorded import given_exposure
 from evflow.io.source import open_frames
 from evflow.light import response as light
 from evflow.light.colour import are_luma, as_seen, mosaic_luma, mosaic_note
@@ -71,10 +71,9 @@ def shifted(recording: Recording, offset_us: int) -> Recording:
 def exposed(recording: Recording, exposure_ms: float) -> Recording:
     """The recording with this exposure of its frames, whatever the file says; EV020 if it is
     negative or longer than the interval between frames."""
-    exposure_us = in_us(exposure_ms, recording.frame_times.tolist())
-    notes = tuple(note for note in recording.notes if note.code != "frames.exposure")
-    said = (exposed_note(exposure_us, "as was given"),) if exposure_us else ()
-    return dataclasses.replace(recording, notes=(*notes, *said), exposure_us=exposure_us)
+    exposure_us, notes = given_exposure(
+        exposure_ms, recording.frame_times.tolist(), recording.notes)
+    return dataclasses.replace(recording, notes=notes, exposure_us=exposure_us)
 
 
 def flipped(recording: Recording, side: str) -> Recording:

@@ -100,9 +100,11 @@ def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:
                 "estimate and simulate take out the blur (--exposure-ms 0: they leave it)")
 
 
-def in_us(exposure_ms: float, times_us: Iterable[int]) -> int:
-    """An exposure in us of frames at these times; EV020 if it is negative, or longer than the
-    interval between frames."""
+def given_exposure(
+    exposure_ms: float, times_us: Iterable[int], notes: Iterable[Note]
+) -> tuple[int, tuple[Note, ...]]:
+    """The exposure in us of frames at these times that a user gives, and the notes with it in place
+    of what a file says; EV020 if it is negative, or longer than the interval between frames."""
     gaps = np.diff(list(times_us))
     length = float(np.median(gaps)) * 1e-3 if len(gaps) else np.inf
     if not 0 <= exposure_ms < np.inf or exposure_ms > LONGEST * length:
@@ -111,7 +113,9 @@ def in_us(exposure_ms: float, times_us: Iterable[int]) -> int:
                 f", where frames are {length:g} ms apart." if exposure_ms > 0 else "."),
             "Give milliseconds (--exposure-ms), at most the interval between frames; 0 if the "
             "exposure is to be ignored.")
-    return round(exposure_ms * 1e3)
+    exposure_us = round(exposure_ms * 1e3)
+    said = (exposed_note(exposure_us, "as was given"),) if exposure_us else ()
+    return exposure_us, (*(note for note in notes if note.code != "frames.exposure"), *said)
 
 
 def in_order(times: np.ndarray, hints: Hints) -> tuple[np.ndarray | None, tuple[Note, ...]]:
