@@ -83,6 +83,17 @@ def test_frames_that_a_format_cannot_hold_are_left_out_with_a_note(
     assert "aedat4 holds frames of uint8, not uint16: the 6 frames were left out" in err
 
 
+def test_an_exposure_that_no_format_keeps_is_named(
+    tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.npz"
+    assert main(["convert", str(flight), str(out), "--exposure-ms", "2.5"]) == 0
+    assert f"does not keep the exposure of the frames: pass --exposure-ms 2.5 when {out}" in (
+        capsys.readouterr().err)
+    assert main(["convert", str(flight), str(out), "--overwrite"]) == 0
+    assert "exposure" not in capsys.readouterr().err
+
+
 def test_convert_errors(
     tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
