@@ -26,8 +26,9 @@ class Footage:
     fps: Annotated[float | None, value("HZ")] = None
     """Frames per second: for images without times, or if the video's own are wrong."""
     timestamps: Annotated[Path | None, value("FILE")] = None
-    """Times of the frames: one per line, alone or beside the image's name (text, csv, .npy). A
-    folder's timestamps.txt or images.txt is found automatically."""
+    """Times of the frames: one per line, alone, beside the image's name, or begin and end of the
+    exposure (text, csv, .npy, .npz). A folder's timestamps.txt or images.txt is found
+    automatically."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of these times, or of a recording's; auto takes the one that gives a plausible frame
     rate; for a recording, its format's own."""
@@ -52,7 +53,7 @@ class Footage:
     natural logarithms of light, relative to --full-scale."""
     exposure_ms: Annotated[float | None, value("MS")] = None
     """Exposure of the frames in the scene's time: the blur of what moves is taken out before others
-    are interpolated. By default what a recording says, none for videos."""
+    are interpolated. By default what a recording or --timestamps says; 0 = none."""
     background: Literal["black", "white"] = "black"
     """What transparent images are laid over."""
     crop: Annotated[str | None, value("WxH[+X+Y]")] = None
@@ -76,7 +77,7 @@ class Footage:
     def source(self, path: Path) -> FrameSource:
         """The frames; EV020 if options contradict each other."""
         from evflow.io.images.cropping import cropped, slowed
-        from evflow.io.images.recorded import given_exposure
+        from evflow.io.images.exposures import given_exposure
         from evflow.io.images.saccades import swept
         from evflow.io.source import open_frames
 

@@ -92,7 +92,7 @@ class Reading:
     """Frames from another file: a folder of images, a video, a stack (.npy, .npz)."""
     timestamps: Annotated[Path | None, value("FILE")] = None
     """Times of --frames on the events' clock: one per line, alone, beside the image's name, or
-    begin and end of the exposure."""
+    begin and end of the exposure, whose blur is then taken out."""
     timestamps_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of these times; auto takes the one that gives a plausible frame rate."""
     frames_fps: Annotated[float | None, value("HZ")] = None

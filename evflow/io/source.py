@@ -18,6 +18,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError, naming
 from evflow.io.images import repeats, values
+from evflow.io.images.exposures import exposed_note
 from evflow.io.images.folder import RADIANCE, SUFFIXES, ImageFolder, open_folder
 from evflow.io.images.frames import FrameHints, Frames, FrameSource, Image, converted, existing
 from evflow.io.images.pages import open_pages, pages
@@ -44,13 +45,14 @@ def _open(path: Path, asked: FrameHints) -> FrameSource:
         stack = open_stack(path, asked)
         asked, notes = _responding(asked, "linear", "numbers of a stack")
         return _source(stack.size, len(stack.times_us), lambda: stack.images(asked.partial), asked,
-                       [*stack.notes, *notes])
+                       [*stack.notes, *notes], stack.exposure_us)
     if (count := pages(path)) > 1:
         found = open_pages(path, count, asked)
         usual = ("srgb", "8-bit images") if found.first.dtype == np.uint8 else (
             "linear", "images of more than 8 bits")
         asked, notes = _responding(asked, *usual)
-        return _source(found.first.shape[1::-1], count, found.images, asked, [*found.notes, *notes])
+        return _source(found.first.shape[1::-1], count, found.images, asked,
+                       [*found.notes, *notes], found.exposure_us)
     if asked.picture and path.suffix.lower() in SUFFIXES:
         return _of_images(ImageFolder((path,), np.zeros(1, np.int64), ()), asked)
     if not _is_recording(path):
@@ -95,7 +97,8 @@ def _of_images(folder: ImageFolder, asked: FrameHints) -> FrameSource:
         white, note = values.white_of_radiance(first, asked.full_scale)
         asked = dataclasses.replace(asked, full_scale=white, clip=True)
         notes = (*notes, note)
-    return _source(size, len(folder.files), folder.images, asked, [*folder.notes, *notes])
+    return _source(size, len(folder.files), folder.images, asked, [*folder.notes, *notes],
+                   folder.exposure_us)
 
 
 def _video(path: Path, asked: FrameHints) -> FrameSource:
@@ -105,7 +108,8 @@ def _video(path: Path, asked: FrameHints) -> FrameSource:
     asked, notes = _responding(asked, *(("srgb", "videos") if asked.bayer is None else
                                       ("linear", "pixels of a raw mosaic")))
     video.notes.extend(notes)
-    return _source(video.size, video.claimed, video.images, asked, video.notes)
+    return _source(video.size, video.claimed, video.images, asked, video.notes,
+                   video.exposure_us)
 
 
 def _recording(path: Path, asked: FrameHints) -> FrameSource:
@@ -168,7 +172,10 @@ def _between(images: Iterator[Image], asked: FrameHints) -> Iterator[Image]:
 
 
 def _source(size: tuple[int, int], count: int, images: Any, asked: FrameHints,
-            notes: list[Note]) -> FrameSource:
+            notes: list[Note], exposure_us: int = 0) -> FrameSource:
+    if exposure_us:
+        notes.append(exposed_note(exposure_us))
+
     def shown() -> Frames:
         return converted(_between(images(), asked), asked, notes)
 
@@ -181,4 +188,4 @@ def _source(size: tuple[int, int], count: int, images: Any, asked: FrameHints,
         if note := runs.note():
             notes.append(note)
 
-    return FrameSource(size, count, frames, notes)
+    return FrameSource(size, count, frames, notes, exposure_us=exposure_us)

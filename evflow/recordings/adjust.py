@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.images.recorded import given_exposure
+from evflow.io.images.exposures import given_exposure, noted
 from evflow.io.source import open_frames
 from evflow.light import response as light
 from evflow.light.colour import are_luma, as_seen, mosaic_luma, mosaic_note
@@ -120,7 +120,7 @@ def with_frames(
             "Another clock? Pass --frames-offset-ms "
             f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; for another "
             "unit pass --timestamps-unit.")
-    notes = (*recording.notes, Note("frames.replaced", f"frames come from {path}"),
+    notes = (*noted(recording.notes, 0), Note("frames.replaced", f"frames come from {path}"),
              *(Note(note.code, _reworded(note.text)) for note in source.notes))
     return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes,
                      source.exposure_us)

@@ -155,7 +155,7 @@ def images_beside(
     def checked(name: str) -> Any:
         return tables.dataset(path, f, name, (None,) * len(of[name].shape))
 
-    return beside(path, of, lambda name: checked(name)[:], lambda name, part:
+    return beside(path, of, lambda name: checked(name)[()], lambda name, part:
                   tables.stored_frames(checked(name), part), found, hints, events.strip("/"), notes)
 
 

@@ -3,8 +3,9 @@ shapes and names.
 
 Images are arrays (T, H, W), or (T, H, W, C) with 1, 3 or 4 channels in R, G, B. Their times are an
 array of T numbers, or (T, 2) begin and end of the exposure, whose name says so (`frame_times`,
-`image_raw_ts`, `t`), in the same group or the one above. As none of it is certain, what cannot be
-read leaves the events, with a note.
+`image_raw_ts`, `t`), in the same group or the one above. Their exposure is that of begin and end,
+or a number, or one per image, in such an array or in an attribute of both, under a name with a unit
+(`exposure_us`). As none of it is certain, what cannot be read leaves the events, with a note.
 """
 
 from __future__ import annotations
@@ -19,11 +20,12 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io.decode.columns import UNIT
 from evflow.io.decode.stream import Gathered
-from evflow.io.decode.tables import Images, frame_size, with_frames
+from evflow.io.decode.tables import Images, Loaded, frame_size, with_frames
 from evflow.io.decode.units import UNITS_US, shared_unit, written_unit
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import Stamps, mid_exposure, names_exposure, stated, stated_by
 from evflow.io.images.streams import WORD, ImageStream
-from evflow.io.images.times import mid_exposure, to_us
+from evflow.io.images.times import to_us
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
@@ -52,11 +54,11 @@ def beside(
             stream = ImageStream(name, frame_size(array), why, (Note(
                 "frames.stream", f"frames are from {name}, at the times in {times}"),))
             streams.append(Images(stream, _loading(
-                name, times, whole, pixels, path, found.events)))
+                name, times, arrays, whole, pixels, path, found.events)))
         elif array.dtype.hasobject and _words(name) & ENCODED:
             streams.append(Images(ImageStream(
                 name, None, "of variable length, as encoded images are: save them as arrays, or as "
-                "files for --frames"), lambda: (np.zeros(0), lambda part: ())))
+                "files for --frames"), lambda: (Stamps(np.zeros(0)), lambda part: ())))
     try:
         return with_frames(path, found, hints, streams, "us", notes, events=events)
     except EvflowDataError as e:
@@ -69,12 +71,35 @@ def beside(
 
 def times_of(images: str, arrays: Mapping[str, Any]) -> str:
     """The array that holds the times of `images`, "" if there is none or no clear one."""
-    count, group = arrays[images].shape[0], images.rpartition("/")[0]
+    count = arrays[images].shape[0]
+    return _near(images, arrays, lambda name, shape: shape in (
+        (count,), (count, 1), (1, count), (count, 2)) and not names_exposure(name) and bool(
+        TIMES.search(UNIT.sub("", name.rpartition("/")[2].lower()))))
+
+
+def stamps_of(
+    images: str, times: str, arrays: Mapping[str, Any], whole: Callable[[str], np.ndarray],
+    path: Path,
+) -> Stamps:
+    """The stamps of `images`, whose times are the array `times`. EV008 (two columns that are not
+    begin and end)."""
+    count = arrays[images].shape[0]
+    beside = _near(images, arrays, lambda name, shape: shape in (
+        (), (1,), (count,), (count, 1), (1, count)) and names_exposure(name) and (
+        written_unit(name) != "auto"))
+    return mid_exposure(whole(times), f"{times} in {path}")._replace(
+        stated_us=stated([beside], whole) or stated_by(arrays[images], arrays[times]))
+
+
+def _near(
+    images: str, arrays: Mapping[str, Any], fits: Callable[[str, tuple[int, ...]], bool]
+) -> str:
+    """The array of numbers beside `images`, or else in the group above, whose name and shape fit;
+    of several the one whose name is nearest, "" if there is none or no clear one."""
+    group = images.rpartition("/")[0]
     for place in dict.fromkeys((group, group.rpartition("/")[0])):
         fit = [name for name, array in arrays.items() if name.rpartition("/")[0] == place
-               and array.shape in ((count,), (count, 1), (1, count), (count, 2))
-               and array.dtype.kind in "iuf"
-               and TIMES.search(UNIT.sub("", name.rpartition("/")[2].lower()))]
+               and array.dtype.kind in "iuf" and fits(name, array.shape)]
         rank = {name: (-len(_words(name) & _words(images)), len(name)) for name in fit}
         best = [name for name in fit if rank[name] == min(rank.values())]
         if best:
@@ -95,16 +120,15 @@ def _words(name: str) -> set[str]:
 
 
 def _loading(
-    name: str, times: str, whole: Callable[[str], np.ndarray], pixels: Pixels, path: Path,
-    events: Events,
-) -> Callable[[], tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]]:
-    def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
-        stamps = mid_exposure(whole(times), times)
-        unit = written_unit(times)
-        if unit == "auto" and (len(stamps) < 2 or np.isfinite(stamps).all()):
-            unit = shared_unit(stamps, events.t, ["us", *UNITS_US]) or "auto"
-        us, _ = to_us(stamps, f"{times} of {path}", unit)
-        return us, lambda part: map(_seen, pixels(name, part))
+    name: str, times: str, arrays: Mapping[str, Any], whole: Callable[[str], np.ndarray],
+    pixels: Pixels, path: Path, events: Events,
+) -> Callable[[], Loaded]:
+    def load() -> Loaded:
+        stamps, unit = stamps_of(name, times, arrays, whole, path), written_unit(times)
+        if unit == "auto" and (len(stamps.times) < 2 or np.isfinite(stamps.times).all()):
+            unit = shared_unit(stamps.times, events.t, ["us", *UNITS_US]) or "auto"
+        us, _, exposure_us, _ = to_us(stamps, f"{times} of {path}", unit)
+        return Stamps(us, stated_us=exposure_us), lambda part: map(_seen, pixels(name, part))
 
     return load
 

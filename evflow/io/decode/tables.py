@@ -20,6 +20,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode.hdf5 import DAMAGE, MAGIC, MAX_RATIO, load_h5py, need_filters, plausible
 from evflow.io.decode.stream import Chunk, Gathered
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import Stamps, stated_by
 from evflow.io.images.recorded import FrameStack, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
@@ -147,12 +148,15 @@ def same_length(path: Path, columns: dict[str, Any]) -> int:
     return next(iter(lengths.values()))
 
 
+Loaded = tuple[Stamps, Callable[[slice], Iterable[np.ndarray]]]
+
+
 class Images(NamedTuple):
-    """Images of a file, decoded on demand. stream: what they are; load(): their times (T,) as
-    stored, and a function that decodes the images of a slice."""
+    """Images of a file, decoded on demand. stream: what they are; load(): their stamps as stored,
+    and a function that decodes the images of a slice."""
 
     stream: ImageStream
-    load: Callable[[], tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]]
+    load: Callable[[], Loaded]
 
 
 def with_frames(
@@ -173,7 +177,7 @@ def with_frames(
         return Recording.of_events(stored, (*notes, *chosen.notes))
     with events_alone():
         stamps, decode = next(i for i in several if i.stream is chosen.stream).load()
-        times, added = beside_events(stamps, path, native, hints, stored)
+        times, added, exposure_us, _ = beside_events(stamps, path, native, hints, stored)
         order, _ = in_order(times, hints)
         check_times(times if order is None else times[order], "frame times", strict=True)
         within = np.flatnonzero((times >= span[0]) & (times < span[1]))
@@ -181,7 +185,7 @@ def with_frames(
         stack = FrameStack(path, stored.size, hints.colour)
         for image, time in zip(decode(keep), times[keep], strict=True) if len(within) else ():
             if span[0] <= time < span[1]:
-                stack.append(image, time)
+                stack.append(image, time, exposure_us=exposure_us)
         return stack.beside(stored, hints, (*clock, *notes, *added, *chosen.notes))
 
 
@@ -198,10 +202,12 @@ def frame_size(data: Any) -> Size | None:
 
 
 def dataset_images(path: Path, group: Any, name: str, times: str) -> Images:
-    """Frames in data set `name` of an HDF5 group, and their times in another."""
-    def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+    """Frames in data set `name` of an HDF5 group, and their times in another; an attribute of
+    either may state their exposure."""
+    def load() -> Loaded:
         frames = dataset(path, group, name, (None, None, None))
-        stamps = dataset(path, group, times, (len(frames),))[:]
+        clock = dataset(path, group, times, (len(frames),))
+        stamps = Stamps(clock[:], stated_us=stated_by(frames, clock))
         return stamps, lambda keep: stored_frames(frames, keep)
 
     whole = f"{group.name}/{name}".strip("/")

@@ -9,7 +9,6 @@ without images the order in which all events fit.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from evflow.io.decode.hdf5_columns import FILTERS
 from evflow.io.decode.hdf5_search import images_beside
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import Stamps, stated_by
 from evflow.io.images.folder import natural
 from evflow.io.images.streams import ImageStream
 from evflow.io.writer import FLUSH, SECONDS_US
@@ -54,9 +54,10 @@ def read(path: Path, hints: Hints) -> Recording:
         if not _names(f):
             return images_beside(path, f, found, hints, "events/ts", notes)
 
-        def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+        def load() -> tables.Loaded:
             images = [_image(path, f["images"], name) for name in _names(f)]
-            stamps = np.array([_time(path, image) for image in images])
+            stamps = Stamps(np.array([_time(path, image) for image in images]),
+                            stated_us=round(np.median([stated_by(image) for image in images])))
             return stamps, lambda keep: (_pixels(image[:]) for image in images[keep])
 
         images = tables.Images(ImageStream("images", seen), load)

@@ -1,13 +1,12 @@
 """The folder of an EVREAL sequence (ercanburak/EVREAL): events_ts.npy (N,) s, events_xy.npy (N, 2),
 events_p.npy (N,); images.npy (T, H, W) or (T, H, W, 1 or 3), images_ts.npy (T,) s; metadata.json
-with sensor_resolution = (height, width).
+with sensor_resolution = (height, width), and perhaps exposure_us.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from evflow.files.whole import write_checked
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import Stamps, stated
 from evflow.io.images.streams import ImageStream
 from evflow.io.writer import SECONDS_US, EventWriter
 from evflow.types import Events, Recording
@@ -30,7 +30,7 @@ from evflow.types import Events, Recording
 NAME = "evreal"
 EXTENSIONS: tuple[str, ...] = ("",)
 
-IMAGES = "images.npy"
+IMAGES, METADATA = "images.npy", "metadata.json"
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -50,10 +50,10 @@ def read(path: Path, hints: Hints) -> Recording:
     if not is_there(path / IMAGES):
         return Recording.of_events(found.events, found.notes)
 
-    def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+    def load() -> tables.Loaded:
         images = _images(path)
         stamps = np.asarray(mapped(path / "images_ts.npy", (len(images),)))
-        return stamps, lambda keep: map(np.array, images[keep])
+        return Stamps(stamps, stated_us=_exposure(path)), lambda keep: map(np.array, images[keep])
 
     images = tables.Images(ImageStream(IMAGES, seen), load)
     return tables.with_frames(path, found, hints, images, _unit(ts))
@@ -88,7 +88,7 @@ def _size(path: Path, images: Size | None) -> Size | None:
 
 
 def _declared_size(path: Path) -> Size | None:
-    file = path / "metadata.json"
+    file = path / METADATA
     if not is_there(file) or file.stat().st_size > 1 << 20:
         return None
     try:
@@ -101,6 +101,17 @@ def _declared_size(path: Path) -> Size | None:
             where=file) from e
 
 
+def _exposure(path: Path) -> int:
+    """The exposure of the images in us from metadata.json, 0 if it does not state one."""
+    file = path / METADATA
+    if not is_there(file) or file.stat().st_size > 1 << 20:
+        return 0
+    with contextlib.suppress(ValueError):
+        held = parse_json(file.read_text("utf-8"))
+        return stated(held, held.__getitem__) if isinstance(held, dict) else 0
+    return 0
+
+
 class EvrealWriter(EventWriter):
     """xy int16, p uint8; images (T, H, W, 1) as EVREAL indexes them, images_ts and
     image_event_indices (events before the image) (T, 1). Its metrics divide images by 255."""
@@ -111,7 +122,7 @@ class EvrealWriter(EventWriter):
     FILES = ("events_ts", "events_xy", "events_p", "images", "images_ts", "image_event_indices")
 
     def _place(self) -> contextlib.AbstractContextManager[Path]:
-        names = {*(f"{name}.npy" for name in self.FILES), "metadata.json"}
+        names = {*(f"{name}.npy" for name in self.FILES), METADATA}
         return atomic_folder(self.path, names=names, overwrite=self.overwrite)
 
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
@@ -151,5 +162,5 @@ class EvrealWriter(EventWriter):
             with GrowingArray(self._folder / "image_event_indices.npy", "i8", (1,)) as out:
                 out.append(np.searchsorted(ts, stamps)[:, None])
                 out.close()
-        write_checked(self._folder / "metadata.json",
+        write_checked(self._folder / METADATA,
                       json.dumps({"sensor_resolution": self.size[::-1]}) + "\n")

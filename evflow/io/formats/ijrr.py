@@ -11,7 +11,7 @@ from __future__ import annotations
 import codecs
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -25,6 +25,7 @@ from evflow.io.decode import tables, text
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.formats import plain_text
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import Stamps
 from evflow.io.images.folder import decode, unread_images
 from evflow.io.images.streams import ImageStream, events_alone
 from evflow.notes import Note
@@ -107,9 +108,9 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
             hints.no_frames) else ()
         return Recording.of_events(found.events, (*layout.notes, *found.notes, *beside))
 
-    def load() -> tuple[np.ndarray, Callable[[slice], Iterable[np.ndarray]]]:
+    def load() -> tables.Loaded:
         seconds, names = _read_index(root / IMAGES)
-        return seconds, lambda keep: (_image(root, n) for n in names[keep])
+        return Stamps(seconds), lambda keep: (_image(root, n) for n in names[keep])
 
     images = tables.Images(ImageStream(IMAGES, seen), load)
     return tables.with_frames(path, found, hints, images, "s", layout.notes, (CLOCK,))

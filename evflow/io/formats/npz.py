@@ -1,6 +1,6 @@
-"""evflow's own .npz: t (int64 us), x, y, p, size = (width, height), and optionally frames and
-frame_times. Other names of these (`decode.columns`) and a single array of records or N x 4 numbers
-(`decode.arrays`) are read too. Pickles are never loaded.
+"""evflow's own .npz: t (int64 us), x, y, p, size = (width, height), and optionally frames,
+frame_times and exposure_us. Other names of these (`decode.columns`) and a single array of records
+or N x 4 numbers (`decode.arrays`) are read too. Pickles are never loaded.
 
 Members are checked against the bytes that the archive really holds before memory is allocated, and
 columns are decompressed in parallel, in blocks.
@@ -25,10 +25,11 @@ from evflow.files.atomic import aside
 from evflow.files.moves import remove
 from evflow.files.whole import need_members
 from evflow.io.decode import arrays, columns, tables
-from evflow.io.decode.images_beside import beside, times_of
+from evflow.io.decode.images_beside import beside, stamps_of, times_of
 from evflow.io.decode.stream import Gathered, gather
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import noted
 from evflow.io.images.recorded import cut, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
@@ -129,12 +130,15 @@ def _with_frames(
     if chosen.stream is None:
         return Recording.of_events(events, notes)
     with events_alone():
-        times, more = beside_events(found["frame_times"].whole(), path, "us", hints, events)
+        stamps = stamps_of(
+            "frames", "frame_times", found, lambda name: found[name].whole(), path)
+        times, more, exposure_us, _ = beside_events(stamps, path, "us", hints, events)
         frames = found["frames"].spooled()
         order, late = in_order(times, hints)
         if order is not None and len(frames) == len(times):
             frames, times = frames[order], times[order]
-        return cut(Recording(events, frames, times, (*notes, *more, *late)), span)
+        notes = noted((*notes, *more, *late), exposure_us, "as the file says")
+        return cut(Recording(events, frames, times, notes, exposure_us), span)
 
 
 def _events(

@@ -17,6 +17,7 @@ import numpy as np
 from evflow.checks import Size
 from evflow.io.decode.stream import Chunk, Damage, gather
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import Stamps
 from evflow.io.images.recorded import FrameStack, cut
 from evflow.io.images.streams import events_alone
 from evflow.io.images.times import beside_events
@@ -66,7 +67,7 @@ class Aside:
         if not self.stack.times:
             return self.stack.beside(found.events, self.hints, collected)
         with events_alone():
-            times, more = beside_events(
-                np.array(self.stack.times), self.path, "us", self.hints, found.events)
-            collected = (MID_EXPOSURE, *collected, *more)
-            return cut(self.stack.at(times, found.events, self.hints, collected), found.span)
+            stamps = Stamps(np.array(self.stack.times))
+            times = beside_events(stamps, self.path, "us", self.hints, found.events)
+            collected = (MID_EXPOSURE, *collected, *times.notes)
+            return cut(self.stack.at(times.us, found.events, self.hints, collected), found.span)

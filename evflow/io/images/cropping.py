@@ -15,6 +15,7 @@ import numpy as np
 from evflow.camera.sensors import SENSOR_SIZES
 from evflow.checks import Size, check_size
 from evflow.errors import EvflowDataError
+from evflow.io.images.exposures import noted
 from evflow.io.images.frames import Frames, FrameSource
 from evflow.notes import Note
 
@@ -117,8 +118,9 @@ def slowed(source: FrameSource, factor: float) -> FrameSource:
 
     source.notes.append(Note("frames.slowed", f"the video is {factor:g} times slower than life: "
                              "its times were divided by this factor."))
-    return dataclasses.replace(
-        source, open=frames, exposure_us=round(source.exposure_us / factor))
+    if exposure_us := round(source.exposure_us / factor):
+        source.notes[:] = noted(source.notes, exposure_us, "in the time of the scene")
+    return dataclasses.replace(source, open=frames, exposure_us=exposure_us)
 
 
 def _part(text: str, size: Size) -> tuple[int, int, int, int]:

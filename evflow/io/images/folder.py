@@ -34,11 +34,13 @@ TIMES = ("timestamps.txt", "images.txt", "image_timestamps.txt", "timestamp.txt"
 
 @dataclasses.dataclass(frozen=True)
 class ImageFolder:
-    """files in the order of their times_us (T,) int64; notes: what was assumed."""
+    """files in the order of their times_us (T,) int64; notes: what was assumed; exposure_us: 0 if
+    it is unknown."""
 
     files: tuple[Path, ...]
     times_us: np.ndarray
     notes: tuple[Note, ...]
+    exposure_us: int = 0
 
     def images(self) -> Iterator[Image]:
         for file, time in zip(self.files, self.times_us.tolist(), strict=True):
@@ -59,7 +61,7 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
         return ImageFolder(tuple(files), times, made + _gaps(files))
     source = _times_file(root, folder, hints)
     by_name = {file.name: file for file in files}
-    us, names, notes = read_times(source, hints.time_unit, by_name)
+    us, notes, exposure_us, names = read_times(source, hints.time_unit, by_name)
     missing = [name for name in names if name not in by_name]
     if missing:
         raise EvflowDataError(
@@ -73,7 +75,7 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
             "Images lost, or from another recording? Give each image one time, or pass --fps.",
             where=folder)
     files = [by_name[name] for name in names] if names else files
-    return ImageFolder(tuple(files), us, notes + made)
+    return ImageFolder(tuple(files), us, notes + made, exposure_us)
 
 
 def _gaps(files: list[Path]) -> tuple[Note, ...]:

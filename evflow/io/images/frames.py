@@ -121,9 +121,9 @@ class FrameHints:
 class FrameSource:
     """size (width, height); count: frames expected (0 = unknown); open(): a new iterator of (frame,
     time in us), decoded one at a time. notes: what was assumed; may grow while frames are read.
-    recorded: by a camera that also recorded events; exposure_us: of the
-    frames, 0 if unknown. Frames are (H, W), or (H, W, 3) if a mosaic of colour input was requested,
-    uint8 or float32 DN on 0..255."""
+    recorded: by a camera that also recorded events; exposure_us: of the frames, 0 if it is unknown.
+    Frames are (H, W), or (H, W, 3) if a mosaic of colour input was requested, uint8 or float32 DN
+    on 0..255."""
 
     size: tuple[int, int]
     count: int

@@ -15,6 +15,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
+from evflow.io.images.exposures import Stamps
 from evflow.io.images.frames import FrameHints, Image
 from evflow.io.images.stacks import frame_times
 from evflow.notes import Note
@@ -40,12 +41,14 @@ def pages(path: Path) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Pages:
-    """The pages of a picture: first, its first page; times_us (T,) int64."""
+    """The pages of a picture: first, its first page; times_us (T,) int64; exposure_us: 0 if it is
+    unknown."""
 
     path: Path
     first: np.ndarray
     times_us: np.ndarray
     notes: tuple[Note, ...]
+    exposure_us: int
 
     def images(self) -> Iterator[Image]:
         """The pages in OpenCV's channel order; EV009 if one cannot be decoded."""
@@ -69,9 +72,9 @@ def open_pages(path: Path, count: int, hints: FrameHints) -> Pages:
                     f"{path}, {count:,} pages")
     if path.suffix.lower() in ANIMATED:
         steps_ms = _durations(path, count)
-    shown = None if steps_ms is None else 1000 * np.cumsum([0, *steps_ms[:-1]])
-    times, notes = frame_times(path, count, hints, shown, "us")
-    return Pages(path, first[0], times, notes)
+    shown = None if steps_ms is None else Stamps(1000 * np.cumsum([0, *steps_ms[:-1]]))
+    found = frame_times(path, count, hints, shown, "us")
+    return Pages(path, first[0], found.us, found.notes, found.exposure_us)
 
 
 def _decoded(path: Path, begin: int, count: int) -> list[np.ndarray]:

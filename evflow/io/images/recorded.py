@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
 from evflow.io.decode.late import longest
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import exposed_note
 from evflow.light.colour import CONVERTED, luma, mosaic, seen_note
 from evflow.notes import Note
 from evflow.types import Events, Recording
-
-LONGEST = 1.05  # an exposure lasts at most the interval between frames; times are rounded
 
 
 class FrameStack:
@@ -92,30 +90,6 @@ class FrameStack:
         if exposure_us:
             more = (*more, exposed_note(exposure_us))
         return Recording(events, frames, times, (*notes, *more), exposure_us)
-
-
-def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:
-    """That frames have an exposure, and what follows."""
-    return Note("frames.exposure", f"frames are exposed for {exposure_us / 1e3:g} ms, {said_by}: "
-                "estimate and simulate take out the blur (--exposure-ms 0: they leave it)")
-
-
-def given_exposure(
-    exposure_ms: float, times_us: Iterable[int], notes: Iterable[Note]
-) -> tuple[int, tuple[Note, ...]]:
-    """The exposure in us of frames at these times that a user gives, and the notes with it in place
-    of what a file says; EV020 if it is negative, or longer than the interval between frames."""
-    gaps = np.diff(list(times_us))
-    length = float(np.median(gaps)) * 1e-3 if len(gaps) else np.inf
-    if not 0 <= exposure_ms < np.inf or exposure_ms > LONGEST * length:
-        raise EvflowDataError(
-            "EV020", f"an exposure of {exposure_ms:g} ms" + (
-                f", where frames are {length:g} ms apart." if exposure_ms > 0 else "."),
-            "Give milliseconds (--exposure-ms), at most the interval between frames; 0 if the "
-            "exposure is to be ignored.")
-    exposure_us = round(exposure_ms * 1e3)
-    said = (exposed_note(exposure_us, "as was given"),) if exposure_us else ()
-    return exposure_us, (*(note for note in notes if note.code != "frames.exposure"), *said)
 
 
 def in_order(times: np.ndarray, hints: Hints) -> tuple[np.ndarray | None, tuple[Note, ...]]:

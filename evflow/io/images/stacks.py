@@ -1,7 +1,8 @@
 """Videos in NumPy files: memory-mapped .npy stacks, and .npz stacks decompressed frame by frame.
 
 A stack is (T, H, W) or (T, H, W, 3) in R, G, B. In an .npz it is called frames (or images, imgs,
-video, arr_0), and its times, if any, frame_times (or timestamps, times, t, or another such name).
+video, arr_0), and its times, if any, frame_times (or timestamps, times, t, or another such name);
+they may be begin and end of the exposures, or beside an exposure (`exposure_us`).
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.files.archives import BLOCK, DAMAGE, Member, is_zip, npy_header, unzipped
 from evflow.files.limits import check_expansion
-from evflow.io.decode.images_beside import times_of
+from evflow.io.decode.images_beside import stamps_of, times_of
+from evflow.io.images.exposures import Stamps
 from evflow.io.images.frames import FrameHints, Image
-from evflow.io.images.times import mid_exposure, read_times, to_us
+from evflow.io.images.times import FrameTimes, read_times, to_us
 from evflow.notes import Note
 
 FRAMES = ("frames", "images", "imgs", "video", "arr_0")
@@ -43,7 +45,8 @@ def is_stack(path: Path) -> bool:
 @dataclasses.dataclass(frozen=True)
 class Stack:
     """A stack of `shape` on disk; member: its name in an .npz, "" for an .npy. count: frames to
-    read, shape[0] unless the file is truncated. times_us (count,) int64."""
+    read, shape[0] unless the file is truncated. times_us (count,) int64; exposure_us: 0 if it is
+    unknown."""
 
     path: Path
     member: str
@@ -53,6 +56,7 @@ class Stack:
     offset: int
     times_us: np.ndarray
     notes: tuple[Note, ...]
+    exposure_us: int = 0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -95,16 +99,17 @@ def open_stack(path: Path, hints: FrameHints) -> Stack:
     truncated, unless `hints.partial`), EV020 (no times)."""
     try:
         if path.suffix.lower() == ".npz":
-            stack, times = _open_npz(path)
+            stack, stamps = _open_npz(path)
         else:
-            stack, times = _open_npy(path, hints.partial), None
+            stack, stamps = _open_npy(path, hints.partial), None
     except (OSError, EOFError, ValueError) as e:
         raise EvflowDataError(
             "EV009", f"{path} is not a valid .npy ({e or type(e).__name__}).",
             "Copy or save it again.", where=path) from e
     _check(stack)
-    us, notes = frame_times(path, stack.shape[0], hints, times)
-    return dataclasses.replace(stack, times_us=us, notes=notes)
+    found = frame_times(path, stack.shape[0], hints, stamps)
+    return dataclasses.replace(
+        stack, times_us=found.us, notes=found.notes, exposure_us=found.exposure_us)
 
 
 def cut_off(path: object, read: int, promised: int, why: str) -> EvflowDataError:
@@ -128,7 +133,7 @@ def _open_npy(path: Path, partial: bool) -> Stack:
     return Stack(path, "", shape, dtype, fortran, offset, np.zeros(0, np.int64), ())
 
 
-def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
+def _open_npz(path: Path) -> tuple[Stack, Stamps | None]:
     with unzipped(path, streamed=[f"{name}.npy" for name in FRAMES]) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
         member = next((name for name in FRAMES if name in names), None)
@@ -141,13 +146,14 @@ def _open_npz(path: Path) -> tuple[Stack, np.ndarray | None]:
         arrays = {name: Member(archive, archive.getinfo(f"{name}.npy")) for name in names}
         clock = next((name for name in TIMES if name in names), "") or (
             times_of(member, arrays) if shape else "")
-        times = mid_exposure(arrays[clock].whole(), f"{clock} in {path}") if clock else None
+        stamps = stamps_of(member, clock, arrays, lambda name: arrays[name].whole(), path) if (
+            clock) else None
     if fortran and len(shape) > 1:
         raise EvflowDataError(
             "EV009", f"{path} holds {member} in Fortran order, in which frames are not contiguous.",
             "Save np.ascontiguousarray(frames).", where=path)
     stack = Stack(path, member + ".npy", shape, dtype, False, 0, np.zeros(0, np.int64), ())
-    return stack, times
+    return stack, stamps
 
 
 def _check(stack: Stack) -> None:
@@ -167,24 +173,24 @@ def _check(stack: Stack) -> None:
 
 
 def frame_times(
-    path: Path, count: int, hints: FrameHints, times: np.ndarray | None, unit: str = "auto"
-) -> tuple[np.ndarray, tuple[Note, ...]]:
-    """Times (count,) of the frames in a file, int64 us: those of the options, else its own in
-    that unit; and notes. EV002 (another number), EV020 (none)."""
+    path: Path, count: int, hints: FrameHints, stamps: Stamps | None, unit: str = "auto"
+) -> FrameTimes:
+    """When the `count` frames of a file were taken: as the options say, else by its own stamps in
+    that unit. EV002 (another number), EV020 (none)."""
     if hints.fps is not None:
-        return np.array([hints.at_rate(i) for i in range(count)], np.int64), ()
+        return FrameTimes(np.array([hints.at_rate(i) for i in range(count)], np.int64), ())
     if hints.timestamps is not None:
         where: Any = Path(hints.timestamps)
-        us, _, notes = read_times(where, hints.time_unit)
-    elif times is not None:
+        found = read_times(where, hints.time_unit)
+    elif stamps is not None:
         where = "but"
-        us, notes = to_us(times, path, hints.time_unit if hints.time_unit != "auto" else unit)
+        found = to_us(stamps, path, hints.time_unit if hints.time_unit != "auto" else unit)
     else:
         raise EvflowDataError(
             "EV020", f"{path} holds {count:,} frames but no times.",
             "Pass --fps or --timestamps FILE.", where=path)
-    if len(us) != count and not (hints.partial and len(us) > count):
+    if len(found.us) != count and not (hints.partial and len(found.us) > count):
         raise EvflowDataError(
-            "EV002", f"{path} holds {count:,} frames, {where} {len(us):,} times.",
+            "EV002", f"{path} holds {count:,} frames, {where} {len(found.us):,} times.",
             "Give one time per frame, or pass --fps.", where=path)
-    return us[:count], notes
+    return found._replace(us=found.us[:count])

@@ -1,11 +1,11 @@
 """Files of frame times: one time per line, alone, before or after the frame's name.
 
 Supported layouts: bare times (vid2e, DSEC), `time name` (IJRR, TUM), `name time` (DVS-Voltmeter),
-`index time`, begin and end of the exposure (DSEC; the middle is used), or any number of columns of
-which a header names one as the time; separated by blanks, tabs, commas or semicolons; and arrays in
-.npy or .npz. Lines that begin with # are comments. A unit written in a comment or header is used
-("[ns]", "timestamp_us"); otherwise the only unit that makes the numbers a plausible video, with a
-note.
+`index time`, begin and end of the exposure (DSEC), or any number of columns of which a header names
+one as the time, and perhaps one as the exposure; separated by blanks, tabs, commas or semicolons;
+and arrays in .npy or .npz. Lines that begin with # are comments. A unit written in a comment or
+header is used ("[ns]", "timestamp_us"); otherwise the only unit that makes the numbers a plausible
+video, with a note.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from evflow.io.decode.units import (
     written_unit,
 )
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import Stamps, mid_exposure, middle, stated
 from evflow.io.images.frames import existing
 from evflow.notes import Note
 from evflow.types import Events
@@ -41,32 +43,41 @@ ENDS = re.compile(r"start|begin"), re.compile(r"end|stop")  # of an exposure, in
 TELL = "pass --timestamps-unit with --frames (simulate: --time-unit)"
 
 Notes = tuple[Note, ...]
-Times = tuple[np.ndarray, list[str], Notes]  # int64 us (T,); names (T,) or none
 
 
-def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> Times:
-    """Frame times of a file, the frames' names if it has them, and what was assumed.
+class FrameTimes(NamedTuple):
+    """us: (T,) int64; notes: what was assumed; exposure_us: 0 if it is unknown; names: (T,) of the
+    frames, or none."""
+
+    us: np.ndarray
+    notes: Notes
+    exposure_us: int = 0
+    names: tuple[str, ...] = ()
+
+
+def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> FrameTimes:
+    """Frame times of a file, with the frames' names and exposure if it has them.
 
     names: of the images at hand, to distinguish a column of names from one of times.
     Raises EV008 (columns of unclear meaning), EV009 (damaged), EV001 (none), EV003 (unclear unit),
     EV004 (not increasing), EV007 (NaN), EV016 (not found).
     """
     if (suffix := existing(path).suffix) in (".npy", ".npz"):
-        us, notes = to_us(_stored(path) if suffix == ".npy" else _archived(path), path, unit)
-        return us, [], notes
+        return to_us(_stored(path) if suffix == ".npy" else _archived(path), path, unit)
     rows, header, written = _rows(path)
     named = [i for i, field in enumerate(header) if meaning(field) == "t"]
     if len(header) == len(rows[0] if rows else ()) and len(named) == 1:
-        times, labels = _numbers(path, rows, named[0]), _labels(rows, names)
-        written = written_unit(header[named[0]])
+        exposure_us = stated(header, lambda name: _values(rows, header.index(name)))
+        stamps = Stamps(_numbers(path, rows, named[0]), stated_us=exposure_us)
+        labels, written = _labels(rows, names), written_unit(header[named[0]])
     else:
-        times, labels = _columns(path, rows, names)
-    us, notes = to_us(times, path, unit if unit != "auto" else written)
-    return us, labels, notes
+        stamps, labels = _columns(path, rows, names)
+    found = to_us(stamps, path, unit if unit != "auto" else written)
+    return found._replace(names=tuple(labels))
 
 
-def _stored(path: Path) -> np.ndarray:
-    """Times (T,) of an .npy of them, or of begin and end of the exposures (T, 2)."""
+def _stored(path: Path) -> Stamps:
+    """The stamps of an .npy of times (T,), or of begin and end of the exposures (T, 2)."""
     try:
         with open(path, "rb") as f:
             pairs = npy_header(f)[0][1:] == (2,)
@@ -75,13 +86,15 @@ def _stored(path: Path) -> np.ndarray:
     return mid_exposure(np.array(mapped(path, (None, 2) if pairs else (None,))), path)
 
 
-def _archived(path: Path) -> np.ndarray:
-    """Times (T,) of an .npz: its only array, or the one that is named a time, or begin and end of
+def _archived(path: Path) -> Stamps:
+    """The stamps of an .npz: its only array, or the one that is named a time, or begin and end of
     the exposures."""
-    arrays = {name: array for name, array in load_npz(path).items() if array.ndim}
+    held = load_npz(path)
+    arrays = {name: array for name, array in held.items() if array.ndim}
     for named in (arrays, [name for name in arrays if meaning(name) == "t"]):
         if len(named) == 1:
-            return mid_exposure(arrays[next(iter(named))], path)
+            return mid_exposure(arrays[next(iter(named))], path)._replace(
+                stated_us=stated(held, held.__getitem__))
     ends = [array for word in ENDS for name, array in arrays.items() if word.search(name)]
     if len(ends) == 2 and ends[0].shape == ends[1].shape == (len(ends[0]),):
         return mid_exposure(np.stack(ends, 1), path)
@@ -90,23 +103,12 @@ def _archived(path: Path) -> np.ndarray:
         "Call that array t, or save it alone (.npy).", where=path)
 
 
-def mid_exposure(times: np.ndarray, where: object) -> np.ndarray:
-    """Times (T,) of exposures whose begin and end are (T, 2), EV008 if they cannot be that; others
-    as they are, without axes of length 1."""
-    if times.ndim != 2 or times.shape[1] != 2:
-        return times.ravel() if times.size == max(times.shape, default=0) else times
-    if (found := middle(*times.T)) is None:
-        raise EvflowDataError(
-            "EV008", f"{where} holds two columns, which are not begin and end of exposures: "
-            f"{times[0].tolist()}, ...", "Keep one time per frame.", where=where)
-    return found
-
-
-def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndarray, Notes]:
-    """Strictly increasing times (T,) as int64 us, and a note if the unit was inferred.
+def to_us(stamps: Stamps, where: object, unit: str = "auto") -> FrameTimes:
+    """Strictly increasing times in us, and a note if the unit was inferred.
 
     Raises EV001, EV002, EV003, EV004, EV007.
     """
+    times = stamps.times
     if times.ndim != 1 or times.dtype.kind not in "iuf":
         raise EvflowDataError(
             "EV002", f"{where} holds times of shape {times.shape} and dtype {times.dtype}.",
@@ -134,32 +136,35 @@ def to_us(times: np.ndarray, where: object, unit: str = "auto") -> tuple[np.ndar
                       "would be those of a video."),)
     us = Hints(time_unit=unit).microseconds(times, unit)
     with naming(where):
-        return check_times(us, f"times read in {unit}", strict=True), notes
+        us = check_times(us, f"times read in {unit}", strict=True)
+    return FrameTimes(us, notes, stamps.exposure_us(unit))
 
 
 def beside_events(
-    times: np.ndarray, where: object, native: str, hints: Hints, events: Events
-) -> tuple[np.ndarray, Notes]:
-    """Times (T,) of the frames stored with a recording's events, as int64 us, and a note if their
-    unit was inferred.
+    stamps: Stamps, where: object, native: str, hints: Hints, events: Events
+) -> FrameTimes:
+    """Times of the frames stored with a recording's events in us, and a note if their unit was
+    inferred.
 
     native: their unit in the format. The unit in `hints` is that of the events; frames share it,
     unless another unit makes their span agree with the events'. Fractions in a unit of integers
     indicate the unit that allows them. Raises as `to_us`.
     """
-    asked = hints.time_unit
+    times, asked = stamps.times, hints.time_unit
     odd = times.dtype.kind == "f" and native != "s"
     usual = asked == "auto" and not odd
     if usual or times.ndim != 1 or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-        return hints.microseconds(times, native), ()
+        unit = native if asked == "auto" else asked
+        return FrameTimes(hints.microseconds(times, native), (), stamps.exposure_us(unit))
     units = [native, *UNITS_US] if asked == "auto" else [asked, native]
-    unit = shared_unit(times, events.t, units)
-    if unit is None and asked == "auto":
-        return to_us(times, where)
-    unit = unit or usual_unit(times, units)
+    shared = shared_unit(times, events.t, units)
+    if shared is None and asked == "auto":
+        return to_us(stamps, where)
+    unit = shared or usual_unit(times, units)
     notes = () if unit == asked else (
         Note("frames.unit", f"frame times of {where} were read in {unit}."),)
-    return Hints(time_unit=unit).microseconds(times, unit), notes
+    return FrameTimes(
+        Hints(time_unit=unit).microseconds(times, unit), notes, stamps.exposure_us(unit))
 
 
 def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
@@ -225,35 +230,27 @@ def _tail(field: str) -> str:
 
 def _columns(
     path: Path, rows: list[list[str]], names: Collection[str]
-) -> tuple[np.ndarray, list[str]]:
-    """The column of times (T,), int64 or float64, and that of the names, if any."""
+) -> tuple[Stamps, list[str]]:
+    """The column of times, or those of begin and end, and that of the names, if any."""
     columns = list(zip(*rows, strict=True))
     if len(columns) <= 1:
-        return _numbers(path, rows, 0), []
+        return Stamps(_numbers(path, rows, 0)), []
     known = _known(names)
     label = [all(_tail(f) in known for f in column) for column in columns]
     if sum(label) != 1:  # not the images at hand: names are non-numbers, or count up
         label = [not all(map(is_float, column)) or _counts(column) for column in columns]
     clock = [i for i, named in enumerate(label) if not named]
-    times = (_numbers(path, rows, clock[0]) if len(clock) == 1 else
-             middle(*(_numbers(path, rows, column) for column in clock)) if len(clock) == 2
-             else None)
-    if times is None or sum(label) > 1:
+    stamps = (Stamps(_numbers(path, rows, clock[0])) if len(clock) == 1 else
+              middle(*(_numbers(path, rows, column) for column in clock)) if len(clock) == 2
+              else None)
+    if stamps is None or sum(label) > 1:
         raise EvflowDataError(
             "EV008", f"{path} has lines like {' '.join(rows[0])[:60]!r}; which column is the time?",
             "Keep one time per line, `time name`, or begin and end of the exposure.", where=path)
     named = columns[label.index(True)] if any(label) else ()
     if all(map(str.isdecimal, named)) and not set(named) <= set(known):
-        return times, []
-    return times, [known.get(_tail(f), _tail(f)) for f in named]
-
-
-def middle(begin: np.ndarray, end: np.ndarray) -> np.ndarray | None:
-    """Mid-exposure (T,) from its begin and end; None if they are something else."""
-    if (end < begin).any() or (end[:-1] > begin[1:]).any():
-        return None
-    return begin + (end - begin) // 2 if begin.dtype == end.dtype == np.int64 else (
-        begin + 0.5 * (end - begin))
+        return stamps, []
+    return stamps, [known.get(_tail(f), _tail(f)) for f in named]
 
 
 def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
@@ -268,6 +265,11 @@ def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
         return np.array([int(f) for f in fields], np.int64)
     except (ValueError, OverflowError):
         return np.array([float(f) for f in fields])
+
+
+def _values(rows: list[list[str]], column: int) -> np.ndarray:
+    """A column as float64, without the fields that are no numbers."""
+    return np.array([float(row[column]) for row in rows if is_float(row[column])])
 
 
 def _counts(column: tuple[str, ...]) -> bool:

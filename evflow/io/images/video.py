@@ -36,7 +36,7 @@ TICK_US = 1000.5  # Matroska and WebM round times to the millisecond
 @dataclasses.dataclass(frozen=True)
 class Video:
     """A video file: size (width, height), fps and the frame count that its header claims (0 =
-    unknown); times_us (T,) if the user gave them."""
+    unknown); times_us (T,) and exposure_us (0 = unknown) if the user gave them."""
 
     path: Path
     size: tuple[int, int]
@@ -45,6 +45,7 @@ class Video:
     hints: FrameHints
     times_us: np.ndarray | None
     notes: list[Note]
+    exposure_us: int = 0
 
     def images(self) -> Iterator[Image]:
         """The frames (H, W, 3) from first to last, B, G, R.
@@ -172,14 +173,15 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
             _check_end(path, capture, claimed)
         if not hints.partial:
             _check_bytes(path)
-    times, notes = None, list(hdr_note(path))
+    times, notes, exposure_us = None, list(hdr_note(path)), 0
     if hints.timestamps is not None:
-        times, _, more = read_times(Path(hints.timestamps), hints.time_unit)
+        times, more, exposure_us, _ = read_times(Path(hints.timestamps), hints.time_unit)
         notes += more
     if not (rate and 0 < rate < 1e6) and times is None and hints.fps is None:
         raise EvflowDataError("EV020", f"{path} states no frame rate ({rate:g}).", "Pass --fps.",
                               where=path)
-    return Video(path, first.shape[1::-1], float(rate), claimed, hints, times, notes)
+    return Video(path, first.shape[1::-1], float(rate), claimed, hints, times, notes,
+                 exposure_us)
 
 
 def _check_converted(path: Path, capture: Any, claimed: int, first: np.ndarray) -> None:

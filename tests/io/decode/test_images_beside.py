@@ -88,6 +88,51 @@ def test_what_cannot_be_frames_leaves_the_events_and_is_told(
         assert not read_recording(write(tmp_path, arrays), no_frames=True).notes
 
 
+ODD = np.stack([TIMES - 2000, TIMES + 2001], 1)
+STATED: dict[str, dict[str, Any]] = {
+    "begin and end": {"images": FRAMES, "exposure_ts": ODD},
+    "in seconds": {"images": FRAMES, "exposure_ts": (ODD - 0.5) / 1e6},
+    "in nanoseconds": {"images": FRAMES, "exposure_ts_ns": 1000 * ODD - 500},
+    "a number": {"images": FRAMES, "image_ts": TIMES, "exposure_us": np.array(4001)},
+    "one per image": {"images": FRAMES, "image_ts": TIMES, "exposure_time_ms": np.full(6, 4.001)},
+    "above": {"cam/left/data": FRAMES, "cam/ts": TIMES, "cam/exposure_ns": np.array([4_001_000])}}
+
+
+@pytest.mark.parametrize("write", [
+    h5("x y t p"), h5("events/x events/y events/t events/p"),
+    h5("events/xs events/ys events/ts events/ps"), npz])
+@pytest.mark.parametrize("kind", STATED)
+def test_exposures_beside_images(
+    tmp_path: Path, write: Callable[[Path, dict[str, Any]], Path], kind: str
+) -> None:
+    path = write(tmp_path, STATED[kind])
+    whole, part = read_recording(path), read_recording(path, start_s=0.1, stop_s=0.2)
+    assert whole.frame_times.tolist() == TIMES.tolist()
+    assert 0 < len(part.frames) < 6
+    for found in (whole, part):
+        assert found.exposure_us == 4001
+        said = [note.text for note in found.notes if note.code == "frames.exposure"]
+        assert len(said) == 1
+        assert "4.001 ms, as the file says" in said[0]
+
+
+@pytest.mark.parametrize("named", ["images", "image_ts"])
+def test_an_attribute_states_an_exposure(tmp_path: Path, named: str) -> None:
+    path = h5("x y t p")(tmp_path, {"images": FRAMES, "image_ts": TIMES})
+    for attribute, exposure_us in (("exposure", 0), ("exposure_time_ms", 4001)):
+        with h5py.File(path, "a") as f:
+            f[named].attrs[attribute] = 4.001
+        assert read_recording(path).exposure_us == exposure_us
+
+
+def test_an_exposure_without_unit_is_not_guessed_nor_taken_for_times(tmp_path: Path) -> None:
+    for name in ("exposure", "exposure_time", "exposure_time_us"):
+        path = npz(tmp_path, {"frames": RGB, "stamps_of_images_ts": TIMES, name: np.arange(6)})
+        found = read_recording(path)
+        assert found.frame_times.tolist() == TIMES.tolist()
+        assert found.exposure_us == (2 if name.endswith("_us") else 0)
+
+
 def test_encoded_images_are_told(tmp_path: Path) -> None:
     path = h5("x y t p")(tmp_path, {"image_ts": TIMES})
     with h5py.File(path, "a") as f:

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evflow import Events, Recording, write_events
+from evflow.io.images.exposures import Stamps
 from evflow.io.images.folder import natural
 from evflow.io.images.times import to_us
 from evflow.io.source import open_frames
@@ -187,15 +188,15 @@ def test_folders_without_what_is_needed(tmp_path: Path) -> None:
 def test_the_unit_of_usual_rates_is_found(fps: float, unit: str, start: int) -> None:
     us = start + np.rint(np.arange(8) * 1e6 / fps).astype(np.int64)
     factor = {"s": 1e-6, "ms": 1e-3, "us": 1, "ns": 1000}[unit]
-    np.testing.assert_array_equal(to_us(us * factor, "them")[0], us)
+    np.testing.assert_array_equal(to_us(Stamps(us * factor), "them").us, us)
 
 
 def test_times_since_1970_and_fast_cameras() -> None:
     ns = 1_700_000_000_123_456_789 + 200_000 * np.arange(5)  # 5000 frames/s: the epoch decides
-    assert (to_us(ns, "t")[0] == (ns + 500) // 1000).all()
+    assert (to_us(Stamps(ns), "t").us == (ns + 500) // 1000).all()
     fast = 200 * np.arange(5)
-    assert (to_us(fast, "t", "us")[0] == fast).all()
-    assert "5 frames/s in ms, 5000 frames/s in us" in message(lambda: to_us(fast, "t"))
+    assert (to_us(Stamps(fast), "t", "us").us == fast).all()
+    assert "5 frames/s in ms, 5000 frames/s in us" in message(lambda: to_us(Stamps(fast), "t"))
 
 
 # --------------------------------------------------------------------------- stacks, recordings

@@ -97,7 +97,12 @@ def test_frames_come_from_a_folder_with_begin_and_end_of_exposure(
     assert (found.frames == recording.frames).all()
     assert (found.frame_times == recording.frame_times).all()
     assert "--timestamps-unit" in found.notes[1].text
-    assert [note.code for note in found.notes] == ["frames.replaced", "frames.unit"]
+    assert [note.code for note in found.notes] == [
+        "frames.replaced", "frames.unit", "frames.exposure"]
+    assert found.exposure_us == 10_001
+    again = with_frames(found, folder, fps=25)
+    assert again.exposure_us == 0
+    assert all(note.code != "frames.exposure" for note in again.notes)
     assert check(found).errors == ()
 
 
@@ -132,8 +137,8 @@ def test_times_of_exposures(tmp_path: Path) -> None:
         with pytest.raises(EvflowDataError, match="EV008"):
             read_times(path)
     path.write_text("1000 5000 a.png\n41000 45000 b.png\n")
-    us, names, _ = read_times(path, "us", ["a.png", "b.png"])
-    assert (us.tolist(), names) == ([3000, 43000], ["a.png", "b.png"])
+    us, _, _, names = read_times(path, "us", ["a.png", "b.png"])
+    assert (us.tolist(), names) == ([3000, 43000], ("a.png", "b.png"))
 
 
 def test_saturated_pixels_tell_nothing(watched: tuple[Recording, Camera]) -> None:

@@ -1,0 +1,113 @@
+"""Exposures of frames, where a file holds them: as begin and end of each in place of its middle, or
+as a number under a name with a unit (`exposure_us`, `exposure_time_ms`).
+
+One number stands for all frames, the median. Times that are both begin and end, negative numbers
+and NaN say nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.io.decode.columns import UNIT
+from evflow.io.decode.units import UNITS_US, written_unit
+from evflow.notes import Note
+
+LONGEST = 1.05  # an exposure lasts at most the interval between frames; times are rounded
+NAMES = re.compile(r"(?:^|_)exposures?(?:_?times?|_?durations?)?$")  # without the unit
+NOTED = "frames.exposure"
+
+
+class Stamps(NamedTuple):
+    """What a file says of when its frames were taken.
+
+    times: (T,) in the file's unit, mid-exposure if it holds begin and end; length: of the exposure
+    in that unit; stated_us: of the exposure, under a name with a unit. 0 if they are unknown.
+    """
+
+    times: np.ndarray
+    length: float = 0.0
+    stated_us: int = 0
+
+    def exposure_us(self, unit: str) -> int:
+        """The exposure, with times in this unit; 0 if it is unknown."""
+        return self.stated_us or round(self.length * UNITS_US[unit])
+
+
+def mid_exposure(times: np.ndarray, where: object) -> Stamps:
+    """The stamps of exposures whose begin and end are (T, 2), EV008 if they cannot be that; others
+    as they are, without axes of length 1."""
+    if times.ndim != 2 or times.shape[1] != 2:
+        return Stamps(times.ravel() if times.size == max(times.shape, default=0) else times)
+    if (found := middle(*times.T)) is None:
+        raise EvflowDataError(
+            "EV008", f"{where} holds two columns, which are not begin and end of exposures: "
+            f"{times[0].tolist()}, ...", "Keep one time per frame.", where=where)
+    return found
+
+
+def middle(begin: np.ndarray, end: np.ndarray) -> Stamps | None:
+    """The stamps of exposures with this begin and end (T,); None if they are something else."""
+    if (end < begin).any() or (end[:-1] > begin[1:]).any():
+        return None
+    lengths = end - begin
+    times = (begin + lengths // 2 if begin.dtype == end.dtype == np.int64 else
+             begin + 0.5 * lengths)
+    length = float(np.median(lengths)) if len(lengths) else 0.0
+    return Stamps(times, length if 0 < length < np.inf else 0.0)
+
+
+def names_exposure(name: str) -> bool:
+    """Whether an array, attribute or column of this name holds lengths of exposures."""
+    return bool(NAMES.search(UNIT.sub("", name.rpartition("/")[2].lower())))
+
+
+def stated(names: Iterable[str], get: Callable[[str], Any]) -> int:
+    """The exposure in us that one of these names states: a number, or one per frame, with its unit
+    in the name. 0 if there is none, or several. get(name): its value."""
+    fit = [name for name in names if names_exposure(name) and written_unit(name) != "auto"]
+    numbers = np.asarray(get(fit[0]) if len(fit) == 1 else ())
+    if numbers.dtype.kind not in "iuf" or not numbers.size:
+        return 0
+    exposure_us = float(np.median(numbers)) * UNITS_US[written_unit(fit[0])]
+    return round(exposure_us) if 0 < exposure_us < np.inf else 0
+
+
+def stated_by(*arrays: Any) -> int:
+    """The exposure in us that an attribute of one of these data sets states; 0 if there is none."""
+    return next((us for array in arrays if (attributes := getattr(array, "attrs", ())) and (
+        us := stated(attributes, attributes.__getitem__))), 0)
+
+
+def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:
+    """That frames have an exposure, and what follows."""
+    return Note(NOTED, f"frames are exposed for {exposure_us / 1e3:g} ms, {said_by}: "
+                "estimate and simulate take out the blur (--exposure-ms 0: they leave it)")
+
+
+def noted(notes: Iterable[Note], exposure_us: int, said_by: str = "") -> tuple[Note, ...]:
+    """The notes with this exposure in place of the one they name; without any if it is 0."""
+    said = (exposed_note(exposure_us, said_by),) if exposure_us else ()
+    return (*(note for note in notes if note.code != NOTED), *said)
+
+
+def given_exposure(
+    exposure_ms: float, times_us: Iterable[int], notes: Iterable[Note]
+) -> tuple[int, tuple[Note, ...]]:
+    """The exposure in us of frames at these times that a user gives, and the notes with it in place
+    of what a file says; EV020 if it is negative, or longer than the interval between frames."""
+    gaps = np.diff(list(times_us))
+    length = float(np.median(gaps)) * 1e-3 if len(gaps) else np.inf
+    if not 0 <= exposure_ms < np.inf or exposure_ms > LONGEST * length:
+        raise EvflowDataError(
+            "EV020", f"an exposure of {exposure_ms:g} ms" + (
+                f", where frames are {length:g} ms apart." if exposure_ms > 0 else "."),
+            "Give milliseconds (--exposure-ms), at most the interval between frames; 0 if the "
+            "exposure is to be ignored.")
+    exposure_us = round(exposure_ms * 1e3)
+    return exposure_us, noted(notes, exposure_us, "as was given")
