@@ -72,6 +72,14 @@ def check_size(size: Any) -> Size:
     return width, height
 
 
+def check_exposure(exposure_us: float) -> int:
+    """Microseconds >= 0 as an int; raises EV020."""
+    if not 0 <= exposure_us < np.inf:
+        raise EvflowDataError("EV020", f"exposure_us={exposure_us}.",
+                              "Give microseconds, >= 0; 0 if it is unknown.")
+    return int(exposure_us)
+
+
 def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
     """Times (N,) as sorted int64 (strict: strictly increasing); raises EV003, EV004."""
     if t.size == 0:

@@ -54,11 +54,6 @@ class Convert(Reading):
                 "frames.unused", f"{why}: the {len(recording.frames)} frames were left out; .h5 "
                 "and .npz can hold them."))
             recording = Recording.of_events(recording.events)
-        elif recording.exposure_us:
-            notes = [note for note in notes if note.code != "frames.exposure"]
-            exposure = f"--exposure-ms {recording.exposure_us / 1e3:g}"
-            notes.append(Note("frames.exposure", f"{writer.NAME} does not keep the exposure of the "
-                              f"frames: pass {exposure} when {self.out} is read."))
         io.write_recording(self.out, recording, writer.NAME, overwrite=self.overwrite)
         for note in notes:
             print(f"note: {note}", file=sys.stderr)

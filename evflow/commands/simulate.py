@@ -102,7 +102,8 @@ class Simulate(Pixels, Footage, Compiling):
         ) as made:
             camera, sensor = self.pixels(source.size), self.model()
             with io.open_writer(
-                self.out, source.size, format, overwrite=self.overwrite
+                self.out, source.size, format, overwrite=self.overwrite,
+                exposure_us=source.exposure_us,
             ) as writer, behind(DEPTH) as later:
                 fits = _fitting(writer, source.notes)
                 seen: list[int] = []

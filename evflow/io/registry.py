@@ -217,12 +217,14 @@ def write_recording(
         EvflowDataError: EV003, EV010, EV013, EV019, EV020 as in `write_events`.
     """
     need(recording, Recording, "recording", "For events: Recording.of_events(events).")
-    with open_writer(path, recording.events.size, format, overwrite=overwrite) as out:
+    with open_writer(path, recording.events.size, format, overwrite=overwrite,
+                     exposure_us=recording.exposure_us) as out:
         copy(recording, out)
 
 
 def open_writer(
-    path: str | os.PathLike, size: Size, format: str | None = None, *, overwrite: bool = False
+    path: str | os.PathLike, size: Size, format: str | None = None, *, overwrite: bool = False,
+    exposure_us: int = 0,
 ) -> EventWriter:
     """A writer for a recording that comes in parts; the file appears when the `with` block ends.
 
@@ -231,19 +233,21 @@ def open_writer(
         size: (width, height) of the sensor.
         format: as in `write_recording`.
         overwrite: replace what exists.
+        exposure_us: exposure time of the frames, 0 if it is unknown or there are none.
 
     Returns:
         A context manager with append(events) and append_frames(frames, frame_times).
 
     Raises:
-        EvflowDataError: EV003 (a larger sensor than the format holds), EV020 (size or format); and
-            from its block EV003, EV004 (order), EV010, EV013, EV015 (another size), EV019.
+        EvflowDataError: EV003 (a larger sensor than the format holds), EV020 (size, format or
+            exposure); and from its block EV003, EV004 (order), EV010, EV013, EV015 (another size),
+            EV019.
 
     Example:
         >>> with ef.open_writer("out.npz", (346, 260)) as out:
         ...     out.append(events)
     """
-    return writer_of(path, format)(path, size, overwrite=overwrite)
+    return writer_of(path, format)(path, size, overwrite=overwrite, exposure_us=exposure_us)
 
 
 def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventWriter]:

@@ -20,7 +20,7 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from evflow.checks import COLUMNS, Size, check_frames, check_size, check_times
+from evflow.checks import COLUMNS, Size, check_exposure, check_frames, check_size, check_times
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
 from evflow.files.spool import forget
@@ -44,7 +44,7 @@ class EventWriter(abc.ABC):
 
     NAME: the format. DEPTHS: dtypes of frames it can hold, () for none. MAX_SIDE: largest side of a
     sensor in pixels. TIMES_US: its first and last possible time. LABELS: whether it can label noise
-    events.
+    events. exposure_us: of the frames, stored with them; 0 = unknown.
     """
 
     NAME: ClassVar[str]
@@ -53,8 +53,11 @@ class EventWriter(abc.ABC):
     TIMES_US: ClassVar[tuple[int, int]] = (-(2**63), 2**63 - 1)
     LABELS: ClassVar[bool] = False
 
-    def __init__(self, path: str | os.PathLike, size: Size, *, overwrite: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike, size: Size, *, overwrite: bool = False, exposure_us: int = 0
+    ) -> None:
         self.path, self.size, self.overwrite = Path(path), check_size(size), overwrite
+        self.exposure_us = check_exposure(exposure_us)
         if max(self.size) > self.MAX_SIDE:
             raise EvflowDataError(
                 "EV003", f"{self.NAME} holds sensors of up to {self.MAX_SIDE} pixels a side, not "

@@ -7,7 +7,7 @@ import functools
 
 import numpy as np
 
-from evflow.checks import check_frames, check_times, need, plain, read_only
+from evflow.checks import check_exposure, check_frames, check_times, need, plain, read_only
 from evflow.errors import EvflowDataError
 from evflow.files.spool import forget
 from evflow.notes import Note
@@ -57,10 +57,7 @@ class Recording:
         times = check_times(times, "frame_times", strict=True)
         for note in self.notes:
             need(note, Note, "a note", "For a sentence: evflow.notes.Note(code, sentence).")
-        if not 0 <= self.exposure_us < np.inf:
-            raise EvflowDataError("EV020", f"exposure_us={self.exposure_us}.",
-                                  "Give microseconds, >= 0; 0 if it is unknown.")
-        object.__setattr__(self, "exposure_us", int(self.exposure_us))
+        object.__setattr__(self, "exposure_us", check_exposure(self.exposure_us))
         object.__setattr__(self, "frames", read_only(frames))
         object.__setattr__(self, "frame_times", read_only(times))
 

@@ -83,15 +83,39 @@ def test_frames_that_a_format_cannot_hold_are_left_out_with_a_note(
     assert "aedat4 holds frames of uint8, not uint16: the 6 frames were left out" in err
 
 
-def test_an_exposure_that_no_format_keeps_is_named(
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "folder", "a.aedat4"])
+def test_an_exposure_is_kept(
+    tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    if name == "a.aedat4":
+        pytest.importorskip("aedat", reason="the package aedat reads AEDAT4")
+    for options, exposure_us, said in ((("--exposure-ms", 2.501), 2501, "as was given"),
+                                       ((), 0, "")):
+        out = tmp_path / name
+        _, _, err = run(capsys, "convert", flight, out, "--overwrite", *options)
+        assert err.count("exposed for") == len(options) / 2
+        assert said in err
+        assert read_recording(out).exposure_us == exposure_us
+        assert run(capsys, "convert", out, tmp_path / "b.npz", "--overwrite")[0] == 0
+        assert read_recording(tmp_path / "b.npz").exposure_us == exposure_us
+        assert run(capsys, "convert", out, tmp_path / "c.h5", "--exposure-ms", 0,
+                   "--overwrite")[0] == 0
+        assert read_recording(tmp_path / "c.h5").exposure_us == 0
+
+
+def test_begin_and_end_beside_a_recording_are_its_exposure(
     tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "a.npz"
-    assert main(["convert", str(flight), str(out), "--exposure-ms", "2.5"]) == 0
-    assert f"does not keep the exposure of the frames: pass --exposure-ms 2.5 when {out}" in (
-        capsys.readouterr().err)
-    assert main(["convert", str(flight), str(out), "--overwrite"]) == 0
-    assert "exposure" not in capsys.readouterr().err
+    want, times, out = read_recording(flight), tmp_path / "times.txt", tmp_path / "a.npz"
+    np.save(tmp_path / "f.npy", want.frames)
+    times.write_text("".join(
+        f"{1000 * (t - 4000)} {1000 * (t + 4001)}\n" for t in want.frame_times.tolist()))
+    beside = ("--frames", tmp_path / "f.npy", "--timestamps", times, "--overwrite")
+    for options, exposure_us in (((), 8001), (("--exposure-ms", 7), 7000), (
+            ("--start", 0.1, "--stop", 0.2), 8001)):
+        _, _, err = run(capsys, "convert", flight, out, *beside, *options)
+        assert err.count(f"exposed for {exposure_us / 1e3:g} ms") == err.count("exposed for") == 1
+        assert read_recording(out).exposure_us == exposure_us
 
 
 def test_convert_errors(

@@ -108,6 +108,21 @@ def test_the_blur_of_an_exposure_is_taken_out(
         1 - counts["blurred"] / counts["sharp"])
 
 
+def test_frames_that_are_written_keep_their_exposure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin, path, out = 40_000 * np.arange(1, 5), tmp_path / "v.npz", tmp_path / "out.h5"
+    np.savez(path, frames=drifting(4, (24, 32)).astype(np.float32),
+             frame_times=np.stack([begin, begin + 8_001], 1))
+    for options, exposure_us in (((), 8001), (("--slow-motion", "2"), 4000),
+                                 (("--exposure-ms", "3.001"), 3001), (("--exposure-ms", "0"), 0)):
+        facts = run(path, "--frames-too", *options, capsys=capsys)[1]
+        assert read_recording(out).exposure_us == exposure_us
+        said = [note["text"] for note in facts["notes"] if note["code"] == "frames.exposure"]
+        assert len(said) == bool(exposure_us)
+        assert all(f"exposed for {exposure_us / 1e3:g} ms" in text for text in said)
+
+
 def test_a_picture_by_saccades(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each of the three moves is seen; at rest between them hardly anything is."""
     cv2.imwrite(str(tmp_path / "cat.png"), drifting(1, (24, 32))[0])

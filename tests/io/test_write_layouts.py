@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -113,6 +114,32 @@ def test_aedat4_by_the_aedat_package(tmp_path: Path) -> None:
         assert {frame[n] for n in ("t", "begin_t", "end_t", "exposure_begin_t",
                                    "exposure_end_t")} == {int(t)}
         assert frame["format"] == "L"
+
+
+def test_where_an_exposure_is_written(tmp_path: Path) -> None:
+    want = dataclasses.replace(make(3000), exposure_us=4001)
+    for name, kind in (("a.h5", "dsec"), ("b.h5", "event_utils"), ("a.npz", "npz"),
+                       ("folder", "evreal")):
+        write_recording(tmp_path / name, want, kind)
+    with h5py.File(tmp_path / "a.h5") as f:
+        assert dict(f["frame_times"].attrs) == {"exposure_us": 4001}
+    with h5py.File(tmp_path / "b.h5") as f:
+        assert {image.attrs["exposure_us"] for image in f["images"].values()} == {4001}
+    with np.load(tmp_path / "a.npz") as data:
+        assert (data["exposure_us"].shape, int(data["exposure_us"])) == ((), 4001)
+    assert json.loads((tmp_path / "folder/metadata.json").read_text()) == {
+        "sensor_resolution": [48, 64], "exposure_us": 4001}
+
+
+def test_aedat4_s_exposure_by_the_aedat_package(tmp_path: Path) -> None:
+    aedat = pytest.importorskip("aedat", reason="the package aedat reads AEDAT4")
+    want = dataclasses.replace(make(3000), exposure_us=4001)
+    write_recording(tmp_path / "a.aedat4", want)
+    frames = [p["frame"] for p in aedat.Decoder(str(tmp_path / "a.aedat4")) if "frame" in p]
+    for frame, t in zip(frames, want.frame_times.tolist(), strict=True):
+        assert (frame["t"], frame["exposure_begin_t"], frame["exposure_end_t"]) == (
+            t, t - 2000, t + 2001)
+        assert (frame["begin_t"], frame["end_t"]) == (t - 2000, t + 2001)
 
 
 @pytest.mark.parametrize("n", [0, 1, 50_000])

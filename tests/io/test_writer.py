@@ -67,6 +67,39 @@ def test_events_and_frames_come_back(tmp_path: Path, kind: str) -> None:
         np.testing.assert_array_equal(part.frames, want.frames[2:4])
 
 
+@pytest.mark.parametrize("kind", [name for name in ANY if WRITERS[name].DEPTHS])
+@pytest.mark.parametrize("exposure_us", [1, 4001, 20_000])
+def test_an_exposure_comes_back_twice(tmp_path: Path, kind: str, exposure_us: int) -> None:
+    """Also that of a frame whose exposure begins before the clock."""
+    events = make(3000).events
+    for start in (0, T0):
+        want = Recording(Events(events.x, events.y, events.t - T0 + start, events.p, SIZE),
+                         make(10).frames, start + 50_000 * np.arange(6), exposure_us=exposure_us)
+        path = place(tmp_path, kind)
+        write_recording(path, want, kind, overwrite=True)
+        for found in (read_recording(path), read_recording(path, start_s=0.08, stop_s=0.18)):
+            assert found.exposure_us == exposure_us
+            assert [note.code for note in found.notes].count("frames.exposure") == 1
+        np.testing.assert_array_equal(found.frames, want.frames[2:4])
+        found = read_recording(path)
+        write_recording(path, found, kind, overwrite=True)
+        again = read_recording(path)
+        same(again, want)
+        assert (again.exposure_us, again.notes) == (exposure_us, found.notes)
+
+
+@pytest.mark.parametrize("kind", [name for name in ANY if WRITERS[name].DEPTHS])
+def test_without_frames_there_is_no_exposure(tmp_path: Path, kind: str) -> None:
+    path, events = place(tmp_path, kind), make(300).events
+    with open_writer(path, SIZE, kind, exposure_us=4001) as out:
+        out.append(events)
+    found = read_recording(path)
+    equal(found.events, events)
+    assert (found.exposure_us, found.notes) == (0, ())
+    with pytest.raises(EvflowDataError, match="EV020"):
+        open_writer(path, SIZE, kind, exposure_us=-1)
+
+
 @pytest.mark.parametrize("kind", ["npz", "e2vid"])
 def test_archives_do_not_say_when_they_were_written(tmp_path: Path, kind: str) -> None:
     path = place(tmp_path, kind)

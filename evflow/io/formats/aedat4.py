@@ -216,12 +216,19 @@ def _decoder(path: Path) -> Any:
 def _exposure(frame: dict[str, Any]) -> int:
     """How long it took (us), 0 if that is not stored."""
     begin, end = frame["exposure_begin_t"], frame["exposure_end_t"]
-    return end - begin if 0 < begin <= end else 0
+    return end - begin if _stored(frame, begin, end) else 0
 
 
 def _mid_exposure(frame: dict[str, Any]) -> int:
     """The middle of the exposure (us); without one, of the frame interval, or the packet's time."""
-    for begin, end in (("exposure_begin_t", "exposure_end_t"), ("begin_t", "end_t")):
-        if 0 < frame[begin] <= frame[end]:
-            return (frame[begin] + frame[end]) // 2
+    for name in ("exposure_", ""):
+        begin, end = frame[f"{name}begin_t"], frame[f"{name}end_t"]
+        if _stored(frame, begin, end):
+            return (begin + end) // 2
     return frame["t"]
+
+
+def _stored(frame: dict[str, Any], begin: int, end: int) -> bool:
+    """Whether these are begin and end of an interval. Up to 0 they are not, unless the frame is at
+    the middle: then the clock began meanwhile."""
+    return 0 < begin <= end or (begin < end and (begin + end) // 2 == frame["t"])

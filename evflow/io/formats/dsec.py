@@ -3,8 +3,9 @@
 /events/{x u16, y u16, p u8, t u32 us}, /t_offset (i64 us, add it to t), /ms_to_idx (u64; event
 ms_to_idx[m] is the first with t >= 1000 m). evflow adds attributes width and height (absent in
 DSEC, which is always 640x480; its ms_to_idx and t_offset identify it), and /frames, /frame_times
-(i64 us, without t_offset) if there are frames. `DsecWriter` takes events in chunks, so that a long
-simulation is never in memory as a whole.
+(i64 us, without t_offset; its attribute exposure_us is the frames' exposure, if known) if there are
+frames. `DsecWriter` takes events in chunks, so that a long simulation is never in memory as a
+whole.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from evflow.io.decode.hdf5_search import (
 )
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
+from evflow.io.images.exposures import KEY
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
@@ -132,6 +134,8 @@ class DsecWriter(Hdf5Writer):
         if "frames" not in self._file:
             self._create("frames", frames.shape[1:], frames.dtype, 1)
             self._create("frame_times", (), "i8", self.CHUNK)
+            if self.exposure_us:
+                self._file["frame_times"].attrs[KEY] = np.int64(self.exposure_us)
         self._extend("frames", frames)
         self._extend("frame_times", times)
 

@@ -22,7 +22,7 @@ from evflow.io.decode.hdf5_columns import FILTERS
 from evflow.io.decode.hdf5_search import images_beside
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import Stamps, stated_by
+from evflow.io.images.exposures import KEY, Stamps, stated_by
 from evflow.io.images.folder import natural
 from evflow.io.images.streams import ImageStream
 from evflow.io.writer import FLUSH, SECONDS_US
@@ -116,8 +116,8 @@ def _size(
 
 
 class EventUtilsWriter(Hdf5Writer):
-    """xs, ys int16, as their loaders expect; ts float64 s; ps bool. Every image has `timestamp` and
-    `event_idx`, the last event before it."""
+    """xs, ys int16, as their loaders expect; ts float64 s; ps bool. Every image has `timestamp`,
+    `event_idx`, the last event before it, and `exposure_us` if it is known."""
 
     NAME = NAME
     MAX_SIDE = 2**15
@@ -142,6 +142,8 @@ class EventUtilsWriter(Hdf5Writer):
             image = self._store(
                 f"images/image{len(self._image_s):09d}", frame, chunks=frame.shape, **FILTERS)
             image.attrs.update(size=frame.shape, timestamp=second, type="greyscale")
+            if self.exposure_us:
+                image.attrs[KEY] = np.int64(self.exposure_us)
             self._image_s = np.append(self._image_s, second)
             self._disk.check()
 

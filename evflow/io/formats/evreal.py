@@ -1,6 +1,6 @@
 """The folder of an EVREAL sequence (ercanburak/EVREAL): events_ts.npy (N,) s, events_xy.npy (N, 2),
 events_p.npy (N,); images.npy (T, H, W) or (T, H, W, 1 or 3), images_ts.npy (T,) s; metadata.json
-with sensor_resolution = (height, width), and perhaps exposure_us.
+with sensor_resolution = (height, width), to which evflow adds exposure_us if it is known.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from evflow.files.whole import write_checked
 from evflow.io.decode import tables
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import Stamps, stated
+from evflow.io.images.exposures import KEY, Stamps, stated
 from evflow.io.images.streams import ImageStream
 from evflow.io.writer import SECONDS_US, EventWriter
 from evflow.types import Events, Recording
@@ -162,5 +162,7 @@ class EvrealWriter(EventWriter):
             with GrowingArray(self._folder / "image_event_indices.npy", "i8", (1,)) as out:
                 out.append(np.searchsorted(ts, stamps)[:, None])
                 out.close()
-        write_checked(self._folder / METADATA,
-                      json.dumps({"sensor_resolution": self.size[::-1]}) + "\n")
+        facts: dict[str, Any] = {"sensor_resolution": self.size[::-1]}
+        if "images" in self._arrays and self.exposure_us:
+            facts[KEY] = self.exposure_us
+        write_checked(self._folder / METADATA, json.dumps(facts) + "\n")

@@ -29,7 +29,7 @@ from evflow.io.decode.images_beside import beside, stamps_of, times_of
 from evflow.io.decode.stream import Gathered, gather
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import noted
+from evflow.io.images.exposures import KEY, noted
 from evflow.io.images.recorded import cut, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
@@ -218,6 +218,10 @@ class NpzWriter(EventWriter):
                 shutil.copyfileobj(f, member, BLOCK)
         with self._archive.open("size.npy", "w") as f:
             np.lib.format.write_array(f, np.array(self.size, np.int32))
+        if "frames" in self._columns and self.exposure_us:
+            self._sizes[f"{KEY}.npy"] = None
+            with self._archive.open(f"{KEY}.npy", "w") as f:
+                np.lib.format.write_array(f, np.array(self.exposure_us, np.int64))
 
     def _verify(self, temporary: Path) -> None:
         need_members(temporary, self._sizes)

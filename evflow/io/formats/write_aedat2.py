@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +31,8 @@ class Aedat2Writer(EventWriter):
     DEPTHS = ()
     TIMES_US = (0, 2**31 - 1)
 
-    def __init__(self, path: str | os.PathLike, size: Size, *, overwrite: bool = False) -> None:
-        super().__init__(path, size, overwrite=overwrite)
+    def __init__(self, path: str | os.PathLike, size: Size, **options: Any) -> None:
+        super().__init__(path, size, **options)
         if self.size not in CHIPS:
             sizes = ", ".join(f"{width}x{height}" for width, height in CHIPS)
             raise EvflowDataError(

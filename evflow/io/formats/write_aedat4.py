@@ -30,7 +30,8 @@ ATTR = '<attr key="{}" type="{}">{}</attr>'
 
 
 class Aedat4Writer(EventWriter):
-    """Events and 8-bit grey frames, whose time is both begin and end of their exposure."""
+    """Events and 8-bit grey frames, whose time is the middle of their exposure, if that is known,
+    else its begin and end."""
 
     NAME = "aedat4"
     DEPTHS = ("uint8",)
@@ -53,7 +54,7 @@ class Aedat4Writer(EventWriter):
     def _write_frames(self, frames: np.ndarray, times: np.ndarray) -> None:
         self._flush()  # the file is ordered by time, as readers expect
         for frame, t in zip(frames, times, strict=True):
-            self._packet(FRAMES, _frame(frame, int(t)), 1, np.array([t]))
+            self._packet(FRAMES, _frame(frame, int(t), self.exposure_us), 1, np.array([t]))
 
     def _packet(self, stream: int, buffer: bytes, count: int, t: np.ndarray) -> None:
         self._file.write(struct.pack("<ii", stream, len(buffer)))
@@ -88,11 +89,14 @@ def _header(size: tuple[int, int], table: int) -> bytes:
     return _buffer(b"IOHE", [("i", 0), ("q", table)], len(xml), xml + b"\0")
 
 
-def _frame(frame: np.ndarray, t: int) -> bytes:
+def _frame(frame: np.ndarray, t: int, exposure_us: int) -> bytes:
     """FRME: its time, begin and end of the interval and of the exposure; format 0 (grey, 8 bits),
     width, height, x and y offset; pixels."""
     height, width = frame.shape
-    scalars = [*[("q", t)] * 5, ("b", 0), ("h", width), ("h", height), ("h", 0), ("h", 0)]
+    begin = t - exposure_us // 2
+    times = (t, *(begin, begin + exposure_us) * 2)
+    scalars = [*(("q", time) for time in times),
+               ("b", 0), ("h", width), ("h", height), ("h", 0), ("h", 0)]
     return _buffer(b"FRME", scalars, frame.size, frame.tobytes())
 
 

@@ -18,6 +18,7 @@ from evflow.io.decode.columns import UNIT
 from evflow.io.decode.units import UNITS_US, written_unit
 from evflow.notes import Note
 
+KEY = "exposure_us"  # name under which it is written
 LONGEST = 1.05  # an exposure lasts at most the interval between frames; times are rounded
 NAMES = re.compile(r"(?:^|_)exposures?(?:_?times?|_?durations?)?$")  # without the unit
 NOTED = "frames.exposure"

@@ -95,6 +95,21 @@ def test_aedat4_exposure_is_the_frames_median(
     assert any("exposed for 8.2 ms, as the file says" in n.text for n in got.notes)
 
 
+def test_aedat4_exposures_up_to_zero_count_if_the_frame_is_at_their_middle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, recording = tmp_path / "a.aedat4", make()
+    path.write_bytes(AEDAT4)
+    for t, begin, end, exposure_us in ((500, -2000, 3001, 5001), (0, -2000, 2001, 4001),
+                                       (9000, 0, 5000, 0), (9000, -1, -1, 0), (0, 0, 0, 0)):
+        events = packet_of(recording.events)
+        events["events"]["t"] -= T0
+        fake_aedat(monkeypatch, [events, frame_packet(
+            t, recording.frames[0], exposure_begin_t=begin, exposure_end_t=end)])
+        got = read_recording(path)
+        assert (got.frame_times.tolist(), got.exposure_us) == ([t], exposure_us)
+
+
 @pytest.mark.parametrize(("old", "new"), [
     (b"</dv>", b"</\xdav>"), (b'"2.0"', b'"2.\xda"'),  # on such bytes the decoder aborts
     (b"</dv>", b"</dw>"), (b"DAT4.0", b"DAT4.9"), (b"\x0c\0\x08\0\x0a", b"\x0c\0\xff\0\x0a")])
