@@ -32,7 +32,7 @@ NOTES: dict[str, str] = {
     "frames.cut": "the scene is cut between two frames",
     "frames.dark": "frame values below the reset level are 0",
     "frames.depth": "16-bit frames do not use the whole range",
-    "frames.exposure": "the blur of the exposure is taken out of the frames",
+    "frames.exposure": "the blur of the exposure is taken out of the frames, if that is possible",
     "frames.fast": "motion too fast to interpolate well",
     "frames.flipped": "frames were mirrored",
     "frames.flow": "the motion between frames was not found",

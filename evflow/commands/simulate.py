@@ -76,6 +76,7 @@ class Simulate(Pixels, Footage, Compiling):
         import jax
 
         from evflow import io
+        from evflow.io.images.exposures import noted
         from evflow.process import early
         from evflow.process.memory import keep
         from evflow.process.terminal import bar
@@ -87,6 +88,8 @@ class Simulate(Pixels, Footage, Compiling):
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
         self._check(io.registry.writer_of(self.out, format))
         source = self.source(self.video)
+        if not (self.interpolate and self.max_motion_px):  # the blur is left in
+            source.notes[:] = noted(source.notes, 0)
         keep()
         early.settle()
         count = frames = 0

@@ -121,6 +121,9 @@ def test_frames_that_are_written_keep_their_exposure(
         said = [note["text"] for note in facts["notes"] if note["code"] == "frames.exposure"]
         assert len(said) == bool(exposure_us)
         assert all(f"exposed for {exposure_us / 1e3:g} ms" in text for text in said)
+    facts = run(path, "--frames-too", "--no-interpolate", capsys=capsys)[1]
+    assert read_recording(out).exposure_us == 8001
+    assert all(note["code"] != "frames.exposure" for note in facts["notes"])  # it stays blurred
 
 
 def test_a_picture_by_saccades(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

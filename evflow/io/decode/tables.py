@@ -177,7 +177,8 @@ def with_frames(
         return Recording.of_events(stored, (*notes, *chosen.notes))
     with events_alone():
         stamps, decode = next(i for i in several if i.stream is chosen.stream).load()
-        times, added, exposure_us, _ = beside_events(stamps, path, native, hints, stored)
+        times, added, exposure_us, _ = beside_events(
+            stamps, path, native, hints, stored).believed()
         order, _ = in_order(times, hints)
         check_times(times if order is None else times[order], "frame times", strict=True)
         within = np.flatnonzero((times >= span[0]) & (times < span[1]))

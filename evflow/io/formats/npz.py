@@ -29,7 +29,7 @@ from evflow.io.decode.images_beside import beside, stamps_of, times_of
 from evflow.io.decode.stream import Gathered, gather
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import KEY, noted
+from evflow.io.images.exposures import KEY, exposed_note
 from evflow.io.images.recorded import cut, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
@@ -132,12 +132,13 @@ def _with_frames(
     with events_alone():
         stamps = stamps_of(
             "frames", "frame_times", found, lambda name: found[name].whole(), path)
-        times, more, exposure_us, _ = beside_events(stamps, path, "us", hints, events)
+        times, more, exposure_us, _ = beside_events(stamps, path, "us", hints, events).believed()
         frames = found["frames"].spooled()
         order, late = in_order(times, hints)
         if order is not None and len(frames) == len(times):
             frames, times = frames[order], times[order]
-        notes = noted((*notes, *more, *late), exposure_us, "as the file says")
+        said = (exposed_note(exposure_us),) if exposure_us else ()
+        notes = (*notes, *more, *late, *said)
         return cut(Recording(events, frames, times, notes, exposure_us), span)
 
 

@@ -2,7 +2,7 @@
 as a number under a name with a unit (`exposure_us`, `exposure_time_ms`).
 
 One number stands for all frames, the median. Times that are both begin and end, negative numbers
-and NaN say nothing.
+and NaN say nothing, and what is longer than the interval between frames is not believed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ KEY = "exposure_us"  # name under which it is written
 LONGEST = 1.05  # an exposure lasts at most the interval between frames; times are rounded
 NAMES = re.compile(r"(?:^|_)exposures?(?:_?times?|_?durations?)?$")  # without the unit
 NOTED = "frames.exposure"
+FOREVER_US = 2.0**62
 
 
 class Stamps(NamedTuple):
@@ -37,7 +38,7 @@ class Stamps(NamedTuple):
 
     def exposure_us(self, unit: str) -> int:
         """The exposure, with times in this unit; 0 if it is unknown."""
-        return self.stated_us or round(self.length * UNITS_US[unit])
+        return self.stated_us or _whole(self.length * UNITS_US[unit])
 
 
 def mid_exposure(times: np.ndarray, where: object) -> Stamps:
@@ -59,8 +60,7 @@ def middle(begin: np.ndarray, end: np.ndarray) -> Stamps | None:
     lengths = end - begin
     times = (begin + lengths // 2 if begin.dtype == end.dtype == np.int64 else
              begin + 0.5 * lengths)
-    length = float(np.median(lengths)) if len(lengths) else 0.0
-    return Stamps(times, length if 0 < length < np.inf else 0.0)
+    return Stamps(times, float(np.median(lengths)) if len(lengths) else 0.0)
 
 
 def names_exposure(name: str) -> bool:
@@ -75,14 +75,29 @@ def stated(names: Iterable[str], get: Callable[[str], Any]) -> int:
     numbers = np.asarray(get(fit[0]) if len(fit) == 1 else ())
     if numbers.dtype.kind not in "iuf" or not numbers.size:
         return 0
-    exposure_us = float(np.median(numbers)) * UNITS_US[written_unit(fit[0])]
-    return round(exposure_us) if 0 < exposure_us < np.inf else 0
+    return _whole(float(np.median(numbers)) * UNITS_US[written_unit(fit[0])])
 
 
 def stated_by(*arrays: Any) -> int:
     """The exposure in us that an attribute of one of these data sets states; 0 if there is none."""
     return next((us for array in arrays if (attributes := getattr(array, "attrs", ())) and (
         us := stated(attributes, attributes.__getitem__))), 0)
+
+
+def _whole(exposure_us: float) -> int:
+    """It, rounded; 0 if it is none."""
+    return round(exposure_us) if 0 < exposure_us < FOREVER_US else 0
+
+
+def believed(exposure_us: int, times_us: np.ndarray) -> tuple[int, tuple[Note, ...]]:
+    """An exposure that a file states for frames at these times (T,); 0 and a note if it is longer
+    than the interval between them."""
+    gap = float(np.median(np.diff(np.sort(times_us)))) if len(times_us) > 1 else np.inf
+    if exposure_us <= LONGEST * gap:
+        return exposure_us, ()
+    return 0, (Note(NOTED, f"the file states an exposure of {exposure_us / 1e3:g} ms, longer than "
+                    f"the {gap / 1e3:g} ms between frames: it is not used (--exposure-ms: the "
+                    "right one)"),)
 
 
 def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:

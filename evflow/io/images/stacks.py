@@ -184,7 +184,8 @@ def frame_times(
         found = read_times(where, hints.time_unit)
     elif stamps is not None:
         where = "but"
-        found = to_us(stamps, path, hints.time_unit if hints.time_unit != "auto" else unit)
+        unit = unit if hints.time_unit == "auto" else hints.time_unit
+        found = to_us(stamps, path, unit).believed()
     else:
         raise EvflowDataError(
             "EV020", f"{path} holds {count:,} frames but no times.",

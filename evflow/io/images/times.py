@@ -33,7 +33,7 @@ from evflow.io.decode.units import (
     written_unit,
 )
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import Stamps, mid_exposure, middle, stated
+from evflow.io.images.exposures import Stamps, believed, mid_exposure, middle, stated
 from evflow.io.images.frames import existing
 from evflow.notes import Note
 from evflow.types import Events
@@ -54,6 +54,12 @@ class FrameTimes(NamedTuple):
     exposure_us: int = 0
     names: tuple[str, ...] = ()
 
+    def believed(self) -> FrameTimes:
+        """The same without an exposure that is longer than the interval between frames, but a note
+        on it."""
+        exposure_us, notes = believed(self.exposure_us, self.us)
+        return self._replace(exposure_us=exposure_us, notes=(*self.notes, *notes))
+
 
 def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> FrameTimes:
     """Frame times of a file, with the frames' names and exposure if it has them.
@@ -63,7 +69,8 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> F
     EV004 (not increasing), EV007 (NaN), EV016 (not found).
     """
     if (suffix := existing(path).suffix) in (".npy", ".npz"):
-        return to_us(_stored(path) if suffix == ".npy" else _archived(path), path, unit)
+        stamps = _stored(path) if suffix == ".npy" else _archived(path)
+        return to_us(stamps, path, unit).believed()
     rows, header, written = _rows(path)
     named = [i for i, field in enumerate(header) if meaning(field) == "t"]
     if len(header) == len(rows[0] if rows else ()) and len(named) == 1:
@@ -73,7 +80,7 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> F
     else:
         stamps, labels = _columns(path, rows, names)
     found = to_us(stamps, path, unit if unit != "auto" else written)
-    return found._replace(names=tuple(labels))
+    return found._replace(names=tuple(labels)).believed()
 
 
 def _stored(path: Path) -> Stamps:

@@ -125,6 +125,17 @@ def test_an_attribute_states_an_exposure(tmp_path: Path, named: str) -> None:
         assert read_recording(path).exposure_us == exposure_us
 
 
+def test_an_exposure_longer_than_the_interval_is_noted_and_not_used(tmp_path: Path) -> None:
+    for names in (("images", "image_ts"), ("frames", "frame_times")):
+        arrays = dict(zip(names, (FRAMES, TIMES), strict=True)) | {"exposure_us": np.array(60_000)}
+        for path in (npz(tmp_path, arrays), h5("x y t p")(tmp_path, arrays)):
+            found = read_recording(path)
+            assert (len(found.frames), found.exposure_us) == (6, 0)
+            said = [note.text for note in found.notes if note.code == "frames.exposure"]
+            assert len(said) == 1
+            assert "60 ms, longer than the 50 ms between frames: it is not used" in said[0]
+
+
 def test_an_exposure_without_unit_is_not_guessed_nor_taken_for_times(tmp_path: Path) -> None:
     for name in ("exposure", "exposure_time", "exposure_time_us"):
         path = npz(tmp_path, {"frames": RGB, "stamps_of_images_ts": TIMES, name: np.arange(6)})

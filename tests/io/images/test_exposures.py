@@ -145,8 +145,26 @@ def test_names_state_an_exposure_only_with_a_unit() -> None:
         assert stated([name, "gain"], {name: value, "gain": 3}.__getitem__) == ODD
     for names, value in ((["exposure"], 8001), (["exposure_time"], 8001), (["exposed_us"], 8001),
                          (["exposure_us", "exposure_ms"], 8001), (["exposure_us"], np.nan),
-                         (["exposure_us"], -1), (["exposure_us"], "8001"), (["exposure_us"], [])):
+                         (["exposure_us"], -1), (["exposure_us"], "8001"), (["exposure_us"], []),
+                         (["exposure_s"], 1e300)):
         assert stated(names, lambda name, value=value: value) == 0
+
+
+def test_what_is_longer_than_the_interval_is_noted_and_not_used(tmp_path: Path) -> None:
+    for length, exposure_us, said in ((40_000, 40_000, "exposed for 40 ms"), (
+            43_000, 0, "states an exposure of 43 ms, longer than the 40 ms between frames")):
+        np.savez(tmp_path / "t.npz", t=BEGIN, exposure_us=length)
+        (tmp_path / "t.csv").write_text("time_us,exposure_ns\n" + "".join(
+            f"{t},{1000 * length}\n" for t in BEGIN.tolist()))
+        np.savez(tmp_path / "v.npz", frames=drifting(5, (24, 32)), t=BEGIN, exposure_us=length)
+        np.save(tmp_path / "v.npy", drifting(5, (24, 32)))
+        for source in (open_frames(tmp_path / "v.npy", timestamps=tmp_path / "t.npz"),
+                       open_frames(tmp_path / "v.npy", timestamps=tmp_path / "t.csv"),
+                       open_frames(tmp_path / "v.npz")):
+            found = [note.text for note in source.notes if note.code == "frames.exposure"]
+            assert source.exposure_us == exposure_us
+            assert len(found) == 1
+            assert said in found[0]
 
 
 def test_one_note_at_most() -> None:
