@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import PARAMETERS, THETA_MIN, Camera, Summary
-from evflow.estimation.pixel_noise import pixel_rates, threshold_law
+from evflow.estimation.pixel_noise import pixel_rates, threshold_law, uneven_rate
 from evflow.estimation.pooled import window_inputs
 from evflow.estimation.refine import Chunk, Found, PixelEvidence, pixel_posterior, refine_summary
 from evflow.network import api
@@ -71,12 +71,14 @@ def with_rates(
     noise of a pixel for the network to improve on the camera's rate."""
     rates, errors = {}, {}
     law = threshold_law(quiet, np.stack([camera.theta_on, camera.theta_off]), hot)
-    for name, (events, seconds), relative in zip(("eta_on", "eta_off"), quiet, law, strict=True):
+    for p, (name, (events, seconds)) in enumerate(zip(("eta_on", "eta_off"), quiet, strict=True)):
         mean, error = (float(getattr(s, name)) for s in (summary, summary_std))
-        rate, own = pixel_rates(events, seconds, mean, hot, relative)
+        error = error / mean
+        if law is not None:
+            mean, error = uneven_rate(events, seconds, mean, hot)
+        rate, own = pixel_rates(events, seconds, mean, hot, 1.0 if law is None else law[p])
         rates[name] = jax.device_put(rate.astype(np.float32))
-        errors[name] = jax.device_put(
-            np.hypot(own, rate * (error / mean)).astype(np.float32))
+        errors[name] = jax.device_put(np.hypot(own, rate * error).astype(np.float32))
     return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)
 
 

@@ -22,6 +22,10 @@ LEAST_THETA = 0.01  # log units: thresholds are clamped there
 LAW_ODDS = 5.0  # log odds required to let rates follow the thresholds
 LAW_EVENTS = 100  # and events: few events of a pixel also lower its estimated threshold
 SIGNAL = 0.5  # maximum share of residual signal among the events of quiet pixels
+SHARES = np.linspace(SIGNAL, 1.0, 6)  # of the noise, that follows the thresholds if any does
+# Where rates follow the thresholds, few pixels send most of the noise, and near them nothing is
+# quiet: log error of the camera's rate there, and that of counts by residual signal (30 cameras).
+UNEVEN_ERROR, SIGNAL_ERROR = 0.25, 0.1
 PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it only
 
 AROUND = 9  # pixels: side of the neighbourhood in which other events are counted
@@ -30,15 +34,16 @@ STILL = 0.05  # log units: 3x3 pixels from frame to frame; less than any useful 
 DRIFT = 0.1  # log units per second, 5x5 pixels: below the frames' noise, but enough for events
 
 
-def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
-    """Rates (2, H, W), ON and OFF, relative to the camera's: 1, or inversely proportional to the
-    thresholds theta (2, H, W) if quiet (2, 2, H, W) from `quiet_time` makes that likelier. Residual
-    signal near moving objects follows the thresholds too: so noise that does not, mixed with a
-    share SIGNAL of it, must also be less likely, with at least LAW_EVENTS events; and pixels whose
-    threshold exceeds what calm places reach must agree."""
+def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array | None:
+    """Rates (2, H, W), ON and OFF, relative to the camera's, of which the most probable share is
+    inversely proportional to the thresholds theta (2, H, W), if quiet (2, 2, H, W) from
+    `quiet_time` makes that likelier than equal rates, else None. Residual signal near moving
+    objects follows the thresholds too: so noise that does not, mixed with a share SIGNAL of it,
+    must also be less likely, with at least LAW_EVENTS events; and pixels whose threshold exceeds
+    what calm places reach must agree."""
     watched = quiet[:, 1] * ~hot
     if (quiet[:, 0] * ~hot).sum() < LAW_EVENTS:
-        return np.ones(theta.shape)
+        return None
     law = 1.0 / np.maximum(np.asarray(theta, np.float64), LEAST_THETA)
     law *= (watched.sum((1, 2)) / np.maximum((watched * law).sum((1, 2)), 1e-30))[:, None, None]
 
@@ -47,9 +52,22 @@ def threshold_law(quiet: Array, theta: Array, hot: Array) -> Array:
             quiet[:, 0], quiet[:, 1], law, left_out, strict=True))
 
     every, low = np.stack([hot] * 2), hot | (np.asarray(theta) < PLAIN_THETA)
-    odds = log_p(1.0, every) - max(log_p(0.0, every), log_p(SIGNAL, every))
-    follows = odds > LAW_ODDS and log_p(1.0, low) - log_p(0.0, low) > PLAIN_ODDS
-    return law if follows else np.ones_like(law)
+    with_shares = np.array([log_p(share, every) for share in SHARES])
+    odds = with_shares[-1] - max(log_p(0.0, every), with_shares[0])
+    if odds <= LAW_ODDS or log_p(1.0, low) - log_p(0.0, low) <= PLAIN_ODDS:
+        return None
+    share = np.average(SHARES, weights=np.exp(with_shares - with_shares.max()))
+    return np.asarray(1.0 + share * (law - 1.0))
+
+
+def uneven_rate(events: Array, seconds: Array, rate_hz: float, hot: Array) -> tuple[float, float]:
+    """The mean rate in Hz of pixels whose rates follow their thresholds, and its relative error:
+    that of the camera, combined with the events (H, W) sent in the seconds (H, W) of quiet."""
+    sent, watched = float((events * ~hot).sum()) + 1.0, float((seconds * ~hot).sum())
+    counted = sent / (watched + 1.0 / rate_hz)
+    known = np.array([UNEVEN_ERROR, np.hypot(sent**-0.5, SIGNAL_ERROR)]) ** -2.0
+    mean = np.average(np.log([rate_hz, counted]), weights=known)
+    return float(np.exp(mean)), float(known.sum() ** -0.5)
 
 
 def _likelihood(events: Array, expected: Array, hot: Array) -> float:
