@@ -41,8 +41,9 @@ def halves(recording: Recording) -> tuple[Recording, Recording]:
     cuts = (min(times[0], events.t[0]), times[middle], max(times[-1], events.t[-1]))
     first, second = (events.slice(int(a) + late, int(b) + 1)
                      for a, b, late in ((cuts[0], cuts[1], 0), (cuts[1], cuts[2], 1)))
-    return (Recording(first, recording.frames[:middle + 1], times[:middle + 1]),
-            Recording(second, recording.frames[middle:], times[middle:]))
+    exposed = {"exposure_us": recording.exposure_us}
+    return (Recording(first, recording.frames[:middle + 1], times[:middle + 1], **exposed),
+            Recording(second, recording.frames[middle:], times[middle:], **exposed))
 
 
 def calibrated_and_scored(case: Case, held_out: bool) -> tuple[Recording, Case, str]:

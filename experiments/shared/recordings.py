@@ -38,4 +38,4 @@ def cut(recording: Recording, span_s: tuple[float, float] | None) -> Recording:
     begin, end = (int(recording.frame_times[0] + 1e6 * s) for s in span_s)
     first, last = np.searchsorted(recording.frame_times, [begin, end])
     return Recording(recording.events.slice(begin, end), recording.frames[first:last],
-                     recording.frame_times[first:last])
+                     recording.frame_times[first:last], exposure_us=recording.exposure_us)

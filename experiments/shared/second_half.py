@@ -26,7 +26,8 @@ def halves(recording: Recording) -> tuple[Recording, Recording]:
     times = recording.frame_times
     first, second = (
         Recording(events.slice(int(times[a]), int(times[b])), recording.frames[a:b + 1],
-                  times[a:b + 1]) for a, b in itertools.pairwise(cuts))
+                  times[a:b + 1], exposure_us=recording.exposure_us)
+        for a, b in itertools.pairwise(cuts))
     return first, second
 
 
