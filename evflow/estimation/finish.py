@@ -63,6 +63,7 @@ def refine(state: State) -> RefinedSummary:
         return RefinedSummary(hot, chunks, summary, std)
     if not state.front_end.seen_by.ideal:
         std = maps.widened(summary, std, found)
+        summary = maps.agreed(summary, found)
     return RefinedSummary(hot, chunks, summary, std,
                           signs(found, state.front_end.noise_dn, summary, std))
 

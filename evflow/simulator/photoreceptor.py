@@ -30,6 +30,7 @@ Array = jax.Array
 FAST = 1e-5  # s: a photoreceptor without visible effect between two fine frames
 LEAST_DN = 0.1  # of light, before the log
 LEAST_LIGHT = 0.02  # of v2e's full rate
+TYPICAL = 0.4  # cutoff of a low-pass proportional to light, in a typical scene, of that at 255 DN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +57,11 @@ class Photoreceptor:
     def cutoff_hz(self) -> float:
         """Cutoff of the low-pass at 255 DN; 0 without one."""
         return 1.0 / (2.0 * np.pi * self.tau_s) if self.tau_s > FAST else 0.0
+
+    @property
+    def typical_tau_s(self) -> float:
+        """Time constant of the low-pass in the light of a typical scene."""
+        return self.tau_s / TYPICAL if self.by_light else self.tau_s
 
 
 IDEAL = Photoreceptor()

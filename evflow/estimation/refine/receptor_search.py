@@ -17,7 +17,7 @@ from evflow.estimation.refine.receptor_prior import DOUBT, Prior, small_sample_o
 from evflow.estimation.refine.receptor_profile import Other, along_offset
 from evflow.estimation.refine.receptor_regression import SCALE, Regression, Slopes
 from evflow.estimation.refine.receptor_result import Found
-from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor
+from evflow.simulator.photoreceptor import FAST, IDEAL, TYPICAL, Photoreceptor
 
 OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, starting grid of the search
 TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
@@ -37,7 +37,6 @@ FLOOR = np.array([0.5, 1e-4, 5e-4])  # std of offset, tau and delay
 ALONE = 2.0
 BY_OFFSET = 5.0  # log odds required for an offset in the frames of a slow pixel
 BY_LIGHT = 1.0  # prior log odds of a low-pass whose cutoff is proportional to light
-TYPICAL = 0.4  # its typical cutoff relative to that at 255 DN
 SMEARS = (0.01, 0.02)  # s
 CUTOFFS = (np.inf, 1000.0, 500.0, 300.0, 200.0, 140.0, 100.0, 70.0, 50.0, 30.0, 20.0)  # Hz
 
