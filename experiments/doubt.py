@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
 
+from evflow.estimation.refine.doubt import NEEDED
 from evflow.network.weights import weights_hash
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, run_script
@@ -25,10 +26,11 @@ from experiments.shared.doubt_fit import FOLDS, cross_validated, figures_of, fit
 from experiments.shared.many import Setup
 from experiments.shared.real_cameras import draw_other, draw_real
 from experiments.shared.refinement import undoubted
-from experiments.shared.rows import collected
+from experiments.shared.rows import Rows, collected
 from experiments.shared.weight_parts import begin_fit, save_part
 
 KINDS = (draw_protocol,) * 4 + (draw_real,) * 8 + (draw_other,) * 3
+Kind = Literal["ideal", "other"]
 COVERED = 0.74  # by one std: tails are heavy, and 1.96 of them are to hold more than nine in ten
 
 
@@ -45,6 +47,8 @@ class Options:
     """Apart from training's and the fusion's."""
     rows: Path | None = None
     """Where to keep the signs, to resume an interrupted run from."""
+    kinds: tuple[Kind, ...] = ("ideal", "other")
+    """Which maps to fit: of cameras found ideal, of others. One left out stays as it is."""
     overwrite: bool = False
 
 
@@ -73,18 +77,27 @@ def main(options: Options) -> dict[str, float]:
     protocols = [drawn(options.seed, i) for i in range(options.recordings)]
     setup = Setup(str(options.weights), options.seed, photos=True)
     rows = collected(row, setup, protocols, options.workers, options.rows, origin)
-    both = flat(rows)
-    std = cross_validated(rows)
+    needed = rows["signs"][:, 0, NEEDED] > 0
+    made, figures = dict(net.get("doubt", {})), dict[str, float]()
+    for kind in options.kinds:
+        made[kind], of = fitted({k: v[needed == (kind == "other")] for k, v in rows.items()})
+        figures |= {f"{kind}/{k}": v for k, v in of.items()}
+    print("\n".join(f"{k:26s} {v:.4f}" for k, v in figures.items()))
+    save_part(options, name, net, {"doubt": made}, {"doubt": {
+        "recordings": options.recordings, "seed": options.seed, "figures": figures}})
+    return figures
+
+
+def fitted(rows: Rows) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """The map of these cameras, and its figures by cross-validation."""
+    at_least(FOLDS, recordings=len(rows["left"]))
+    both, std = flat(rows), cross_validated(rows)
     widen = float(np.quantile(np.abs(both["left"]) / std, COVERED))
     figures = {"recordings": len(rows["left"]),
                "median": float(np.median(np.abs(both["left"]))),
                **figures_of(both["left"], both["before"], "before"),
                **figures_of(both["left"], std * widen, "after")}
-    made = {**fit(both["signs"], both["left"], both["before"]), "widen": np.array(widen)}
-    print("\n".join(f"{k:20s} {v:.4f}" for k, v in figures.items()))
-    save_part(options, name, net, {"doubt": made}, {"doubt": {
-        "recordings": options.recordings, "seed": options.seed, "figures": figures}})
-    return figures
+    return {**fit(both["signs"], both["left"], both["before"]), "widen": np.array(widen)}, figures
 
 
 if __name__ == "__main__":

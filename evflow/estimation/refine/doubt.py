@@ -3,8 +3,8 @@
 The fusion (fit.py) learned its errors on pixels without a low-pass and on frames that measure
 light. Exposure, noise, an undetected offset and a slow photoreceptor add errors. They show in
 disagreement between pooled regression, fusion and path, and above all in a low share of variance
-that the path explains. A linear map from such indicators ("signs") to the log of the std was
-fitted on simulated cameras, ideal ones and others.
+that the path explains. Linear maps from such indicators ("signs") to the log of the std were fitted
+on simulated cameras: one on those that were found ideal, one on the others.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ NAMES = (
     "fused_std", "theta", "other_theta", "size", "on", "unexplained_ideal", "poor_ideal",
     "with_missed")
 MOST_DEVIATIONS = 2.0  # signs are clipped to so many standard deviations of those it was fitted to
+NEEDED = NAMES.index("needed")
 NARROWER = 0.5  # the new std is at least this share of the one before
 MOST_ODDS = 10.0
 LENIENT = 3.0  # log odds added to the search's for a camera that is not ideal
@@ -79,18 +80,19 @@ def signs(found: Found, noise_dn: float, summary: Summary, std: Summary) -> Arra
     return np.array(rows, np.float64)
 
 
-def doubted(net: dict[str, Any], rows: Array, summary: Summary, std: Summary) -> Summary:
+def doubted(nets: dict[str, Any], rows: Array, summary: Summary, std: Summary) -> Summary:
     """The std of a summary, with that of its thresholds replaced.
 
     Args:
-        net: "mean", "scale" (F,) of the signs in the fit, "map" (F + 1,) to the log of the
-            relative std, "widen" (), its calibration.
+        nets: of cameras found "ideal", and of the "other" ones: "mean", "scale" (F,) of the signs
+            in the fit, "map" (F + 1,) to the log of the relative std, "widen" (), its calibration.
         rows: (2, F) of `signs`.
         summary, std: the estimate.
 
     Raises:
         EvflowDataError: EV018 for weights fitted to other signs.
     """
+    net = nets.get("other" if rows[0, NEEDED] else "ideal", {"mean": ()})
     if np.shape(net["mean"]) != (len(NAMES),):
         raise EvflowDataError(
             "EV018", f"the weights' `doubt` part was fitted to {np.size(net['mean'])} signs, this "

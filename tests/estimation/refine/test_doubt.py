@@ -58,12 +58,17 @@ def test_the_std_of_the_thresholds_alone_is_replaced() -> None:
     rows = signs(found(1.0), 0.0, SUMMARY, STD)
     net: dict[str, Any] = {"mean": np.zeros(len(NAMES)), "scale": np.ones(len(NAMES)),
                            "map": np.r_[np.zeros(len(NAMES)), np.log(0.05)], "widen": 2.0}
-    std = doubted(net, rows, SUMMARY, STD)
+    std = doubted({"other": net}, rows, SUMMARY, STD)
     assert float(std.theta_on) == pytest.approx(0.2 * 0.05 * 2.0)
     assert float(std.theta_off) == pytest.approx(0.3 * 0.05 * 2.0)
     assert dataclasses.replace(std, theta_on=STD.theta_on, theta_off=STD.theta_off) == STD
-    with pytest.raises(EvflowDataError, match=r"EV018.*3 signs"):
-        doubted({**net, "mean": np.zeros(3)}, rows, SUMMARY, STD)
+    ideal = signs(found(0.0), 0.0, SUMMARY, STD)
+    narrow = doubted({"other": net, "ideal": {**net, "widen": 1.0}}, ideal, SUMMARY, STD)
+    assert float(narrow.theta_on) == pytest.approx(0.2 * 0.05)
+    other = {"other": {**net, "mean": np.zeros(3)}}
+    for nets, count in ((other, 3), ({"ideal": net}, 0), (net, 0)):
+        with pytest.raises(EvflowDataError, match=rf"EV018.*{count} signs"):
+            doubted(nets, rows, SUMMARY, STD)
 
 
 def test_the_fit_finds_whose_errors_are_larger() -> None:
