@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from evflow.estimation.refine.doubt import NEEDED
-from evflow.network.weights import weights_hash
+from evflow.network.weights import model_card, weights_hash
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, run_script
 from experiments.shared.doubt_fit import FOLDS, cross_validated, figures_of, fit, flat
@@ -78,13 +78,14 @@ def main(options: Options) -> dict[str, float]:
     setup = Setup(str(options.weights), options.seed, photos=True)
     rows = collected(row, setup, protocols, options.workers, options.rows, origin)
     needed = rows["signs"][:, 0, NEEDED] > 0
-    made, figures = dict(net.get("doubt", {})), dict[str, float]()
+    made, card = (dict(of.get("doubt", {})) for of in (net, model_card(options.weights)))
+    figures: dict[str, float] = {}
     for kind in options.kinds:
         made[kind], of = fitted({k: v[needed == (kind == "other")] for k, v in rows.items()})
+        card[kind] = {"recordings": options.recordings, "seed": options.seed, "figures": of}
         figures |= {f"{kind}/{k}": v for k, v in of.items()}
     print("\n".join(f"{k:26s} {v:.4f}" for k, v in figures.items()))
-    save_part(options, name, net, {"doubt": made}, {"doubt": {
-        "recordings": options.recordings, "seed": options.seed, "figures": figures}})
+    save_part(options, name, net, {"doubt": made}, {"doubt": card})
     return figures
 
 
