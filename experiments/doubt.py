@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
+from evflow.errors import EvflowDataError
 from evflow.estimation.refine.doubt import NEEDED
 from evflow.network.weights import model_card, weights_hash
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
@@ -78,10 +79,17 @@ def main(options: Options) -> dict[str, float]:
     setup = Setup(str(options.weights), options.seed, photos=True)
     rows = collected(row, setup, protocols, options.workers, options.rows, origin)
     needed = rows["signs"][:, 0, NEEDED] > 0
+    of_kind = {kind: {k: v[needed == (kind == "other")] for k, v in rows.items()}
+               for kind in options.kinds}
+    for kind, some in of_kind.items():
+        if (count := len(some["left"])) < FOLDS:
+            raise EvflowDataError(
+                "EV017", f"of {len(needed)} cameras that were measured, {count} count as {kind}.",
+                f"{FOLDS} are needed: more --recordings, or leave --kinds {kind} out.")
     made, card = (dict(of.get("doubt", {})) for of in (net, model_card(options.weights)))
     figures: dict[str, float] = {}
-    for kind in options.kinds:
-        made[kind], of = fitted({k: v[needed == (kind == "other")] for k, v in rows.items()})
+    for kind, some in of_kind.items():
+        made[kind], of = fitted(some)
         card[kind] = {"recordings": options.recordings, "seed": options.seed, "figures": of}
         figures |= {f"{kind}/{k}": v for k, v in of.items()}
     print("\n".join(f"{k:26s} {v:.4f}" for k, v in figures.items()))
@@ -91,7 +99,6 @@ def main(options: Options) -> dict[str, float]:
 
 def fitted(rows: Rows) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """The map of these cameras, and its figures by cross-validation."""
-    at_least(FOLDS, recordings=len(rows["left"]))
     both, std = flat(rows), cross_validated(rows)
     widen = float(np.quantile(np.abs(both["left"]) / std, COVERED))
     figures = {"recordings": len(rows["left"]),
