@@ -78,7 +78,7 @@ def with_rates(
         mean, error = (float(getattr(s, name)) for s in (summary, summary_std))
         error = error / mean
         if law is not None:
-            mean, error = uneven_rate(events, seconds, mean, hot)
+            mean, error = uneven_rate(events, seconds, mean, error, hot, law[p])
         rate, own = pixel_rates(events, seconds, mean, hot, 1.0 if law is None else law[p])
         rates[name] = jax.device_put(rate.astype(np.float32))
         errors[name] = jax.device_put(np.hypot(own, rate * error).astype(np.float32))

@@ -140,12 +140,18 @@ def test_rates_of_their_own_do_not_follow_the_thresholds() -> None:
 def test_the_rate_of_uneven_pixels_is_what_they_sent_where_they_sent_enough() -> None:
     rates = np.full(SHAPE, 2.0)
     quiet = quiet_counts(np.stack([rates, rates]), 2.0)[0]
-    many, error = uneven_rate(*quiet, 1.0, NONE_HOT)
-    few, wider = uneven_rate(*(quiet * (np.arange(SHAPE[1]) < 1) / 50), 1.0, NONE_HOT)
-    assert 1.7 < many < 2.0
-    assert 1.0 < few < 1.5
-    assert error < 0.1 < wider < 0.25
-    assert uneven_rate(*(0 * quiet), 1.0, NONE_HOT)[0] == pytest.approx(1.0)
+    law = np.where(np.arange(SHAPE[1]) % 10, 0.4, 6.4) * np.ones(SHAPE)  # mean 1, median .4
+
+    def found(quiet: np.ndarray, law: np.ndarray) -> tuple[float, float]:
+        return uneven_rate(*quiet, 1.0, 0.05, NONE_HOT, law)
+
+    many, error = found(quiet, law)
+    few, wider = found(quiet * (np.arange(SHAPE[1]) < 1) / 50, law)
+    assert 1.5 < many < 2.0
+    assert 1.0 < few < 1.4
+    assert 0.05 < error < wider < 0.3
+    assert found(quiet, np.ones(SHAPE)) == pytest.approx((1.0, 0.05), rel=0.03)
+    assert found(0 * quiet, law)[0] == pytest.approx(1.0)
 
 
 def test_signal_left_among_even_noise_does_not_make_it_follow_the_thresholds() -> None:
