@@ -27,7 +27,7 @@ SHARES = np.linspace(SIGNAL, 1.0, 6)  # of the noise, that follows the threshold
 # quiet: log error of the camera's rate there, times log(mean / median of the rates) to the power of
 # 1.5, and log error of counts by residual signal. Measured on 30 cameras of mismatch .15, and on
 # four of .08 whose rates seem to follow but do not.
-UNEVEN_ERROR, SIGNAL_ERROR = 0.3, 0.15
+UNEVEN_ERROR, COUNTS_ERROR = 0.3, 0.15
 PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it only
 
 AROUND = 9  # pixels: side of the neighbourhood in which other events are counted
@@ -72,7 +72,7 @@ def uneven_rate(
     counted = sent / (watched + 1.0 / rate_hz)
     uneven = float(np.log(max(law.mean() / np.median(law), 1.0)))
     errors = np.array([np.hypot(0.01, UNEVEN_ERROR * uneven**1.5),
-                       np.hypot(sent**-0.5, SIGNAL_ERROR)])
+                       np.hypot(sent**-0.5, COUNTS_ERROR)])
     mean = np.average(np.log([rate_hz, counted]), weights=errors**-2.0)
     return float(np.exp(mean)), float(np.hypot(error, np.sum(errors**-2.0) ** -0.5))
 

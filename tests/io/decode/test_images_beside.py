@@ -55,9 +55,11 @@ def npz(folder: Path, arrays: dict[str, Any]) -> Path:
     return folder / "a.npz"
 
 
-@pytest.mark.parametrize("write", [
-    h5("x y t p"), h5("events/x events/y events/t events/p"),
-    h5("events/xs events/ys events/ts events/ps"), npz])
+LAYOUTS = [h5("x y t p"), h5("events/x events/y events/t events/p"),
+           h5("events/xs events/ys events/ts events/ps"), npz]
+
+
+@pytest.mark.parametrize("write", LAYOUTS)
 @pytest.mark.parametrize("kind", BESIDE)
 def test_images_of_other_names_are_the_frames(
     tmp_path: Path, write: Callable[[Path, dict[str, Any]], Path], kind: str
@@ -98,9 +100,7 @@ STATED: dict[str, dict[str, Any]] = {
     "above": {"cam/left/data": FRAMES, "cam/ts": TIMES, "cam/exposure_ns": np.array([4_001_000])}}
 
 
-@pytest.mark.parametrize("write", [
-    h5("x y t p"), h5("events/x events/y events/t events/p"),
-    h5("events/xs events/ys events/ts events/ps"), npz])
+@pytest.mark.parametrize("write", LAYOUTS)
 @pytest.mark.parametrize("kind", STATED)
 def test_exposures_beside_images(
     tmp_path: Path, write: Callable[[Path, dict[str, Any]], Path], kind: str
