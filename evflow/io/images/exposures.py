@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.io.decode.columns import UNIT
+from evflow.io.decode.columns import BRACKETS, UNIT
 from evflow.io.decode.units import UNITS_US, written_unit
 from evflow.notes import Note
 
@@ -65,7 +65,8 @@ def middle(begin: np.ndarray, end: np.ndarray) -> Stamps | None:
 
 def names_exposure(name: str) -> bool:
     """Whether an array, attribute or column of this name holds lengths of exposures."""
-    return bool(NAMES.search(UNIT.sub("", name.rpartition("/")[2].lower())))
+    bare = BRACKETS.sub("", name.rpartition("/")[2].lower()).strip().replace(" ", "_")
+    return bool(NAMES.search(UNIT.sub("", bare)))
 
 
 def stated(names: Iterable[str], get: Callable[[str], Any]) -> int:

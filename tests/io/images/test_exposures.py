@@ -141,7 +141,8 @@ def test_the_unit_of_the_times_is_that_of_the_length(unit: str, length: float) -
 
 def test_names_state_an_exposure_only_with_a_unit() -> None:
     for name, value in (("exposure_us", 8001), ("cam/frame_exposure_time_ms", 8.001),
-                        ("Exposures_ns", [8_001_000] * 3), ("exposure_duration_s", 0.008001)):
+                        ("Exposures_ns", [8_001_000] * 3), ("exposure_duration_s", 0.008001),
+                        ("Exposure [us]", 8001), ("exposure time (ms)", 8.001)):
         assert stated([name, "gain"], {name: value, "gain": 3}.__getitem__) == ODD
     for names, value in ((["exposure"], 8001), (["exposure_time"], 8001), (["exposed_us"], 8001),
                          (["exposure_us", "exposure_ms"], 8001), (["exposure_us"], np.nan),
