@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from evflow.camera import Summary
-from evflow.estimation.refine import Chunk, fused, refine_summary
+from evflow.estimation.refine import fused
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.points import Points, chunk_points
 from evflow.estimation.refine.signal import joined
@@ -28,7 +28,7 @@ from evflow.network.coordinates import squash_summary, summary_std, unsquash_sum
 from experiments.shared.cameras import Hidden, Protocol, draw_protocols
 from experiments.shared.common import at_least, run_script
 from experiments.shared.many import Setup, study
-from experiments.shared.refinement import before_refinement
+from experiments.shared.refinement import Begun, begun
 from experiments.shared.signal_fit import Row, judged, train
 from experiments.shared.weight_parts import begin_fit, save_part
 
@@ -53,11 +53,11 @@ class Options:
 def row(params: Any, hidden: Hidden, _protocol: Protocol) -> list[Row] | None:
     """ON and OFF: points, which of them are noise, the true rate and the events of signal; None
     where nothing fired."""
-    start = before_refinement(params, hidden.recording)
+    start = begun(params, hidden.recording)
     if start is None:
         return None
-    chunks = start[0]
-    found, std = fused_summary(params, *start)
+    chunks = start.chunks
+    found, std = fused_summary(params, start)
     theta = np.array([float(found.theta_on), float(found.theta_off)])
     sides: list[list[Points]] = [[], []]
     noise: list[list[np.ndarray]] = [[], []]
@@ -75,12 +75,10 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> list[Row] | None:
     return made
 
 
-def fused_summary(
-    params: Any, chunks: list[Chunk], summary: Summary, std: Summary
-) -> tuple[Summary, Summary]:
+def fused_summary(params: Any, start: Begun) -> tuple[Summary, Summary]:
     """What is known of the camera and its std before noise is distinguished from signal."""
     (net,) = params.values()
-    steps = refine_summary(chunks, summary, std)
+    steps = start.stepped()
     y, y_std = fused(net["fusion"], jnp.asarray(steps.features), unsquash_summary(steps.summary))
     return squash_summary(y), summary_std(squash_summary(y), y_std)
 

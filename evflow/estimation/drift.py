@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from evflow.estimation.refine import PixelEvidence
-from evflow.estimation.refine.receptor_result import LACKING, LEAST_KEPT
+from evflow.estimation.refine.receptor_result import contrast_kept
 from evflow.notes import Note
 
 Array = np.ndarray
@@ -67,7 +67,7 @@ def part(span_us: tuple[int, int], evidence: PixelEvidence) -> Part:
         return Part(middle, np.full(2, np.nan))
     theta = np.linalg.solve(scale, [ay, by])
     explained = float(theta @ [ay, by]) / yy
-    kept = float(np.clip(1 - LACKING * (1 - explained), LEAST_KEPT, 1.0))
+    kept = contrast_kept(explained)
     return Part(middle, theta / kept)
 
 

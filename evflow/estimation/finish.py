@@ -18,7 +18,6 @@ from evflow.estimation.leak import Leak, measured_leak
 from evflow.estimation.one_polarity import undetermined, with_prior
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
-from evflow.estimation.refine.doubt import doubted, signs
 from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
@@ -35,37 +34,37 @@ SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RefinedSummary:
-    """hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera, before
-    refine/doubt.py; signs: the input of that, None if nothing was searched for on the path."""
+class Start:
+    """What the refinement begins with. hot: (H, W) bool; chunks: without these pixels; summary,
+    std: of the camera."""
 
     hot: Array
     chunks: tuple[Chunk, ...]
     summary: Summary
     std: Summary
-    signs: Array | None = None
 
 
-def refine(state: State) -> RefinedSummary:
-    """The camera's summary by simulation and regression, if there is a path between frames."""
+def starting(state: State) -> Start:
+    """The camera's summary before it is refined, and the chunks of the path between frames, if
+    there is one, on which it is."""
     summary, std = summary_so_far(state)
-    hot = np.zeros(np.shape(state.n_events), bool)
-    if state.evidence is None or state.quiet is None:
-        return RefinedSummary(hot, state.chunks, summary, std)
-    found = state.front_end.found
+    if state.quiet is None:
+        return Start(np.zeros(np.shape(state.n_events), bool), state.chunks, summary, std)
     hot = hot_pixels(
         state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
         state.n_events, state.seconds)
-    chunks = tuple(_without_hot(c, hot) for c in state.chunks)
-    summary, std = maps.refined(state.params, list(chunks), summary, std)
-    forget(*(c.path for c in chunks))
-    if found is None:
-        return RefinedSummary(hot, chunks, summary, std)
-    if not state.front_end.seen_by.ideal:
-        std = maps.widened(summary, std, found)
-        summary = maps.agreed(summary, found)
-    return RefinedSummary(hot, chunks, summary, std,
-                          signs(found, state.front_end.noise_dn, summary, std))
+    return Start(hot, tuple(_without_hot(c, hot) for c in state.chunks), summary, std)
+
+
+def refine(state: State) -> Start:
+    """The same with the summary refined by simulation, if there is a path between frames."""
+    start = starting(state)
+    if state.quiet is None:
+        return start
+    summary, std = maps.refined(
+        state.params, list(start.chunks), start.summary, start.std, state.front_end)
+    forget(*(c.path for c in start.chunks))
+    return dataclasses.replace(start, summary=summary, std=std)
 
 
 def estimate(
@@ -83,11 +82,8 @@ def estimate(
     refined = refine(state)
     hot, summary, std = refined.hot, refined.summary, refined.std
     dead = dead_pixels(n_events)
-    doubt = next(iter(state.params.values())).get("doubt")
     if lacking := undetermined(stats, summary):
         summary, std = with_prior(lacking, list(refined.chunks), summary, std)
-    elif doubt is not None and refined.signs is not None:
-        std = doubted(doubt, refined.signs, summary, std)
     stage("noise rates and maps")
     quiet = quiet_times(_counted(windows_of(state.read), advance), summary, hot, front_end.seen_by)
     std = maps.with_unquiet_error(summary, std, quiet.share, quiet.pixel_s)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import PARAMETERS, THETA_MIN, Camera, Summary
+from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.pixel_noise import pixel_rates, threshold_law, uneven_rate
 from evflow.estimation.pooled import window_inputs
 from evflow.estimation.refine import Chunk, Found, PixelEvidence, pixel_posterior, refine_summary
@@ -28,7 +29,6 @@ UNQUIET, QUIET_HALF, EVENTS_HALF = 0.3, 0.03, 300.0
 # Relative error of the network's thresholds if pixels are not ideal, and log units per second of
 # tau by which it finds those of slow ones too high: measured on 124 cameras, tau 0 to 13 ms.
 SLOW_ERROR, SLOW_BIAS = 0.15, 15.5
-REFINED_ERROR = 0.08  # of thresholds refined with a low-pass or an offset, relative
 
 
 def by_flow(
@@ -98,11 +98,12 @@ def with_unquiet_error(
 
 
 def refined(
-    params: api.Params, chunks: list[Chunk], summary: Summary, std: Summary
+    params: api.Params, chunks: list[Chunk], summary: Summary, std: Summary, front_end: FrontEnd
 ) -> tuple[Summary, Summary]:
     """The summary and its std after refinement."""
     parts = next(iter(params.values()))
-    refined = refine_summary(chunks, summary, std, parts.get("fusion"), parts.get("signal"))
+    refined = refine_summary(chunks, summary, std, parts.get("fusion"), parts.get("signal"),
+                             found=front_end.found, noise_dn=front_end.noise_dn)
     return refined.summary, refined.std
 
 
@@ -121,27 +122,9 @@ def regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Su
     return dataclasses.replace(summary, **values), dataclasses.replace(std, **errors)
 
 
-def agreed(summary: Summary, found: Found) -> Summary:
-    """The refined summary with its thresholds averaged with those of the pooled regression, from
-    which the refinement, made for fast pixels, moves away."""
-    theta, error = found.thresholds()
-    return dataclasses.replace(summary, **{
-        name: jnp.float32(_averaged((float(getattr(summary, name)), REFINED_ERROR),
-                                    (float(other), error))[0])
-        for name, other in zip(("theta_on", "theta_off"), theta, strict=True)})
-
-
 def _averaged(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
     """The geometric mean of two thresholds, each with its relative error, weighted by precision,
     and its relative error."""
     known = np.array([one[1], other[1]]) ** -2.0
     middle = np.average(np.log(np.maximum([one[0], other[0]], THETA_MIN)), weights=known)
     return float(np.exp(middle)), float(known.sum() ** -0.5)
-
-
-def widened(summary: Summary, std: Summary, found: Found) -> Summary:
-    """The std plus the uncertainty of the thresholds that the photoreceptor's leaves."""
-    on, off = found.theta_error
-    return dataclasses.replace(
-        std, theta_on=jnp.hypot(std.theta_on, jnp.float32(on) * summary.theta_on),
-        theta_off=jnp.hypot(std.theta_off, jnp.float32(off) * summary.theta_off))

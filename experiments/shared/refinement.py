@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
-from evflow import Recording, finish
+from evflow import Recording
 from evflow.camera import Summary
-from evflow.estimation.finish import refine
+from evflow.estimation.finish import starting
+from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.pipeline import read_whole
-from evflow.estimation.pooled import pool_recording
-from evflow.estimation.refine import Chunk, refinement_chunks
+from evflow.estimation.refine import Chunk, Refined, refine_summary
 from evflow.recordings.windows import plan_windows
 
 COVERED = 0.7  # by one std: a little more than 68 %, as the tails are heavier than a Gaussian's
 
 
-def undoubted(params: Any, recording: Recording) -> tuple[Any, Summary, Summary] | None:
-    """The signs of refine/doubt.py, and the summary and its std before it is applied; None with too
-    few events."""
+class Begun(NamedTuple):
+    """A recording before its refinement: the chunks, the camera's summary so far and its std."""
+
+    chunks: list[Chunk]
+    summary: Summary
+    std: Summary
+    front_end: FrontEnd
+
+    def stepped(self) -> Refined:
+        """The summary after the Gauss-Newton steps, and the fusion's features."""
+        return refine_summary(self.chunks, self.summary, self.std,
+                              found=self.front_end.found, noise_dn=self.front_end.noise_dn)
+
+
+def begun(params: Any, recording: Recording) -> Begun | None:
+    """A recording up to its refinement; None with too few events, or no path between frames."""
     if len(recording.events) < 10 or not plan_windows(recording).pairs:
         return None
-    refined = refine(read_whole(recording, params))
-    return None if refined.signs is None else (refined.signs, refined.summary, refined.std)
-
-
-def before_refinement(
-    params: Any, recording: Recording
-) -> tuple[list[Chunk], Summary, Summary] | None:
-    """Inputs of the refinement: chunks, the network's summary and its std; None without events."""
-    if len(recording.events) < 10:
+    state = read_whole(recording, params)
+    if state.quiet is None:
         return None
-    plan = plan_windows(recording)
-    if not plan.pairs:
-        return None
-    stats, _ = pool_recording(params, recording)
-    return refinement_chunks(recording, plan.pairs), *finish(params, stats)
+    start = starting(state)
+    return Begun(list(start.chunks), start.summary, start.std, state.front_end)

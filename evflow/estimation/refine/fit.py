@@ -2,8 +2,9 @@
 
 The steps move log theta until the balance of the simulated recording equals that of the recorded
 one, with the network's estimate as prior; the noise rates come from quiet pixels (noise.py). The
-residuals, the number of events behind each and the speed of motion are features of `FusionNet`,
-trained on simulated recordings, which corrects the estimate and gives its std.
+residuals, the number of events behind each, the speed of motion and what the search for the
+photoreceptor says (path_signs.py) are features of `FusionNet`, trained on simulated recordings,
+which corrects the estimate and gives its std.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from evflow.estimation.refine.noise import (
     with_tie,
 )
 from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.path_signs import path_signs
+from evflow.estimation.refine.receptor_result import Found
 from evflow.estimation.refine.signal import separated_noise_rates
 from evflow.estimation.refine.trace import FRESH, RUNNING, Draws, draw, trace_of_camera
 from evflow.light.log_maps import lin_log_inverse, noise_factor, normalised_intensity
@@ -217,7 +220,8 @@ def _mean_factor(chunks: list[Chunk]) -> float:
 
 def refine_summary(
     chunks: list[Chunk], summary: Summary, std: Summary, fusion: dict[str, Any] | None = None,
-    signal: dict[str, Any] | None = None, *, seed: int = 0,
+    signal: dict[str, Any] | None = None, *, found: Found | None = None, noise_dn: float = 0.0,
+    seed: int = 0,
 ) -> Refined:
     """Refine the network's estimate of a camera on the chunks of a recording.
 
@@ -229,6 +233,8 @@ def refine_summary(
             Gauss-Newton steps, with the network's std.
         signal: the network that separates noise from signal (signal.py); None: the noise rates are
             those of quiet pixels.
+        found, noise_dn: the search for the photoreceptor, None if there was none, and the std of
+            the frames' noise in DN: features beside those of the events.
         seed: of the simulated noise and mismatch.
 
     Returns:
@@ -241,7 +247,8 @@ def refine_summary(
     fit.choose_start()
     for offset in OFFSETS:
         fit.step(offset)
-    features = fit.features()
+    signs = path_signs(found, noise_dn, fit.values[:2])
+    features = np.concatenate([fit.features(), signs.astype(np.float32)])
     stepped = Summary(*(jnp.float32(v) for v in fit.values))
     if fusion is None:
         return Refined(stepped, std, features, fit.start == FRESH)

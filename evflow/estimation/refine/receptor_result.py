@@ -78,5 +78,10 @@ class Found:
     def thresholds(self) -> tuple[np.ndarray, float]:
         """theta (2,) of the pooled regression, corrected for the contrast that the path loses, and
         its relative error."""
-        kept = float(np.clip(1 - LACKING * (1 - self.explained[1]), LEAST_KEPT, 1.0))
+        kept = contrast_kept(self.explained[1])
         return self.theta / kept, float(np.hypot(KEPT_ERROR[0], KEPT_ERROR[1] * (1 - kept)))
+
+
+def contrast_kept(explained: float) -> float:
+    """Share of the contrast that a path keeps which explains this share of the variance."""
+    return float(np.clip(1 - LACKING * (1 - explained), LEAST_KEPT, 1.0))
