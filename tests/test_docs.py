@@ -320,7 +320,7 @@ def test_what_is_said_of_the_experiments_presets_is_so() -> None:
     options = {name: importlib.import_module(f"experiments.{name}").Options for name in scripts}
     without = {name for name, kind in options.items()
                if "preset" not in {field.name for field in dataclasses.fields(kind)}}
-    making = {"calibrate", "combine", "doubt", "fuse", "tell_apart"}
+    making = {"calibrate", "combine", "fuse", "tell_apart"}
     assert without == {
         "quickstart", "gallery", "evaluate_network", "guessed_frames", "long_recordings", *making}
     text = (ROOT / "docs/experiments.md").read_text("utf-8")

@@ -1,4 +1,4 @@
-"""The fit of the fusion network (refine/fit.py), and its errors on recordings it has not seen."""
+"""The fit of the fusion network (refine/fusion.py), and its errors on recordings it has not seen."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 import optax
 
 from evflow.estimation.refine import fused
-from evflow.estimation.refine.fit import FusionNet
+from evflow.estimation.refine.fusion import FusionNet
+from evflow.estimation.refine.path_signs import NAMES, NEEDED
 from evflow.network.coordinates import squash
 from experiments.shared.rows import Rows
 
@@ -19,6 +20,7 @@ Array = jax.Array
 
 FOLDS = 5
 JITTER, DEGREES = 0.5, 30.0  # in standard deviations; of Student's t
+HIDDEN = 0.15  # share of cameras found ideal that count as not searched, as with pixel="ideal"
 
 
 def fit(rows: Rows, steps: int, seed: int) -> dict[str, Any]:
@@ -31,10 +33,16 @@ def fit(rows: Rows, steps: int, seed: int) -> dict[str, Any]:
     fusion = {k: jnp.asarray(v, jnp.float32) for k, v in fusion.items()}
     data = {k: jnp.asarray(rows[k], jnp.float32) for k in ("features", "y", "true")}
 
+    searched = x.shape[1] - len(NAMES)
+    ideal = data["features"][:, searched + NEEDED, None] == 0
+
     def loss(net: Any, key: Array) -> Array:
+        k_hidden, k_noise = jax.random.split(key)
+        hidden = ideal & jax.random.bernoulli(k_hidden, HIDDEN, ideal.shape)
+        features = data["features"].at[:, searched:].multiply(~hidden)
         # Jitter: some thousand recordings support little more than a linear map of the features.
-        noise = JITTER * jax.random.normal(key, data["features"].shape)
-        features = data["features"] + fusion["scale"][None] * noise
+        noise = JITTER * jax.random.normal(k_noise, features.shape)
+        features = features + fusion["scale"][None] * noise
         y, std = predict({**fusion, "net": net}, features, data["y"])
         error = (data["true"] - y) / std
         # Student's t bounds the influence of a few uninformative recordings.
@@ -73,7 +81,7 @@ def cross_validated(rows: Rows, steps: int, seed: int) -> tuple[np.ndarray, np.n
 
 def figures_of(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
     """Mean |theta| and |eta| errors of network, steps and fusion over recordings with 200 signal
-    events of the polarity; coverage of 68 and 95 % over all recordings."""
+    events of the polarity; coverage of 68 and 95 % over all recordings, and `of_kinds`."""
     figures: dict[str, Any] = {"recordings": len(y)}
     for i, name in enumerate(("theta_on", "theta_off", "eta_on", "eta_off")):
         used = rows["signal"][:, i % 2] >= 200
@@ -88,4 +96,22 @@ def figures_of(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
         miss = np.abs(y - rows["true"])[:, i] / std[:, i]
         figures[f"inside_68/{name}"] = float((miss < 1).mean())
         figures[f"inside_95/{name}"] = float((miss < 1.96).mean())
+    return figures | of_kinds(rows, y, std)
+
+
+def of_kinds(rows: Rows, y: np.ndarray, std: np.ndarray) -> dict[str, Any]:
+    """Median relative |theta| error, coverage and median relative std of both thresholds, of
+    cameras found ideal and of others."""
+    needed = rows["features"][:, NEEDED - len(NAMES)] > 0
+    found, true, above = (np.asarray(jnp.stack([squash(jnp.asarray(v[:, :4])).theta_on,
+                                                squash(jnp.asarray(v[:, :4])).theta_off], 1))
+                          for v in (y, rows["true"], y + std))
+    figures: dict[str, Any] = {}
+    for kind, which in (("ideal", ~needed), ("other", needed)):
+        miss = (np.abs(y - rows["true"]) / std)[which, :2]
+        figures |= {f"{kind}/recordings": int(which.sum()),
+                    f"{kind}/theta": float(np.median(np.abs(found / true - 1)[which])),
+                    f"{kind}/inside_68": float((miss < 1).mean()),
+                    f"{kind}/inside_95": float((miss < 1.96).mean()),
+                    f"{kind}/std": float(np.median((above / found - 1)[which]))}
     return figures

@@ -25,7 +25,6 @@ from experiments import (
     compare_systems,
     coverage,
     curves,
-    doubt,
     evaluate,
     fuse,
     generate,
@@ -40,7 +39,7 @@ from experiments import (
 from experiments.shared.common import begin, estimator, write_result
 from experiments.shared.rows import saved_rows
 
-FITS: list[Any] = [calibrate, doubt, fuse, tell_apart]
+FITS: list[Any] = [calibrate, fuse, tell_apart]
 
 
 @pytest.mark.parametrize(("script", "option"), [

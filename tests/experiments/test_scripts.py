@@ -30,7 +30,6 @@ NO_DEBUG = {
     "gallery": "as many pictures as are asked for",
     "calibrate": "as many steps as are asked for",
     "long_recordings": "as long as is asked for",
-    "doubt": "as many recordings as are asked for",
     "fuse": "as many recordings as are asked for",
     "tell_apart": "as many recordings as are asked for"}
 
@@ -77,7 +76,7 @@ def test_a_script_has_options_a_main_and_few_lines(name: str) -> None:
 def test_held_out_means_held_out() -> None:
     """No script scores weights on the seed that one trains them by; the targets' scenes, whose
     keys are folded from names, are others than those of a study by the same seed."""
-    training = {"calibrate", "doubt", "fuse", "tell_apart", "train", "train_eventgan",
+    training = {"calibrate", "fuse", "tell_apart", "train", "train_eventgan",
                 "train_network"}
     draws_none = {"real_recordings", "guessed_frames"}  # real scenes; its seeds begin at 1000
     seeds: dict[bool, dict[int, str]] = {True: {}, False: {}}

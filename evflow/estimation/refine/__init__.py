@@ -6,6 +6,7 @@
     recorded events, simulated events --> Trace          trace.py
     Trace + path --> Moments, additive                   moments.py
     recorded against simulated Moments --> the summary   fit.py
+    what remains, and the search below --> its correction and std   fusion.py
     the same of one polarity alone --> its threshold     alone.py
     recorded events on the path --> each pixel's theta   pixels.py
     recorded events on the path --> photoreceptor, offset of the frames   photoreceptor.py
@@ -25,7 +26,8 @@ from evflow.estimation.refine.chunk import (
     simulated_part,
 )
 from evflow.estimation.refine.denoise import frame_noise
-from evflow.estimation.refine.fit import Refined, fused, refine_summary
+from evflow.estimation.refine.fit import Refined, refine_summary
+from evflow.estimation.refine.fusion import fused
 from evflow.estimation.refine.photoreceptor import find_photoreceptor, receptor_sample
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
 from evflow.estimation.refine.receptor_result import Found

@@ -13,7 +13,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ import numpy as np
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine.chunk import Chunk
+from evflow.estimation.refine.fusion import corrected
 from evflow.estimation.refine.moments import Moments, measure
 from evflow.estimation.refine.noise import (
     combined_rate,
@@ -37,7 +37,7 @@ from evflow.estimation.refine.receptor_result import Found
 from evflow.estimation.refine.signal import separated_noise_rates
 from evflow.estimation.refine.trace import FRESH, RUNNING, Draws, draw, trace_of_camera
 from evflow.light.log_maps import lin_log_inverse, noise_factor, normalised_intensity
-from evflow.network.coordinates import squashed_summary, unsquash_summary
+from evflow.network.coordinates import squashed_summary
 
 Array = jax.Array
 Start = tuple[float, float]
@@ -47,9 +47,6 @@ LONGEST_STEP = 0.5  # log theta per pass
 MODEL_ERROR = 0.04  # of a balance residual, by interpolation; counts add their own
 EMPTY = 0.3  # balance weight below which a residual is negligible
 FRESH_ODDS = 2.0  # log odds required for a fresh start: few recordings have one
-# Relative increase of the variance for each feature outside of training's range; measured on
-# recordings of up to 8 s.
-VARIANCE_PER_OUTLIER_FEATURE = 0.04
 THETA_ERROR = 0.05  # relative error of the stepped thresholds, where noise follows from them
 
 
@@ -62,19 +59,6 @@ class Refined:
     std: Summary
     features: np.ndarray
     fresh: bool
-
-
-class FusionNet(nn.Module):
-    """features (F,) -> correction of y (6,) and log std of y (6,): a linear map and one small
-    hidden layer, as it learns from only some thousand recordings."""
-
-    width: int = 32
-
-    @nn.compact
-    def __call__(self, x: Array) -> tuple[Array, Array]:
-        hidden = nn.relu(nn.Dense(self.width)(x))
-        out = nn.Dense(12, kernel_init=nn.initializers.zeros)(jnp.concatenate([hidden, x], -1))
-        return out[..., :6], out[..., 6:] - 1.0
 
 
 def _total(parts: Sequence[Moments]) -> Moments:
@@ -257,17 +241,9 @@ def refine_summary(
             "EV018", f"the weights' fusion sees {fusion['mean'].size} features of a recording, "
             f"this version has {features.size}.",
             'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
-    result, result_std = squashed_summary(*_corrected(fusion, features, stepped))
+    result, result_std = squashed_summary(*corrected(fusion, features, stepped))
     result, result_std = _with_noise(chunks, result, result_std, signal, fit.factor)
     return Refined(result, result_std, features, fit.start == FRESH)
-
-
-@jax.jit
-def _corrected(
-    fusion: dict[str, Any], features: Array, stepped: Summary
-) -> tuple[Array, Array]:
-    """y (6,) of the stepped summary, corrected by the fusion, and its std."""
-    return fused(fusion, features, unsquash_summary(stepped))
 
 
 def _with_noise(
@@ -286,18 +262,3 @@ def _with_noise(
     rates = dict(zip(("eta_on", "eta_off"), map(jnp.float32, np.exp(log_eta)), strict=True))
     errors = dict(zip(rates, map(jnp.float32, np.exp(log_eta) * log_std), strict=True))
     return dataclasses.replace(summary, **rates), dataclasses.replace(std, **errors)
-
-
-def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:
-    """Correct y (..., 6) by the fusion; returns it and its std.
-
-    Features outside of training's range are clipped to it (a longer recording counts as the
-    longest in training) and widen the std.
-    """
-    inside = jnp.clip(features, fusion["low"], fusion["high"])
-    beyond = (inside != features).sum(-1, keepdims=True)
-    outputs: Any = FusionNet().apply(
-        {"params": fusion["net"]}, (inside - fusion["mean"]) / fusion["scale"])
-    correction, log_std = outputs
-    return y + correction, (
-        jnp.exp(log_std) * fusion["widen"] * jnp.sqrt(1.0 + VARIANCE_PER_OUTLIER_FEATURE * beyond))

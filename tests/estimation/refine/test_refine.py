@@ -27,7 +27,7 @@ from evflow.estimation.refine import (
     stretches,
 )
 from evflow.estimation.refine.bounds import ERROR, EXCESS, NOTHING, bounded
-from evflow.estimation.refine.fit import FusionNet
+from evflow.estimation.refine.fusion import FusionNet
 from evflow.estimation.refine.moments import measure
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_evidence
 from evflow.estimation.refine.stretches import plan_chunks
