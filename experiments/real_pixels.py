@@ -89,6 +89,8 @@ def halves(path: Path) -> list[str] | None:
     if first is None or second is None:
         return None
     found = find(first)
+    if found is None:
+        return None
     return [path.name, *(f"{s:.3f}" for s in (
         explained(second, IDEAL, found.ideal_theta), explained(second, found.seen, found.theta))),
         f"{found.seen.offset_dn:.0f} DN", f"{found.seen.cutoff_hz:.0f} Hz"]

@@ -223,4 +223,5 @@ def held_out_shares(
         return None
     receptor = found.receptor
     ideal = explained(data, IDEAL, receptor.ideal_theta)
-    return ideal, explained(data, receptor.seen, receptor.theta) if receptor.needed else ideal
+    seen = explained(data, receptor.seen, receptor.theta) if receptor.needed else ideal
+    return None if np.isnan(ideal + seen) else (ideal, seen)

@@ -68,6 +68,6 @@ def draw(result: dict[str, Row], path: Path) -> None:
                               label=side.upper())
             axis.axhline(result[CONSTANT][at], color=line.get_color(), linestyle=":")
         axis.set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=7)
-        axis.set(ylim=(0, None), ylabel=f"|{letter} − of the sequence|")
+        axis.set(ylim=(0, 1.05 * axis.get_ylim()[1]), ylabel=f"|{letter} − of the sequence|")
         axis.legend(frameon=False, fontsize=8, title="dotted: constant", title_fontsize=7)
     plots.save_figure(figure, path)

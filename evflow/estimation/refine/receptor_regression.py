@@ -16,12 +16,13 @@ import numpy as np
 
 from evflow.estimation.refine.receptor_data import EVENTS, TILES, Sample
 from evflow.estimation.refine.receptor_prior import Prior
-from evflow.simulator.photoreceptor import seen_path
+from evflow.simulator.photoreceptor import FAST, seen_path
 
 Array = jax.Array
 
 SCALE = np.array([2.0, 2e-4, 2e-4])  # small changes of offset (DN), tau and delay (s)
 LEAST_BENT = 1e-9  # minimal eigenvalue of the curvature in units of SCALE
+LEAST_VARIED = 1e-6  # of the counts' squares about their means, and of their determinant's share
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,6 +51,12 @@ class Regression:
     @property
     def prior(self) -> Prior:
         return Prior.of(self.data)
+
+    def determines(self) -> bool:
+        """Whether both thresholds follow from the sample: pixels of several events, whose numbers
+        of ON and of OFF events so far vary, each by itself."""
+        (on, both), (_, off) = self._total(np.array([0.0, FAST, 0.0]))[:2, :2]
+        return bool(min(on, off) > LEAST_VARIED and on * off - both**2 > LEAST_VARIED * on * off)
 
     def solved(self, phi: np.ndarray) -> tuple[np.ndarray, float, float]:
         """theta (2,) ON and OFF of the regression, residual and total sum of squares."""

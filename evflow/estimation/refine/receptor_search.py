@@ -41,16 +41,20 @@ SMEARS = (0.01, 0.02)  # s
 CUTOFFS = (np.inf, 1000.0, 500.0, 300.0, 200.0, 140.0, 100.0, 70.0, 50.0, 30.0, 20.0)  # Hz
 
 
-def find(data: Sample) -> Found:
+def find(data: Sample) -> Found | None:
     """Search for the most probable photoreceptor; errors follow from the curvature and from the
-    scatter of the gradient over blocks."""
+    scatter of the gradient over blocks. None where noise divides the events so finely that no
+    threshold follows from them."""
     by_light = Regression(split_at_noise(data, IDEAL))
+    if not by_light.determines():
+        return None
     phi = _start(by_light)
     for _ in range(2):
         size = _size(phi, by_light)
         phi = _descend(phi, by_light, size)
         theta = np.abs(by_light.solved(phi)[0])
-        by_light = Regression(split_at_noise(data, _receptor(phi), theta))
+        divided = Regression(split_at_noise(data, _receptor(phi), theta))
+        by_light = divided if divided.determines() else by_light
     plain = by_light.unexplained(PLAIN)
     believed = min(size, BELIEVED)
     model, phi, other = _with_law(phi, by_light, believed)
@@ -84,10 +88,10 @@ def _receptor(phi: np.ndarray, *, by_light: bool = True) -> Photoreceptor:
 
 def explained(data: Sample, seen_by: Photoreceptor, theta: np.ndarray) -> float:
     """Share of a sample's variance explained by a photoreceptor and thresholds (2,) that were
-    measured on another part of the recording."""
+    measured on another part of the recording; NaN where no threshold follows from the sample."""
     at = np.array([seen_by.offset_dn, max(seen_by.tau_s, FAST), seen_by.delay_s])
-    parted = split_at_noise(data, seen_by, theta)
-    return Regression(parted, seen_by.by_light).explained_by(at, theta)
+    model = Regression(split_at_noise(data, seen_by, theta), seen_by.by_light)
+    return model.explained_by(at, theta) if model.determines() else float("nan")
 
 
 def _with_law(

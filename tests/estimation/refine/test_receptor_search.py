@@ -14,7 +14,7 @@ from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_search import find
 from evflow.estimation.refine.sightings import Sightings, sight
-from evflow.simulator.photoreceptor import FAST, seen_path
+from evflow.simulator.photoreceptor import FAST, IDEAL, seen_path
 from evflow.types import Events
 
 INTERVALS, SHAPE, FRAME_S = 16, (20, 26), 0.02
@@ -201,6 +201,17 @@ def test_events_that_no_frame_shows_tell_nothing(shown: bool) -> None:
     s = sight(events, times, lin_log(dn), STEPS, np.full((INTERVALS + 1, *SHAPE), shown))
     found = sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s, no_readouts(s))])
     assert (found is not None) == shown
+
+
+@pytest.mark.parametrize("noise_hz", [0.0, 30.0])
+def test_noise_that_divides_all_pixels_leaves_nothing_to_search(noise_hz: float) -> None:
+    """Each event is a group of its own, and none has counts that vary."""
+    data = looked_at(0.0, 0.0)
+    noisy = data._replace(noise_hz=np.full((1, 2), 1e4 * noise_hz, np.float32))
+    found = find(noisy)
+    assert (found is None) == (noise_hz > 0)
+    share = receptor_search.explained(noisy, IDEAL, np.array([0.25, 0.2]))
+    assert np.isnan(share) == (noise_hz > 0)
 
 
 def test_the_less_was_watched_the_more_it_takes() -> None:
