@@ -1,4 +1,4 @@
-"""The fit of the fusion network (refine/fusion.py), and its errors on recordings it has not seen."""
+"""The fit of the fusion network (refine/fusion.py), and its errors on recordings not seen."""
 
 from __future__ import annotations
 
