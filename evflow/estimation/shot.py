@@ -78,7 +78,7 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
             continue  # ON noise may contain leak, which does not depend on light
         likely = []
         for shape in shapes:
-            expected = np.maximum(sent * shape / shape.sum() + other, 1e-12)
+            expected = np.maximum(sent * shape / max(shape.sum(), 1e-12) + other, 1e-12)
             likely.append(float((n * np.log(expected) * (n > 0) - expected).sum()))
         odds += (likely[0] - likely[1]) / scattered
     if odds < -ODDS:

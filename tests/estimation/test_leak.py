@@ -11,7 +11,7 @@ from evflow import Camera, Events, Recording, SensorModel, simulate
 from evflow.estimation.intervals import EDGES, QuietWaits, life_table, waits_at_rest
 from evflow.estimation.leak import measured_leak
 from evflow.estimation.pixel_noise import calm, quiet_time
-from evflow.estimation.shot import at_mean_light, by_light, measured_shot, scatter
+from evflow.estimation.shot import Shot, at_mean_light, by_light, measured_shot, scatter
 from evflow.estimation.static import estimate_noise
 
 SHAPE = (48, 64)
@@ -132,6 +132,14 @@ def test_shot_noise_is_that_of_the_dark_if_it_falls_with_light() -> None:
     assert found.hz == 0
     few = measured_shot(0.01 * by_light(quiet, dn, NONE_HOT), 0.0, 1.0)
     assert (few.hz, few.even) == (0.0, False)
+
+
+def test_of_a_polarity_that_is_never_quiet_no_law_of_noise_is_known() -> None:
+    dn, quiet = light(lambda i01: 0.5 * 3.0 * (1.0 - 0.75 * i01))
+    quiet[1] = 0.0
+    with np.errstate(all="raise"):
+        found = measured_shot(by_light(quiet, dn, NONE_HOT), 0.0, scatter(quiet, NONE_HOT))
+    assert found == Shot()
 
 
 def test_leak_that_is_not_told_apart_is_not_taken_for_shot_noise() -> None:
