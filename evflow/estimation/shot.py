@@ -86,8 +86,10 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     halves = noise / np.maximum(falling.sum(1), 1e-9)
     excess = 0.0 if leak_hz else max(float(halves[0] - halves[1]), 0.0)  # of ON: maybe leak
     hz = float(halves.sum()) - excess
+    if hz <= 0.0:
+        return Shot()
     relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2
-                       + (0.5 * excess / max(hz, 1e-9)) ** 2)
+                       + (0.5 * excess / hz) ** 2)
     return Shot(hz, hz * float(relative), falls=odds > ODDS)
 
 
