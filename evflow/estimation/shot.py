@@ -78,7 +78,7 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
             continue  # ON noise may contain leak, which does not depend on light
         likely = []
         for shape in shapes:
-            expected = np.maximum(sent * shape / shape.sum() + other, 1e-12)
+            expected = np.maximum(sent * shape / max(shape.sum(), 1e-12) + other, 1e-12)
             likely.append(float((n * np.log(expected) * (n > 0) - expected).sum()))
         odds += (likely[0] - likely[1]) / scattered
     if odds < -ODDS:
@@ -86,8 +86,10 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     halves = noise / np.maximum(falling.sum(1), 1e-9)
     excess = 0.0 if leak_hz else max(float(halves[0] - halves[1]), 0.0)  # of ON: maybe leak
     hz = float(halves.sum()) - excess
+    if hz <= 0.0:
+        return Shot()
     relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2
-                       + (0.5 * excess / max(hz, 1e-9)) ** 2)
+                       + (0.5 * excess / hz) ** 2)
     return Shot(hz, hz * float(relative), falls=odds > ODDS)
 
 

@@ -134,6 +134,15 @@ def test_shot_noise_is_that_of_the_dark_if_it_falls_with_light() -> None:
     assert (few.hz, few.even) == (0.0, False)
 
 
+def test_of_a_polarity_that_is_never_quiet_no_law_of_noise_is_known() -> None:
+    dn, quiet = light(lambda i01: 0.5 * 3.0 * (1.0 - 0.75 * i01))
+    quiet[1] = 0.0
+    with np.errstate(all="raise"):
+        found = measured_shot(by_light(quiet, dn, NONE_HOT), 0.0, scatter(quiet, NONE_HOT))
+    assert (found.hz, found.even, found.falls) == (0.0, False, False)
+    assert np.isnan(found.std_hz)
+
+
 def test_leak_that_is_not_told_apart_is_not_taken_for_shot_noise() -> None:
     dn, quiet = light(lambda i01: 0.5 * 3.0 * (1.0 - 0.75 * i01))
     quiet[0, 0] += np.random.default_rng(1).poisson(4.0, SHAPE)  # 1 Hz of ON, in any light

@@ -186,7 +186,7 @@ def _smear(phi: np.ndarray, model: Regression) -> np.ndarray:
     rows = []
     for seconds in SMEARS:
         smeared = dataclasses.replace(model, data=smeared_sample(model.data, seconds))
-        other, less, _ = smeared.solved(phi)
+        other, less, _ = smeared.solved(phi) if smeared.determines() else (theta, left, 0.0)
         rows.append([np.log(left / less), *np.log(np.abs(other / theta))])
     return np.array(rows)
 

@@ -214,6 +214,19 @@ def test_noise_that_divides_all_pixels_leaves_nothing_to_search(noise_hz: float)
     assert np.isnan(share) == (noise_hz > 0)
 
 
+def test_counts_that_smearing_levels_say_nothing_of_an_exposure(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of bursts shorter than the exposure, the mean of a pixel's counts is the same throughout."""
+    def levelled(data: Sample, _: float) -> Sample:
+        return data._replace(on=0 * data.on, off=0 * data.off)
+
+    monkeypatch.setattr(receptor_search, "smeared_sample", levelled)
+    found = find(looked_at(0.0, 0.0))
+    assert found is not None
+    assert not found.smear.any()
+
+
 def test_the_less_was_watched_the_more_it_takes() -> None:
     """To take a pixel for slow, or frames for lacking light."""
     data = looked_at(0.0, 0.0)
