@@ -41,7 +41,7 @@ class Options:
     weights: tyro.conf.Positional[Path]
     out: Path
     recordings: int = 5000
-    steps: int = 500
+    steps: int = 1000
     workers: int = 1
     """Processes that simulate side by side."""
     seed: int = 3_000_017

@@ -19,7 +19,7 @@ from experiments.shared.rows import Rows
 Array = jax.Array
 
 FOLDS = 5
-JITTER, DEGREES = 0.5, 30.0  # in standard deviations; of Student's t
+JITTER, DEGREES = 0.5, 8.0  # in standard deviations; of Student's t
 HIDDEN = 0.15  # share of cameras found ideal that count as not searched, as with pixel="ideal"
 
 

@@ -27,7 +27,7 @@ class FusionNet(nn.Module):
     """features (F,) -> correction of y (6,) and log std of y (6,): a linear map and one small
     hidden layer, as it learns from only some thousand recordings."""
 
-    width: int = 32
+    width: int = 64
 
     @nn.compact
     def __call__(self, x: Array) -> tuple[Array, Array]:
