@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Summary
+from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
 from evflow.estimation import drift, maps
 from evflow.estimation.extent import EVERYTHING, Extent
@@ -36,24 +37,28 @@ SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual
 @dataclasses.dataclass(frozen=True, eq=False)
 class Start:
     """What the refinement begins with. hot: (H, W) bool; chunks: without these pixels; summary,
-    std: of the camera."""
+    std: of the camera; optics: of the frames, None if they were not measured."""
 
     hot: Array
     chunks: tuple[Chunk, ...]
     summary: Summary
     std: Summary
+    optics: Optics | None
 
 
 def starting(state: State) -> Start:
     """The camera's summary before it is refined, and the chunks of the path between frames, if
     there is one, on which it is."""
     summary, std = summary_so_far(state)
+    found = state.front_end.found
+    optics = found.optics if found else None
     if state.quiet is None:
-        return Start(np.zeros(np.shape(state.n_events), bool), state.chunks, summary, std)
+        return Start(
+            np.zeros(np.shape(state.n_events), bool), state.chunks, summary, std, optics)
     hot = hot_pixels(
         state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
         state.n_events, state.seconds)
-    return Start(hot, tuple(_without_hot(c, hot) for c in state.chunks), summary, std)
+    return Start(hot, tuple(_without_hot(c, hot) for c in state.chunks), summary, std, optics)
 
 
 def refine(state: State) -> Start:
@@ -61,10 +66,10 @@ def refine(state: State) -> Start:
     start = starting(state)
     if state.quiet is None:
         return start
-    summary, std = maps.refined(
+    summary, std, optics = maps.refined(
         state.params, list(start.chunks), start.summary, start.std, state.front_end)
     forget(*(c.path for c in start.chunks))
-    return dataclasses.replace(start, summary=summary, std=std)
+    return dataclasses.replace(start, summary=summary, std=std, optics=optics)
 
 
 def estimate(
@@ -104,10 +109,10 @@ def estimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
         (*before, *camera_notes(stats, lacking, n_events, summary, hot, dead),
-         *receptor_notes(front_end.found), *noise_notes(shot), *after, *extent.notes(),
-         *drift.notes(thirds)),
-        tuple(f"theta_{name}" for name in lacking), **_measured(front_end, leak, shot),
-        extent=extent, thirds=thirds)
+         *receptor_notes(front_end.found, refined.optics), *noise_notes(shot), *after,
+         *extent.notes(), *drift.notes(thirds)),
+        tuple(f"theta_{name}" for name in lacking),
+        **_measured(front_end, refined.optics, leak, shot), extent=extent, thirds=thirds)
 
 
 def _at_mean_light(
@@ -121,14 +126,16 @@ def _at_mean_light(
             dataclasses.replace(std, **dict(zip(names, map(jnp.float32, error), strict=True))))
 
 
-def _measured(front_end: FrontEnd, leak: Leak, shot: Shot) -> dict[str, Any]:
+def _measured(
+    front_end: FrontEnd, optics: Optics | None, leak: Leak, shot: Shot
+) -> dict[str, Any]:
     """The fields of a CameraEstimate that are not per pixel."""
     found, dead = front_end.found, front_end.dead
     sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
     sensor, std = measured_noise(sensor, std, leak, shot)
     fields = {"sensor": dataclasses.replace(sensor, refractory_s=dead.seconds),
               "sensor_std": {**std, "refractory_s": dead.std_s}}
-    return {**fields, "optics": found.optics, "receptor": found} if found else fields
+    return {**fields, "optics": optics, "receptor": found} if found else fields
 
 
 def _without_hot(chunk: Chunk, hot: Array) -> Chunk:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import PARAMETERS, THETA_MIN, Camera, Summary
+from evflow.camera.optics import Optics
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.pixel_noise import pixel_rates, threshold_law, uneven_rate
 from evflow.estimation.pooled import window_inputs
@@ -99,12 +100,18 @@ def with_unquiet_error(
 
 def refined(
     params: api.Params, chunks: list[Chunk], summary: Summary, std: Summary, front_end: FrontEnd
-) -> tuple[Summary, Summary]:
-    """The summary and its std after refinement."""
+) -> tuple[Summary, Summary, Optics | None]:
+    """The summary and its std after refinement, and the optics that agree with it."""
     parts = next(iter(params.values()))
-    refined = refine_summary(chunks, summary, std, parts.get("fusion"), parts.get("signal"),
-                             found=front_end.found, noise_dn=front_end.noise_dn)
-    return refined.summary, refined.std
+    fusion, found = parts.get("fusion"), front_end.found
+    refined = refine_summary(chunks, summary, std, fusion, parts.get("signal"),
+                             found=found, noise_dn=front_end.noise_dn)
+    if found is None or fusion is None:
+        return refined.summary, refined.std, found.optics if found else None
+    theta, stepped, error = (np.array([s.theta_on, s.theta_off], np.float64)
+                             for s in (refined.summary, refined.stepped, refined.std))
+    change, relative = np.log(theta / stepped).mean(), (error / theta).mean()
+    return refined.summary, refined.std, found.optics_given(float(change), float(relative))
 
 
 def regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Summary]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import Summary
+from evflow.camera.optics import Optics
 from evflow.estimation.refine import Found
 from evflow.estimation.shot import Shot
 from evflow.network.pooling import Stats
@@ -55,8 +56,8 @@ def camera_notes(
     return found
 
 
-def receptor_notes(found: Found | None) -> list[Note]:
-    if found is None:
+def receptor_notes(found: Found | None, optics: Optics | None) -> list[Note]:
+    if found is None or optics is None:
         return []
     notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be measured: it "
                   f"is above {found.least_cutoff_hz:.0f} Hz at 255 DN.")]
@@ -65,7 +66,6 @@ def receptor_notes(found: Found | None) -> list[Note]:
                       "photoreceptor's low-pass"
                       + ("" if found.seen.by_light else ", equally fast in dark and bright light")
                       + "; ignoring it would change them where things move fast.")]
-    optics = found.optics
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
         notes.append(Note(

@@ -52,11 +52,13 @@ THETA_ERROR = 0.05  # relative error of the stepped thresholds, where noise foll
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Refined:
-    """summary, std: the camera; features: (F,) float32, the fusion's input; fresh: whether the
-    memory is at the first frame when the recording starts, as in a simulation."""
+    """summary, std: the camera; stepped: before the fusion; features: (F,) float32, the fusion's
+    input; fresh: whether the memory is at the first frame when the recording starts, as in a
+    simulation."""
 
     summary: Summary
     std: Summary
+    stepped: Summary
     features: np.ndarray
     fresh: bool
 
@@ -222,7 +224,7 @@ def refine_summary(
         seed: of the simulated noise and mismatch.
 
     Returns:
-        The refined summary, its std and the features.
+        The refined summary, its std, what the steps alone give and the features.
 
     Raises:
         EvflowDataError: EV018 where `fusion` was trained on another number of features.
@@ -235,7 +237,7 @@ def refine_summary(
     features = np.concatenate([fit.features(), signs.astype(np.float32)])
     stepped = Summary(*(jnp.float32(v) for v in fit.values))
     if fusion is None:
-        return Refined(stepped, std, features, fit.start == FRESH)
+        return Refined(stepped, std, stepped, features, fit.start == FRESH)
     if fusion["mean"].shape != features.shape:
         raise EvflowDataError(
             "EV018", f"the weights' fusion sees {fusion['mean'].size} features of a recording, "
@@ -243,7 +245,7 @@ def refine_summary(
             'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
     result, result_std = squashed_summary(*corrected(fusion, features, stepped))
     result, result_std = _with_noise(chunks, result, result_std, signal, fit.factor)
-    return Refined(result, result_std, features, fit.start == FRESH)
+    return Refined(result, result_std, stepped, features, fit.start == FRESH)
 
 
 def _with_noise(
