@@ -22,6 +22,7 @@ import tyro
 
 from evflow.network.coordinates import unsquash_summary
 from evflow.network.weights import weights_hash
+from evflow.training.config import PRESETS
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, run_script
 from experiments.shared.fusion_fit import cross_validated, figures_of, fit
@@ -32,6 +33,7 @@ from experiments.shared.rows import collected
 from experiments.shared.weight_parts import begin_fit, save_part
 
 KINDS = (draw_protocol,) * 6 + (draw_real,) * 7 + (draw_other,) * 2
+AS_DRAWN, OTHER_SHAPES = 5000, ((180, 240), (64, 64), (64, 64), (64, 64))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Options:
 
     weights: tyro.conf.Positional[Path]
     out: Path
-    recordings: int = 5000
+    recordings: int = 7500
     steps: int = 1000
     workers: int = 1
     """Processes that simulate side by side."""
@@ -52,8 +54,13 @@ class Options:
 
 
 def drawn(seed: int, number: int) -> Protocol:
-    """What the recording of that number is like."""
-    return KINDS[number % len(KINDS)](np.random.default_rng((seed, number)))
+    """What the recording of that number is like. Beyond the first AS_DRAWN, size and scenes say
+    nothing of the kind of camera: those of 64x64 pixels were ideal."""
+    protocol = KINDS[number % len(KINDS)](np.random.default_rng((seed, number)))
+    if number < AS_DRAWN:
+        return protocol
+    return dataclasses.replace(protocol, shape=OTHER_SHAPES[number % len(OTHER_SHAPES)],
+                               scene=PRESETS["default"].scene)
 
 
 def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarray] | None:
