@@ -42,7 +42,7 @@ class Options:
 
     weights: tyro.conf.Positional[Path]
     out: Path
-    recordings: int = 7500
+    recordings: int = 6500
     steps: int = 1000
     workers: int = 1
     """Processes that simulate side by side."""

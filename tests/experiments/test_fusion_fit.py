@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine.path_signs import NAMES, NEEDED
+from experiments.fuse import AS_DRAWN, KINDS, OTHER_SHAPES, drawn
 from experiments.shared.fusion_fit import cross_validated, fit, of_kinds, predict
 
 EVENTS, ROWS = 4, 600
@@ -60,3 +61,10 @@ def test_figures_are_of_cameras_found_ideal_and_of_others(rows: dict[str, np.nda
     exact = of_kinds(rows, rows["true"], std)
     assert exact["ideal/theta"] == 0.0
     assert exact["other/inside_68"] == 1.0
+
+
+def test_size_and_scenes_do_not_betray_the_kind_of_camera() -> None:
+    numbers = range(AS_DRAWN, AS_DRAWN + len(KINDS) * len(OTHER_SHAPES))
+    seen = {(KINDS[i % len(KINDS)], drawn(0, i).shape, drawn(0, i).scene) for i in numbers}
+    assert len(seen) == len(set(KINDS)) * len(set(OTHER_SHAPES))
+    assert drawn(0, 6).shape != drawn(0, 0).shape
