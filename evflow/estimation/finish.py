@@ -35,8 +35,8 @@ SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Start:
-    """What the refinement begins with. hot: (H, W) bool; chunks: without these pixels; summary,
+class Known:
+    """What is known of the camera, before or after its refinement. hot: (H, W) bool; chunks: without these pixels; summary,
     std: of the camera; optics: of the frames, None if they were not measured."""
 
     hot: Array
@@ -46,22 +46,22 @@ class Start:
     optics: Optics | None
 
 
-def starting(state: State) -> Start:
+def starting(state: State) -> Known:
     """The camera's summary before it is refined, and the chunks of the path between frames, if
     there is one, on which it is."""
     summary, std = summary_so_far(state)
     found = state.front_end.found
     optics = found.optics if found else None
     if state.quiet is None:
-        return Start(
+        return Known(
             np.zeros(np.shape(state.n_events), bool), state.chunks, summary, std, optics)
     hot = hot_pixels(
         state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
         state.n_events, state.seconds)
-    return Start(hot, tuple(_without_hot(c, hot) for c in state.chunks), summary, std, optics)
+    return Known(hot, tuple(_without_hot(c, hot) for c in state.chunks), summary, std, optics)
 
 
-def refine(state: State) -> Start:
+def refine(state: State) -> Known:
     """The same with the summary refined by simulation, if there is a path between frames."""
     start = starting(state)
     if state.quiet is None:
