@@ -36,8 +36,10 @@ SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Known:
-    """What is known of the camera, before or after its refinement. hot: (H, W) bool; chunks: without these pixels; summary,
-    std: of the camera; optics: of the frames, None if they were not measured."""
+    """What is known of the camera, before or after its refinement.
+
+    hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera; optics: of the
+    frames, None if they were not measured."""
 
     hot: Array
     chunks: tuple[Chunk, ...]
@@ -53,8 +55,8 @@ def starting(state: State) -> Known:
     found = state.front_end.found
     optics = found.optics if found else None
     if state.quiet is None:
-        return Known(
-            np.zeros(np.shape(state.n_events), bool), state.chunks, summary, std, optics)
+        none = np.zeros(np.shape(state.n_events), bool)
+        return Known(none, state.chunks, summary, std, optics)
     hot = hot_pixels(
         state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
         state.n_events, state.seconds)
