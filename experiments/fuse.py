@@ -27,13 +27,14 @@ from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, run_script
 from experiments.shared.fusion_fit import cross_validated, figures_of, fit
 from experiments.shared.many import Setup
-from experiments.shared.real_cameras import draw_other, draw_real
+from experiments.shared.real_cameras import draw_exposed, draw_other, draw_real
 from experiments.shared.refinement import COVERED, begun
 from experiments.shared.rows import collected
 from experiments.shared.weight_parts import begin_fit, save_part
 
 KINDS = (draw_protocol,) * 6 + (draw_real,) * 7 + (draw_other,) * 2
 AS_DRAWN, OTHER_SHAPES = 5000, ((180, 240), (64, 64), (64, 64), (64, 64))
+EXPOSURE_TOLD = 6500  # beyond: frames whose exposure the recording tells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Options:
 
     weights: tyro.conf.Positional[Path]
     out: Path
-    recordings: int = 6500
+    recordings: int = 7500
     steps: int = 1000
     workers: int = 1
     """Processes that simulate side by side."""
@@ -56,6 +57,8 @@ class Options:
 def drawn(seed: int, number: int) -> Protocol:
     """What the recording of that number is like. Beyond the first AS_DRAWN, size and scenes say
     nothing of the kind of camera: those of 64x64 pixels were ideal."""
+    if number >= EXPOSURE_TOLD:
+        return draw_exposed(np.random.default_rng((seed, number)))
     protocol = KINDS[number % len(KINDS)](np.random.default_rng((seed, number)))
     if number < AS_DRAWN:
         return protocol

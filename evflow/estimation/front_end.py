@@ -8,6 +8,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import numpy as np
+
 from evflow.estimation.dead_time import DeadTime, dead_time, first_events
 from evflow.estimation.refine import Found, Stretch, find_photoreceptor, frame_noise
 from evflow.estimation.refine.path import Films
@@ -16,12 +18,13 @@ from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrontEnd:
-    """seen_by: how the pixels see what the frames show; noise_dn: the frames' noise in DN; found:
-    the search for the photoreceptor, None if there was none; dead: the dead time; films: of
-    stretches that are still to be read."""
+    """seen_by: how the pixels see what the frames show; noise_dn, blur_s: the frames' noise in DN
+    and their exposure, 0 if it is unknown; found: the search for the photoreceptor, None if there
+    was none; dead: the dead time; films: of stretches that are still to be read."""
 
     seen_by: Photoreceptor = IDEAL
     noise_dn: float = 0.0
+    blur_s: float = 0.0
     found: Found | None = None
     dead: DeadTime = dataclasses.field(default_factory=DeadTime)
     films: Films = dataclasses.field(default_factory=dict)
@@ -37,5 +40,6 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
     films: Films = {}
     found = find_photoreceptor(runs, noise_dn, films) if measured else None
-    return FrontEnd(found.seen if found is not None and found.needed else IDEAL, noise_dn, found,
-                dead, films)
+    blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
+    return FrontEnd(found.seen if found is not None and found.needed else IDEAL, noise_dn, blur_s,
+                    found, dead, films)

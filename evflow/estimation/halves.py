@@ -76,7 +76,7 @@ def _on_its_own(first: FirstPart) -> State:
     seen_by = found.seen if found is not None and found.needed else IDEAL
     events = state.read[0].recording.events
     end = int(state.read[0].recording.frame_times[first.rest[0]])
-    own = FrontEnd(seen_by, front_end.noise_dn, found,
+    own = FrontEnd(seen_by, front_end.noise_dn, front_end.blur_s, found,
                    dead_time(first_events(events.slice(int(events.t[0]), end))))
     simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
     if seen_by != front_end.seen_by:

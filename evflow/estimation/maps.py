@@ -105,7 +105,7 @@ def refined(
     parts = next(iter(params.values()))
     fusion, found = parts.get("fusion"), front_end.found
     refined = refine_summary(chunks, summary, std, fusion, parts.get("signal"),
-                             found=found, noise_dn=front_end.noise_dn)
+                             found=found, noise_dn=front_end.noise_dn, blur_s=front_end.blur_s)
     if found is None or fusion is None:
         return refined.summary, refined.std, found.optics if found else None
     theta, stepped, error = (np.array([s.theta_on, s.theta_off], np.float64)

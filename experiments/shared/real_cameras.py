@@ -98,6 +98,14 @@ def draw_real(rng: np.random.Generator) -> Protocol:
         black_dn=black if rng.random() < 0.5 else 0.0)
 
 
+def draw_exposed(rng: np.random.Generator) -> Protocol:
+    """One of `draw_real` whose frames are exposed for a time that the recording tells."""
+    protocol = draw_real(rng)
+    exposure_ms = round(float(np.exp(rng.uniform(np.log(2.0), np.log(30.0)))))
+    return dataclasses.replace(
+        protocol, exposure_ms=min(exposure_ms, protocol.frame_ms), exposure_known=True)
+
+
 def draw_other(rng: np.random.Generator) -> Protocol:
     """Cameras beside `draw_real`: DVS-Voltmeter's pixels, else one of `draw_real` seen for 5 s."""
     protocol = draw_real(rng)

@@ -25,8 +25,9 @@ class Begun(NamedTuple):
 
     def stepped(self) -> Refined:
         """The summary after the Gauss-Newton steps, and the fusion's features."""
+        seen = self.front_end
         return refine_summary(self.chunks, self.summary, self.std,
-                              found=self.front_end.found, noise_dn=self.front_end.noise_dn)
+                              found=seen.found, noise_dn=seen.noise_dn, blur_s=seen.blur_s)
 
 
 def begun(params: Any, recording: Recording) -> Begun | None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine.path_signs import NAMES, NEEDED
-from experiments.fuse import AS_DRAWN, KINDS, OTHER_SHAPES, drawn
+from experiments.fuse import AS_DRAWN, EXPOSURE_TOLD, KINDS, OTHER_SHAPES, drawn
 from experiments.shared.fusion_fit import cross_validated, fit, of_kinds, predict
 
 EVENTS, ROWS = 4, 600
@@ -68,3 +68,9 @@ def test_size_and_scenes_do_not_betray_the_kind_of_camera() -> None:
     seen = {(KINDS[i % len(KINDS)], drawn(0, i).shape, drawn(0, i).scene) for i in numbers}
     assert len(seen) == len(set(KINDS)) * len(set(OTHER_SHAPES))
     assert drawn(0, 6).shape != drawn(0, 0).shape
+
+
+def test_recordings_that_tell_their_exposure_come_last_and_tell_it() -> None:
+    told = [drawn(0, i) for i in range(EXPOSURE_TOLD, EXPOSURE_TOLD + 40)]
+    assert all(p.exposure_known and 2 <= p.exposure_ms <= p.frame_ms for p in told)
+    assert not any(drawn(0, i).exposure_known for i in range(EXPOSURE_TOLD - 40, EXPOSURE_TOLD))

@@ -207,20 +207,21 @@ def _mean_factor(chunks: list[Chunk]) -> float:
 def refine_summary(
     chunks: list[Chunk], summary: Summary, std: Summary, fusion: dict[str, Any] | None = None,
     signal: dict[str, Any] | None = None, *, found: Found | None = None, noise_dn: float = 0.0,
-    seed: int = 0,
+    blur_s: float = 0.0, seed: int = 0,
 ) -> Refined:
     """Refine the network's estimate of a camera on the chunks of a recording.
 
     Args:
         chunks: of the recording.
         summary, std: the network's estimate.
-        fusion: {"net": parameters of FusionNet, "mean", "scale", "low", "high": (F,) of the
-            features in training, "widen": (6,) calibration of the std}; None: only the
+        fusion: {"net": parameters of several FusionNets, stacked, "mean", "scale", "low", "high":
+            (F,) of the features in training, "widen": (6,) calibration of the std}; None: only the
             Gauss-Newton steps, with the network's std.
         signal: the network that separates noise from signal (signal.py); None: the noise rates are
             those of quiet pixels.
-        found, noise_dn: the search for the photoreceptor, None if there was none, and the std of
-            the frames' noise in DN: features beside those of the events.
+        found, noise_dn, blur_s: the search for the photoreceptor, None if there was none, and the
+            frames' noise (std in DN) and exposure if it is known: features beside those of the
+            events.
         seed: of the simulated noise and mismatch.
 
     Returns:
@@ -233,7 +234,7 @@ def refine_summary(
     fit.choose_start()
     for offset in OFFSETS:
         fit.step(offset)
-    signs = path_signs(found, noise_dn, fit.values[:2])
+    signs = path_signs(found, noise_dn, blur_s, fit.values[:2])
     features = np.concatenate([fit.features(), signs.astype(np.float32)])
     stepped = Summary(*(jnp.float32(v) for v in fit.values))
     if fusion is None:

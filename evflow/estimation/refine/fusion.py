@@ -45,15 +45,18 @@ def corrected(
 
 
 def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:
-    """Correct y (..., 6) by the fusion; returns it and its std.
+    """Correct y (..., 6) by the fusion, the mean of its networks; returns it and its std.
 
     Features outside of training's range are clipped to it (a longer recording counts as the
     longest in training) and widen the std.
     """
     inside = jnp.clip(features, fusion["low"], fusion["high"])
     beyond = (inside != features).sum(-1, keepdims=True)
-    outputs: Any = FusionNet().apply(
-        {"params": fusion["net"]}, (inside - fusion["mean"]) / fusion["scale"])
-    correction, log_std = outputs
+    scaled = (inside - fusion["mean"]) / fusion["scale"]
+
+    def output(net: Any) -> Any:
+        return FusionNet().apply({"params": net}, scaled)
+
+    correction, log_std = (v.mean(0) for v in jax.vmap(output)(fusion["net"]))
     return y + correction, (
         jnp.exp(log_std) * fusion["widen"] * jnp.sqrt(1.0 + VARIANCE_PER_OUTLIER_FEATURE * beyond))

@@ -16,7 +16,8 @@ Array = np.ndarray
 OF_BOTH = (
     "needed", "odds", "unexplained", "log_unexplained", "explained_more", "poor", "poor_unneeded",
     "smear_10", "smear_20", "frame_noise", "offset", "offset_unneeded", "offset_std", "tau",
-    "tau_unneeded", "tau_std", "delay", "even", "size")
+    "tau_unneeded", "tau_std", "delay", "even", "size",
+    "blur")
 OF_ONE = ("regression", "found_regression", "ideal_regression", "theta_10", "theta_20", "open",
           "open_unneeded", "missed")
 NAMES = (*OF_BOTH, *(f"{name}_{side}" for side in ("on", "off") for name in OF_ONE))
@@ -26,12 +27,13 @@ LENIENT = 3.0  # log odds added to the search's for a camera that is not ideal
 POOR = 0.3  # share of variance left unexplained by the path, above which an offset is often missed
 
 
-def path_signs(found: Found | None, noise_dn: float, theta: Array) -> Array:
+def path_signs(found: Found | None, noise_dn: float, blur_s: float, theta: Array) -> Array:
     """The search's result beside the stepped thresholds.
 
     Args:
         found: the search for the photoreceptor; None if there was none.
         noise_dn: std of the frames' noise, DN.
+        blur_s: exposure of the frames whose blur was taken out of the path; 0 if it is unknown.
         theta: (2,) thresholds ON and OFF after the Gauss-Newton steps.
 
     Returns:
@@ -53,7 +55,7 @@ def path_signs(found: Found | None, noise_dn: float, theta: Array) -> Array:
         needed * found.seen.offset_dn / 20.0, unneeded * found.seen.offset_dn / 20.0,
         np.log(offset_std), needed * found.seen.tau_s * 1e3, unneeded * found.seen.tau_s * 1e3,
         np.log(tau_std * 1e3), found.seen.delay_s * 1e3, float(not found.seen.by_light),
-        np.log(found.size)]
+        np.log(found.size), blur_s * 1e2]
     missed = unneeded / (1.0 + np.exp(-log_odds - LENIENT))
     change = np.log(found.theta / found.ideal_theta)
     used, explained = (found.theta, seen) if found.needed else (found.ideal_theta, ideal)

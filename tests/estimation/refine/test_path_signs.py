@@ -20,7 +20,7 @@ def found(chance: float, few: float = 0.0) -> Found:
 
 
 def named(chance: float, few: float = 0.0) -> dict[str, float]:
-    return dict(zip(NAMES, path_signs(found(chance, few), 1.5, THETA), strict=True))
+    return dict(zip(NAMES, path_signs(found(chance, few), 1.5, 0.02, THETA), strict=True))
 
 
 def test_signs_are_those_that_are_named() -> None:
@@ -31,6 +31,7 @@ def test_signs_are_those_that_are_named() -> None:
     assert (seen["smear_10"], seen["theta_10_on"], seen["theta_20_off"]) == (0.01, 0.02, 0.06)
     assert (seen["offset"], seen["offset_unneeded"], seen["odds"]) == (1.0, 0.0, 1.0)
     assert (seen["tau"], seen["delay"], seen["frame_noise"]) == pytest.approx((1.0, 0.2, 0.5))
+    assert seen["blur"] == pytest.approx(2.0)
     assert seen["open_on"] == pytest.approx(np.log(0.05))
     assert seen["open_unneeded_on"] == pytest.approx(np.log(0.01))
     assert seen["unexplained"] == pytest.approx(0.1)
@@ -55,7 +56,7 @@ def test_where_little_was_watched_a_slow_pixel_is_missed_as_easily() -> None:
 
 
 def test_thresholds_far_apart_are_bounded_and_no_search_says_nothing() -> None:
-    far = path_signs(found(1.0), 1.5, np.array([1e-3, 10.0]))
+    far = path_signs(found(1.0), 1.5, 0.02, np.array([1e-3, 10.0]))
     assert np.abs(far).max() < 10.0
-    assert not path_signs(None, 1.5, THETA).any()
-    assert path_signs(None, 1.5, THETA).shape == (len(NAMES),)
+    assert not path_signs(None, 1.5, 0.02, THETA).any()
+    assert path_signs(None, 1.5, 0.02, THETA).shape == (len(NAMES),)
