@@ -93,7 +93,7 @@ def make_chunk(
     quiet = _quiet(fine, trace, film.dt_s, film.shown[1:] & film.shown[:-1])
     first = run[0] == 0 if first is None else first
     if bright.size <= LARGE:
-        sightings = sight(events, times, fine, steps, film.shown)
+        sightings = sight(recording.events, times, fine, steps, film.shown)
         evidence = evidence_of(sightings, first=first)
     else:
         give_back()

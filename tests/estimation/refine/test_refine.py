@@ -21,6 +21,7 @@ from evflow.estimation.reading import ordered
 from evflow.estimation.refine import (
     cut,
     fused,
+    make_chunk,
     pixel_posterior,
     plan_runs,
     refine_summary,
@@ -86,6 +87,21 @@ def test_simulated_trace_is_the_trace_of_the_simulated_events(
     when = np.asarray(made.step) + np.asarray(made.fraction)
     np.testing.assert_allclose(when[fired], (seen.step + seen.fraction)[fired], atol=2e-3)
     np.testing.assert_array_equal(np.asarray(made.step)[~fired], NEVER)
+
+
+def test_sightings_are_numbered_as_the_events_of_the_whole_recording() -> None:
+    """Labels of simulated noise are looked up by these numbers, for stretches that begin late."""
+    rng, count, (height, width) = np.random.default_rng(0), 400, (24, 32)
+    times = 25_000 * np.arange(6)
+    events = Events(rng.integers(0, width, count), rng.integers(0, height, count),
+                    np.sort(rng.integers(0, times[-1], count)), rng.random(count) < 0.5,
+                    (width, height))
+    frames = rng.integers(60, 200, (len(times), height, width)).astype(np.uint8)
+    seen = make_chunk(Recording(events, frames, times), (2, 3)).sightings
+    assert events.t[seen.number].min() > times[2]
+    np.testing.assert_array_equal(events.p[seen.number], seen.on)
+    np.testing.assert_array_equal(
+        events.y[seen.number].astype(int) * width + events.x[seen.number], seen.pixel)
 
 
 def test_every_event_is_counted_once(events: Events) -> None:
