@@ -1,13 +1,14 @@
-"""Fit the fusion network of the refinement on simulated recordings, everything else frozen.
+"""Fit the fusion networks of the refinement on simulated recordings, everything else frozen.
 
     python -m experiments.fuse runs/default/weights.safetensors --out final.safetensors
 
 Each recording of a hidden camera (of fifteen, six of the training's distribution, seven as cameras
 may be: ideal, slow, blind for a while after an event, noisy, with exposed, offset and noisy frames;
-two DVS-Voltmeter's, or seen for 5 s) passes through the network, the search for the photoreceptor
-and the Gauss-Newton steps of `refine`; what they leave is regressed on the features. Five-fold
-cross-validation gives the figures of the model card and the factor that makes the std cover 70 % of
-the held-out folds; the network that ships is fitted to all recordings.
+two DVS-Voltmeter's, or seen for 5 s; of the last thousand the exposure is known) passes through the
+network, the search for the photoreceptor and the Gauss-Newton steps of `refine`; what they leave is
+regressed on the features, by the mean of several networks. Five-fold cross-validation gives the
+figures of the model card and the factor that makes the std cover 70 % of the held-out folds; the
+network that ships is fitted to all recordings.
 """
 
 from __future__ import annotations

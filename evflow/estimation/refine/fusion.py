@@ -1,8 +1,9 @@
-"""The small network that corrects the stepped camera (fit.py) and gives its std.
+"""The small networks whose mean corrects the stepped camera (fit.py) and gives its std.
 
-It learns from simulated recordings of cameras as they may be: what the steps leave, given the
+They learn from simulated recordings of cameras as they may be: what the steps leave, given the
 remaining differences between recorded and simulated events, how much was seen, and what the search
-for the photoreceptor says (path_signs.py).
+for the photoreceptor says (path_signs.py). Networks that begin with other values differ by about
+1 % of theta.
 """
 
 from __future__ import annotations

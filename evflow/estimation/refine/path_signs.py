@@ -16,8 +16,7 @@ Array = np.ndarray
 OF_BOTH = (
     "needed", "odds", "unexplained", "log_unexplained", "explained_more", "poor", "poor_unneeded",
     "smear_10", "smear_20", "frame_noise", "offset", "offset_unneeded", "offset_std", "tau",
-    "tau_unneeded", "tau_std", "delay", "even", "size",
-    "blur")
+    "tau_unneeded", "tau_std", "delay", "even", "size", "blur")
 OF_ONE = ("regression", "found_regression", "ideal_regression", "theta_10", "theta_20", "open",
           "open_unneeded", "missed")
 NAMES = (*OF_BOTH, *(f"{name}_{side}" for side in ("on", "off") for name in OF_ONE))
