@@ -25,7 +25,7 @@ HIDDEN = 1e-9  # weight of events beside saturated or black frames; not 0, to av
 class Sightings:
     """N events beside the path, by pixel and time.
 
-    number: (N,) index among the recording's events; pixel: (N,) flat index; interval: (N,);
+    number: (N,) index among the events given to `sight`; pixel: (N,) flat index; interval: (N,);
     fraction: (N,) of the interval; on: (N,) bool; path: (N,) the path's value at the event;
     first: index of each pixel's first event; frames: (K + 1, H*W) path at the frames;
     inner: (K, H*W) range of the path within each interval; seen: (K + 1, H*W) bool, frames that
