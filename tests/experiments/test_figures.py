@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 import pytest
 from helpers.figures import cells, mean, numbers, span, values, wrong
 
+from evflow.network.weights import model_card
+
 Figures = list[float]
 ACCURACY = "docs/accuracy.md"
 
@@ -33,7 +35,20 @@ def readme() -> dict[str, Figures]:
         "threshold of each pixel": [*of("theta", "mae_pixel"), *of("theta", "constant truth")],
         "noise rate (Hz)": [*of("eta", "refined"), mean("evaluate", r"0.03\|eta", "constant prior"),
                             mean("evaluate", r"0.03\|eta", "paper")],
+        "68 % / 95 % intervals of θ": [*held_of_theta(), *all_cameras()],
     }
+
+
+def held_of_theta() -> Figures:
+    return [end for column in ("within 68", "within 95")
+            for end in span("evaluate", r"0.\d+( v2e)?\|theta", column)]
+
+
+def all_cameras() -> Figures:
+    """Share of the thresholds inside both intervals, by the fusion's cross-validation."""
+    found = model_card("default")["fusion"]["figures"]
+    return [50.0 * sum(found[f"inside_{share}/theta_{side}"] for side in ("on", "off"))
+            for share in (68, 95)]
 
 
 def evaluate() -> dict[str, Figures]:
@@ -65,10 +80,10 @@ def intervals() -> dict[str, Figures]:
         return [end for rows in parameters for column in ("in 68", "in 95")
                 for end in span(source, rows, column)]
 
-    theta, eta, free = ([end for column in ("within 68", "within 95")
-                         for end in span("evaluate", rows, column)]
-                        for rows in (r"0.\d+( v2e)?\|theta", r"0.\d+( v2e)?\|eta",
-                                     r"0.03 free noise\|eta"))
+    theta = held_of_theta()
+    eta, free = ([end for column in ("within 68", "within 95")
+                  for end in span("evaluate", rows, column)]
+                 for rows in (r"0.\d+( v2e)?\|eta", r"0.03 free noise\|eta"))
     whole = ("theta_on, summary|theta_off, summary", "eta_on, summary|eta_off, summary",
              "theta_on, pixels|theta_off, pixels", "eta_on, pixels|eta_off, pixels")
     return {
