@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 from evflow.estimation.dead_time import dead_time, first_events
 from evflow.estimation.finish import estimate
-from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.photoreceptor import receptor_places
@@ -76,8 +75,8 @@ def _on_its_own(first: FirstPart) -> State:
     seen_by = found.seen if found is not None and found.needed else IDEAL
     events = state.read[0].recording.events
     end = int(state.read[0].recording.frame_times[first.rest[0]])
-    own = FrontEnd(seen_by, front_end.noise_dn, front_end.blur_s, found,
-                   dead_time(first_events(events.slice(int(events.t[0]), end))))
+    dead = dead_time(first_events(events.slice(int(events.t[0]), end)))
+    own = dataclasses.replace(front_end, seen_by=seen_by, found=found, dead=dead, films={})
     simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
     if seen_by != front_end.seen_by:
         state = State(state.params, own)
