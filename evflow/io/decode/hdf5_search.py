@@ -17,7 +17,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import arrays, columns, tables
 from evflow.io.decode.hdf5 import DAMAGE
-from evflow.io.decode.images_beside import are_images, beside, times_of
+from evflow.io.decode.images_beside import are_images, beside, channels_first, times_of
 from evflow.io.decode.stream import Gathered
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
@@ -139,11 +139,15 @@ def as_stack(f: Any) -> str:
     """How to save the images of a file without events as a stack of frames; "" if it holds none."""
     of = arrays_in(f)
     name = next((name for name, data in of.items() if are_images(data)), "")
-    times = times_of(name, of) if name else ""
-    return "" if not name else (
+    if not name:
+        return ""
+    times, pixels = times_of(name, of), f"f['{name}'][:]"
+    if channels_first(of[name].shape):
+        pixels = f"np.moveaxis({pixels}, 1, -1)"
+    return (
         f"It holds images and no events. As frames (--frames, evflow simulate): np.savez('a.npz', "
-        f"frames=f['{name}'][:]" + (f", frame_times=f['{times}'][:])" if times else
-                                   ", frame_times=their times)") + " with f = h5py.File(path).")
+        f"frames={pixels}" + (f", frame_times=f['{times}'][:])" if times else
+                              ", frame_times=their times)") + " with f = h5py.File(path).")
 
 
 def images_beside(

@@ -1,11 +1,12 @@
 """Images that a file holds beside its events under names of its own, and their times: recognised by
 shapes and names.
 
-Images are arrays (T, H, W), or (T, H, W, C) with 1, 3 or 4 channels in R, G, B. Their times are an
-array of T numbers, or (T, 2) begin and end of the exposure, whose name says so (`frame_times`,
-`image_raw_ts`, `t`), in the same group or the one above. Their exposure is that of begin and end,
-or a number, or one per image, in such an array or in an attribute of both, under a name with a unit
-(`exposure_us`). As none of it is certain, what cannot be read leaves the events, with a note.
+Images are arrays (T, H, W), or (T, H, W, C) or (T, C, H, W) with 1, 3 or 4 channels in R, G, B.
+Their times are an array of T numbers, or (T, 2) begin and end of the exposure, whose name says so
+(`frame_times`, `image_raw_ts`, `t`), in the same group or the one above. Their exposure is that of
+begin and end, or a number, or one per image, in such an array or in an attribute of both, under a
+name with a unit (`exposure_us`). As none of it is certain, what cannot be read leaves the events,
+with a note.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode.columns import UNIT
 from evflow.io.decode.stream import Gathered
-from evflow.io.decode.tables import Images, Loaded, frame_size, with_frames
+from evflow.io.decode.tables import Images, Loaded, with_frames
 from evflow.io.decode.units import UNITS_US, shared_unit, written_unit
 from evflow.io.hints import Hints
 from evflow.io.images.exposures import Stamps, mid_exposure, names_exposure, stated, stated_by
@@ -30,6 +32,7 @@ from evflow.notes import Note
 from evflow.types import Events, Recording
 
 LEAST_SIDE = 8  # pixels; smaller ones are no images
+CHANNELS = (1, 3, 4)
 ENCODED = {"frame", "image", "img", "picture", "photo", "jpeg", "jpg", "png"}
 TIMES = re.compile(r"(?:^|_)ts?$|(?:time|stamp)s?$")
 
@@ -51,7 +54,7 @@ def beside(
         if are_images(array):
             times = times_of(name, arrays)
             why = "" if times else f"without an array of {array.shape[0]} times"
-            stream = ImageStream(name, frame_size(array), why, (Note(
+            stream = ImageStream(name, _size(array.shape), why, (Note(
                 "frames.stream", f"frames are from {name}, at the times in {times}"),))
             streams.append(Images(stream, _loading(
                 name, times, arrays, whole, pixels, path, found.events)))
@@ -110,8 +113,20 @@ def _near(
 def are_images(array: Any) -> bool:
     """Whether an array may be images."""
     shape = array.shape
-    return (len(shape) in (3, 4) and min(shape[1:3]) >= LEAST_SIDE and shape[0] > 0
-            and array.dtype.kind in "iuf" and (len(shape) == 3 or shape[3] in (1, 3, 4)))
+    last = len(shape) in (3, 4) and min(shape[1:3]) >= LEAST_SIDE and (
+        len(shape) == 3 or shape[3] in CHANNELS)
+    return bool((last or channels_first(shape)) and shape[0] and array.dtype.kind in "iuf")
+
+
+def channels_first(shape: tuple[int, ...]) -> bool:
+    """Whether images of a shape are (T, C, H, W), as PyTorch holds them."""
+    return len(shape) == 4 and shape[1] in CHANNELS and min(shape[2:]) >= LEAST_SIDE
+
+
+def _size(shape: tuple[int, ...]) -> Size:
+    """(width, height) of images of a shape."""
+    height, width = shape[2:] if channels_first(shape) else shape[1:3]
+    return width, height
 
 
 def _words(name: str) -> set[str]:
@@ -135,6 +150,8 @@ def _loading(
 
 def _seen(image: np.ndarray) -> np.ndarray:
     """An image of a dtype that frames have, with channels in B, G, R."""
+    if channels_first((1, *image.shape)):
+        image = np.moveaxis(image, 0, -1)
     if image.ndim == 3:
         image = image[..., 0] if image.shape[-1] == 1 else image[..., [2, 1, 0]]
     if image.dtype.kind == "f":

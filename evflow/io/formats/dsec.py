@@ -29,6 +29,7 @@ from evflow.io.decode.hdf5_search import (
     declared_unit,
     images_beside,
 )
+from evflow.io.decode.images_beside import are_images
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
 from evflow.io.images.exposures import KEY
@@ -82,10 +83,21 @@ def read(path: Path, hints: Hints) -> Recording:
         offset = (hints.instant(_scalar(path, f, "t_offset"), "us") if "t_offset" in f else
                   declared_offset(hints, f["events"], f))
         found = gather(path, _chunks(columns, hints), hints, size, "us", offset)
-        if not {"frames", "frame_times"} <= set(f) or len(getattr(f["frames"], "keys", list)()):
+        if not _own_frames(f):
             return images_beside(path, f, found, hints, "events/t", notes)
         images = tables.dataset_images(path, f, "frames", "frame_times")
         return tables.with_frames(path, found, hints, images, "us", notes)
+
+
+def _own_frames(f: Any) -> bool:
+    """Whether /frames are as `DsecWriter` writes them, or were meant to be: no group of others, no
+    images with channels."""
+    if not {"frames", "frame_times"} <= set(f):
+        return False
+    frames = f["frames"]
+    if hasattr(frames, "keys"):
+        return not len(frames)
+    return not (len(frames.shape or ()) == 4 and are_images(frames))
 
 
 def _size(f: Any) -> tuple[Size | None, Note | None]:

@@ -2,7 +2,8 @@
 
 /events uint32 (N, 4): t us, x, y, p in {0, 1}; other tools use other orders, inferred from the
 values. With frames: /frame uint8 (T, H, W), /frame_ts uint32 us. Without them the file does not
-contain the sensor's size.
+contain the sensor's size, and images under other names are its frames if their times can be found
+(`images_beside`).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from evflow.io.decode import arrays, columns, tables
+from evflow.io.decode.hdf5_search import images_beside
 from evflow.io.hints import Hints
 from evflow.types import Recording
 
@@ -41,6 +43,6 @@ def read(path: Path, hints: Hints) -> Recording:
             table = arrays.Table("events", len(data), rows, "us", tables.stored_rows(data))
         found = table.gather(path, hints, size)
         if "frame" not in f:
-            return Recording.of_events(found.events, found.notes)
+            return images_beside(path, f, found, hints, "events")
         return tables.with_frames(
             path, found, hints, tables.dataset_images(path, f, "frame", "frame_ts"), "us")

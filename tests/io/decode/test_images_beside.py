@@ -31,6 +31,8 @@ BESIDE: dict[str, dict[str, Any]] = {
     "begin and end": {"images": FRAMES, "exposure_timestamps": EXPOSED},
     "one channel": {"images": FRAMES[..., None], "image_ts": TIMES[:, None]},
     "colour": {"images": RGB, "image_ts": TIMES},
+    "one channel first": {"images": FRAMES[:, None], "image_ts": TIMES},
+    "colour first": {"images": np.moveaxis(RGB, -1, 1), "image_ts": TIMES},
     "wide integers": {"images": FRAMES.astype(np.int64), "image_ts": TIMES},
     "float64": {"images": FRAMES.astype(float), "image_ts": TIMES},
     "big-endian": {"images": FRAMES.astype(">u2"), "image_ts": TIMES.astype(">i8")}}
@@ -69,6 +71,33 @@ def test_images_of_other_names_are_the_frames(
     np.testing.assert_array_equal(found.frames, FRAMES)
     np.testing.assert_array_equal(found.frame_times, TIMES)
     assert "frames are from" in found.notes[0].text
+
+
+def test_colours_are_red_green_and_blue_wherever_their_axis_is(tmp_path: Path) -> None:
+    colour = np.stack([FRAMES, FRAMES // 2, 255 - FRAMES], -1)
+    last, first = (read_recording(npz(tmp_path, {"images": images, "image_ts": TIMES})).frames
+                   for images in (colour, np.moveaxis(colour, -1, 1)))
+    np.testing.assert_array_equal(first, last)
+    assert not np.array_equal(last, FRAMES)
+
+
+@pytest.mark.parametrize("kind", BESIDE)
+def test_events_in_rows_of_four_have_images_beside_them(tmp_path: Path, kind: str) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as f:
+        f["events"] = np.stack([E.x, E.y, E.t, E.p], 1).astype(np.int32)
+        for name, array in BESIDE[kind].items():
+            f[name] = array
+    found = read_recording(tmp_path / "a.h5", size=SIZE)
+    equal(found.events, E)
+    np.testing.assert_array_equal(found.frames, FRAMES)
+    np.testing.assert_array_equal(found.frame_times, TIMES)
+
+
+def test_our_own_frames_may_have_channels(tmp_path: Path) -> None:
+    path = h5("events/x events/y events/t events/p")(
+        tmp_path, {"frames": FRAMES[:, None], "frame_times": TIMES, "ms_to_idx": np.zeros(9)})
+    found = read_recording(path, size=SIZE)
+    np.testing.assert_array_equal(found.frames, FRAMES)
 
 
 @pytest.mark.parametrize(("arrays", "said"), [

@@ -170,10 +170,13 @@ def test_a_matrix_that_is_none_of_events(tmp_path: Path) -> None:
     assert refused(tmp_path / "a.h5", size=SIZE).code == "EV008"
 
 
-def test_images_without_events_become_a_stack_as_the_message_says(tmp_path: Path) -> None:
+@pytest.mark.parametrize("channels", [(), (1,)])
+def test_images_without_events_become_a_stack_as_the_message_says(
+    tmp_path: Path, channels: tuple[int, ...]
+) -> None:
     path, frames = tmp_path / "a.h5", np.arange(3 * 48 * 64, dtype=np.uint8).reshape(3, 48, 64)
     with h5py.File(path, "w") as f:
-        f["cam/images"], f["cam/ts"] = frames, [0, 40_000, 80_000]
+        f["cam/images"], f["cam/ts"] = frames.reshape(3, *channels, 48, 64), [0, 40_000, 80_000]
     fix = refused(path).fix
     with h5py.File(path) as f:
         exec(fix[fix.index("np.savez"): fix.index(" with f =")].replace("'a.npz'", "out"),
