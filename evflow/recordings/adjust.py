@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.io.decode.units import too_large
 from evflow.io.images.exposures import given_exposure, noted
 from evflow.io.source import open_frames
 from evflow.light import response as light
@@ -114,10 +115,12 @@ def with_frames(
             kept.append(frame)
             times.append(seen[-1])
     if not kept:
+        large = too_large(np.array(seen, np.int64) - offset_us, t)
         raise EvflowDataError(
             "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but the frames of {path} "
             f"{seen[0]:,}..{seen[-1]:,} us.",
-            "Another clock? Pass --frames-offset-ms "
+            f"Frame times are {large} the events': pass the unit they are in, --timestamps-unit."
+            if large else "Another clock? Pass --frames-offset-ms "
             f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; for another "
             "unit pass --timestamps-unit.")
     notes = (*noted(recording.notes, 0), Note("frames.replaced", f"frames come from {path}"),

@@ -16,6 +16,7 @@ import numpy as np
 
 from evflow.checks import need
 from evflow.errors import EvflowDataError
+from evflow.io.decode.units import too_large
 from evflow.notes import Note, why_no_frames
 from evflow.recordings.gaps import event_gaps
 from evflow.recordings.glitches import faulty_frames
@@ -230,8 +231,12 @@ def check_overlap(recording: Recording) -> None:
             "Thresholds are measured against intensity: record or add frames.")
     start, stop = _covered(recording)
     if times[-1] <= start or times[0] >= stop:
+        large = too_large(times, t)
         raise EvflowDataError(
             "EV012", f"events cover {t[0]:,}..{t[-1]:,} us but frames {times[0]:,}.."
             f"{times[-1]:,} us.",
+            f"Frame times are {large} the events': one of both was read in a wrong unit. Pass "
+            "--time-unit for times in the recording, --timestamps-unit for those of --frames."
+            if large else
             "Are both on one clock and in one unit? If they begin together, --frames-offset-ms "
             f"{(int(t[0]) - int(times[0])) / 1e3:.3f}; in another unit, --time-unit.")

@@ -31,6 +31,7 @@ FEW_EVENTS = 100  # too few to say anything
 POSSIBLE_S = (2e-5, 2.0)  # 50,000 frames/s to one in two seconds
 USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s: only one of units 1000 apart can lie within
 MIDDLE_S = 0.02  # of two units, the one nearer to 50 frames/s
+LEAST_SHARED = 0.01  # of the whole span: in a wrong unit, times share a thousandth
 
 DIGITS = "Export them again as integer microseconds, or as float64 seconds with six decimals."
 WORDS = re.compile(
@@ -85,16 +86,42 @@ def usual_step(times: np.ndarray) -> float:
 def shared_unit(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | None:
     """The unit of `units` in which times (T,) overlap most of the span of events at t (N,) us; the
     first if equal, None if none overlaps."""
+    best = max(units, key=lambda unit: _shared(times, t, UNITS_US[unit]))
+    return best if _shared(times, t, UNITS_US[best]) > 0 else None
+
+
+def other_unit(times: np.ndarray, t: np.ndarray, native: str) -> str | None:
+    """The unit in which times (T,) fall among events at t (N,) us if in the native one they do not;
+    None if they do, or in no unit."""
+    factor = _factor(times, t, UNITS_US[native], [*UNITS_US.values()])
+    return next((unit for unit, us in UNITS_US.items() if us == factor), None)
+
+
+def too_large(times: np.ndarray, t: np.ndarray) -> str:
+    """How many times times (T,) us are those of events at t (N,) us, in words ("1,000 times"), if
+    they only look apart because one of both was read in a wrong unit; "" if nothing says so."""
+    factor = _factor(times, t, 1.0, [10.0**power for power in (-9, -6, -3, 3, 6, 9)])
+    if not factor and len(times) and len(t) and since_1970(float(t[0])) == ["us"]:
+        factor = next((UNITS_US[unit] for unit in since_1970(float(times[0])) if unit != "us"), 0.0)
+    return "" if not factor else (
+        f"{1 / factor:,.0f} times" if factor < 1 else f"1/{factor:,.0f} of")
+
+
+def _factor(times: np.ndarray, t: np.ndarray, native: float, factors: list[float]) -> float:
+    """The factor at which times (T,) share most with events at t (N,), if at `native` they share
+    nothing; 0 if there is none."""
+    best = max(factors, key=lambda factor: _shared(times, t, factor))
+    apart = not _shared(times, t, native)
+    return best if apart and _shared(times, t, best) > LEAST_SHARED else 0.0
+
+
+def _shared(times: np.ndarray, t: np.ndarray, factor: float) -> float:
+    """How much of their whole span times (T,) times a factor share with sorted t (N,)."""
     if not (len(times) and len(t)):
-        return None
-
-    def shared(unit: str) -> float:
-        first, last = (float(v) * UNITS_US[unit] for v in (times.min(), times.max()))
-        common = min(last, float(t[-1])) - max(first, float(t[0])) + 1.0
-        return max(common, 0.0) / (max(last, float(t[-1])) - min(first, float(t[0])) + 1.0)
-
-    best = max(units, key=shared)
-    return best if shared(best) > 0 else None
+        return 0.0
+    first, last = (float(v) * factor for v in (times.min(), times.max()))
+    common = min(last, float(t[-1])) - max(first, float(t[0])) + 1.0
+    return max(common, 0.0) / (max(last, float(t[-1])) - min(first, float(t[0])) + 1.0)
 
 
 def likeliest_unit(

@@ -97,7 +97,7 @@ def _own_frames(f: Any) -> bool:
     frames = f["frames"]
     if hasattr(frames, "keys"):
         return not len(frames)
-    return not (len(frames.shape or ()) == 4 and are_images(frames))
+    return not (len(getattr(frames, "shape", None) or ()) == 4 and are_images(frames))
 
 
 def _size(f: Any) -> tuple[Size | None, Note | None]:

@@ -26,6 +26,7 @@ from evflow.io.decode.columns import meaning
 from evflow.io.decode.text import is_float
 from evflow.io.decode.units import (
     UNITS_US,
+    other_unit,
     shared_unit,
     usual_step,
     usual_unit,
@@ -153,17 +154,20 @@ def beside_events(
     """Times of the frames stored with a recording's events in us, and a note if their unit was
     inferred.
 
-    native: their unit in the format. The unit in `hints` is that of the events; frames share it,
-    unless another unit makes their span agree with the events'. Fractions in a unit of integers
-    indicate the unit that allows them. Raises as `to_us`.
+    native: their unit in the format; if in it they fall beside the events, that in which they fall
+    among them. The unit in `hints` is that of the events; frames share it, unless another unit
+    makes their span agree with the events'. Fractions in a unit of integers indicate the unit that
+    allows them. Raises as `to_us`.
     """
     times, asked = stamps.times, hints.time_unit
     odd = times.dtype.kind == "f" and native != "s"
     usual = asked == "auto" and not odd
-    if usual or times.ndim != 1 or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+    numbers = times.ndim == 1 and times.dtype.kind in "iuf" and bool(np.isfinite(times).all())
+    other = other_unit(times, events.t, native) if usual and numbers else None
+    if not numbers or (usual and other is None):
         unit = native if asked == "auto" else asked
         return FrameTimes(hints.microseconds(times, native), (), stamps.exposure_us(unit))
-    units = [native, *UNITS_US] if asked == "auto" else [asked, native]
+    units = [other] if other else [native, *UNITS_US] if asked == "auto" else [asked, native]
     shared = shared_unit(times, events.t, units)
     if shared is None and asked == "auto":
         return to_us(stamps, where)

@@ -13,8 +13,10 @@ from evflow.io import read_recording
 from evflow.io.decode.misread import misread
 from evflow.io.decode.units import (
     UNITS_US,
+    other_unit,
     shared_unit,
     since_1970,
+    too_large,
     usual_unit,
     video_unit,
     written_unit,
@@ -51,6 +53,17 @@ def test_frames_tell_their_unit_by_rate_date_and_events(unit: str) -> None:
     fast = 1.7e15 / UNITS_US[unit] + 200.0 / UNITS_US[unit] * np.arange(9)  # 5,000 frames/s
     if unit in ("us", "ns"):
         assert video_unit(fast.astype(np.int64))[0] == unit  # the date tells
+
+
+def test_a_clock_that_is_off_is_no_other_unit() -> None:
+    t, us = events().t, FRAMES_US.astype(np.int64)
+    assert other_unit(1000 * us + 500_000, t, "us") is None  # they overlap as they are
+    assert other_unit(1000 * (us + 2_000_000), t + 2_000_000, "us") == "ns"
+    for away in (10**7, 10**9, 10**9 + 400_000, 1_700_000_000_000_000):
+        assert other_unit(us + away, t, "us") is None
+        assert too_large(us + away, t) == ""
+    assert other_unit(us[:0], t, "us") is None
+    assert too_large(us, t[:0]) == ""
 
 
 def test_times_that_tell_no_unit() -> None:

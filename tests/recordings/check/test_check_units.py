@@ -3,6 +3,7 @@ and nowhere else."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import h5py
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 from helpers.recordings import write_ijrr
 
-from evflow import Events, Recording, check
+from evflow import Events, EvflowDataError, Recording, check
 from evflow.io import read_recording
 from evflow.notes import texts
+from evflow.recordings.adjust import with_frames
 
 SIZE = (64, 48)
 MS = 1000
@@ -116,6 +118,51 @@ def test_the_events_unit_leaves_plausible_frame_times_alone(
     part = read_recording(
         mixed(tmp_path / "part", layout, frames_unit), time_unit="ns", start_s=0.2, stop_s=0.3)
     np.testing.assert_array_equal(part.frame_times, made.frame_times[5:8])
+
+
+@pytest.mark.parametrize("layout", ["npz", "h5"])
+def test_frame_times_that_fall_beside_the_events_are_in_another_unit(
+    tmp_path: Path, layout: str
+) -> None:
+    made, epoch = watched(20_000, 500 * MS), 1_700_000_000_000_000
+    ev, times, path = made.events, 1000 * (made.frame_times + epoch), tmp_path / f"a.{layout}"
+    if layout == "npz":
+        np.savez(path, timestamp_ns=1000 * (ev.t + epoch), x=ev.x, y=ev.y, p=ev.p, size=SIZE,
+                 frames=made.frames, frame_times=times)
+    else:
+        with h5py.File(path, "w") as f:
+            f.attrs["width"], f.attrs["height"] = SIZE
+            for name, column in (("x", ev.x), ("y", ev.y), ("t", ev.t + epoch), ("p", ev.p)):
+                f[f"events/{name}"] = column
+            f["frames"], f["frame_times"] = made.frames, times
+    found = read_recording(path)
+    np.testing.assert_array_equal(found.events.t - epoch, ev.t)
+    np.testing.assert_array_equal(found.frame_times - epoch, made.frame_times)
+    assert [n.text for n in found.notes if n.code == "frames.unit"] == [
+        f"frame times of {path} were read in ns."]
+    part = read_recording(path, start_s=0.2, stop_s=0.3)
+    np.testing.assert_array_equal(part.frame_times - epoch, made.frame_times[5:8])
+
+
+@pytest.mark.parametrize("later_us", [0, 7_000_000])
+@pytest.mark.parametrize(("factor", "words"), [
+    (1000, "1,000 times the events'"), (1e-3, "1/1,000 of the events'")])
+def test_times_a_thousandfold_apart_are_no_offset(
+    tmp_path: Path, factor: float, words: str, later_us: int
+) -> None:
+    made, epoch = watched(20_000, 500 * MS), 1_700_000_000_000_000
+    events = dataclasses.replace(made.events, t=made.events.t + epoch)
+    times = (factor * (made.frame_times + epoch + later_us)).astype(np.int64)
+    (finding,) = (f for f in check(Recording(events, made.frames, times)).errors
+                  if f.code == "EV012")
+    assert words in finding.fix
+    assert "--timestamps-unit" in finding.fix
+    assert "offset" not in finding.fix
+    np.savez(tmp_path / "frames.npz", frames=made.frames, frame_times=times)
+    with pytest.raises(EvflowDataError, match=r"EV012.*--timestamps-unit") as caught:
+        with_frames(Recording.of_events(events), tmp_path / "frames.npz", time_unit="us")
+    assert words in caught.value.fix
+    assert "offset" not in caught.value.fix
 
 
 def test_frame_times_in_seconds_beside_whole_events(tmp_path: Path) -> None:
