@@ -3,6 +3,8 @@ only."""
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from evflow.notes import why_no_frames
@@ -15,7 +17,7 @@ ONE_SHARE = 0.99
 VALID_EVENTS = 3  # fewer say next to nothing about a pixel
 ACTIVE_SHARE = 0.05  # of the pixels should have this many
 HOT_SHARE = 0.05  # of the events
-BLOCKS, BLOCK = 8, 1 << 17  # events searched for repeats, evenly spread
+BLOCKS, BLOCK = 8, 1 << 17  # events searched for repeats: of a long recording, evenly spread
 REPEATED_SHARE, MOST_REPEATED = 0.01, 0.1  # of the events: a warning, an error
 COARSE = 0.25  # distinct times, as a share of those of events at random: fewer lie on a grid
 
@@ -60,9 +62,8 @@ def repeated(events: Events) -> list[Finding]:
     """EV038 if events repeat others exactly. A pixel cannot send one polarity twice in the same
     microsecond; events of a simulator whose clock is coarse can."""
     count = repeats = 0
-    for first in np.unique(np.linspace(0, max(len(events) - BLOCK, 0), BLOCKS).astype(np.int64)):
-        part = np.s_[first: first + BLOCK]
-        t = events.t[part] - events.t[first]
+    for part in _blocks(len(events)):
+        t = events.t[part] - events.t[part.start]
         pixel = events.y[part].astype(np.int64) * events.size[0] + events.x[part]
         code = np.sort((t * (events.size[0] * events.size[1]) + pixel) * 2 + events.p[part])
         span, distinct = int(t[-1]) + 1, 1 + int((np.diff(t) > 0).sum())
@@ -78,6 +79,15 @@ def repeated(events: Events) -> list[Finding]:
         "which no camera sends: were they written twice, or overlapping parts joined? Thresholds "
         "would come out too low.",
         "Keep each once: in Python, np.unique(np.stack([t, x, y, p], 1), axis=0).")]
+
+
+def _blocks(count: int) -> list[slice]:
+    """Blocks of events without overlap: all of them, or as many as are searched."""
+    if count > BLOCKS * BLOCK:
+        return [slice(first, first + BLOCK)
+                for first in np.linspace(0, count - BLOCK, BLOCKS).astype(int).tolist()]
+    ends = np.linspace(0, count, -(-count // BLOCK) + 1).astype(int).tolist()
+    return [slice(*pair) for pair in itertools.pairwise(ends)]
 
 
 def _hot(counts: np.ndarray) -> list[Finding]:

@@ -13,6 +13,7 @@ import pytest
 from evflow import Events, Recording, check
 from evflow.recordings.adjust import flipped, shifted
 from evflow.recordings.check import frames_offset
+from evflow.recordings.check.contents import BLOCK, BLOCKS, repeated
 
 
 def codes_of(recording: Recording) -> set[str]:
@@ -124,6 +125,15 @@ def test_what_makes_thresholds_wrong_is_found(
 ) -> None:
     findings = {f.code: f for f in check(make(sound)).findings}
     assert (findings[code].severity, said in str(findings[code])) == (severity, True)
+
+
+@pytest.mark.parametrize("count", [3_000, BLOCK + 2, 3 * BLOCK, 9 * BLOCK, 20 * BLOCK])
+def test_every_event_is_counted_once_when_repeats_are_looked_for(count: int) -> None:
+    once = np.random.default_rng(0).integers(0, 60, (2, (count + 1) // 2))
+    x, y = np.repeat(once, 2, axis=1)[:, :count]
+    t = np.repeat(7 * np.arange(once.shape[1]), 2)[:count]
+    (finding,) = repeated(Events(x, y, t, np.ones(count, bool), (60, 60)))
+    assert finding.seen.startswith(f"50% of {min(count, BLOCKS * BLOCK):,} events repeat another")
 
 
 def test_an_exposure_that_varies_displaces_nothing(sound: Recording) -> None:
