@@ -92,6 +92,10 @@ class Pixels:
         model = dataclasses.replace(model, **given)
         if not model.leak_hz:
             refuse(self, ("leak_jitter", "leak_fpn_decades"), "there is no leak without --leak-hz")
+        if not model.cutoff_hz and self.photoreceptor == "first-order":
+            refuse(self, ("cutoff_by_light",), "the camera's own cutoff keeps its measured law"
+                   if self._circuit()[0].cutoff_hz and self.cutoff_hz is None else
+                   "there is no cutoff without --cutoff-hz")
         return model if self.photoreceptor == "first-order" else self._second_order(model)
 
     def _second_order(self, model: SensorModel) -> SensorModel:

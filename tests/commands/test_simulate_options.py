@@ -188,12 +188,32 @@ def test_frames_of_light_in_a_format_of_bytes(
     (["--slow-motion", "0"], "EV020"), (["--leak-jitter", "0.1"], "EV020"),
     (["--photoreceptor", "second-order", "--cutoff-hz", "0"], "EV020"),
     (["--photoreceptor", "second-order", "--sensor", "esim"], "EV020"),
-    (["--photoreceptor", "second-order", "--no-cutoff-by-light"], "EV020")])
+    (["--photoreceptor", "second-order", "--no-cutoff-by-light"], "EV020"),
+    (["--no-cutoff-by-light"], "EV020"),
+    (["--sensor", "noisy", "--cutoff-hz", "0", "--no-cutoff-by-light"], "EV020")])
 def test_options_out_of_range(
     video: Path, options: list[str], code: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["simulate", str(video), "-o", str(video.with_name("out.h5")), *BASE, *options])
     assert capsys.readouterr().err.startswith(code)
+
+
+def test_the_law_of_a_cutoff_needs_one(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, law = video.with_name("out.npz"), "--no-cutoff-by-light"
+    camera = Camera.constant((24, 32)).save(video.with_name("camera.npz"), sensor_cutoff_hz=40.0)
+    simulate = ["simulate", str(video), "-o", str(out), "--overwrite", *BASE]
+    events = []
+    for options in (["--cutoff-hz", "20"], ["--cutoff-hz", "20", law]):
+        assert main([*simulate, *options]) == 0
+        events.append(len(read_events(out)))
+    assert events[0] != events[1]
+    assert main([*simulate, "--sensor", "noisy", law]) == 0
+    assert main([*simulate, "--camera", str(camera), "--cutoff-hz", "20", law]) == 0
+    for options, why in (([], "no cutoff without --cutoff-hz"),
+                         (["--camera", str(camera)], "own cutoff keeps its measured law")):
+        capsys.readouterr()
+        assert main([*simulate, *options, law]) == 2
+        assert why in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("shape", "change", "code", "said"), [
