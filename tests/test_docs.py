@@ -158,6 +158,34 @@ def test_documents_run(
     assert run_document(document, quick=True) >= 3
 
 
+def test_a_camera_is_cropped_with_all_that_its_file_holds(
+    material: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (recipe,) = (b for b in blocks(ROOT / "docs/networks.md") if "cam/cropped.npz" in b.text)
+    (tmp_path / "cam").mkdir()
+    monkeypatch.chdir(tmp_path)
+    whole = ef.Camera.load(material / "camera.npz")
+    whole.save("cam/camera.npz", sensor_cutoff_hz=20.0, sensor_refractory_s=0.02,
+               optics_offset_dn=5.0, undetermined=np.array(["theta_on"]),
+               valid=np.ones(SHAPE, bool))
+    exec(recipe.text, {})
+    whole.save("cam/maps.npz")
+    events = {}
+    for name in ("camera", "cropped", "maps"):
+        assert main(["simulate", str(material / "flight.aedat4"), "--camera", f"cam/{name}.npz",
+                     "-o", f"{name}.npz"]) == 0
+        events[name] = ef.read_events(f"{name}.npz")
+    for column in "txyp":
+        np.testing.assert_array_equal(getattr(events["camera"], column),
+                                      getattr(events["cropped"], column))
+    assert len(events["maps"]) > 1.1 * len(events["camera"])
+    exec(recipe.text.replace(":48", ":24").replace(":64", ":32"), {})
+    with np.load("cam/cropped.npz") as part:
+        assert {n: part[n].shape for n in ("theta_off", "valid", "undetermined")} == {
+            "theta_off": (24, 32), "valid": (24, 32), "undetermined": (1,)}
+    np.testing.assert_array_equal(ef.Camera.load("cam/cropped.npz").eta_on, whole.eta_on[:24, :32])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("document", WITH_CODE, ids=lambda d: d.name)
 def test_documents_run_to_the_last_line(

@@ -187,6 +187,9 @@ class Camera:
     def save(self, path: str | os.PathLike, *, overwrite: bool = False, **extra: ArrayLike) -> Path:
         """Write an .npz with the four maps and their units; all or nothing.
 
+        Of a camera that was loaded, the circuit and all else that its file holds is not written:
+        docs/networks.md shows how to crop a file with all that it holds.
+
         Args:
             path: of the file.
             overwrite: replace a file that exists.
@@ -206,6 +209,9 @@ class Camera:
     @staticmethod
     def load(path: str | os.PathLike) -> Camera:
         """Read the maps written by `save` (pickled arrays are refused).
+
+        The circuit and the optics of an estimate stay in the file: `evflow simulate --camera` and
+        `evflow export` read them there.
 
         Args:
             path: of an .npz.
