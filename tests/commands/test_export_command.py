@@ -16,10 +16,12 @@ from helpers.recordings import SIZE, T0
 
 from evflow.camera import Camera, CameraPrior
 from evflow.camera.exports import TARGETS, export_camera
-from evflow.camera.exports.common import NOISE
+from evflow.camera.exports.common import LIGHT, NOISE
 from evflow.camera.exports.iebcs import FREQUENCIES, spectrum
 from evflow.camera.optics import Optics
 from evflow.cli import main
+from evflow.io.source import open_frames
+from evflow.light.response import linear_light
 
 
 def run(capsys: pytest.CaptureFixture[str], *command: object) -> tuple[int, str, str]:
@@ -131,6 +133,90 @@ def test_v2e_script_replaces_what_v2e_draws(
         np.testing.assert_array_equal(second[2][theirs], getattr(known, ours))
     assert options["shot_noise_rate_hz"] / 2 * (1 - 0.75 * 148 / 275) == pytest.approx(1, rel=1e-4)
     assert np.load(tmp_path / "e.npy").shape == (6, 4)
+
+
+def test_the_table_of_the_scripts_is_that_of_evflow() -> None:
+    names = {"np": np}
+    exec(LIGHT, names)
+    every = np.arange(256, dtype=np.uint8)[None]
+    assert names["light_of"].dtype == np.float32
+    np.testing.assert_allclose(names["light_of"], linear_light(every, "srgb")[0], rtol=2e-6)
+
+
+class Remembers:
+    """In the place of a simulator: keeps every frame that it is given."""
+
+    def __init__(self) -> None:
+        self.frames: list[np.ndarray] = []
+        self.cur_th_pos, self.cur_th_neg = np.zeros((2, 48, 64))
+        self.event_maker = types.SimpleNamespace()
+
+    def __call__(self, *args: Any, **options: Any) -> Remembers:
+        return self
+
+    def given(self, frame: np.ndarray, *rest: Any) -> None:
+        self.frames.append(np.array(frame))
+
+    def get_events(self) -> np.ndarray:
+        return np.zeros(0, [("t", "i8"), ("x", "u2"), ("y", "u2"), ("p", "i2")])
+
+    generate_events = image_callback = init_image = update = given
+    set_shape = set_dvs_sensor = init_bgn_hist = increase_ev = write = __call__
+
+
+@pytest.mark.parametrize("response", ["srgb", "linear"])
+@pytest.mark.parametrize("to", ["v2e", "openeb", "iebcs"])
+def test_scripts_see_the_light_that_evflow_sees(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str, response: str
+) -> None:
+    video = str(tmp_path / "a.avi")
+    film = cv2.VideoWriter(video, cv2.VideoWriter.fourcc(*"MJPG"), 50, SIZE)
+    for image in np.random.default_rng(0).integers(0, 256, (3, 6, 8, 3), dtype=np.uint8):
+        film.write(cv2.resize(image, SIZE))
+    film.release()
+    at = export_camera(Camera.constant((48, 64)), to)
+    np.savez(tmp_path / "maps.npz", **at[1])
+    fake = Remembers()
+    noise = types.SimpleNamespace(add_noise=lambda x, y, t, p, *rest: (x, y, t, p))
+    for name, module in {
+            "torch": types.SimpleNamespace(tensor=np.asarray), "add_noise": noise,
+            "v2ecore": types.ModuleType("v2ecore"),
+            "v2ecore.emulator": types.SimpleNamespace(EventEmulator=fake),
+            "metavision_core_ml": types.ModuleType("metavision_core_ml"),
+            "metavision_core_ml.video_to_event": types.ModuleType("video_to_event"),
+            "metavision_core_ml.video_to_event.simulator":
+                types.SimpleNamespace(EventSimulator=fake),
+            "dvs_sensor": types.SimpleNamespace(DvsSensor=fake),
+            "event_buffer": types.SimpleNamespace(EventBuffer=fake)}.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "argv", ["run", video, "50", str(tmp_path / "out"),
+                                      *(["--linear"] if response == "linear" else [])])
+    exec(at[0].scripts[f"run_{to}.py"], {"__file__": str(tmp_path / f"run_{to}.py")})
+    seen = np.stack(fake.frames) / (1e4 / 255 if to == "iebcs" else 1)
+    assert len(seen) == 3
+    light = np.stack([frame for frame, _ in open_frames(video, fps=50, response=response).open()])
+    # without a curve to undo evflow rounds luma to whole DN
+    np.testing.assert_allclose(seen, light, rtol=1e-5, atol=0.51 if response == "linear" else 1e-4)
+
+
+def test_images_for_esim_are_made_linear(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = export_camera(Camera.constant((4, 4)), "esim")[0].scripts["linear_images.py"]
+    there, out = tmp_path / "images", tmp_path / "linear"
+    there.mkdir()
+    image = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    for name in ("b.bmp", "a.png"):
+        cv2.imwrite(str(there / name), image)
+    (there / "times.txt").write_text("0\n")
+    monkeypatch.setattr(sys, "argv", ["linear", str(there), str(out)])
+    exec(script, {})
+    assert sorted(path.name for path in out.iterdir()) == ["a.png", "b.png"]
+    light = [frame for frame, _ in open_frames(there, fps=50, response="srgb").open()]
+    for name, want in zip("ab", light, strict=True):
+        found = cv2.imread(str(out / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(found, np.rint(want))
 
 
 def test_noise_that_is_added_has_the_measured_rates() -> None:

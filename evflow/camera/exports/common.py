@@ -15,6 +15,17 @@ PACE = (128 + 20) / 275  # cutoff at 128 DN over that at 255 DN, for a low-pass 
 GREY = 1 - 0.75 * PACE  # shot noise of v2e and OpenEB at 128 DN over that at 0 DN
 MAD = 1.4826  # standard deviations in a median absolute deviation of a normal distribution
 
+LIGHT = '''# the light, 0..255, of each byte: sRGB is undone, as evflow simulate does for videos
+light_of = np.arange(256) / 255
+light_of = np.where(light_of <= 0.04045, light_of / 12.92, ((light_of + 0.055) / 1.055) ** 2.4)
+light_of = (255 * light_of).astype(np.float32)'''
+SWITCH = '''
+if "--linear" in sys.argv[4:]:
+    light_of = np.arange(256, dtype=np.float32)'''
+SRGB = '''The script undoes the sRGB of the video, as evflow simulate does; with --linear
+as the last word it takes the video's bytes as light.
+'''
+
 NOISE = '''"""Adds the measured noise to simulated events: Poisson, per pixel and polarity."""
 
 import numpy as np

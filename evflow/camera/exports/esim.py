@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import NOISE, Export, Maps, Settings
+from evflow.camera.exports.common import LIGHT, NOISE, Export, Maps, Settings
 
 SCRIPT = '''"""Images through esim_py with the nearest scalars, and the measured noise added.
 
@@ -26,15 +26,41 @@ np.savez(sys.argv[3], t=t, x=x.astype(np.uint16), y=y.astype(np.uint16), p=p > 0
          size=np.array([{width}, {height}]))
 '''
 
+LINEAR = f'''"""Images in sRGB -> grey images that are linear in light, of the same names, as PNG.
+
+    python linear_images.py IMAGES OUT
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+{LIGHT}
+out = Path(sys.argv[2])
+out.mkdir(parents=True)
+for path in sorted(Path(sys.argv[1]).iterdir()):
+    image = cv2.imread(str(path))
+    if image is not None:
+        grey = np.rint(cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY)).astype(np.uint8)
+        cv2.imwrite(str(out / f"{{path.stem}}.png"), grey)
+'''
+
 TEXT = '''The camera for ESIM (https://github.com/uzh-rpg/rpg_vid2e)
 
+Videos and most images are in sRGB, which ESIM takes as light: first undo it.
+    python linear_images.py IMAGES LINEAR_IMAGES
 esim_py, noise added:
-    python run_esim.py IMAGES TIMESTAMPS.txt EVENTS.npz
+    python run_esim.py LINEAR_IMAGES TIMESTAMPS.txt EVENTS.npz
 esim_torch, without noise:
     python esim_torch/scripts/generate_events.py -i FRAMES -o OUT \\
         -cp {theta_on:.4f} -cn {theta_off:.4f} -rp {dead_ns}
 
 What ESIM cannot represent
+- The response of the images: evflow simulate undoes the sRGB of a video, ESIM reads its bytes as
+  light. Of sRGB images it sees about half the contrast, and sends about half the events. Linear
+  images of 8 bits, which is all it reads, have coarse steps in the dark.
 - Thresholds per pixel: it has one number per polarity, here the medians. The measured spread, ON
   {sigma_on:.4f} and OFF {sigma_off:.4f}, is lost. (rpg_esim's contrast_threshold_sigma is no
   substitute: it draws anew for every pixel and frame.)
@@ -51,4 +77,5 @@ def export(maps: Maps, s: Settings) -> Export:
     """The medians, and a script that adds the noise."""
     values = vars(s) | {"circuit": s.circuit, "dead_ns": round(s.dead_s * 1e9)}
     return Export(TEXT.format(**values),
-                  {"run_esim.py": SCRIPT.format(**vars(s)), "add_noise.py": NOISE})
+                  {"run_esim.py": SCRIPT.format(**vars(s)), "add_noise.py": NOISE,
+                   "linear_images.py": LINEAR})

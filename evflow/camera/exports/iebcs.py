@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from evflow.camera.exports.common import Export, Maps, Settings
+from evflow.camera.exports.common import LIGHT, SRGB, SWITCH, Export, Maps, Settings
 
 USUAL_DEAD_US = 100  # in IEBCS's examples
 FREQUENCIES = np.concatenate([np.arange(1, 10) * 10.0**k for k in range(-3, 5)])
 
 SCRIPT = '''"""A video through IEBCS with the measured thresholds and noise; run in its root folder.
 
-    python run_iebcs.py VIDEO FPS EVENTS.dat
+    python run_iebcs.py VIDEO FPS EVENTS.dat [--linear]
 """
 
 import sys
@@ -38,12 +38,13 @@ sensor.set_shape({width}, {height})
 sensor.set_dvs_sensor(th_pos={theta_on:.5f}, th_neg={theta_off:.5f}, th_n=0.0, lat=100, tau=40,
                       jit=10, bgnp={bgnp:.5f}, bgnn={bgnn:.5f}, ref={dead_us})
 sensor.init_bgn_hist(str(folder / "noise_pos.npy"), str(folder / "noise_neg.npy"))
+{light}
 video, step, events, frame = cv2.VideoCapture(sys.argv[1]), 1e6 / float(sys.argv[2]), None, 0
 while True:
     more, image = video.read()
     if not more:
         break
-    light = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) / 255.0 * 1e4
+    light = cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY).astype(float) / 255.0 * 1e4
     # IEBCS draws a threshold anew, around one mean, after each event: the maps are put back
     sensor.cur_th_pos[...], sensor.cur_th_neg[...] = maps["theta_on"], -maps["theta_off"]
     if frame == 0:
@@ -58,7 +59,7 @@ events.write(sys.argv[3])
 TEXT = '''The camera for IEBCS (https://github.com/neuromorphicsystems/IEBCS)
 
     python run_iebcs.py VIDEO FPS EVENTS.dat                     (in the root of IEBCS)
-
+{srgb}
 Scalars only: set_dvs_sensor(th_pos={theta_on:.4f}, th_neg={theta_off:.4f}, th_n={sigma:.4f},
     lat=100, tau=40, jit=10, bgnp={bgnp:.4f}, bgnn={bgnn:.4f}, ref={dead_us})
 
@@ -82,7 +83,8 @@ def export(maps: Maps, s: Settings) -> Export:
     slowest = float(FREQUENCIES[0])  # IEBCS divides by the rate
     rates = {"bgnp": max(s.eta_on, slowest), "bgnn": max(s.eta_off, slowest)}
     values = vars(s) | rates | {
-        "sigma": s.sigma, "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
+        "light": LIGHT + SWITCH, "srgb": SRGB, "sigma": s.sigma, "circuit": s.circuit,
+        "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}
     return Export(TEXT.format(**values), {"run_iebcs.py": SCRIPT.format(**values)}, arrays)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import GREY, NOISE, Export, Maps, Settings
+from evflow.camera.exports.common import GREY, LIGHT, NOISE, SRGB, SWITCH, Export, Maps, Settings
 
 LOW, HIGH = 0.01, 1.0  # where OpenEB clips thresholds
 
 SCRIPT = '''"""A video through OpenEB with the measured thresholds and noise of every pixel.
 
-    python run_openeb.py VIDEO FPS EVENTS.npz     # t int64 us, x, y, p {{0, 1}}, size
+    python run_openeb.py VIDEO FPS EVENTS.npz [--linear]     # t int64 us, x, y, p {{0, 1}}, size
 """
 
 import sys
@@ -24,12 +24,13 @@ simulator = EventSimulator(
     {height}, {width}, {theta_on:.5f}, {theta_off:.5f}, {dead_us}, cutoff_hz={cutoff_hz:.1f})
 simulator.Cps = np.clip(maps["theta_on"], 0.01, 1)
 simulator.Cns = np.clip(maps["theta_off"], 0.01, 1)
+{light}
 video, step, found, frame = cv2.VideoCapture(sys.argv[1]), 1e6 / float(sys.argv[2]), [], 0
 while True:
     more, image = video.read()
     if not more:
         break
-    simulator.image_callback(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), round(frame * step))
+    simulator.image_callback(cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY), round(frame * step))
     found.append(simulator.get_events())
     simulator.event_maker.num = 0  # flush_events would zero its buffer of 1.6 GB for each frame
     frame += 1
@@ -44,13 +45,15 @@ TEXT = '''The camera for OpenEB (https://github.com/prophesee-ai/openeb, metavis
 
 Every pixel (recommended):
     python run_openeb.py VIDEO FPS EVENTS.npz
-
+{srgb}
 Scalars only, its own sample:
     python viz_video_to_event_simulator.py VIDEO --Cp {theta_on:.4f} --Cn {theta_off:.4f} \\
         --sigma_threshold {sigma:.4f} --refractory_period {dead_us} --cutoff_hz {cutoff_hz:.1f} \\
         --leak_rate_hz 0 --shot_noise_rate_hz {shot:.4f}
 
 What OpenEB cannot represent
+- Its sample takes the bytes of a video as light. Of an sRGB video it sees about half the contrast,
+  and sends about half the events.
 - The command line has one sigma for both polarities (measured ON {sigma_on:.4f}, OFF
   {sigma_off:.4f}); thresholds are clipped to .01 .. 1{clipped}.
 - Noise: one rate for ON and OFF together, in the dark; and its simulator makes shot noise only in
@@ -69,6 +72,7 @@ def export(maps: Maps, s: Settings) -> Export:
     clipped = f"; {outside:,} of the measured ones are" if outside else ""
     values = vars(s) | {
         "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
-        "clipped": clipped, "shot": (s.eta_on + s.eta_off) / GREY}
+        "clipped": clipped, "light": LIGHT + SWITCH, "srgb": SRGB,
+        "shot": (s.eta_on + s.eta_off) / GREY}
     return Export(TEXT.format(**values),
                   {"run_openeb.py": SCRIPT.format(**values), "add_noise.py": NOISE})

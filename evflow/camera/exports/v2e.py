@@ -4,11 +4,11 @@ Log map, thresholds and memory are those of evflow's `SensorModel(kind="v2e")`.
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import GREY, Export, Maps, Settings
+from evflow.camera.exports.common import GREY, LIGHT, SRGB, SWITCH, Export, Maps, Settings
 
 SCRIPT = '''"""A video through v2e with the measured thresholds and noise of every pixel.
 
-    python run_v2e.py VIDEO FPS EVENTS.npy     # rows t[s], x, y, p (-1, 1), float32 as v2e has them
+    python run_v2e.py VIDEO FPS EVENTS.npy [--linear]     # rows t[s], x, y, p (-1, 1), float32
 """
 
 import sys
@@ -26,12 +26,13 @@ emulator = EventEmulator(
     pos_thres={theta_on:.5f}, neg_thres={theta_off:.5f}, sigma_thres=0.01,
     cutoff_hz={cutoff_hz:.1f}, leak_rate_hz={leak_hz:.5f}, refractory_period_s={dead_s:.6f},
     shot_noise_rate_hz=2 * GAIN, device="cpu")
+{light}
 video, step, found, frame = cv2.VideoCapture(sys.argv[1]), 1 / float(sys.argv[2]), [], 0
 while True:
     more, image = video.read()
     if not more:
         break
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY)
     events = emulator.generate_events(grey, frame * step)
     if frame == 0:  # v2e draws its thresholds at the first frame: here they are replaced
         emulator.pos_thres, emulator.neg_thres = maps["theta_on"], maps["theta_off"]
@@ -49,11 +50,13 @@ TEXT = '''The camera for v2e (https://github.com/SensorsINI/v2e)
 
 Every pixel (recommended): thresholds and noise rates of maps.npz in v2e's emulator
     python run_v2e.py VIDEO FPS EVENTS.npy
-
+{srgb}
 Scalars only, from v2e's command line:
     {command}
 
 What v2e cannot represent
+- The command line takes the bytes of a video as light. Of an sRGB video it sees about half the
+  contrast, and sends about half the events.
 - The command line draws its own thresholds: one sigma for both polarities ({sigma:.4f} here;
   measured ON {sigma_on:.4f}, OFF {sigma_off:.4f}), normal and uncorrelated. Which pixel has which
   is lost.
@@ -89,6 +92,8 @@ def export(maps: Maps, s: Settings) -> Export:
         "--leak_rate_hz, a regular drift" if leak else
         "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))
     values = vars(s) | {
-        "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess}
-    source = SCRIPT.format(**vars(s) | {"gain": gain, "leak_seen": s.leak_seen})
+        "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess,
+        "srgb": SRGB}
+    source = SCRIPT.format(**vars(s) | {
+        "gain": gain, "leak_seen": s.leak_seen, "light": LIGHT + SWITCH})
     return Export(TEXT.format(**values), {"run_v2e.py": source})
