@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from evflow.errors import EvflowDataError
-from evflow.estimation.extent import Extent
+from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import estimate
 from evflow.estimation.front_end import find_front_end
 from evflow.estimation.pipeline import check_options
@@ -85,7 +85,7 @@ class CameraEstimator:
         stretches = cut(piece, plan, path=self._refine == "auto", first=self._size is None)
         self._size = piece.events.size
         self._stretches += len(stretches)
-        self._seconds += sum((s.span_us[1] - s.span_us[0]) * 1e-6 for s in stretches)
+        self._seconds += covered_s(s.span_us for s in stretches)
         if self._state is None:
             self._waiting += stretches
             if len(self._waiting) >= self.FIRST:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 from evflow.notes import Note
@@ -52,6 +53,17 @@ class Extent:
         """JSON-ready values."""
         gain = self.gain if self.gain == self.gain else None
         return {**dataclasses.asdict(self), "gain": gain}
+
+
+def covered_s(spans: Iterable[tuple[int, int]]) -> float:
+    """Seconds that spans (begin, end) in us cover together. Stretches overlap where a window that
+    begins in one ends in the next."""
+    covered, done = 0, None
+    for begin, end in sorted(spans):
+        begin = begin if done is None else max(begin, done)
+        covered += max(end - begin, 0)
+        done = max(begin, end)
+    return covered / 1e6
 
 
 EVERYTHING = Extent()

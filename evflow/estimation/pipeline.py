@@ -22,7 +22,7 @@ import numpy as np
 from evflow import io
 from evflow.camera import Summary
 from evflow.errors import EvflowDataError
-from evflow.estimation.extent import Extent
+from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import Stage, estimate
 from evflow.estimation.front_end import find_front_end
 from evflow.estimation.halves import FirstPart, divided
@@ -223,11 +223,10 @@ def _read(
                 break
     if partial and state.evidence is not None and history and history[-1][0] < len(read):
         history.append((len(read), _variance(state)))
-    spans = np.array([s.span_us for s in stretches])
-    seconds = np.diff(spans, axis=1)[:, 0] * 1e-6
-    return state, early, Extent(float(seconds[read].sum()), float(seconds.sum()), len(read),
-                                len(stretches), gain(history),
-                                ended and len(read) < len(order.numbers))
+    spans = [s.span_us for s in stretches]
+    return state, early, Extent(
+        covered_s(spans[i] for i in read), covered_s(spans), len(read), len(stretches),
+        gain(history), ended and len(read) < len(order.numbers))
 
 
 def _variance(state: State) -> float:

@@ -13,6 +13,7 @@ from helpers.networks import hidden
 from evflow import CameraEstimator, Recording, estimate_camera
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
+from evflow.estimation.extent import covered_s
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.halves import divided
 from evflow.estimation.refine import chunk, cut, make_chunk, path
@@ -41,6 +42,27 @@ def test_one_piece_is_the_whole_to_the_byte_and_pieces_come_near() -> None:
         np.testing.assert_array_equal(a, b)
     assert whole.extent.whole
     assert whole.extent.read_s == pytest.approx(0.24)
+
+
+def test_what_was_read_is_no_longer_than_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows of three intervals in stretches of two: each ends in the next stretch."""
+    recording, _ = hidden(3)
+    monkeypatch.setattr(cutting, "INTERVALS", 2)
+    part = estimate_camera(recording, min_window_us=120_000, until=lambda *_: True)
+    assert (part.extent.stretches, part.extent.of) == (1, 3)
+    assert (part.extent.read_s, part.extent.seconds) == pytest.approx((0.12, 0.24))
+    assert "0.1 of 0.2 s were read" in part.extent.notes()[0].text
+    estimator = CameraEstimator(min_window_us=120_000)
+    assert estimator.add(recording) == 2
+    whole = estimator.estimate().extent
+    assert whole.whole
+    assert (whole.read_s, whole.seconds) == pytest.approx((0.24, 0.24))
+
+
+def test_spans_are_counted_once() -> None:
+    assert covered_s([]) == 0.0
+    assert covered_s([(0, 4_000_000), (1_000_000, 2_000_000)]) == 4.0
+    assert covered_s([(7_000_000, 9_000_000), (0, 2_000_000), (1_000_000, 3_000_000)]) == 5.0
 
 
 def test_what_cannot_be_added_leaves_what_was() -> None:
