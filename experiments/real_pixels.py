@@ -26,7 +26,6 @@ from evflow.estimation.refine import frame_noise, plan_runs, receptor_sample
 from evflow.estimation.refine.receptor_search import explained, find
 from evflow.network.weights import weights_hash
 from evflow.recordings.windows import plan_windows
-from evflow.simulator.photoreceptor import IDEAL
 from experiments.shared import pages
 from experiments.shared import real_scores as scores
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
@@ -92,7 +91,7 @@ def halves(path: Path) -> list[str] | None:
     if found is None:
         return None
     return [path.name, *(f"{s:.3f}" for s in (
-        explained(second, IDEAL, found.ideal_theta), explained(second, found.seen, found.theta))),
+        explained(second, found.ideal, found.ideal_theta), explained(second, found.seen, found.theta))),
         f"{found.seen.offset_dn:.0f} DN", f"{found.seen.cutoff_hz:.0f} Hz"]
 
 

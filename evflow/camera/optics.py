@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from evflow.camera.prior import Summary
-from evflow.camera.sensors import SensorModel
+from evflow.camera.sensors import LogMap, SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.archives import load_npz
 
 MEASURED = ("cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # of a SensorModel, with an error
 LAW = "cutoff_by_light"  # 1 or 0
+MAP = "log_eps"  # 1: the sensor's log map is "log_eps", 0: "linlog"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +47,7 @@ def as_arrays(
     named = {f"sensor_{name}": getattr(sensor, name) for name in MEASURED}
     named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
     named[f"sensor_{LAW}"] = float(sensor.cutoff_by_light)
+    named[f"sensor_{MAP}"] = float(sensor.log_map == MAP)
     named |= {f"optics_{name}": value for name, value in dataclasses.asdict(optics).items()}
     return {name: np.asarray(value, np.float64) for name, value in named.items()}
 
@@ -102,7 +104,7 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
     Raises EV009 if a value is not a finite number, EV016 if there is no file."""
     held = load_npz(Path(path))
     values: dict[str, dict[str, Any]] = {"sensor": {}, "optics": {}}
-    names = {"sensor": (*MEASURED, LAW),
+    names = {"sensor": (*MEASURED, LAW, MAP),
              "optics": tuple(f.name for f in dataclasses.fields(Optics))}
     for room, wanted in names.items():
         for name in wanted:
@@ -116,5 +118,7 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
             values[room][name] = float(value)
     if LAW in values["sensor"]:
         values["sensor"][LAW] = bool(values["sensor"][LAW])
-    sensor = SensorModel(**values["sensor"], eta_is_all=True, noise_resets_memory=True)
+    log_map: LogMap = "log_eps" if values["sensor"].pop(MAP, 0.0) else "linlog"
+    sensor = SensorModel(
+        **values["sensor"], log_map=log_map, eta_is_all=True, noise_resets_memory=True)
     return sensor, Optics(**values["optics"])

@@ -41,5 +41,4 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
     films: Films = {}
     found = find_photoreceptor(runs, noise_dn, films) if measured else None
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
-    return FrontEnd(found.seen if found is not None and found.needed else IDEAL, noise_dn, blur_s,
-                    found, dead, films)
+    return FrontEnd(found.used if found else IDEAL, noise_dn, blur_s, found, dead, films)

@@ -72,7 +72,7 @@ def _on_its_own(first: FirstPart) -> State:
     found = front_end.found
     if found is not None and receptor_places(runs) != receptor_places(searched):
         found = find_photoreceptor(runs, front_end.noise_dn)
-    seen_by = found.seen if found is not None and found.needed else IDEAL
+    seen_by = found.used if found is not None else IDEAL
     events = state.read[0].recording.events
     end = int(state.read[0].recording.frame_times[first.rest[0]])
     dead = dead_time(first_events(events.slice(int(events.t[0]), end)))

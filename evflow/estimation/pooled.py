@@ -8,6 +8,7 @@ import operator
 from collections.abc import Iterable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -17,7 +18,13 @@ from evflow.estimation.intervals import QuietWaits, Waits
 from evflow.estimation.pixel_noise import calm, quiet_time
 from evflow.estimation.refine.stretches import BAND, LARGE
 from evflow.estimation.shot import LIGHTS, by_light
-from evflow.light.log_maps import mean_and_change, noise_factor, normalised_intensity
+from evflow.light.log_maps import (
+    lin_log_inverse,
+    log_dn,
+    mean_and_change,
+    noise_factor,
+    normalised_intensity,
+)
 from evflow.network import api
 from evflow.network.weighted import summarize_weighted
 from evflow.recordings.glitches import exposed
@@ -41,10 +48,17 @@ def window_inputs(
 
 
 def _light(frame: np.ndarray, seen_by: Photoreceptor) -> np.ndarray:
-    """A frame (H, W) in DN, with the light that its pixels see beside it."""
-    if not seen_by.offset_dn:
-        return frame
-    return np.maximum(frame.astype(np.float32) + np.float32(seen_by.offset_dn), np.float32(0.0))
+    """A frame (H, W) in DN, with the light that its pixels see beside it. The network knows lin-log
+    alone: if the pixels' logarithm is another, in the DN that have it as their lin-log."""
+    if seen_by.offset_dn:
+        frame = np.maximum(
+            frame.astype(np.float32) + np.float32(seen_by.offset_dn), np.float32(0.0))
+    return np.asarray(_of_log(frame)) if seen_by.logarithmic else frame
+
+
+@jax.jit
+def _of_log(frame: ArrayLike) -> jax.Array:
+    return lin_log_inverse(log_dn(jnp.asarray(frame, jnp.float32)))
 
 
 def pool_recording(

@@ -66,6 +66,10 @@ def receptor_notes(found: Found | None, optics: Optics | None) -> list[Note]:
                       "photoreceptor's low-pass"
                       + ("" if found.seen.by_light else ", equally fast in dark and bright light")
                       + "; ignoring it would change them where things move fast.")]
+    if found.seen.logarithmic:
+        notes.append(Note(
+            "pixels.log", "the pixels' response is logarithmic in dark light too, as ESIM's "
+            "(log_eps), not linear below 20 DN as v2e's (linlog): the thresholds are of that."))
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
         notes.append(Note(

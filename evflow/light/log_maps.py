@@ -25,6 +25,7 @@ Values = Any  # jax.Array or np.ndarray; results have the same type
 LINLOG_KNEE = 20.0  # DN; v2e's threshold between the linear and the logarithmic part
 LINLOG_SLOPE = float(np.log(LINLOG_KNEE) / LINLOG_KNEE)
 LOG_EPS = 1e-3
+LOG_EPS_DN = 255.0 * LOG_EPS
 MOST_LOG = 6.0  # above the logarithm of 255 DN
 MOST_OF_ONE = 12.0  # for a single pixel: a thousand times as bright as white
 SAMPLED = 61  # stride of the values that are compared with it
@@ -54,6 +55,16 @@ def log_eps(dn: ArrayLike) -> Array:
 def log_eps_inverse(log_i: Array) -> Array:
     """The DN of a `log_eps` value."""
     return 255.0 * (jnp.exp(log_i) - LOG_EPS)
+
+
+def log_dn(dn: ArrayLike) -> Array:
+    """`log_eps` in units of DN, ln(I + .255): for I far above .255 the same as ln I."""
+    return jnp.log(jnp.asarray(dn) + LOG_EPS_DN)
+
+
+def log_dn_inverse(log_i: Array) -> Array:
+    """The DN of a `log_dn` value."""
+    return jnp.exp(log_i) - LOG_EPS_DN
 
 
 LOG_MAPS = {"linlog": (lin_log, lin_log_inverse), "log_eps": (log_eps, log_eps_inverse)}

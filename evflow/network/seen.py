@@ -29,16 +29,17 @@ def seen_changes(
 ) -> tuple[Array, Array]:
     """Changes (..., H, W, m) of log intensity and its mean (..., H, W), as the pixels see them.
     intensity, window_s: of the light, broadcastable to (..., H, W)."""
-    if seen_by.ideal:
+    if seen_by.ideal and not seen_by.logarithmic:
         return changes, intensity
-    law = seen_by.offset_dn, seen_by.tau_s, seen_by.delay_s, seen_by.by_light
+    law = (seen_by.offset_dn, seen_by.tau_s, seen_by.delay_s, seen_by.by_light,
+           seen_by.logarithmic)
     return _seen(changes, intensity, window_s, *law)
 
 
 @jax.jit
 def _seen(
     changes: Array, intensity: Array, window_s: Array, offset_dn: float, tau_s: float,
-    delay_s: float, by_light: bool,
+    delay_s: float, by_light: bool, logarithmic: bool,
 ) -> tuple[Array, Array]:
     count = changes.shape[-1]
     each = jnp.moveaxis(jnp.repeat(changes / SUBSTEPS, SUBSTEPS, -1), -1, 0)
@@ -46,7 +47,8 @@ def _seen(
     log_light = first[None] + jnp.concatenate([jnp.zeros_like(each[:1]), jnp.cumsum(each, 0)])
     dt_s = jnp.broadcast_to(window_s / (SUBSTEPS * count), intensity.shape)
     steps = jnp.broadcast_to(dt_s, (len(each), *dt_s.shape))
-    path = seen_path(lin_log_inverse(log_light), steps, offset_dn, tau_s, by_light)
+    path = seen_path(lin_log_inverse(log_light), steps, offset_dn, tau_s, by_light,
+                     logarithmic)
     # At the ends of the parts, `delay` later; after the window the light stays constant.
     ends = jnp.arange(0, len(path), SUBSTEPS).reshape(-1, *[1] * dt_s.ndim)
     at = jnp.clip(ends - (delay_s / dt_s)[None], 0.0, len(each))

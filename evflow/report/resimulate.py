@@ -29,7 +29,7 @@ from evflow.recordings.bunches import beside, bunch
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, Seen, notes_on, unzip, upsample
-from evflow.simulator.photoreceptor import IDEAL, as_measured, seen_frames
+from evflow.simulator.photoreceptor import as_measured, seen_frames
 from evflow.types import Events, Recording, release
 
 SECONDS = 3.0  # of recording, at most, that are simulated
@@ -222,6 +222,6 @@ def held_out_shares(
     if data is None:
         return None
     receptor = found.receptor
-    ideal = explained(data, IDEAL, receptor.ideal_theta)
+    ideal = explained(data, receptor.ideal, receptor.ideal_theta)
     seen = explained(data, receptor.seen, receptor.theta) if receptor.needed else ideal
     return None if np.isnan(ideal + seen) else (ideal, seen)

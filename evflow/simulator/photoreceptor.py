@@ -3,10 +3,11 @@
 A pixel sees log(light + dark current) through a low-pass. A frame has its black level subtracted,
 and a small error of its time stamp. With light L in DN of the frames, the pixel's signal s follows
 
-    ds/dt = r(t) (u(t) - s),    u = lin-log(L + offset),    r = (L + offset + 20) / 275 / tau
+    ds/dt = r(t) (u(t) - s),    u = log(L + offset),    r = (L + offset + 20) / 275 / tau
 
 (first order, with a rate proportional to light as in v2e; or r = 1 / tau at any light, where a
-later stage is slower than the photoreceptor), `delay` after the frames' clock. u is linear between
+later stage is slower than the photoreceptor), `delay` after the frames' clock. The logarithm is
+v2e's lin-log, or ESIM's, which is one in dark light too. u is linear between
 the given times, which is solved exactly for steps of any length. `SensorModel.cutoff_hz` is v2e's
 discretisation, valid for steps far below tau. tau = 1 / (2 pi cutoff).
 """
@@ -22,8 +23,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera.optics import Optics
-from evflow.camera.sensors import SensorModel
-from evflow.light.log_maps import lin_log_inverse
+from evflow.camera.sensors import LogMap, SensorModel
+from evflow.light.log_maps import lin_log_inverse, log_dn, log_dn_inverse
 
 Array = jax.Array
 
@@ -37,21 +38,29 @@ TYPICAL = 0.4  # cutoff of a low-pass proportional to light, in a typical scene,
 class Photoreceptor:
     """offset_dn: light added to the frames' DN before the log; tau_s: time constant of the low-pass
     at 255 DN, 0 without one; delay_s: of the events after the frames; by_light: whether the
-    low-pass's cutoff is proportional to light."""
+    low-pass's cutoff is proportional to light; log_map: of a `SensorModel`."""
 
     offset_dn: float = 0.0
     tau_s: float = 0.0
     delay_s: float = 0.0
     by_light: bool = True
+    log_map: LogMap = "linlog"
 
     @staticmethod
     def of(sensor: SensorModel, optics: Optics) -> Photoreceptor:
         tau_s = 1.0 / (2.0 * np.pi * sensor.cutoff_hz) if sensor.cutoff_hz > 0 else 0.0
-        return Photoreceptor(optics.offset_dn, tau_s, optics.delay_s, sensor.cutoff_by_light)
+        return Photoreceptor(optics.offset_dn, tau_s, optics.delay_s, sensor.cutoff_by_light,
+                             sensor.log_map)
 
     @property
     def ideal(self) -> bool:
+        """Whether the pixel sees the light of the frames, without delay."""
         return not (self.offset_dn or self.tau_s or self.delay_s)
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether the logarithm is one in dark light too."""
+        return self.log_map == "log_eps"
 
     @property
     def cutoff_hz(self) -> float:
@@ -81,10 +90,11 @@ def lin_log_dn(dn: ArrayLike) -> Array:
 
 
 def seen_path(
-    dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike, by_light: ArrayLike = True
+    dn: ArrayLike, dt_s: ArrayLike, offset: ArrayLike, tau_s: ArrayLike, by_light: ArrayLike = True,
+    logarithmic: ArrayLike = False,
 ) -> Array:
     """s (T + 1, ...) of light dn (T + 1, ...) in DN at times dt_s (T,) apart, starting at rest."""
-    u, rate = _light(dn, offset, tau_s, by_light)
+    u, rate = _light(dn, offset, tau_s, by_light, logarithmic)
 
     def step(s: Array, x: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
         s = _followed(s, *x)
@@ -116,22 +126,24 @@ def seen_frames(
     before: tuple[Array, Array, Array, int] | None = None
     for frame, t_us in pairs:
         now, rate = _light_of_frame(
-            np.asarray(frame, np.float32), offset, tau_s, seen_by.by_light)
+            np.asarray(frame, np.float32), offset, tau_s, seen_by.by_light, seen_by.logarithmic)
         s = now
         if before is not None and seen_by.tau_s:
             old, u, pace, last_us = before
             s = _step(old, u, now, 0.5 * (pace + rate), np.float32((t_us - last_us) * 1e-6))
         before = s, now, rate, t_us
-        yield np.asarray(_shown(s, darker)), t_us + round(seen_by.delay_s * 1e6)
+        shown = np.asarray(_shown(s, darker, seen_by.logarithmic))
+        yield shown, t_us + round(seen_by.delay_s * 1e6)
 
 
 def _light(
-    dn: ArrayLike, offset: ArrayLike, tau_s: ArrayLike, by_light: ArrayLike
+    dn: ArrayLike, offset: ArrayLike, tau_s: ArrayLike, by_light: ArrayLike, logarithmic: ArrayLike
 ) -> tuple[Array, Array]:
     """u and r at light in DN."""
     light = jnp.maximum(jnp.asarray(dn) + offset, LEAST_DN)
     share = jnp.where(by_light, jnp.maximum((light + 20.0) / 275.0, LEAST_LIGHT), 1.0)
-    return lin_log_dn(light), share / jnp.maximum(tau_s, FAST)
+    u = jnp.where(logarithmic, log_dn(light), lin_log_dn(light))
+    return u, share / jnp.maximum(tau_s, FAST)
 
 
 def _followed(s: Array, before: Array, now: Array, rate: Array, dt_s: Array) -> Array:
@@ -141,9 +153,10 @@ def _followed(s: Array, before: Array, now: Array, rate: Array, dt_s: Array) -> 
 
 
 @jax.jit
-def _shown(s: Array, darker: ArrayLike) -> Array:
+def _shown(s: Array, darker: ArrayLike, logarithmic: ArrayLike) -> Array:
     """The frame in DN (0..255) whose log is s minus `darker` log units."""
-    return jnp.minimum(lin_log_inverse(s - darker), 255.0)
+    s = s - darker
+    return jnp.minimum(jnp.where(logarithmic, log_dn_inverse(s), lin_log_inverse(s)), 255.0)
 
 
 _light_of_frame, _step = jax.jit(_light), jax.jit(_followed)

@@ -32,6 +32,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     **{f"frame noise {dn} DN": {"frame_noise_dn": dn} for dn in (1.0, 3.0)},
     **{f"black level {dn:+.0f} DN": {"black_dn": dn} for dn in (-8.0, 8.0, 16.0)},
     "dark light 24 DN": {"dark_dn": 24.0},
+    "ESIM's logarithm": {"model": SensorModel(log_map="log_eps", noise_resets_memory=True)},
     **{f"dead time {ms} ms": {"model": SensorModel(refractory_s=ms * 1e-3)} for ms in (1, 5)},
     "leak .3 Hz": {"model": SensorModel(leak_hz=0.3, leak_jitter=0.1, noise_resets_memory=True)},
     "leak .3 Hz, 10 s, background at rest": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,10 +14,13 @@ from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 
 
+@pytest.mark.parametrize("log_map", ["linlog", "log_eps"])
 @pytest.mark.parametrize("by_light", [True, False])
-def test_it_is_read_as_it_was_written(by_light: bool, tmp_path: Path) -> None:
+def test_it_is_read_as_it_was_written(
+    by_light: bool, log_map: Literal["linlog", "log_eps"], tmp_path: Path
+) -> None:
     sensor = SensorModel(cutoff_hz=150.0, cutoff_by_light=by_light, refractory_s=2e-3, leak_hz=0.1,
-                         shot_hz=2.0, eta_is_all=True, noise_resets_memory=True)
+                         shot_hz=2.0, log_map=log_map, eta_is_all=True, noise_resets_memory=True)
     optics = Optics(20.0, 1e-3, 4.0, 5e-4)
     path = tmp_path / "camera.npz"
     Camera.constant((4, 5)).save(path, **as_arrays(sensor, {"cutoff_hz": 30.0}, optics))

@@ -44,9 +44,11 @@ def light(dn: np.ndarray) -> tuple[Any, Any]:
 @pytest.mark.parametrize(("sensor", "optics"), [
     (SLOW, Optics()), (SensorModel(cutoff_hz=40.0, cutoff_by_light=False), Optics()),
     (SensorModel(cutoff_hz=200.0), Optics(offset_dn=24.0, delay_s=2.5e-3)),
-    (SensorModel(), Optics(delay_s=-2e-3)), (SensorModel(), Optics(offset_dn=10.0))])
+    (SensorModel(), Optics(delay_s=-2e-3)), (SensorModel(), Optics(offset_dn=10.0)),
+    (SensorModel(log_map="log_eps"), Optics()),
+    (SensorModel(cutoff_hz=40.0, log_map="log_eps"), Optics(offset_dn=2.0))])
 def test_changes_are_those_of_many_short_steps(sensor: SensorModel, optics: Optics) -> None:
-    dn = pattern()
+    dn = pattern(15.0 if sensor.log_map == "log_eps" else 90.0)
     changes, intensity = light(dn)
     seen_by = photoreceptor(sensor, optics)
     found, middle = seen_changes(seen_by, changes, intensity, jnp.float32(WINDOW_S))
@@ -56,7 +58,8 @@ def test_changes_are_those_of_many_short_steps(sensor: SensorModel, optics: Opti
     low = np.minimum(at.astype(int), 15)
     log = knots[low] + (at - low)[:, None, None] * (knots[low + 1] - knots[low])
     lit = np.where(log < np.log(20), log * 20 / np.log(20), np.exp(log)) + optics.offset_dn
-    u = np.where(lit < 20, lit * np.log(20) / 20, np.log(lit))
+    u = (np.log(lit + 0.255) if sensor.log_map == "log_eps"
+         else np.where(lit < 20, lit * np.log(20) / 20, np.log(lit)))
     path = u.copy()
     if sensor.cutoff_hz:
         pace = (lit + 20) / 275 if sensor.cutoff_by_light else np.ones_like(lit)

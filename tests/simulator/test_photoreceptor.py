@@ -7,6 +7,7 @@ import pytest
 
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import to_log
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, seen_frames
 
 KNEE = np.log(20) / 20
@@ -47,8 +48,19 @@ def test_light_that_is_added_lowers_contrast_and_stays_within_8_bits() -> None:
     np.testing.assert_allclose(np.diff(lin_log(seen)), np.diff(np.log(dn + 24)), atol=2e-5)
 
 
+def test_of_another_logarithm_frames_have_the_light_in_that_one() -> None:
+    """So the circuit behind, whose logarithm it is, sees log(L + offset) in the dark too."""
+    dn = np.array([[0.0, 3.0, 40.0, 255.0]])
+    (seen, _), = seen_frames([(dn, 50)], Photoreceptor(offset_dn=6.0, log_map="log_eps"))
+    signal = to_log(seen.astype(np.float32), "log_eps")
+    np.testing.assert_allclose(np.diff(signal), np.diff(np.log(dn + 6.255)), atol=2e-5)
+    (same, _), = seen_frames([(dn, 50)], Photoreceptor(log_map="log_eps"))
+    assert same is dn
+
+
 def test_it_is_that_of_a_measured_camera() -> None:
     measured = Photoreceptor.of(SensorModel(cutoff_hz=100.0), Optics(offset_dn=7.0, delay_s=2e-3))
     assert measured.cutoff_hz == pytest.approx(100.0)
     assert (measured.offset_dn, measured.delay_s) == (7.0, 2e-3)
     assert Photoreceptor.of(SensorModel(), Optics()).ideal
+    assert Photoreceptor.of(SensorModel(log_map="log_eps"), Optics()).logarithmic

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evflow.camera.sensors import LogMap
 from evflow.estimation.refine.sightings import Sightings
 from evflow.light.log_maps import log64
 
@@ -77,29 +78,32 @@ def joined(of_stretches: Sequence[tuple[Changes, ...]]) -> tuple[Changes, ...]:
                  for some in zip(*of_stretches, strict=True))
 
 
-def offset_by_changes(of_lags: tuple[Changes, ...], seen: int) -> tuple[float, float]:
+def offset_by_changes(
+    of_lags: tuple[Changes, ...], seen: int, log_map: LogMap = "linlog"
+) -> tuple[float, float]:
     """The offset of the frames.
 
     Args:
         of_lags: changes for each of LAGS.
         seen: pixels times intervals from which the changes were taken.
+        log_map: of the pixels.
 
     Returns:
         Offset in DN, and the std that it would have if it were 0 (Prior.offset_std adds SHARE of
         the offset); 0 and infinity where it is undetermined.
     """
-    found = [_best(c) for c in of_lags if len(c.on) >= ENOUGH] if seen >= LEAST_SEEN else []
-    if len(found) < len(LAGS):
+    if seen < LEAST_SEEN or any(len(c.on) < ENOUGH for c in of_lags):
         return 0.0, float("inf")
+    found = [_best(c, log_map) for c in of_lags]
     offsets, scatter = np.array(found).T
     std = float(np.sqrt(FLOOR_DN**2 + (WIDER * scatter.max()) ** 2 + np.ptp(offsets) ** 2))
     return (float(offsets.mean()), std) if std < TOO_FAR else (0.0, float("inf"))
 
 
-def _best(c: Changes) -> tuple[float, float]:
+def _best(c: Changes, log_map: LogMap) -> tuple[float, float]:
     """The best offset, by a parabola through the best of OFFSETS and its neighbours, and its
     scatter over the blocks."""
-    left = np.array([_unexplained(c, offset) for offset in OFFSETS])
+    left = np.array([_unexplained(c, offset, log_map) for offset in OFFSETS])
     value = np.log(left.sum(1))
     k = int(np.clip(np.argmin(value), 1, len(OFFSETS) - 2))
     if left[k].sum() > MOST_LEFT:
@@ -115,10 +119,10 @@ def _best(c: Changes) -> tuple[float, float]:
     return float(best), scatter / (2 * bent)
 
 
-def _unexplained(c: Changes, offset: float) -> Array:
+def _unexplained(c: Changes, offset: float, log_map: LogMap) -> Array:
     """Squared residuals (blocks,) of the net events after regression on the change (a line in each
     of BINS), as a share of the total, at the best of RATIOS."""
-    before, after = (log64(np.maximum(dn + offset, 0.0), "linlog") for dn in (c.before, c.after))
+    before, after = (log64(np.maximum(dn + offset, 0.0), log_map) for dn in (c.before, c.after))
     y = after - before
     weight = 1.0 / (1.0 + np.minimum(c.on, c.off))  # pairs of ON and OFF add mismatch errors
     order = np.argsort(y, kind="stable")

@@ -14,7 +14,7 @@ import numpy as np
 
 from evflow.estimation.refine.denoise import denoised
 from evflow.estimation.refine.stretches import BAND, LARGE
-from evflow.light.log_maps import lin_log
+from evflow.light.log_maps import lin_log, log_dn
 from evflow.recordings.glitches import exposed
 from evflow.recordings.region import bands
 from evflow.simulator.between import intervals
@@ -81,8 +81,8 @@ def as_seen(film: Film, seen_by: Photoreceptor, out: np.ndarray | None = None) -
 
     def seen(dn: np.ndarray) -> jax.Array:
         if not seen_by.offset_dn and not seen_by.tau_s:
-            return _log(dn)
-        return _seen(dn, dt_s, *values, seen_by.by_light)
+            return (_log_dn if seen_by.logarithmic else _lin_log)(dn)
+        return _seen(dn, dt_s, *values, seen_by.by_light, seen_by.logarithmic)
 
     if film.dn[0].size <= LARGE:
         return np.asarray(seen(film.dn))
@@ -92,4 +92,4 @@ def as_seen(film: Film, seen_by: Photoreceptor, out: np.ndarray | None = None) -
     return out
 
 
-_seen, _log = jax.jit(seen_path), jax.jit(lin_log)
+_seen, _lin_log, _log_dn = jax.jit(seen_path), jax.jit(lin_log), jax.jit(log_dn)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from evflow.camera.sensors import LogMap
 from evflow.estimation.refine.net_changes import Changes, changes, joined, offset_by_changes
 from evflow.estimation.refine.sightings import Sightings, counts_so_far, path_weights
 from evflow.estimation.refine.smear import smeared
@@ -19,6 +20,7 @@ PIXELS, EVENTS = 2048, 1 << 14  # used of a stretch
 SETTLE_S = 0.03  # initial part of a stretch, where the low-pass still remembers earlier light
 TILES = (6, 8)  # blocks of the image whose errors are independent
 ENOUGH = 200  # events of each polarity
+MAPS: tuple[LogMap, ...] = ("linlog", "log_eps")  # that are distinguished
 LEAST = 20  # usable ones of these: most may lie beside saturated or black frames
 
 
@@ -29,7 +31,8 @@ class Sample(NamedTuple):
     in fine steps; on, off, counts so far; weight; group, of events that share a regression
     constant: those of a pixel, divided at readouts (readouts.py) and noise (receptor_noise.py).
     block: (C, P); noise_hz: (C, 2), of `noise_rates`; watched: (C,) pixel seconds of all pixels;
-    net_offset: (C, 2) offset of the frames and its std by net_changes.py, of all stretches."""
+    net_offset: (C, len(MAPS), 2) offset of the frames and its std by net_changes.py, of all
+    stretches, with each log map."""
 
     dn: Array
     dt_s: Array
@@ -74,9 +77,10 @@ def sample(
         del dn, s  # free the memory before the next is made
     if count.min() < ENOUGH or usable.min() < LEAST:
         return None
-    offset = np.tile(offset_by_changes(joined(nets), seen), (len(rows), 1)).astype(np.float32)
+    all_nets = joined(nets)
+    offsets = np.array([offset_by_changes(all_nets, seen, log_map) for log_map in MAPS], np.float32)
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
-    return Sample(*map(jax.device_put, [*columns, offset]))
+    return Sample(*map(jax.device_put, [*columns, np.stack([offsets] * len(rows))]))
 
 
 def _changes(

@@ -48,7 +48,8 @@ def _groups(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) ->
     """(N,) int32 groups of one stretch."""
     step_s = float(np.mean(d.dt_s))
     path = np.asarray(_seen(d.dn, d.dt_s, np.float32(seen_by.offset_dn),
-                            np.float32(max(seen_by.tau_s, FAST)), seen_by.by_light))
+                            np.float32(max(seen_by.tau_s, FAST)), seen_by.by_light,
+                            seen_by.logarithmic))
     used = np.flatnonzero(np.asarray(d.weight) > 0)
     at, pixel, on, part = (np.asarray(v)[used] for v in (d.at, d.pixel, d.on, d.group))
     last = len(path) - 1

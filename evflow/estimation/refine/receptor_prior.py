@@ -7,8 +7,9 @@ import dataclasses
 
 import numpy as np
 
+from evflow.camera.sensors import LogMap
 from evflow.estimation.refine.net_changes import SHARE
-from evflow.estimation.refine.receptor_data import Sample
+from evflow.estimation.refine.receptor_data import MAPS, Sample
 
 Array = np.ndarray
 
@@ -31,10 +32,12 @@ class Prior:
     std_dn: float = float("inf")
 
     @staticmethod
-    def of(data: Sample) -> Prior:
-        """The prior of a sample."""
-        net = data.net_offset
-        return Prior() if net is None else Prior(*map(float, np.asarray(net)[0]))
+    def of(data: Sample, log_map: LogMap = "linlog") -> Prior:
+        """The prior of a sample whose pixels have this log map."""
+        if data.net_offset is None:
+            return Prior()
+        net = np.asarray(data.net_offset)[0, MAPS.index(log_map)]
+        return Prior(*map(float, net))
 
     @property
     def offset_std(self) -> float:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.camera.sensors import LogMap
 from evflow.estimation.refine.receptor_data import EVENTS, TILES, Sample
 from evflow.estimation.refine.receptor_prior import Prior
 from evflow.simulator.photoreceptor import FAST, seen_path
@@ -42,15 +43,16 @@ class Slopes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Regression:
-    """The regression of a sample. by_light: whether the low-pass's cutoff is proportional to light.
-    phi (3,) of its methods: offset (DN), tau and delay (s)."""
+    """The regression of a sample. by_light: whether the low-pass's cutoff is proportional to light;
+    log_map: of the light. phi (3,) of its methods: offset (DN), tau and delay (s)."""
 
     data: Sample
     by_light: bool = True
+    log_map: LogMap = "linlog"
 
     @property
     def prior(self) -> Prior:
-        return Prior.of(self.data)
+        return Prior.of(self.data, self.log_map)
 
     def determines(self) -> bool:
         """Whether both thresholds follow from the sample: pixels of several events, whose numbers
@@ -106,7 +108,8 @@ class Regression:
 
     def _by_block(self, phi: np.ndarray, *, slopes: bool) -> np.ndarray:
         sums = _slopes if slopes else _sums
-        return np.asarray(sums(phi.astype(np.float32), self.by_light, self.data), np.float64)
+        law = self.by_light, self.log_map == "log_eps"
+        return np.asarray(sums(phi.astype(np.float32), *law, self.data), np.float64)
 
 
 def left_over(products: np.ndarray, theta: np.ndarray) -> float:
@@ -115,7 +118,9 @@ def left_over(products: np.ndarray, theta: np.ndarray) -> float:
     return float(rest @ products[:3, :3] @ rest)
 
 
-def _products(phi: Array, by_light: Array, data: Sample, *, slopes: bool) -> Array:
+def _products(
+    phi: Array, by_light: Array, logarithmic: Array, data: Sample, *, slopes: bool
+) -> Array:
     """(blocks, M, M): weighted products of a, b, y and, with `slopes`, the derivatives of y, about
     each group's means."""
     blocks = data.dn.shape[0] * TILES[0] * TILES[1]
@@ -126,7 +131,7 @@ def _products(phi: Array, by_light: Array, data: Sample, *, slopes: bool) -> Arr
         step = jnp.floor(at).astype(jnp.int32)
 
         def path(two: Array) -> Array:
-            return seen_path(d.dn, d.dt_s, two[0], two[1], by_light)
+            return seen_path(d.dn, d.dt_s, two[0], two[1], by_light, logarithmic)
 
         def looked_up(s: Array) -> tuple[Array, Array]:
             before, after = s[step, d.pixel], s[step + 1, d.pixel]

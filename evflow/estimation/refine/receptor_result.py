@@ -58,7 +58,7 @@ class Found:
         seen = self.needed and tau > 2.0 * error
         cutoff = self.seen.cutoff_hz if seen else 0.0
         return (SensorModel(cutoff_hz=cutoff, cutoff_by_light=self.seen.by_light or not cutoff,
-                            noise_resets_memory=True),
+                            log_map=self.seen.log_map, noise_resets_memory=True),
                 {"cutoff_hz": cutoff * error / tau if seen else float("nan")})
 
     @property
@@ -77,6 +77,16 @@ class Found:
     def needed(self) -> bool:
         """Whether an ideal pixel is less probable than the photoreceptor found."""
         return self.chance > 0.5
+
+    @property
+    def ideal(self) -> Photoreceptor:
+        """An ideal one, with the log map found."""
+        return Photoreceptor(log_map=self.seen.log_map)
+
+    @property
+    def used(self) -> Photoreceptor:
+        """The photoreceptor found if it is needed, else the ideal one."""
+        return self.seen if self.needed else self.ideal
 
     def optics_given(self, change: float, error: float) -> Optics:
         """Offset and delay given the refined thresholds: too large an offset makes thresholds too

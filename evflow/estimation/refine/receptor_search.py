@@ -11,13 +11,15 @@ import dataclasses
 
 import numpy as np
 
+from evflow.camera.sensors import LogMap
 from evflow.estimation.refine.receptor_data import Sample, smeared_sample
 from evflow.estimation.refine.receptor_noise import split_at_noise
 from evflow.estimation.refine.receptor_prior import DOUBT, Prior, small_sample_odds
 from evflow.estimation.refine.receptor_profile import Other, along_offset
 from evflow.estimation.refine.receptor_regression import SCALE, Regression, Slopes
 from evflow.estimation.refine.receptor_result import Found
-from evflow.simulator.photoreceptor import FAST, IDEAL, TYPICAL, Photoreceptor
+from evflow.light.log_maps import LINLOG_KNEE
+from evflow.simulator.photoreceptor import FAST, TYPICAL, Photoreceptor
 
 OFFSETS = (-16.0, -8.0, 0.0, 6.0, 14.0, 26.0, 45.0)  # DN, starting grid of the search
 TAUS = (FAST, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # s
@@ -36,6 +38,7 @@ FLOOR = np.array([0.5, 1e-4, 5e-4])  # std of offset, tau and delay
 # pixel:
 ALONE = 2.0
 BY_OFFSET = 5.0  # log odds required for an offset in the frames of a slow pixel
+DARK = 0.01  # share of light below lin-log's knee from which the log maps are compared
 BY_LIGHT = 1.0  # prior log odds of a low-pass whose cutoff is proportional to light
 SMEARS = (0.01, 0.02)  # s
 CUTOFFS = (np.inf, 1000.0, 500.0, 300.0, 200.0, 140.0, 100.0, 70.0, 50.0, 30.0, 20.0)  # Hz
@@ -45,16 +48,10 @@ def find(data: Sample) -> Found | None:
     """Search for the most probable photoreceptor; errors follow from the curvature and from the
     scatter of the gradient over blocks. None where noise divides the events so finely that no
     threshold follows from them."""
-    by_light = Regression(split_at_noise(data, IDEAL))
-    if not by_light.determines():
+    begun = _with_map(data)
+    if begun is None:
         return None
-    phi = _start(by_light)
-    for _ in range(2):
-        size = _size(phi, by_light)
-        phi = _descend(phi, by_light, size)
-        theta = np.abs(by_light.solved(phi)[0])
-        divided = Regression(split_at_noise(data, _receptor(phi), theta))
-        by_light = divided if divided.determines() else by_light
+    by_light, phi, size = begun
     plain = by_light.unexplained(PLAIN)
     believed = min(size, BELIEVED)
     model, phi, other = _with_law(phi, by_light, believed)
@@ -73,7 +70,7 @@ def find(data: Sample) -> Found | None:
         covariance, open_ = other.beside(phi[1], fits, covariance, open_)
     if fits.min() <= 0:  # brightness falls at ON events: the path is wrong
         odds = -np.inf
-    return Found(_receptor(phi, by_light=model.by_light), np.abs(fits), np.abs(ideal_fits),
+    return Found(_receptor(phi, model), np.abs(fits), np.abs(ideal_fits),
                  covariance, open_,
                  (float(1 - np.exp(plain)), float(1 - np.exp(value))),
                  float(1.0 / (1.0 + np.exp(-np.clip(odds, -50, 50)))),
@@ -81,16 +78,52 @@ def find(data: Sample) -> Found | None:
                  _smear(phi if odds > 0 else PLAIN, model), _curve(phi, model))
 
 
-def _receptor(phi: np.ndarray, *, by_light: bool = True) -> Photoreceptor:
+def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
+    """The more probable log map, its most probable constants, and the effective number of events;
+    None where no threshold follows from them. The maps differ in dark light alone."""
+    begun = _begin(data, "linlog")
+    if begun is None or float((np.asarray(data.dn) < LINLOG_KNEE).mean()) < DARK:
+        return begun
+    other = _begin(data, "log_eps")
+    if other is None:
+        return begun
+    model, phi, size = begun
+    size = min(size, BELIEVED)
+    odds = _value(phi, model, size) - _value(other[1], other[0], size) - DOUBT
+    return other if odds > 0 else begun
+
+
+def _begin(data: Sample, log_map: LogMap) -> tuple[Regression, np.ndarray, float] | None:
+    """`_with_map`, of one map."""
+    ideal = Photoreceptor(log_map=log_map)
+    model = Regression(split_at_noise(data, ideal), log_map=log_map)
+    if not model.determines():
+        return None
+    starts = [_start(model)]
+    if log_map == "log_eps":  # whose bend near 0 DN can hold the search at a wrong offset
+        starts.append(np.where(OFFSET, 0.0, starts[0]))
+    for _ in range(2):
+        size = _size(starts[0], model)
+        phi = min((_descend(start, model, size) for start in starts),
+                  key=lambda at: _value(at, model, size))
+        starts = [phi]
+        theta = np.abs(model.solved(phi)[0])
+        divided = dataclasses.replace(
+            model, data=split_at_noise(data, _receptor(phi, model), theta))
+        model = divided if divided.determines() else model
+    return model, phi, size
+
+
+def _receptor(phi: np.ndarray, model: Regression) -> Photoreceptor:
     return Photoreceptor(float(phi[0]), float(phi[1]) if phi[1] > 2 * FAST else 0.0, float(phi[2]),
-                         by_light)
+                         model.by_light, model.log_map)
 
 
 def explained(data: Sample, seen_by: Photoreceptor, theta: np.ndarray) -> float:
     """Share of a sample's variance explained by a photoreceptor and thresholds (2,) that were
     measured on another part of the recording; NaN where no threshold follows from the sample."""
     at = np.array([seen_by.offset_dn, max(seen_by.tau_s, FAST), seen_by.delay_s])
-    model = Regression(split_at_noise(data, seen_by, theta), seen_by.by_light)
+    model = Regression(split_at_noise(data, seen_by, theta), seen_by.by_light, seen_by.log_map)
     return model.explained_by(at, theta) if model.determines() else float("nan")
 
 

@@ -3,6 +3,8 @@ found again in events that an independent pixel makes of a known film."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_search import find
 from evflow.estimation.refine.sightings import Sightings, sight
-from evflow.simulator.photoreceptor import FAST, IDEAL, seen_path
+from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
 from evflow.types import Events
 
 INTERVALS, SHAPE, FRAME_S = 16, (20, 26), 0.02
@@ -23,6 +25,10 @@ SUB = 8  # instants of the independent pixel in a fine step
 
 def lin_log(dn: np.ndarray) -> np.ndarray:
     return np.where(dn <= 20, dn * np.log(20) / 20, np.log(np.maximum(dn, 1)))
+
+
+def log_eps(dn: np.ndarray) -> np.ndarray:
+    return np.log(dn / 255 + 1e-3)
 
 
 def film(seed: int = 0) -> np.ndarray:
@@ -40,11 +46,12 @@ def film(seed: int = 0) -> np.ndarray:
 
 
 def integrated(
-    dn: np.ndarray, dt_s: float, offset: float, tau_s: float, sub: int, by_light: bool = True
+    dn: np.ndarray, dt_s: float, offset: float, tau_s: float, sub: int, by_light: bool = True,
+    log: Callable[[np.ndarray], np.ndarray] = lin_log,
 ) -> np.ndarray:
     """The photoreceptor at `sub` instants of each step, by short explicit steps."""
     light = np.maximum(dn + offset, 0.1)
-    u = lin_log(light)
+    u = log(light)
     s, out = u[0].copy(), [u[0]]
     for i in range(len(dn) - 1):
         share = ((light[i] + light[i + 1]) / 2 + 20) / 275 if by_light else 1.0
@@ -106,12 +113,12 @@ def no_readouts(s: Sightings) -> np.ndarray:
 
 def looked_at(
     offset: float, cutoff_hz: float, delay_s: float = 0.0, by_light: bool = True,
-    noise_hz: float = 0.0,
+    noise_hz: float = 0.0, gain: float = 1.0, log: Callable[[np.ndarray], np.ndarray] = lin_log,
 ) -> Sample:
-    """What such pixels, of .25 and .2, show of the film."""
-    dn, dt_s = film(), FRAME_S / STEPS
+    """What such pixels, of .25 and .2, show of the film, whose light is multiplied by gain."""
+    dn, dt_s = gain * film(), FRAME_S / STEPS
     tau_s = 1 / (2 * np.pi * cutoff_hz) if cutoff_hz else 0.0
-    seen = integrated(dn, dt_s, offset, tau_s, SUB, by_light)
+    seen = integrated(dn, dt_s, offset, tau_s, SUB, by_light, log)
     events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2, noise_hz)
     times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
     s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
@@ -154,6 +161,24 @@ def test_the_constants_are_found_again(
     assert found.explained[1] > 0.98
     if cutoff_hz:
         assert found.seen.cutoff_hz == pytest.approx(cutoff_hz, rel=0.15)
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.0, 60.0])
+@pytest.mark.parametrize(("log", "name"), [(lin_log, "linlog"), (log_eps, "log_eps")])
+def test_dark_light_shows_which_logarithm_it_is(
+    log: Callable[[np.ndarray], np.ndarray], name: str, cutoff_hz: float
+) -> None:
+    """Of which the wrong one would be taken for an offset, with thresholds far too low."""
+    found = find(looked_at(0.0, cutoff_hz, gain=0.15, log=log))
+    assert found.seen.log_map == name
+    assert found.needed == bool(cutoff_hz)
+    assert found.optics.offset_dn == 0.0
+    np.testing.assert_allclose(found.theta, [0.25, 0.2], rtol=0.04)
+    assert found.used == (found.seen if cutoff_hz else Photoreceptor(log_map=name))
+
+
+def test_bright_light_does_not() -> None:
+    assert find(looked_at(0.0, 0.0, log=log_eps)).seen.log_map == "linlog"
 
 
 @pytest.mark.parametrize(("asked", "kept"), [(0.0, True), (1e6, False)])
