@@ -90,9 +90,10 @@ def halves(path: Path) -> list[str] | None:
     found = find(first)
     if found is None:
         return None
-    return [path.name, *(f"{s:.3f}" for s in (
-        explained(second, found.ideal, found.ideal_theta), explained(second, found.seen, found.theta))),
-        f"{found.seen.offset_dn:.0f} DN", f"{found.seen.cutoff_hz:.0f} Hz"]
+    shares = (explained(second, found.ideal, found.ideal_theta),
+              explained(second, found.seen, found.theta))
+    return [path.name, *(f"{s:.3f}" for s in shares),
+            f"{found.seen.offset_dn:.0f} DN", f"{found.seen.cutoff_hz:.0f} Hz"]
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from evflow.camera.exports import TARGETS, export_camera
 from evflow.camera.exports.common import LIGHT, NOISE
 from evflow.camera.exports.iebcs import FREQUENCIES, spectrum
 from evflow.camera.optics import Optics
+from evflow.camera.sensors import SensorModel
 from evflow.cli import main
 from evflow.io.source import open_frames
 from evflow.light.response import linear_light
@@ -45,6 +46,14 @@ def test_light_that_frames_do_not_show_is_told(to: str) -> None:
     told = export_camera(camera, to, optics=Optics(18.7, 0.0, 4.6))[0].text
     assert told.rstrip().endswith("other videos do not need it.")
     assert "18.7 DN more than" in told
+
+
+@pytest.mark.parametrize("to", list(TARGETS))
+def test_v2e_is_told_that_its_logarithm_is_another(to: str) -> None:
+    told = [export_camera(Camera.constant((4, 6)), to, sensor=SensorModel(log_map=log_map))[0].text
+            for log_map in ("linlog", "log_eps")]
+    assert "logarithm is linear below 20 DN" not in told[0]
+    assert ("logarithm is linear below 20 DN" in told[1]) == (to == "v2e")
 
 
 @pytest.mark.parametrize("to", ["v2e", "esim", "openeb", "iebcs"])

@@ -74,6 +74,7 @@ class Settings:
     dead_s: float = 0.0
     leak_hz: float = 0.0
     shot_hz: float = 0.0
+    log_eps: bool = False
 
     @staticmethod
     def of(
@@ -96,7 +97,8 @@ class Settings:
             cutoff = {"cutoff_hz": sensor.cutoff_hz / PACE, "even_hz": sensor.cutoff_hz}
         values = {**middle, **sigma, **cutoff, **(summary or {})}
         return Settings(width, height, **values, dead_s=sensor.refractory_s,
-                        leak_hz=sensor.leak_hz, shot_hz=sensor.shot_hz)
+                        leak_hz=sensor.leak_hz, shot_hz=sensor.shot_hz,
+                        log_eps=sensor.log_map == "log_eps")
 
     @property
     def leak_seen(self) -> float:

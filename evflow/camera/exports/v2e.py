@@ -67,8 +67,12 @@ What v2e cannot represent
 - A noise event stores the present intensity in the pixel's memory.
 - Its circuit is the measured one ({circuit}), if the frames come at several times the cutoff: its
   low-pass is exact for short steps only, and its dead time delays events by whole frames.
-- All events of a pixel between two frames share v2e's time slots; its times are float32 seconds.
+{log}- All events of a pixel between two frames share v2e's time slots; times are float32 seconds.
 '''
+
+LOG = """- Its logarithm is linear below 20 DN, with up to three times the contrast; that of the measured
+  pixels is logarithmic there too.
+"""
 
 
 def export(maps: Maps, s: Settings) -> Export:
@@ -93,7 +97,7 @@ def export(maps: Maps, s: Settings) -> Export:
         "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))
     values = vars(s) | {
         "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess,
-        "srgb": SRGB}
+        "srgb": SRGB, "log": LOG if s.log_eps else ""}
     source = SCRIPT.format(**vars(s) | {
         "gain": gain, "leak_seen": s.leak_seen, "light": LIGHT + SWITCH})
     return Export(TEXT.format(**values), {"run_v2e.py": source})
