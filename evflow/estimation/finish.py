@@ -38,14 +38,20 @@ SIGNAL_ERROR = 0.1  # relative error of noise rates if something moves: residual
 class Known:
     """What is known of the camera, before or after its refinement.
 
-    hot: (H, W) bool; chunks: without these pixels; summary, std: of the camera; optics: of the
-    frames, None if they were not measured."""
+    hot, dead: (H, W) bool; chunks: without these pixels; summary, std: of the camera; optics: of
+    the frames, None if they were not measured."""
 
     hot: Array
+    dead: Array
     chunks: tuple[Chunk, ...]
     summary: Summary
     std: Summary
     optics: Optics | None
+
+    @property
+    def faulty(self) -> Array:
+        """(H, W) bool: pixels whose silence or noise is not the camera's."""
+        return self.hot | self.dead
 
 
 def starting(state: State) -> Known:
@@ -54,13 +60,14 @@ def starting(state: State) -> Known:
     summary, std = summary_so_far(state)
     found = state.front_end.found
     optics = found.optics if found else None
+    dead = dead_pixels(np.asarray(state.n_events))
     if state.quiet is None:
-        none = np.zeros(np.shape(state.n_events), bool)
-        return Known(none, state.chunks, summary, std, optics)
+        return Known(np.zeros(dead.shape, bool), dead, state.chunks, summary, std, optics)
     hot = hot_pixels(
         state.quiet, float(np.float32(summary.eta_on) + np.float32(summary.eta_off)),
         state.n_events, state.seconds)
-    return Known(hot, tuple(_without_hot(c, hot) for c in state.chunks), summary, std, optics)
+    chunks = tuple(_without(c, hot | dead) for c in state.chunks)
+    return Known(hot, dead, chunks, summary, std, optics)
 
 
 def refine(state: State) -> Known:
@@ -87,21 +94,22 @@ def estimate(
     front_end, stats = state.front_end, state.stats
     n_events = state.n_events.astype(np.uint32)
     refined = refine(state)
-    hot, summary, std = refined.hot, refined.summary, refined.std
-    dead = dead_pixels(n_events)
+    hot, dead, summary, std = refined.hot, refined.dead, refined.summary, refined.std
     if lacking := undetermined(stats, summary):
         summary, std = with_prior(lacking, list(refined.chunks), summary, std)
     stage("noise rates and maps")
-    quiet = quiet_times(_counted(windows_of(state.read), advance), summary, hot, front_end.seen_by)
+    quiet = quiet_times(
+        _counted(windows_of(state.read), advance), summary, refined.faulty, front_end.seen_by)
     std = maps.with_unquiet_error(summary, std, quiet.share, quiet.pixel_s)
     leak = measured_leak(quiet.waits)
-    shot = measured_shot(quiet.light, leak.rate_hz, scatter(quiet.maps, hot), SIGNAL_ERROR)
-    sent = quiet.maps
+    shot = measured_shot(
+        quiet.light, leak.rate_hz, scatter(quiet.maps, refined.faulty), SIGNAL_ERROR)
+    sent = quiet.at_mean_light() if shot.falls else quiet.maps.copy()
+    sent[:, 1, dead] = 0.0  # seconds in which noise could be seen
     if shot.falls:
-        sent = quiet.at_mean_light()
         summary, std = _at_mean_light(summary, std, quiet, leak)
     if state.evidence is not None:
-        camera, error = maps.by_regression(state.evidence, summary, std)
+        camera, error = maps.by_regression(state.evidence.without(dead), summary, std)
     else:
         again = _counted(windows_of(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
@@ -140,8 +148,8 @@ def _measured(
     return {**fields, "optics": optics, "receptor": found} if found else fields
 
 
-def _without_hot(chunk: Chunk, hot: Array) -> Chunk:
-    return dataclasses.replace(chunk, bright=chunk.bright & ~hot[chunk.box])
+def _without(chunk: Chunk, faulty: Array) -> Chunk:
+    return dataclasses.replace(chunk, bright=chunk.bright & ~faulty[chunk.box])
 
 
 def _counted(windows: Iterator[Window], advance: Advance) -> Iterator[Window]:

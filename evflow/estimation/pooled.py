@@ -92,21 +92,26 @@ def window_counts(window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def window_stats(
-    params: api.Params, window: Window, seen_by: Photoreceptor = IDEAL
+    params: api.Params, window: Window, seen_by: Photoreceptor = IDEAL,
+    silent: np.ndarray | None = None,
 ) -> api.Stats:
-    """Stats of the pixels that a window's frames show, or of all if they show none. Large sensors
-    go band by band, whose sums add."""
+    """Stats of the pixels that a window's frames show, or of all if they show none, without silent
+    ones (H, W). Large sensors go band by band, whose sums add."""
     shape = window.frame0.shape
+    silent = np.zeros(shape, bool) if silent is None else silent
     if shape[0] * shape[1] <= LARGE:
-        return _stats(params, window, seen_by)
+        return _stats(params, window, seen_by, silent)
     return functools.reduce(operator.add, (
-        _stats(params, rows_of(window, rows), seen_by) for rows in bands(shape, BAND)))
+        _stats(params, rows_of(window, rows), seen_by, silent[rows])
+        for rows in bands(shape, BAND)))
 
 
-def _stats(params: api.Params, window: Window, seen_by: Photoreceptor) -> api.Stats:
+def _stats(
+    params: api.Params, window: Window, seen_by: Photoreceptor, silent: np.ndarray
+) -> api.Stats:
     """Quiet pixels of the same brightness go through the network once, with their number."""
     shown = exposed(window.frame0, window.frame1).ravel()
-    counted = shown if shown.any() else ~shown
+    counted = (shown if shown.any() else ~shown) & ~silent.ravel()
     frames = np.stack([_light(f, seen_by).ravel() for f in (window.frame0, window.frame1)], 1)
     pixels, voxels = fired_voxels(window.events, window.t0_us, window.t1_us - window.t0_us)
     quiet = counted.copy()

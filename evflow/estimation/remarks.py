@@ -20,17 +20,9 @@ def camera_notes(
     stats: Stats, undetermined: tuple[str, ...], n_events: np.ndarray, summary: Summary,
     hot: np.ndarray, dead: np.ndarray,
 ) -> list[Note]:
-    found = []
-    for name, mask, what in (
-        ("hot", hot, "they fire while nothing moves and were left out of the refinement."),
-        ("dead", dead, "they never fire while all around them do; the maps show the camera's "
-         "summary there."),
-    ):
-        if mask.any():
-            y, x = np.argwhere(mask)[0]
-            found.append(Note(
-                f"pixels.{name}",
-                f"{name} pixels ({mask.sum()}, the first at x={x}, y={y}): {what}"))
+    found = _faulty(
+        "hot", hot, "they fire while nothing moves and were left out of the refinement.")
+    found += dead_notes(dead)
     low, high = PRESETS["default"].prior.theta
     for name, events in (("on", stats.events_on), ("off", stats.events_off)):
         theta = float(getattr(summary, f"theta_{name}"))
@@ -54,6 +46,20 @@ def camera_notes(
             "pixels.unsure", f"only {active:.1%} of the pixels have {VALID_EVENTS} or more events: "
             "elsewhere the maps show the camera's summary. Record more motion."))
     return found
+
+
+def dead_notes(dead: np.ndarray) -> list[Note]:
+    return _faulty("dead", dead, "they never fire while those beside them do (whole columns or "
+                   "rows: a region of interest?); the maps show the camera's summary there, and "
+                   "their silence is left out of the noise rates.")
+
+
+def _faulty(name: str, mask: np.ndarray, what: str) -> list[Note]:
+    if not mask.any():
+        return []
+    y, x = np.argwhere(mask)[0]
+    return [Note(f"pixels.{name}",
+                 f"{name} pixels ({mask.sum()}, the first at x={x}, y={y}): {what}")]
 
 
 def receptor_notes(found: Found | None, optics: Optics | None) -> list[Note]:

@@ -83,7 +83,8 @@ def read_stretch(
     stats, n_events, n_shown = None, np.zeros(()), np.zeros(())
     for number, window in enumerate(windows_of([stretch])):
         if number % every == 0:
-            more = window_stats(state.params, window, state.front_end.seen_by)
+            front_end = state.front_end
+            more = window_stats(state.params, window, front_end.seen_by, front_end.silent)
             stats = more if stats is None else stats + more
         counts, shown = window_counts(window)
         n_events, n_shown = n_events + counts, n_shown + shown

@@ -18,7 +18,7 @@ from evflow.estimation.bench.levels import Bench, Level
 from evflow.estimation.intervals import waits_at_rest
 from evflow.estimation.leak import Leak, measured_leak
 from evflow.estimation.pixel_noise import pixel_rates
-from evflow.estimation.remarks import noise_notes
+from evflow.estimation.remarks import dead_notes, noise_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.estimation.shot import Shot, by_light, measured_noise, measured_shot, scatter
 from evflow.notes import Note
@@ -32,18 +32,20 @@ def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraE
     """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
 
     A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
-    over pixels that are not hot. Thresholds are those of the network's training prior, with its
-    width; `valid` is False everywhere. lux: the illuminance, for `.bench`, which `noise_over_light`
-    joins. Leak is identified by its intervals, shot noise if frames show the light. Raises EV011
-    (EV017 with frames) if the scene moves, or the recording is too short to decide.
+    over pixels that are neither hot nor dead. Thresholds are those of the network's training prior,
+    with its width; `valid` is False everywhere. lux: the illuminance, for `.bench`, which
+    `noise_over_light` joins. Leak is identified by its intervals, shot noise if frames show the
+    light. Raises EV011 (EV017 with frames) if the scene moves, or the recording is too short to
+    decide.
     """
     events = recording.events
     counts = events.count_map()
-    hot = hot_at_rest(counts.sum(0))
+    total = counts.sum(0, dtype=np.uint32)
+    hot, dead = hot_at_rest(total), dead_pixels(total)
     _require_static(recording, hot)
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(
-        *(_rates(n, hot, seconds) for n in counts), strict=True)
+        *(_rates(n, hot, dead, seconds) for n in counts), strict=True)
     middle, width = uniform(PRESETS["default"].prior.theta)
     mismatch, mismatch_width = uniform(PRESETS["default"].prior.mismatch)
 
@@ -54,32 +56,32 @@ def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraE
     def summary(theta: float, eta: tuple[float, ...], sigma: float) -> Summary:
         return Summary(*(jnp.float32(v) for v in (theta, theta, *eta, sigma, sigma)))
 
-    leak, shot = _kinds(recording, counts, hot)
+    leak, shot = _kinds(recording, counts, hot | dead)
     sensor, std = measured_noise(SensorModel(noise_resets_memory=True), {}, leak, shot)
-    total = counts.sum(0, dtype=np.uint32)
     level = () if lux is None else (Level(
         lux, 1, seconds, means[0], mean_errors[0], means[1], mean_errors[1]),)
     return CameraEstimate(
         camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
-        dead_pixels(total), 0,
-        (*_notes(hot, total, recording.has_frames), *noise_notes(shot)), THRESHOLDS,
+        dead, 0,
+        (*_notes(hot, total, recording.has_frames), *dead_notes(dead), *noise_notes(shot)),
+        THRESHOLDS,
         sensor=sensor, sensor_std=std,
         bench=Bench("lux", level) if level else None)
 
 
-def _kinds(recording: Recording, counts: np.ndarray, hot: np.ndarray) -> tuple[Leak, Shot]:
+def _kinds(recording: Recording, counts: np.ndarray, faulty: np.ndarray) -> tuple[Leak, Shot]:
     """Leak and, if frames show the light, shot noise."""
     events, begin = recording.events, int(recording.events.t[0])
     if recording.has_frames:
         begin = min(begin, int(recording.frame_times[0]))
-    leak = measured_leak(waits_at_rest(events, hot, (begin, int(events.t[-1]))))
+    leak = measured_leak(waits_at_rest(events, faulty, (begin, int(events.t[-1]))))
     if not recording.has_frames:
         return leak, Shot()
-    watched = np.full(hot.shape, events.duration_us * 1e-6)
+    watched = np.full(faulty.shape, events.duration_us * 1e-6)
     quiet = np.stack([np.stack([n, watched]) for n in counts])
-    light = by_light(quiet, recording.frame_dn(len(recording.frame_times) // 2), hot)
-    return leak, measured_shot(light, leak.rate_hz, scatter(quiet, hot))
+    light = by_light(quiet, recording.frame_dn(len(recording.frame_times) // 2), faulty)
+    return leak, measured_shot(light, leak.rate_hz, scatter(quiet, faulty))
 
 
 def noise_over_light(found: Sequence[CameraEstimate]) -> CameraEstimate:
@@ -112,14 +114,14 @@ def _require_static(recording: Recording, hot: np.ndarray) -> None:
 
 
 def _rates(
-    counts: np.ndarray, hot: np.ndarray, seconds: float
+    counts: np.ndarray, hot: np.ndarray, dead: np.ndarray, seconds: float
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Rates (H, W) of one polarity in Hz and their std; and the mean over pixels that are not hot
-    with its std."""
-    normal = counts[~hot].astype(np.float64)
+    """Rates (H, W) of one polarity in Hz and their std; and the mean over pixels that are neither
+    hot nor dead with its std. Dead pixels have that mean."""
+    normal = counts[~(hot | dead)].astype(np.float64)
     mean, variance, least = float(normal.mean()), float(normal.var()), 1.0 / normal.size
     rate, error = pixel_rates(
-        counts, np.full(hot.shape, seconds), max(mean, least) / seconds, hot)
+        counts, np.where(dead, 0.0, seconds), max(mean, least) / seconds, hot)
     mean_error = np.sqrt(max(variance, mean, least) / normal.size)
     return rate, error, mean / seconds, float(mean_error) / seconds
 

@@ -1,4 +1,5 @@
-"""Pixels that do not measure the scene: hot ones fire without a signal, dead ones never fire.
+"""Pixels that do not measure the scene: hot ones fire without a signal, dead ones never fire, alone
+or as whole columns and rows (a region of interest, a mask, a broken readout).
 
 One rule identifies a hot pixel: it sends several times the expected number of events, and more than
 chance allows (`fires_alone`). Expected is the noise while nothing happens (`hot_pixels`, from
@@ -24,6 +25,7 @@ OWN_SHARE = 0.5  # minimum excess over the neighbours, relative to what its quie
 MANY_FIRED = 4  # quiet times with events: an edge is not missed so often
 QUIET_NEAR = 8.0  # times its own quiet time: that of a neighbourhood that can show rest
 MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, including itself
+LEAST_SILENT, MOSTLY = 40, 0.5  # pixels; share of a column's: chance 0.5^40, with room for noise
 DEAD_EVENTS = 12  # median of the neighbourhood: chance e^-12, with room for a high threshold
 
 
@@ -91,8 +93,32 @@ def hot_among_neighbours(counts: np.ndarray) -> np.ndarray:
 
 
 def dead_pixels(n_events: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels without a single event amid pixels with many; n_events (H, W)."""
-    return (n_events == 0) & (_median_around(n_events) >= DEAD_EVENTS)
+    """(H, W) bool: pixels without a single event amid pixels with many, or in columns and rows
+    without any beside ones whose pixels mostly fire; n_events (H, W)."""
+    alone = (n_events == 0) & (_median_around(n_events) >= DEAD_EVENTS)
+    return alone | silent_lines(n_events)
+
+
+def silent_lines(n_events: np.ndarray) -> np.ndarray:
+    """(H, W) bool: columns and rows without a single event beside ones whose pixels mostly fire, as
+    outside a region of interest; n_events (H, W)."""
+    fired = n_events > 0
+    return _silent_columns(fired) | _silent_columns(fired.T).T
+
+
+def _silent_columns(fired: np.ndarray) -> np.ndarray:
+    """(H, W) bool: the columns in which nothing fired, of LEAST_SILENT pixels or more side by side,
+    if of each column next to them most of the rows that fire anywhere did. Where a scene ends
+    instead, its edge passes few pixels of a column."""
+    rows, silent = max(int(fired.any(1).sum()), 1), np.logical_not(fired.any(0))
+    busy = fired.sum(0) >= MOSTLY * rows
+    found = np.zeros(fired.shape, bool)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], silent, [False]]).astype(int)))
+    for begin, end in edges.reshape(-1, 2):
+        beside = [i for i in (begin - 1, end) if 0 <= i < len(silent)]
+        if (end - begin) * rows >= LEAST_SILENT and beside and busy[beside].all():
+            found[:, begin:end] = True
+    return found
 
 
 def _most_of_others(counts: np.ndarray, hot: np.ndarray) -> np.ndarray:

@@ -166,6 +166,25 @@ def test_a_dead_pixel_is_listed(watched: tuple[Recording, Camera]) -> None:
     assert "pixels.dead" in [note.code for note in found.notes]
 
 
+def test_what_a_region_of_interest_leaves_out_changes_nothing(
+    watched: tuple[Recording, Camera], measured: Found
+) -> None:
+    """Its silence is no sign of little noise, nor of high thresholds."""
+    (recording, _), (whole, _) = watched, measured
+    events, width = recording.events, SHAPE[1] // 2
+    kept = events.x < width
+    part = Events(*(a[kept] for a in (events.x, events.y, events.t, events.p)), events.size)
+    found = estimate_camera(dataclasses.replace(recording, events=part))
+    assert found.dead[:, width:].all()
+    np.testing.assert_array_equal(found.dead[:, :width], whole.dead[:, :width])
+    assert "pixels.dead" in [note.code for note in found.notes]
+    for name in PARAMETERS:
+        value, error = (float(getattr(s, name)) for s in (found.summary, found.summary_std))
+        assert value == pytest.approx(float(getattr(whole.summary, name)), abs=2 * error)
+        beyond = np.asarray(getattr(found.camera, name))[:, width:]
+        np.testing.assert_allclose(beyond, value, rtol=1e-3)
+
+
 def test_refusals(watched: tuple[Recording, Camera]) -> None:
     recording, params = watched[0], load_weights()
     bare = Recording.of_events(recording.events)

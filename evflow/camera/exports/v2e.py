@@ -70,8 +70,8 @@ What v2e cannot represent
 {log}- All events of a pixel between two frames share v2e's time slots; times are float32 seconds.
 '''
 
-LOG = """- Its logarithm is linear below 20 DN, with up to three times the contrast; that of the measured
-  pixels is logarithmic there too.
+LOG = """- Its logarithm is linear below 20 DN, with up to three times the contrast; the measured
+  one is logarithmic there too.
 """
 
 

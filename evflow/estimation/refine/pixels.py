@@ -70,6 +70,13 @@ class PixelEvidence:
             np.concatenate([self.start[:4] + other.start[:4],
                             np.maximum(self.start[4:], other.start[4:])]))
 
+    def without(self, pixels: Array) -> PixelEvidence:
+        """The same, but nothing about pixels (H, W) bool."""
+        none = PixelEvidence.nothing(pixels.shape)
+        return PixelEvidence(*(np.where(pixels, b, a) for a, b in (
+            (self.equations, none.equations), (self.bounds, none.bounds),
+            (self.start, none.start))))
+
 
 def _no_start(shape: tuple[int, int]) -> Array:
     """`since_start` of no events, a read-only view."""
