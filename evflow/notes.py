@@ -47,6 +47,7 @@ NOTES: dict[str, str] = {
     "frames.mosaic": "a colour mosaic was converted to luma",
     "frames.moved": "frame times were shifted",
     "frames.none": "there are no frames",
+    "frames.offset": "light that the frames do not show is hardly determined",
     "frames.rate": "the frame rate varies",
     "frames.raw": "frames are a colour mosaic",
     "frames.repeated": "frames repeat the one before",

@@ -119,7 +119,7 @@ def estimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
         (*before, *camera_notes(stats, lacking, n_events, summary, hot, dead),
-         *receptor_notes(front_end.found, refined.optics), *noise_notes(shot), *after,
+         *receptor_notes(front_end.found, refined.optics, summary, std), *noise_notes(shot), *after,
          *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),
         **_measured(front_end, refined.optics, leak, shot), extent=extent, thirds=thirds)

@@ -13,6 +13,7 @@ from evflow.notes import Note
 from evflow.recordings.check.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.training.config import PRESETS
 
+UNDETERMINED = 2.0  # times the stated error of theta: what the light alone may change is told
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
 
@@ -62,7 +63,9 @@ def _faulty(name: str, mask: np.ndarray, what: str) -> list[Note]:
                  f"{name} pixels ({mask.sum()}, the first at x={x}, y={y}): {what}")]
 
 
-def receptor_notes(found: Found | None, optics: Optics | None) -> list[Note]:
+def receptor_notes(
+    found: Found | None, optics: Optics | None, summary: Summary, std: Summary
+) -> list[Note]:
     if found is None or optics is None:
         return []
     notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be measured: it "
@@ -82,6 +85,16 @@ def receptor_notes(found: Found | None, optics: Optics | None) -> list[Note]:
             "frames.light", f"pixels see {abs(optics.offset_dn):.0f} DN {more} light than the "
             "frames show (dark current, black level): the thresholds refer to that light. A gamma "
             "of the frames cannot be recognised in a single recording."))
+        return notes
+    stated = np.mean([float(std.theta_on) / float(summary.theta_on),
+                      float(std.theta_off) / float(summary.theta_off)])
+    if (due := float(found.theta_error.mean())) > UNDETERMINED * stated:
+        notes.append(Note(
+            "frames.offset", "how much more light the pixels see than the frames show is hardly "
+            f"determined ({optics.offset_dn:.0f} ± {optics.offset_dn_std:.0f} DN), and by itself "
+            f"changes the thresholds by {due:.0%}. Their errors count on most cameras having no "
+            "such light; two real DAVIS had 17 and 20 DN. A longer recording, with dark and bright "
+            "areas, determines it."))
     return notes
 
 
