@@ -31,6 +31,7 @@ NOTES: dict[str, str] = {
     "frames.coarse": "the frame rate is too low for the low-pass",
     "frames.cut": "the scene is cut between two frames",
     "frames.dark": "frame values below the reset level are 0",
+    "frames.dense": "frames come faster than an estimate can use",
     "frames.depth": "16-bit frames do not use the whole range",
     "frames.exposure": "the blur of the exposure is taken out of the frames, if that is possible",
     "frames.fast": "motion too fast to interpolate well",

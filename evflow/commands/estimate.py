@@ -184,6 +184,7 @@ class Estimate(Compiling, Reading):
         from evflow.files.spool import SOME, on_disk
         from evflow.process.terminal import bar
         from evflow.recordings.check import check
+        from evflow.recordings.dense import thinned
         from evflow.recordings.repeats import without_repeats
 
         with bar("reading the recording") as progress:
@@ -203,6 +204,7 @@ class Estimate(Compiling, Reading):
             print(f"warning: {doubt}", file=sys.stderr)
         recording = without_repeats(recording) if self.protocol == "motion" else recording
         recording = self._reconstructed(recording) if self.reconstruct else recording
+        recording = thinned(recording) if self.protocol == "motion" else recording
         return recording, report, doubts
 
     def _stepping(self, recording: Recording) -> Note | None:

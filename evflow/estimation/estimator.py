@@ -65,7 +65,8 @@ class CameraEstimator:
 
         Args:
             piece: events and at least two frames around them, from the same camera. Its last frame
-                is the next piece's first.
+                is the next piece's first. Frames 10 ms apart or more are best, as
+                `estimate_camera` thins them.
 
         Returns:
             How many usable windows between frames it had; 0 for a piece in which nothing happens,

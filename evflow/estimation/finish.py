@@ -16,7 +16,7 @@ from evflow.estimation import drift, maps
 from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.leak import Leak, measured_leak
-from evflow.estimation.one_polarity import undetermined, with_prior
+from evflow.estimation.one_polarity import no_more_than_all, undetermined, with_prior
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
 from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
@@ -97,6 +97,7 @@ def estimate(
     hot, dead, summary, std = refined.hot, refined.dead, refined.summary, refined.std
     if lacking := undetermined(stats, summary):
         summary, std = with_prior(lacking, list(refined.chunks), summary, std)
+    summary, std = no_more_than_all(stats, summary, std)
     stage("noise rates and maps")
     quiet = quiet_times(
         _counted(windows_of(state.read), advance), summary, refined.faulty, front_end.seen_by)

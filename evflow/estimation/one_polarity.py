@@ -16,6 +16,7 @@ from evflow.training.config import PRESETS
 
 POLARITIES = ("on", "off")
 BEYOND_NOISE = 3.0  # standard deviations by which events must exceed the noise
+ALLOWED = 2.0  # the same, by which noise may exceed a polarity's events
 UNREFINED = (0.5, 1.0)  # relative errors of theta, eta from the network alone
 
 
@@ -28,6 +29,19 @@ def undetermined(stats: Stats, summary: Summary) -> tuple[str, ...]:
         if events - noise < BEYOND_NOISE * np.sqrt(max(events, 1.0)):
             found.append(name)
     return tuple(found)
+
+
+def no_more_than_all(stats: Stats, summary: Summary, std: Summary) -> tuple[Summary, Summary]:
+    """The summary and its std with noise rates that a polarity's events allow: noise sends no more
+    than all of them."""
+    known = {}
+    for name in POLARITIES:
+        events, watched = float(getattr(stats, f"events_{name}")), float(stats.exposure)
+        rate, error = (float(getattr(s, f"eta_{name}")) for s in (summary, std))
+        most = (events + ALLOWED * math.sqrt(events) + 1.0) / max(watched, 1e-9)
+        if rate > most:
+            known[f"eta_{name}"] = most, min(error, most)
+    return _changed(summary, std, known)
 
 
 def with_prior(

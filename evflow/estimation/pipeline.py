@@ -36,6 +36,7 @@ from evflow.files.spool import SOME, on_disk
 from evflow.network import api
 from evflow.network.architecture import config_of
 from evflow.network.weights import load_weights
+from evflow.recordings.dense import thinned
 from evflow.recordings.repeats import without_repeats
 from evflow.recordings.stillness import stands_still
 from evflow.recordings.windows import WindowPlan, iter_windows, left_out, plan_windows
@@ -113,7 +114,7 @@ def measure(
         stage("reading the file")
         with on_disk(SOME):
             recording = io.read_recording(recording)
-    recording = without_repeats(recording)
+    recording = thinned(without_repeats(recording))
     if not recording.has_frames or stands_still(recording):
         stage("counting noise")
         return Measured(estimate_noise(recording))
@@ -135,8 +136,8 @@ def measure(
     division = divided(stretches)
     state, early, extent = _read(state, stretches, order, effort, until, counter,
                                  division.first if division else range(0))
-    repeated = [note for note in recording.notes if note.code == "frames.repeated"]
-    found = estimate(state, extent=extent, before=left_out(recording, plan), after=repeated,
+    left = [n for n in recording.notes if n.code in ("frames.repeated", "frames.dense")]
+    found = estimate(state, extent=extent, before=left_out(recording, plan), after=left,
                      advance=counter.advance, stage=stage)
     counter.finish()
     first = FirstPart(early, tuple(used), division.rest) if division and early.read else None

@@ -152,6 +152,9 @@ def test_polarity_without_events_is_said_to_be_undetermined(
     away = float(found.summary.theta_on) - float(jnp.median(camera.theta_on))
     assert abs(away) < 2 * float(found.summary_std.theta_on)
     assert float(found.summary_std.theta_on) > 0.2 * float(found.summary.theta_on)
+    # No event in some hundred seconds of all pixels: no noise rate either.
+    assert float(found.summary.eta_off) < 0.01
+    assert float(found.summary_std.eta_off) <= float(found.summary.eta_off)
 
 
 def test_a_dead_pixel_is_listed(watched: tuple[Recording, Camera]) -> None:
