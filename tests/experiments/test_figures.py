@@ -230,6 +230,16 @@ def video() -> dict[str, Figures]:
     return {label: of(name) for label, name in names.items()}
 
 
+def longer() -> dict[str, Figures]:
+    names = {"estimate": "evflow", "truth": "oracle", "LGAN": "lgan"}
+    gains = {label: [values("see_better_long", rf"SSIM\|{name} \(3\)", "to default", k)[0]
+                     for k in range(2)] for label, name in names.items()}
+    return {label: [*gains.get(label, [0.0]), *(
+        values("see_better_long", rf"{measure}\|{name} \(3\)", 2)[0]
+        for measure in ("LPIPS", "MSE"))]
+        for label, name in {"default parameters": "default", **names}.items()}
+
+
 def flow() -> dict[str, Figures]:
     names = {"thresholds uniform": "wide", "thresholds log-uniform": "wide-log",
              "estimate": "evflow", "truth": "oracle", "the camera's own": "raw"}
@@ -282,6 +292,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "### The inverse direction"): generate,
     (ACCURACY, "The middle one of three frames"): changes,
     (ACCURACY, "### Video"): video,
+    (ACCURACY, "### Longer trainings"): longer,
     (ACCURACY, "### Flow"): flow,
     (ACCURACY, "### Losses and flow steps"): losses,
     (ACCURACY, "A Newton's cradle, thresholds from"): cradle,
