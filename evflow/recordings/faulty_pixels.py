@@ -25,7 +25,9 @@ OWN_SHARE = 0.5  # minimum excess over the neighbours, relative to what its quie
 MANY_FIRED = 4  # quiet times with events: an edge is not missed so often
 QUIET_NEAR = 8.0  # times its own quiet time: that of a neighbourhood that can show rest
 MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, including itself
-LEAST_SILENT, MOSTLY = 40, 0.5  # pixels; share of a column's: chance 0.5^40, with room for noise
+# Silent pixels side by side; those of a column beside them that fire, and their share: so many
+# silent ones come by chance with a probability of .5^40.
+LEAST_SILENT, LEAST_BUSY, MOSTLY = 40, 8, 0.5
 DEAD_EVENTS = 12  # median of the neighbourhood: chance e^-12, with room for a high threshold
 
 
@@ -111,7 +113,7 @@ def _silent_columns(fired: np.ndarray) -> np.ndarray:
     if of each column next to them most of the rows that fire anywhere did. Where a scene ends
     instead, its edge passes few pixels of a column."""
     rows, silent = max(int(fired.any(1).sum()), 1), np.logical_not(fired.any(0))
-    busy = fired.sum(0) >= MOSTLY * rows
+    busy = fired.sum(0) >= max(MOSTLY * rows, LEAST_BUSY)
     found = np.zeros(fired.shape, bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], silent, [False]]).astype(int)))
     for begin, end in edges.reshape(-1, 2):

@@ -44,6 +44,7 @@ def test_where_a_scene_ends_nothing_is_silent() -> None:
         assert not silent_lines(noise(0.05, seed)).any()
         assert not silent_lines(noise(0.02, seed)).any()
     assert not silent_lines(np.zeros(SHAPE, int)).any()
+    assert not silent_lines(5 * (np.arange(100) < 30)[None]).any()  # a line of pixels
 
 
 def test_noise_of_half_a_sensor_is_that_of_the_half() -> None:

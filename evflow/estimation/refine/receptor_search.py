@@ -85,7 +85,7 @@ def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
     """The more probable log map, its most probable constants, and the effective number of events;
     None where no threshold follows from them. The maps differ in dark light alone."""
     begun = _begin(data, "linlog")
-    if begun is None or float((np.asarray(data.dn) < LINLOG_KNEE).mean()) < DARK:
+    if begun is None or _dark(data) < DARK:
         return begun
     model, phi, size = begun
     other = _begin(data, "log_eps", np.where(OFFSET, 0.0, phi))
@@ -94,6 +94,13 @@ def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
     size = min(size, BELIEVED)
     gain = _value(phi, model, size) - _value(other[1], other[0], size)
     return other if gain > OTHER_MAP + small_sample_odds(data) else begun
+
+
+def _dark(data: Sample) -> float:
+    """Share of the used pixels' light, over time, that is below lin-log's knee."""
+    stretches = zip(*map(np.asarray, (data.dn, data.pixel, data.weight)), strict=True)
+    light = [dn[:, np.unique(pixel[weight > 0])].ravel() for dn, pixel, weight in stretches]
+    return float((np.concatenate(light) < LINLOG_KNEE).mean())
 
 
 def _begin(
