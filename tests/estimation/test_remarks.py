@@ -1,0 +1,43 @@
+"""What is told of the light that the frames do not show, and of the pixels' logarithm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evflow.camera import Summary
+from evflow.camera.optics import Optics
+from evflow.camera.sensors import LogMap
+from evflow.estimation.refine import Found
+from evflow.estimation.remarks import receptor_notes
+from evflow.simulator.photoreceptor import Photoreceptor
+
+SUMMARY = Summary(*(np.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
+STD = Summary(*(np.float32(v) for v in (0.01, 0.0125, 0.03, 0.04, 0.005, 0.006)))  # 5 % of theta
+
+
+def told(offset_dn: float, std_dn: float, due: float, log_map: LogMap = "linlog") -> dict[str, str]:
+    """The notes, by code, where the constants' errors alone change theta by the share `due`."""
+    seen = Photoreceptor(offset_dn, log_map=log_map)
+    found = Found(
+        seen, np.full(2, 0.3), np.full(2, 0.3), np.diag([std_dn**2, 1e-8, 1e-8]), np.full(2, due),
+        (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)))
+    optics = Optics(offset_dn, 0.0, std_dn, 1e-4)
+    return {note.code: note.text for note in receptor_notes(found, optics, SUMMARY, STD)}
+
+
+@pytest.mark.parametrize(("offset_dn", "std_dn", "due", "code"), [
+    (0.0, 24.0, 0.15, "frames.offset"), (0.0, 2.0, 0.02, ""), (20.0, 5.0, 0.15, "frames.light")])
+def test_light_is_told_where_it_is_seen_or_may_matter(
+    offset_dn: float, std_dn: float, due: float, code: str
+) -> None:
+    notes = told(offset_dn, std_dn, due)
+    assert {name for name in notes if name.startswith("frames.")} == ({code} if code else set())
+    if code == "frames.offset":
+        assert "0 ± 24 DN" in notes[code]
+        assert "15%" in notes[code]
+
+
+def test_a_logarithm_in_dark_light_is_told() -> None:
+    assert "pixels.log" in told(0.0, 1.0, 0.01, "log_eps")
+    assert "pixels.log" not in told(0.0, 1.0, 0.01)
