@@ -72,6 +72,8 @@ class PixelEvidence:
 
     def without(self, pixels: Array) -> PixelEvidence:
         """The same, but nothing about pixels (H, W) bool."""
+        if not pixels.any():
+            return self  # a copy takes 100 MB of a large sensor
         none = PixelEvidence.nothing(pixels.shape)
         return PixelEvidence(*(np.where(pixels, b, a) for a, b in (
             (self.equations, none.equations), (self.bounds, none.bounds),
