@@ -9,20 +9,21 @@ The same network is trained for each condition: default parameters, wide randomi
 uniform on .1 to 1, and log-uniform on .05 to 1), evflow's estimate of the target camera from a 2 s
 recording of it, and the target's true maps (oracle); in `full` also what the compared systems
 estimate and, for video, the thresholds of the original E2VID (e2vid), for flow the target's own
-recordings, from whose frames EV-FlowNet learns (raw). Seeds are paired: scenes,
-initial parameters and batches are the same for all conditions of a seed, only the camera differs
-(not so of `raw`). Events for training come from one sensor model, those of the targets from others
-(shared/targets.py). Images are scored in the later windows of held-out scenes, clipped to
-[0, 1]: SSIM (preset evreal), MSE, PSNR, LPIPS where its weights are installed, and MSE of
-log(1 + 255 I) / log 256; flow by its error at pixels with events, and FWL (votes rounded to the
-nearest pixel) beside that of the true flow.
+recordings, from whose frames EV-FlowNet learns (raw). Seeds are paired: scenes, initial parameters
+and batches are the same for all conditions of a seed, only the camera differs (not so of `raw`).
+Training events come from one sensor model, those of the targets from others (shared/targets.py);
+evflow+circuit and oracle+circuit train with the target's circuit too, estimated or true. Images
+are scored in the later windows of held-out scenes, clipped to [0, 1]: SSIM (preset evreal), MSE,
+PSNR, LPIPS where its weights are installed, and MSE of log(1 + 255 I) / log 256; flow by its error
+at pixels with events, and FWL (votes rounded to the nearest pixel) beside that of the true flow.
+--recordings NAME=PATH: real recordings, measured, and scored by their frames, or by FWL.
 
 A finished training stays in --out with its scores: the same command goes on with what is missing,
 and one that asks for more adds to it. One that asks for less than the tables there have is refused.
 Tables VII and IX: weights that `experiments.ablate` keeps, as --estimators "8 steps=PATH" ...; any
-camera file is a condition by --cameras NAME=PATH, EventGAN by --eventgan eventgan=PATH (the
-generator.safetensors of `experiments.train_eventgan`). Writes see_better.json, .md, .png and
-_clips.png.
+camera file (maps and circuit) is a condition by --cameras NAME=PATH, EventGAN by --eventgan
+eventgan=PATH (generator.safetensors of `experiments.train_eventgan`). Writes see_better.json, .md,
+.png and _clips.png.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ from experiments.shared import gains, held_out
 from experiments.shared.common import at_least, run_script, write_result, write_text
 from experiments.shared.conditions import Files, named_files
 from experiments.shared.same_runs import nothing_lost, same_setting
-from experiments.shared.see_better_settings import Preset, Task, heading, preset_of
-from experiments.shared.trainings import Setting, Trainings
+from experiments.shared.see_better_settings import Preset, Setting, Task, heading, preset_of
+from experiments.shared.trainings import Trainings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +62,8 @@ class Options:
     """Target cameras (default: the preset's)."""
     circuits: tuple[Literal["noisy", "voltmeter", "esim"], ...] = ()
     """Their circuits (default: noisy)."""
+    recordings: tuple[str, ...] = ()
+    """Real targets in place of those, NAME=PATH."""
     normalised: bool = False
     """Event tensors of deviation 1, which hide the scale of thresholds; `small` has them for flow
     in any case."""
@@ -92,7 +95,7 @@ def main(options: Options) -> dict[str, Any]:
     """Train and test what is missing; returns the tables' figures of all there is."""
     plots.require()
     began, setting = time.monotonic(), chosen(options)
-    runs = Trainings(setting, options.out, options.weights)
+    runs = Trainings(setting, options.out, options.weights, named_files(options.recordings))
     conditions = runs.conditions(
         Files(*map(named_files, (options.estimators, options.eventgan, options.cameras))))
     same_setting(options.out, options.task, options.weights, setting)
@@ -100,8 +103,9 @@ def main(options: Options) -> dict[str, Any]:
     left = runs.complete_all(conditions, began + options.max_seconds)
     result = {k: gains.compared(scores) for k, scores in runs.scores(conditions).items()}
     untrained = runs.untrained(options.task)
-    text = "\n\n".join((heading(options.task, options.preset, setting), gains.report(
-        result, options.task, runs.camera_medians(conditions), left, untrained)))
+    text = "\n\n".join((
+        heading(options.task, options.preset, setting, len(options.recordings)),
+        gains.report(result, options.task, runs.camera_medians(conditions), left, untrained)))
     write_result(
         options.out / "see_better.json",
         {"targets": result, "without_network": untrained, "missing": left,

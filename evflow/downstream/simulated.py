@@ -23,10 +23,10 @@ from evflow.checks import require
 from evflow.downstream.prior import WidePrior
 from evflow.downstream.tensor import BINS, normalise, signed
 from evflow.errors import EvflowDataError
-from evflow.light.log_maps import lin_log
 from evflow.scenes import Scene, TextureBank, render, sample_scene, watch
 from evflow.scenes.config import SceneConfig
 from evflow.scenes.motion import optical_flow
+from evflow.simulator.photoreceptor import seen_log
 
 Array = jax.Array
 
@@ -36,7 +36,8 @@ class SequenceConfig:
     """Training data of the networks.
 
     sequences: a batch; windows: T of each; steps_per_window: rendered frames in one; crop: side
-    in pixels; window_s: of a window. prior, model, scene: as everywhere.
+    in pixels; window_s: of a window. prior, scene: as everywhere. model: the pixel circuit, its
+    low-pass as `evflow simulate --camera` has it.
     pause, resume: probability per window that the scene stops, and that it continues (S2R: .05,
     .1). noise: std of Gaussian noise on every bin but of the first window; hot_pixels: largest
     share of pixels with a constant offset of the same std in all bins and windows.
@@ -168,8 +169,9 @@ def _simulate(key: Array, frames: Array, camera: Camera, config: SequenceConfig)
     """Event tensors (T, H, W, bins) of a camera that has been running for a while."""
     k_phase, k_sim = jax.random.split(key)
     dt = config.window_s / config.steps_per_window
+    log_frames, circuit = seen_log(frames, dt, config.model)
     return signed(watch.voxels(
-        k_sim, lin_log(frames), camera, config.model, config.windows, dt, config.bins,
+        k_sim, log_frames, camera, circuit, config.windows, dt, config.bins,
         watch.memory(k_phase, camera)))
 
 

@@ -35,7 +35,8 @@ def is_zip(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; EV009 if it, or anything the block reads from it, is damaged or a bomb.
+    """Open an archive; EV016 without the file, EV009 if it, or anything the block reads from it, is
+    damaged or a bomb.
 
     streamed: members that are read in pieces and may therefore be of any size."""
     try:
@@ -47,6 +48,8 @@ def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.Zip
             sizes = [info.file_size for info in found if info.filename not in streamed]
             check_expansion(sum(sizes), there, path)
             yield archive
+    except FileNotFoundError as e:
+        raise EvflowDataError("EV016", f"no file at {path}.", where=path) from e
     except DAMAGE as e:
         raise EvflowDataError(
             "EV009", f"{path} is damaged ({e or type(e).__name__}).", "Copy it again.",
@@ -77,7 +80,8 @@ def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz by key; EV009 if any of them is damaged or pickled."""
+    """All arrays of an .npz by key; EV016 without the file, EV009 if any of them is damaged or
+    pickled."""
     with members(path) as found:
         return {name: member.whole() for name, member in found.items()}
 

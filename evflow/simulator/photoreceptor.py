@@ -24,7 +24,7 @@ from jax.typing import ArrayLike
 
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import LogMap, SensorModel
-from evflow.light.log_maps import lin_log_inverse, log_dn, log_dn_inverse
+from evflow.light.log_maps import lin_log_inverse, log_dn, log_dn_inverse, to_log
 
 Array = jax.Array
 
@@ -103,6 +103,17 @@ def seen_path(
     pace = 0.5 * (rate[1:] + rate[:-1])
     _, s = jax.lax.scan(step, u[0], (u[:-1], u[1:], pace, jnp.asarray(dt_s)))
     return jnp.concatenate([u[:1], s])
+
+
+def seen_log(frames: Array, dt_s: float, sensor: SensorModel) -> tuple[Array, SensorModel]:
+    """`seen_frames` on the device, of light (T, H, W) in DN at instants dt_s apart: log intensity
+    in the map of the circuit behind the photoreceptor, and that circuit."""
+    seen_by, behind = as_measured(sensor, Optics())
+    if seen_by.ideal:
+        return to_log(frames, behind.log_map), behind
+    s = seen_path(frames, jnp.full(len(frames) - 1, dt_s), 0.0, seen_by.tau_s, seen_by.by_light,
+                  seen_by.logarithmic)
+    return to_log(_shown(s, 0.0, seen_by.logarithmic), behind.log_map), behind
 
 
 def seen_frames(

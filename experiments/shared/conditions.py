@@ -12,7 +12,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ import numpy as np
 from evflow import Recording, estimate_camera, load_weights
 from evflow.baselines import SYSTEMS
 from evflow.camera import THETA_MIN, Camera, Summary, sample_pixels
+from evflow.camera.optics import read_sensor
+from evflow.camera.sensors import SensorModel
 from evflow.downstream.prior import WidePrior
 from evflow.errors import EvflowDataError
 from evflow.estimation.pooled import pool_recording, window_inputs
@@ -29,14 +31,20 @@ from evflow.network.api import Params, config_of, estimate_y, finish
 from evflow.network.coordinates import squash
 from evflow.network.weights import weights_path
 from evflow.recordings import iter_windows
+from experiments.shared.scored_on import Recorded
 from experiments.shared.targets import Target
 
 Array = jax.Array
 Shape = tuple[int, int]
+AnyTarget = Target | Recorded
+Made = TypeVar("Made")
 
 DEFAULT, WIDE, WIDE_LOG, E2V = "default", "wide", "wide-log", "e2vid"
 OURS, ORACLE, RAW = "evflow", "oracle", "raw"
-FREE = (DEFAULT, WIDE, WIDE_LOG, E2V)  # independent of the target
+CIRCUIT = "+circuit"
+OURS_WHOLE, ORACLE_WHOLE = OURS + CIRCUIT, ORACLE + CIRCUIT
+OF_KNOWN = (ORACLE, ORACLE_WHOLE, RAW)
+CHOICES = (DEFAULT, WIDE, WIDE_LOG, E2V, OURS, OURS_WHOLE, *OF_KNOWN, *SYSTEMS)
 # Thresholds uniform in .1 to 1, or log-uniform in .05 to 1 (the prior for unknown cameras).
 PRIORS = {WIDE: WidePrior(theta=(0.1, 1.0), uniform=True), WIDE_LOG: WidePrior()}
 DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
@@ -47,14 +55,16 @@ E2V_THETA = (0.18, 0.03)  # mean and deviation over cameras (Rebecq et al., PAMI
 class Condition:
     """One condition. label: its name in the tables; name: of the run, one per training; targets:
     to test on; make: maps of K cameras (K, H, W), or None where events do not come from a simulated
-    camera; source: digest of the file that it is made from; generator: weights of EventGAN."""
+    camera; circuit: of their pixels, None for that of the training; source: digest of the file that
+    it is made from; generator: weights of EventGAN."""
 
     label: str
     name: str
-    targets: tuple[Target, ...]
+    targets: tuple[AnyTarget, ...]
     make: Callable[[], Camera | None]
     source: str = ""
     generator: Path | None = None
+    circuit: Callable[[], SensorModel] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +99,7 @@ class Workshop:
     shape: Shape
     count: int
     folder: Path
-    record: Callable[[Target], Recording]
+    record: Callable[[AnyTarget], Recording]
     params: Any
 
     def default(self) -> Camera:
@@ -113,50 +123,57 @@ class Workshop:
         none = jnp.zeros_like(on)
         return Camera(on, off, none, none)
 
-    def same(self, camera: Camera) -> Camera:
-        """One camera, K times."""
-        return jax.tree.map(
-            lambda m: jnp.broadcast_to(m, (self.count, *self.shape)), self.fitted(camera))
+    def parts(self, camera: Camera) -> Camera:
+        """K parts of this size of one camera, at random where it is larger, repeated where it is
+        smaller."""
+        def repeated(m: Array) -> Array:
+            return jnp.tile(m, [-(-n // have) for n, have in zip(self.shape, m.shape, strict=True)])
 
-    def fitted(self, camera: Camera) -> Camera:
-        """Maps of this size: repeated or cut."""
-        def fit(m: Array) -> Array:
-            wanted = [-(-n // have) for n, have in zip(self.shape, m.shape, strict=True)]
-            return jnp.tile(m, wanted)[:self.shape[0], :self.shape[1]]
-
-        return jax.tree.map(fit, camera)
+        whole = jax.tree.map(repeated, camera)
+        rows, columns = (
+            jax.random.randint(key, (self.count,), 0, have - n + 1) for key, have, n in zip(
+                jax.random.split(jax.random.key(5)), whole.shape, self.shape, strict=True))
+        return jax.vmap(lambda *corner: jax.tree.map(
+            lambda m: jax.lax.dynamic_slice(m, corner, self.shape), whole))(rows, columns)
 
     def stored(self, path: Path) -> Camera:
         """Draws from the estimate in a file, or the maps in it."""
         camera, std = Camera.load_with_std(path)
         if std is None:
-            return self.same(camera)
-        whole, error = self.fitted(camera), self.fitted(std)
+            return self.parts(camera)
         keys = jax.random.split(jax.random.key(3), self.count)
-        return jax.vmap(lambda key: whole.drawn(key, error))(keys)
+        return jax.vmap(lambda key, part, error: part.drawn(key, error))(
+            keys, self.parts(camera), self.parts(std))
 
-    def estimated(self, target: Target) -> Camera:
+    def estimated(self, target: AnyTarget) -> Camera:
         """`estimate_camera` of the target's recording."""
+        return self.stored(self._estimate(target))
+
+    def circuit(self, target: AnyTarget) -> SensorModel:
+        """That of `estimated`."""
+        return _circuit_in(self._estimate(target))
+
+    def mapped(self, target: AnyTarget, name: str, params: Params) -> Camera:
+        """Maps of the target's recording by a network alone."""
+        return self.stored(self.kept(target, name, lambda r: network_maps(r, params)))
+
+    def compared(self, target: AnyTarget, name: str) -> Camera:
+        """Estimate of the target's recording by a compared system."""
+        return self.stored(self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera))
+
+    def _estimate(self, target: AnyTarget) -> Path:
         return self.kept(target, OURS, lambda r: estimate_camera(r, self.params))
 
-    def mapped(self, target: Target, name: str, params: Params) -> Camera:
-        """Maps of the target's recording by a network alone."""
-        return self.kept(target, name, lambda r: network_maps(r, params))
-
-    def compared(self, target: Target, name: str) -> Camera:
-        """Estimate of the target's recording by a compared system."""
-        return self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera)
-
     def kept(
-        self, target: Target, name: str, measure: Callable[[Recording], Camera | CameraEstimate]
-    ) -> Camera:
-        """A measurement of the target's recording, saved on first use."""
+        self, target: AnyTarget, name: str, measure: Callable[[Recording], Camera | CameraEstimate]
+    ) -> Path:
+        """The file of a measurement of the target's recording, made on first use."""
         path = self.folder / f"{target.name} {name}.npz"
         if not path.is_file():
             measured = measure(self.record(target))
             path.parent.mkdir(parents=True, exist_ok=True)
             measured.save(path)
-        return self.stored(path)
+        return path
 
 
 def network_maps(recording: Recording, params: Params) -> Camera:
@@ -175,34 +192,14 @@ def network_maps(recording: Recording, params: Params) -> Camera:
 
 
 def conditions(
-    shop: Workshop, targets: Sequence[Target], names: Sequence[str], files: Files = NONE
+    shop: Workshop, targets: Sequence[AnyTarget], names: Sequence[str], files: Files = NONE
 ) -> list[Condition]:
-    """Of the names (`default`, `wide`, `wide-log`, `e2vid`, `evflow`, `oracle`, `raw`, or a
-    compared system) and of files; raises EV020 for an unknown name or one used twice."""
+    """Of the names (`CHOICES`) and of files; raises EV020 for an unknown name, one used twice, or
+    one that no target can have."""
     counts = Counter((*names, *files.estimators, *files.generators, *files.cameras))
     if twice := [name for name, count in counts.items() if count > 1]:
         raise EvflowDataError("EV020", f"two conditions are called {twice}.", "Rename one.")
-    free: dict[str, Callable[[], Camera | None]] = {
-        DEFAULT: shop.default, E2V: shop.e2vid,
-        **{name: _bound(shop.wide, name) for name in PRIORS}}
-    found = []
-    for name in names:
-        if name in FREE:
-            found.append(Condition(name, name, tuple(targets), free[name]))
-        elif name == ORACLE:
-            by_camera = {t.camera_name: t for t in targets}
-            found += [_oracle(shop, targets, t) for t in by_camera.values()]
-        elif name == OURS:
-            found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.estimated, t))
-                      for t in targets]
-        elif name == RAW:
-            found += [Condition(name, f"{t.name} {name}", (t,), lambda: None) for t in targets]
-        elif name in SYSTEMS:
-            found += [Condition(name, f"{t.name} {name}", (t,), _bound(shop.compared, t, name))
-                      for t in targets]
-        else:
-            raise EvflowDataError("EV020", f"condition {name!r}.", "Choose of "
-                                  f"{[*FREE, OURS, ORACLE, RAW, *SYSTEMS]}.")
+    found = [condition for name in names for condition in _named(shop, targets, name)]
     for name, path in files.estimators.items():
         params = load_weights(path)
         found += [Condition(name, f"{t.name} {name}", (t,),
@@ -210,17 +207,52 @@ def conditions(
                   for t in targets]
     found += [Condition(name, name, tuple(targets), lambda: None, digest(path), path)
               for name, path in files.generators.items()]
-    return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path))
+    return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path),
+                              circuit=_bound(_circuit_in, path))
                     for name, path in files.cameras.items()]
 
 
-def _oracle(shop: Workshop, targets: Sequence[Target], one: Target) -> Condition:
-    """True maps, which targets of one camera share."""
-    alike = tuple(t for t in targets if t.camera_name == one.camera_name)
-    return Condition(ORACLE, f"{one.camera_name} {ORACLE}", alike, _bound(shop.same, one.camera))
+def _named(shop: Workshop, targets: Sequence[AnyTarget], name: str) -> list[Condition]:
+    """The conditions of one name."""
+    free: dict[str, Callable[[], Camera | None]] = {
+        DEFAULT: shop.default, E2V: shop.e2vid,
+        **{prior: _bound(shop.wide, prior) for prior in PRIORS}}
+    if name in free:
+        return [Condition(name, name, tuple(targets), free[name])]
+    if name in OF_KNOWN:
+        return _of_known(shop, [t for t in targets if isinstance(t, Target)], name)
+    own: dict[str, Callable[[AnyTarget], Camera]] = {
+        OURS: shop.estimated, OURS_WHOLE: shop.estimated,
+        **{system: lambda t: shop.compared(t, name) for system in SYSTEMS}}
+    if name not in own:
+        raise EvflowDataError("EV020", f"condition {name!r}.", f"Choose of {list(CHOICES)}.")
+    circuit = shop.circuit if name == OURS_WHOLE else None
+    return [Condition(name, f"{t.name} {name}", (t,), _bound(own[name], t),
+                      t.source if isinstance(t, Recorded) else "",
+                      circuit=circuit and _bound(circuit, t)) for t in targets]
 
 
-def _bound(make: Callable[..., Camera], *arguments: Any) -> Callable[[], Camera | None]:
+def _of_known(shop: Workshop, known: Sequence[Target], name: str) -> list[Condition]:
+    """Of targets whose true camera is known, or whose recordings can be made."""
+    if not known:
+        raise EvflowDataError("EV020", f"condition {name!r} for recordings alone.",
+                              "Their true camera is not known: leave it out.")
+    if name == RAW:
+        return [Condition(name, f"{t.name} {name}", (t,), lambda: None) for t in known]
+    if name == ORACLE_WHOLE:
+        return [Condition(name, f"{t.name} {name}", (t,), _bound(shop.parts, t.camera),
+                          circuit=_bound(lambda t: t.circuit, t)) for t in known]
+    by_camera = {t.camera_name: t for t in known}
+    return [Condition(name, f"{camera} {name}",
+                      tuple(t for t in known if t.camera_name == camera),
+                      _bound(shop.parts, one.camera)) for camera, one in by_camera.items()]
+
+
+def _circuit_in(path: Path) -> SensorModel:
+    return read_sensor(path)[0]
+
+
+def _bound(make: Callable[..., Made], *arguments: Any) -> Callable[[], Made]:
     return lambda: make(*arguments)
 
 

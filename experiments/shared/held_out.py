@@ -91,7 +91,12 @@ def outputs(network: Network, params: Params, tensors: Array, normalised: bool) 
 
 def video_scores(images: Array, clips: Clips, skipped: int, lpips: Params | None) -> Scores:
     """`VIDEO` of the windows after those skipped; without lpips where there are no weights."""
-    found = _video(images[skipped:], clips.frames[skipped:], lpips)
+    return image_scores(images[skipped:], clips.frames[skipped:], lpips)
+
+
+def image_scores(images: Array, frames: Array, lpips: Params | None) -> Scores:
+    """`VIDEO` of images and frames (T, N, H, W), means over T."""
+    found = _video(images, frames, lpips)
     return {name: np.asarray(found[name], np.float64) for name in VIDEO if name in found}
 
 

@@ -11,7 +11,7 @@ from evflow.network.weights import weights_path
 from evflow.training.config import as_dict
 from experiments.shared.common import write_result
 from experiments.shared.conditions import Condition, digest
-from experiments.shared.trainings import Setting
+from experiments.shared.see_better_settings import Setting
 
 
 def same_setting(out: Path, task: str, weights: str, setting: Setting) -> None:

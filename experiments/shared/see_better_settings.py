@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet
+from evflow.downstream import E2VID, E2VID_PLUS, E2VID_SMALL, EVFlowNet, Network
 from evflow.downstream.simulated import SequenceConfig
 from evflow.downstream.train import LearningConfig
 from evflow.process.provenance import provenance
-from experiments.shared.conditions import E2V, RAW
+from experiments.shared.conditions import DEFAULT, E2V, ORACLE, OURS, RAW, WIDE, WIDE_LOG
 from experiments.shared.targets import CAMERAS, SCENES
-from experiments.shared.trainings import SIMULATED, Setting
 
 Task = Literal["video", "flow"]
 Preset = Literal["debug", "small", "full"]
@@ -19,8 +18,33 @@ Preset = Literal["debug", "small", "full"]
 # of scenes as those of images, few steps of a small network learned no flow.
 MOVING = dataclasses.replace(
     SCENES, contrast=(0.5, 1.0), foregrounds=0, speed_px_s=(50.0, 250.0))
+SIMULATED = (DEFAULT, WIDE, WIDE_LOG, OURS, ORACLE)
 COMPARED = ("s2r", "jaer", "ecc median", "match", "lgan")
 ALONE: dict[Task, str] = {"video": E2V, "flow": RAW}  # what the paper has beside them
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What is trained and how it is tested. names: of conditions; cameras, circuits: of targets;
+    seeds: paired trainings; shape: of the targets' sensors; textures: procedural ones of
+    training; drawn: K of `conditions`; seconds: of the recording to estimate from; scenes,
+    windows, skipped: clips, their length, and the windows that are not scored; perceptual:
+    LPIPS is also what video is trained by, where its weights are."""
+
+    network: Network
+    learning: LearningConfig
+    names: tuple[str, ...] = SIMULATED
+    cameras: tuple[str, ...] = ("high",)
+    circuits: tuple[str, ...] = ("noisy",)
+    seeds: int = 5
+    shape: tuple[int, int] = (64, 64)
+    textures: int = 128
+    drawn: int = 256
+    seconds: float = 2.0
+    scenes: int = 48
+    windows: int = 20
+    skipped: int = 6
+    perceptual: bool = False
 
 
 def preset_of(task: Task, preset: Preset) -> Setting:
@@ -52,13 +76,15 @@ def preset_of(task: Task, preset: Preset) -> Setting:
         large, steps=5000, warmup=200, rate=2e-4))
 
 
-def heading(task: Task, preset: Preset, setting: Setting) -> str:
-    """The title of the tables: network, training, data, and the machine."""
+def heading(task: Task, preset: Preset, setting: Setting, recorded: int) -> str:
+    """The title of the tables: network, training, data, and the machine. recorded: targets that
+    are recordings."""
     learning, made = setting.learning, provenance()
     data = learning.data
     return (f"# {task}, preset {preset}\n\n"
             f"{type(setting.network).__name__} of base {setting.network.base}, {setting.seeds} "
             f"seeds, {learning.steps} steps of {data.sequences} sequences of {data.windows} windows"
-            f" of {1e3 * data.window_s:g} ms at {data.crop} px; {setting.scenes} held-out clips. "
+            f" of {1e3 * data.window_s:g} ms at {data.crop} px; "
+            f"{f'{recorded} recordings' if recorded else f'{setting.scenes} held-out clips'}. "
             f"evflow {made['evflow']}, jax {made['versions']['jax']}, "
             f"{made['machine']['device']}, {made['machine']['cpus']} CPUs.")

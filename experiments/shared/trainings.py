@@ -19,11 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow import Camera, load_weights
+from evflow import Camera, Recording, load_weights
+from evflow.camera.sensors import SensorModel
 from evflow.downstream import EVFlowNet, Network
 from evflow.downstream.recorded import RecordedBank, sample_recorded
 from evflow.downstream.released import save_network
-from evflow.downstream.train import LearningConfig, LearningState, init_state, make_step, optimiser
+from evflow.downstream.train import LearningState, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
 from evflow.network.weights import model_card
 from evflow.process.provenance import provenance
@@ -34,42 +35,20 @@ from experiments.shared.common import slug, write_result
 from experiments.shared.conditions import (
     NONE,
     RAW,
+    AnyTarget,
     Condition,
     Files,
     Workshop,
     camera_medians,
     conditions,
 )
+from experiments.shared.scored_on import OfClips, Recorded, ScoredOn
+from experiments.shared.see_better_settings import Setting
 
 Params = dict[str, Any]
 Scores = dict[str, dict[str, dict[str, dict[int, np.ndarray]]]]  # target, label, measure, seed
 
-SIMULATED = ("default", "wide", "wide-log", "evflow", "oracle")
 TEXTURE_SEED = 11
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """What is trained and how it is tested. names: of conditions; cameras, circuits: of targets;
-    seeds: paired trainings; shape: of the targets' sensors; textures: procedural ones of
-    training; drawn: K of `conditions`; seconds: of the recording to estimate from; scenes,
-    windows, skipped: clips, their length, and the windows that are not scored; perceptual:
-    LPIPS is also what video is trained by, where its weights are."""
-
-    network: Network
-    learning: LearningConfig
-    names: tuple[str, ...] = SIMULATED
-    cameras: tuple[str, ...] = ("high",)
-    circuits: tuple[str, ...] = ("noisy",)
-    seeds: int = 5
-    shape: tuple[int, int] = (64, 64)
-    textures: int = 128
-    drawn: int = 256
-    seconds: float = 2.0
-    scenes: int = 48
-    windows: int = 20
-    skipped: int = 6
-    perceptual: bool = False
 
 
 def run_card(condition: Condition, camera: Camera | None, **figures: float) -> dict[str, Any]:
@@ -81,11 +60,18 @@ def run_card(condition: Condition, camera: Camera | None, **figures: float) -> d
 class Trainings:
     """Trains and tests; what runs share is made once, on first use."""
 
-    def __init__(self, setting: Setting, out: Path, weights: str = "default") -> None:
+    def __init__(
+        self, setting: Setting, out: Path, weights: str = "default",
+        recordings: dict[str, Path] | None = None,
+    ) -> None:
+        """recordings: real ones by name, in place of the setting's targets."""
         self.setting, self.out, self.weights = setting, out, weights
-        self.targets = [targets.target(camera, circuit, setting.shape)
-                        for camera in setting.cameras for circuit in setting.circuits]
-        self._clips: dict[str, held_out.Clips] = {}
+        self.targets: list[AnyTarget] = [
+            Recorded.read(name, path) for name, path in (recordings or {}).items()
+        ] or [targets.target(camera, circuit, setting.shape)
+              for camera in setting.cameras for circuit in setting.circuits]
+        self._scored_on: dict[str, ScoredOn] = {}
+        self._steps: dict[SensorModel, Any] = {}
         self._recorded: dict[str, RecordedBank] = {}
         self._starts: dict[tuple[int, Network], LearningState] = {}
 
@@ -111,8 +97,9 @@ class Trainings:
             return dataclasses.replace(network, scales=network.encoders)
         return network
 
-    def recorded(self, target: targets.Target) -> RecordedBank:
+    def recorded(self, target: AnyTarget) -> RecordedBank:
         """The target's own recordings of training scenes."""
+        assert isinstance(target, targets.Target)
         if target.name not in self._recorded:
             data = self.setting.learning.data
             made = held_out.gather(targets.clips(
@@ -126,25 +113,33 @@ class Trainings:
         """Weights of LPIPS, where they are installed."""
         return held_out.installed_lpips()
 
-    def clips(self, target: targets.Target) -> held_out.Clips:
-        if target.name not in self._clips:
+    def scored_on(self, target: AnyTarget) -> ScoredOn:
+        """A target's held-out clips, or the recording itself."""
+        if isinstance(target, Recorded):
+            return target
+        if target.name not in self._scored_on:
             s = self.setting
-            self._clips[target.name] = held_out.gather(targets.clips(
-                target, self.held_out_bank, s.learning.data, s.scenes, s.windows))
-        return self._clips[target.name]
+            self._scored_on[target.name] = OfClips(held_out.gather(targets.clips(
+                target, self.held_out_bank, s.learning.data, s.scenes, s.windows)), s.skipped)
+        return self._scored_on[target.name]
 
     def conditions(self, files: Files = NONE) -> list[Condition]:
         s = self.setting
-        shop = Workshop(
-            s.shape, s.drawn, self.out / "cameras",
-            lambda t: targets.recording(t, self.held_out_bank, s.learning.data, s.seconds),
-            load_weights(self.weights))
+        shop = Workshop(s.shape, s.drawn, self.out / "cameras", self._recording,
+                        load_weights(self.weights))
         return conditions(shop, self.targets, s.names, files)
+
+    def _recording(self, target: AnyTarget) -> Recording:
+        """What a target's camera is measured by."""
+        if isinstance(target, Recorded):
+            return target.recording
+        s = self.setting
+        return targets.recording(target, self.held_out_bank, s.learning.data, s.seconds)
 
     def folder(self, condition: Condition, seed: int) -> Path:
         return self.out / "runs" / slug(condition.name) / str(seed)
 
-    def scored(self, condition: Condition, seed: int, target: targets.Target) -> Path:
+    def scored(self, condition: Condition, seed: int, target: AnyTarget) -> Path:
         return self.folder(condition, seed) / f"{slug(target.name)}.json"
 
     def done(self, condition: Condition, seed: int) -> bool:
@@ -186,15 +181,17 @@ class Trainings:
     def train(self, condition: Condition, seed: int, path: Path) -> None:
         """Train from the seed and save; the scenes and batches are those of every condition but
         `raw`, whose recordings end."""
-        steps, began = self.setting.learning.steps, time.monotonic()
-        camera, network = condition.make(), self.network(condition)
+        learning, began = self.setting.learning, time.monotonic()
+        steps, camera, network = learning.steps, condition.make(), self.network(condition)
+        circuit = condition.circuit() if condition.circuit else learning.data.model
         bank: TextureBank | RecordedBank = self.bank
         cameras: Any = camera
-        step = self._step
         if condition.generator is not None:
             cameras, step = load_weights(condition.generator), self._generated_step
         elif condition.label == RAW:
             bank, step = self.recorded(condition.targets[0]), self._recorded_step
+        else:
+            step = self._simulated_step(circuit)
         lpips = self.lpips if self.setting.perceptual else None
         state, losses = self._start(seed, network), []
         with bar(f"{condition.name}, seed {seed}") as progress:
@@ -208,7 +205,8 @@ class Trainings:
         if not math.isfinite(loss):
             raise EvflowDataError("EV007", f"{condition.name}, seed {seed}: the loss is {loss}.")
         card = run_card(condition, camera, seed=seed, steps=steps, loss=loss,
-                        seconds=time.monotonic() - began)
+                        seconds=time.monotonic() - began) | (
+                            {} if camera is None else {"circuit": repr(circuit)})
         path.parent.mkdir(parents=True, exist_ok=True)
         save_network(path, network, state.params, card,
                      normalised=self.setting.learning.normalised)
@@ -217,9 +215,14 @@ class Trainings:
     def _tx(self) -> Any:
         return optimiser(self.setting.learning)
 
-    @functools.cached_property
-    def _step(self) -> Any:
-        return jax.jit(make_step(self.setting.network, self.setting.learning, self._tx))
+    def _simulated_step(self, circuit: SensorModel) -> Any:
+        """With pixels of this circuit."""
+        if circuit not in self._steps:
+            learning = self.setting.learning
+            learning = dataclasses.replace(
+                learning, data=dataclasses.replace(learning.data, model=circuit))
+            self._steps[circuit] = jax.jit(make_step(self.setting.network, learning, self._tx))
+        return self._steps[circuit]
 
     @functools.cached_property
     def _generated_step(self) -> Any:
@@ -238,13 +241,10 @@ class Trainings:
             self._starts[seed, network] = init_state(network, learning, self._tx)
         return self._starts[seed, network]
 
-    def score(self, network: Network, params: Params, target: targets.Target) -> held_out.Scores:
-        """Scores of a network on the clips of a target."""
-        s, clips = self.setting, self.clips(target)
-        made = held_out.outputs(network, params, clips.tensors, s.learning.normalised)
-        if isinstance(network, EVFlowNet):
-            return held_out.flow_scores(made, clips, s.skipped)
-        return held_out.video_scores(made, clips, s.skipped, self.lpips)
+    def score(self, network: Network, params: Params, target: AnyTarget) -> held_out.Scores:
+        """Scores of a network on a target."""
+        return self.scored_on(target).scores(
+            network, params, self.setting.learning.normalised, self.lpips)
 
     def scores(self, wanted: list[Condition]) -> Scores:
         """Saved scores of clips, by target, condition, measure and seed."""
@@ -263,31 +263,27 @@ class Trainings:
     def untrained(self, task: str) -> dict[str, gains.Means]:
         """Means of the baselines without a network, by target."""
         return {t.name: {label: {name: float(np.nanmean(v)) for name, v in scores.items()}
-                         for label, scores in held_out.without_network(
-                             task, self.clips(t), self.setting.skipped, self.lpips).items()}
+                         for label, scores in self.scored_on(t).without_network(
+                             task, self.lpips).items()}
                 for t in self.targets}
 
     def camera_medians(self, wanted: list[Condition]) -> dict[str, dict[str, float]]:
         """Medians of the cameras that each condition was trained for, and of the true ones."""
-        found = {f"{t.name}, truth": camera_medians(t.camera) for t in self.targets}
+        found = {f"{t.name}, truth": camera_medians(t.camera) for t in self.targets
+                 if isinstance(t, targets.Target)}
         for condition in wanted:
             path = self.folder(condition, 0) / "weights.safetensors"
             if path.is_file() and model_card(path)["cameras"]:
                 found[condition.name] = model_card(path)["cameras"]
         return found
 
-    def examples(
-        self, wanted: list[Condition], target: targets.Target
-    ) -> dict[str, np.ndarray]:
-        """The last frames of a target's clips (N, H, W), and images of them by the first network
-        of each condition."""
-        clips, s = self.clips(target), self.setting
-        found = {"frame": np.asarray(clips.frames[-1])}
+    def examples(self, wanted: list[Condition], target: AnyTarget) -> dict[str, np.ndarray]:
+        """The last frames of a target's clips, or all of a recording (N, H, W), and images of them
+        by the first network of each condition."""
+        found: dict[str, np.ndarray] = {}
         for condition in wanted:
             path = self.folder(condition, 0) / "weights.safetensors"
             if target in condition.targets and path.is_file():
-                images = held_out.outputs(
-                    self.network(condition), load_weights(path), clips.tensors,
-                    s.learning.normalised)
-                found[condition.label] = np.asarray(images[-1])
-        return found
+                found[condition.label], found["frame"] = self.scored_on(target).images(
+                    self.network(condition), load_weights(path), self.setting.learning.normalised)
+        return {"frame": found.pop("frame"), **found} if found else found

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from evflow.camera import Camera
-from evflow.camera.optics import Optics, as_arrays, read_sensor
+from evflow.camera.optics import (
+    Optics,
+    as_arrays,
+    read_sensor,
+    read_summary,
+    read_undetermined,
+)
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 
@@ -39,3 +45,6 @@ def test_what_is_no_number_is_refused(tmp_path: Path, value: object) -> None:
     Camera.constant((4, 5)).save(tmp_path / "camera.npz", sensor_cutoff_hz=np.asarray(value))
     with pytest.raises(EvflowDataError, match=r"EV009.*sensor_cutoff_hz"):
         read_sensor(tmp_path / "camera.npz")
+    for read in (read_sensor, read_summary, read_undetermined):
+        with pytest.raises(EvflowDataError, match=r"EV016.*absent\.npz"):
+            read(tmp_path / "absent.npz")

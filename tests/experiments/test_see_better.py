@@ -16,6 +16,9 @@ from helpers.networks import small_params
 from scipy import stats
 
 from evflow.camera import Camera
+from evflow.camera.optics import Optics, as_arrays
+from evflow.camera.sensors import SensorModel
+from evflow.downstream import E2VID, EVFlowNet
 from evflow.downstream.released import load_network
 from evflow.downstream.simulated import SequenceConfig, Sequences, _crop
 from evflow.errors import EvflowDataError
@@ -34,10 +37,12 @@ from experiments.shared.conditions import (
     named_files,
     network_maps,
 )
-from experiments.shared.see_better_settings import preset_of
-from experiments.shared.trainings import SIMULATED, Trainings, run_card
+from experiments.shared.scored_on import OfClips, Recorded
+from experiments.shared.see_better_settings import SIMULATED, preset_of
+from experiments.shared.trainings import Trainings, run_card
 
 SHAPE = (24, 32)
+SMALL = E2VID(base=4, encoders=1, blocks=0)
 
 
 def target(camera: str = "high", circuit: str = "noisy") -> targets.Target:
@@ -167,11 +172,63 @@ def test_unclear_conditions_are_refused(tmp_path: Path) -> None:
     for absent in (Files(cameras={"mine": path}), Files(generators={"mine": path})):
         with pytest.raises(EvflowDataError, match=r"EV016.*absent"):
             conditions(shop, [target()], (), absent)
+    real = Recorded("real", "", recordings.make())
+    for name in ("oracle", "oracle+circuit", "raw"):
+        with pytest.raises(EvflowDataError, match=r"EV020.*recordings alone"):
+            conditions(shop, [real], (name,))
     for given in (("x",), ("=y",), ("a=b", "a=c")):
         with pytest.raises(EvflowDataError, match="EV020"):
             named_files(given)
     assert named_files(("8 steps=a/b.npz",)) == {"8 steps": Path("a/b.npz")}
     assert slug("L_P + L_F/x") == "L_P_+_L_F_x"
+
+
+def test_a_condition_has_the_targets_circuit_where_it_says_so(tmp_path: Path) -> None:
+    measured = SensorModel(cutoff_hz=70.0, eta_is_all=True, noise_resets_memory=True)
+    path = Camera.constant(SHAPE).save(tmp_path / "mine.npz", **as_arrays(measured, {}, Optics()))
+    slow, fast = target(), target(circuit="esim")
+    shop = workshop(tmp_path / "cameras")
+    for seen in (slow, fast):
+        kept = shop.folder / f"{seen.name} evflow.npz"
+        kept.parent.mkdir(exist_ok=True)
+        kept.write_bytes(path.read_bytes())
+    found = {c.name: c.circuit and c.circuit() for c in conditions(
+        shop, [slow, fast], ("default", "evflow", "oracle", "evflow+circuit", "oracle+circuit"),
+        Files(cameras={"mine": path}))}
+    assert found == {
+        "default": None, "high noisy evflow": None, "high esim evflow": None, "high oracle": None,
+        "high noisy evflow+circuit": measured, "high esim evflow+circuit": measured,
+        "high noisy oracle+circuit": slow.circuit, "high esim oracle+circuit": fast.circuit,
+        "mine": measured}
+
+
+def test_cameras_larger_than_a_target_are_cropped_alike_with_their_errors(tmp_path: Path) -> None:
+    maps = jnp.arange(40 * 50, dtype=jnp.float32).reshape(40, 50)
+    whole = Camera(maps, maps + 1, maps, maps)
+    shop = workshop(tmp_path)
+    parts = shop.parts(whole)
+    assert parts.shape == (4, *SHAPE)
+    np.testing.assert_array_equal(parts.theta_off, parts.theta_on + 1)
+    np.testing.assert_array_equal(np.diff(parts.eta_on, axis=1), 50)
+    assert len({float(m[0, 0]) for m in parts.theta_on}) > 1
+    np.testing.assert_array_equal(parts.theta_on, shop.parts(whole).theta_on)
+
+
+@pytest.mark.slow
+def test_a_recording_is_scored_by_its_own_frames_and_by_the_sharpness_of_its_events() -> None:
+    whole = recordings.make(count=5)
+    real = Recorded("real", "", whole)
+    made, frames = real.images(SMALL, SMALL.init(jax.random.key(0), (48, 64)), False)
+    assert made.shape == frames.shape
+    np.testing.assert_allclose(frames[-1], whole.frame_dn(-1) / 255, atol=1e-6)
+    grey = real.without_network("video", None)["even grey"]
+    np.testing.assert_allclose(grey["mse"], np.mean((frames - 0.5) ** 2, (1, 2)), rtol=1e-4)
+    flow = EVFlowNet(base=4)
+    params = flow.init(jax.random.key(0), (48, 64))
+    found = real.scores(flow, params, False, None)
+    assert found.keys() == {"fwl"}
+    np.testing.assert_allclose(real.without_network("flow", None)["no flow"]["fwl"], 1, rtol=1e-4)
+    assert len(found["fwl"]) == 9  # whole windows of 30 ms in not quite 300
 
 
 def test_a_run_is_that_of_the_file_its_camera_comes_from(tmp_path: Path) -> None:
@@ -344,7 +401,9 @@ def test_recordings_of_the_target_train_without_true_flow(tmp_path: Path) -> Non
     bank = runs.recorded(raw.targets[0])
     assert bank.tensors.shape == (3, 4, 32, 32, 5)
     assert bank.borders.shape == (3, 5, 32, 32)
-    assert not np.array_equal(bank.borders[0, 0], runs.clips(raw.targets[0]).borders[0, 0])
+    held = runs.scored_on(raw.targets[0])
+    assert isinstance(held, OfClips)
+    assert not np.array_equal(bank.borders[0, 0], held.clips.borders[0, 0])
     assert runs.recorded(raw.targets[0]) is bank  # made once for all seeds
     runs.complete(raw, 0)
     trained = load_network(str(runs.folder(raw, 0) / "weights.safetensors"))

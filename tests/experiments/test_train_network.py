@@ -10,6 +10,9 @@ import jax
 import numpy as np
 import pytest
 
+from evflow.camera import Camera
+from evflow.camera.optics import Optics, as_arrays
+from evflow.camera.sensors import SensorModel
 from evflow.downstream import load_network
 from evflow.downstream.presets import KINDS, TRAININGS, training
 from evflow.downstream.train import make_step, optimiser
@@ -78,15 +81,17 @@ def test_files_of_a_run_are_known_by_what_they_hold(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "camera.npz"
-    path.write_bytes(b"one")
+    Camera.constant((16, 16)).save(path)
 
     def run(**files: object) -> Run:
         return command.configuration(command.Options(out=Path(), **files))
 
+    rng = np.random.default_rng(0)
     for name, kind in (("camera", Path), ("start", str), ("lpips", str)):
         first, same = run(**{name: kind(path)}), run(**{name: kind("camera.npz")})
         assert first == same != run()
-        path.write_bytes(path.read_bytes() + b"another")
+        other = Camera.constant((16, 16), theta_on=float(rng.uniform(0.1, 0.9)))
+        other.save(path, overwrite=True)
         assert run(**{name: kind(path)}) != first
         with pytest.raises(EvflowDataError, match="EV016"):
             run(**{name: kind("absent.npz")})
@@ -94,6 +99,16 @@ def test_files_of_a_run_are_known_by_what_they_hold(
     for recording in (path, tmp_path):  # a file, a folder
         assert run(recordings=(recording,), **original) == run(
             recordings=(recording.relative_to(tmp_path),), **original)
+
+
+def test_a_measured_camera_brings_its_circuit(tmp_path: Path) -> None:
+    measured = SensorModel(cutoff_hz=60.0, cutoff_by_light=False, refractory_s=2e-3, leak_hz=0.2,
+                           log_map="log_eps", eta_is_all=True, noise_resets_memory=True)
+    path = Camera.constant((48, 48)).save(
+        tmp_path / "camera.npz", **as_arrays(measured, {}, Optics()))
+    run = command.configuration(command.Options(out=Path(), camera=path))
+    assert run.learning.data.model == measured
+    assert command.configuration(command.Options(out=Path())).learning.data.model != measured
 
 
 @pytest.mark.slow
