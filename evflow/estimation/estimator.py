@@ -16,6 +16,8 @@ from evflow.estimation.state import State, add, thinned
 from evflow.network import api
 from evflow.network.weights import load_weights
 from evflow.notes import Note
+from evflow.recordings import dense
+from evflow.recordings.repeats import without_repeats
 from evflow.recordings.windows import condensed, plan_windows
 from evflow.types import Recording
 
@@ -65,8 +67,8 @@ class CameraEstimator:
 
         Args:
             piece: events and at least two frames around them, from the same camera. Its last frame
-                is the next piece's first. Frames 10 ms apart or more are best, as
-                `estimate_camera` thins them.
+                is the next piece's first. Of frames less than 10 ms apart every nth is used, and
+                repeated ones are left out, as in `estimate_camera`.
 
         Returns:
             How many usable windows between frames it had; 0 for a piece in which nothing happens,
@@ -81,6 +83,10 @@ class CameraEstimator:
                                   f"{self._size}.", "Add pieces of one camera only.")
         if isinstance(piece, Recording) and piece.has_frames and not len(piece.events):
             return 0
+        if isinstance(piece, Recording):
+            piece, given = dense.thinned(without_repeats(piece)), piece.notes
+            told = {note.code for note in self._notes}
+            self._notes += tuple(n for n in piece.notes[len(given):] if n.code not in told)
         plan = plan_windows(piece, self._min_us)
         self._notes = tuple(dict.fromkeys((*self._notes, *condensed(plan.skipped))))[:self.NOTES]
         stretches = cut(piece, plan, path=self._refine == "auto", first=self._size is None)

@@ -13,6 +13,7 @@ from helpers.networks import hidden
 from evflow import CameraEstimator, Recording, estimate_camera
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
+from evflow.estimation import estimator as estimator_module
 from evflow.estimation.extent import covered_s
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.halves import divided
@@ -42,6 +43,22 @@ def test_one_piece_is_the_whole_to_the_byte_and_pieces_come_near() -> None:
         np.testing.assert_array_equal(a, b)
     assert whole.extent.whole
     assert whole.extent.read_s == pytest.approx(0.24)
+
+
+def test_of_dense_frames_pieces_use_every_nth(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    plan = estimator_module.plan_windows
+    monkeypatch.setattr(estimator_module, "plan_windows", lambda piece, us: (
+        seen.append(len(piece.frame_times)), plan(piece, us))[1])
+    recording, _ = hidden(3)
+    times = recording.frame_times[0] + 2000 * np.arange(101)
+    frames = np.repeat(recording.frames, 21, 0)[:101] + np.arange(101)[:, None, None] % 2
+    whole = dataclasses.replace(recording, frames=frames.astype(np.uint8), frame_times=times)
+    estimator = CameraEstimator()
+    for first in (0, 50):
+        estimator.add(piece(whole, first, first + 50))
+    assert seen == [11, 11]
+    assert [n.code for n in estimator._notes].count("frames.dense") == 1
 
 
 def test_what_was_read_is_no_longer_than_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
