@@ -21,8 +21,9 @@ RESET_US = 1_000_000  # a step back by more than this is another clock, not a la
 
 
 def plain(name: str, value: Any) -> Any:
-    """`value` as a NumPy array; JAX arrays pass unchanged. Raises EV003 for masked arrays (the mask
-    would be lost), datetime64 or timedelta64, and objects that are not arrays."""
+    """`value` as a NumPy array in native byte order; JAX arrays pass unchanged. Raises EV003 for
+    masked arrays (the mask would be lost), datetime64 or timedelta64, and objects that are not
+    arrays."""
     if hasattr(value, "aval"):
         return value
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
@@ -42,7 +43,7 @@ def plain(name: str, value: Any) -> Any:
             "EV003", f"{name} has dtype {array.dtype}, a type with its own time unit.",
             f"Times are integer us: {'t' if array.dtype.kind == 'm' else '(t - t[0])'}"
             ".astype('timedelta64[us]').astype(np.int64).")
-    return array
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
 def need(value: Any, kind: Any, name: str, fix: str) -> None:

@@ -124,8 +124,15 @@ class Camera:
 
         Returns:
             A camera of the same shape, thresholds >= .01, noise rates >= 0.
+
+        Raises:
+            EvflowDataError: EV015 (maps of another shape).
         """
-        draws = jax.random.normal(key, (len(PARAMETERS), *self.shape))
+        if std.shape != self.shape:
+            raise EvflowDataError("EV015", f"standard deviations of shape {std.shape} for maps of "
+                                  f"shape {self.shape}.", "Give those of this camera.")
+        draws = jax.random.normal(
+            key, (len(PARAMETERS), *self.shape), jnp.result_type(self.theta_on))
         least = {"theta_on": THETA_MIN, "theta_off": THETA_MIN}
         return Camera(**{
             name: jnp.maximum(getattr(self, name) + getattr(std, name) * draw,
@@ -262,15 +269,15 @@ def sample_pixels(
     """Spread the camera-wide values over pixels: theta ~ N(median, sigma) clamped at .01 (v2e),
     eta log-normal around its median. Returns maps (*batch, H, W)."""
     k_on, k_off, k_eta = jax.random.split(key, 3)
-    size = (*jnp.shape(nominal.theta_on), *shape)
+    size, kind = (*jnp.shape(nominal.theta_on), *shape), jnp.result_type(nominal.theta_on)
 
     def theta(k: Array, median: Array, sigma: Array) -> Array:
-        draw = median[..., None, None] + sigma[..., None, None] * jax.random.normal(k, size)
+        draw = median[..., None, None] + sigma[..., None, None] * jax.random.normal(k, size, kind)
         return jnp.maximum(draw, THETA_MIN)
 
-    spread = jnp.ones((2, *size))
+    spread = jnp.ones((2, *size), kind)
     if eta_spread:
-        spread = jnp.exp(eta_spread * jax.random.normal(k_eta, spread.shape))
+        spread = jnp.exp(eta_spread * jax.random.normal(k_eta, spread.shape, kind))
     return Camera(
         theta(k_on, nominal.theta_on, nominal.sigma_on),
         theta(k_off, nominal.theta_off, nominal.sigma_off),

@@ -110,12 +110,12 @@ def sample_nominal(
     """Draw the camera-wide values, each of shape `batch`. factor: the intensity factor of Eq. 12
     of the scene to be seen, if known."""
     k_theta, k_sigma, k_gain, k_free, k_link = jax.random.split(key, 5)
-    theta = jax.random.uniform(k_theta, (2, *batch), minval=prior.theta[0], maxval=prior.theta[1])
-    sigma = jax.random.uniform(
-        k_sigma, (2, *batch), minval=prior.mismatch[0], maxval=prior.mismatch[1])
+    pair, kind = (2, *batch), jnp.float32  # in x64 mode too: the same key, the same camera
+    theta = jax.random.uniform(k_theta, pair, kind, prior.theta[0], prior.theta[1])
+    sigma = jax.random.uniform(k_sigma, pair, kind, prior.mismatch[0], prior.mismatch[1])
     if prior.noise == "none":
         return Summary(*theta, *jnp.zeros_like(theta), *sigma)
-    gain = jax.random.uniform(k_gain, (2, *batch), minval=0.25)
+    gain = jax.random.uniform(k_gain, pair, kind, 0.25)
     if factor is not None:
         exact = 0.5 if prior.noise == "mixed" else 1.0
         gain = jnp.where(jax.random.bernoulli(jax.random.fold_in(k_gain, 1), exact, batch),
@@ -123,7 +123,7 @@ def sample_nominal(
     eta = noise_of_threshold(theta) * gain
     if prior.noise != "eq12":
         lo, hi = np.log(prior.eta[0]), np.log(prior.eta[1])
-        free = jnp.exp(jax.random.uniform(k_free, (2, *batch), minval=lo, maxval=hi))
+        free = jnp.exp(jax.random.uniform(k_free, pair, kind, lo, hi))
         tied = jax.random.bernoulli(k_link, 0.5, batch) & (prior.noise == "mixed")
         eta = jnp.where(tied, eta, free)
     return Summary(*theta, *eta, *sigma)

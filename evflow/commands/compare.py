@@ -73,12 +73,12 @@ class Compare(Reading):
         facts = {"a": str(self.real), "b": str(self.synthetic), "verdict": verdict(numbers),
                  **numbers}
         names = _short(self.real), _short(self.synthetic)
-        if self.out:
-            write_json(self.out / "compare.json", facts)
         if self.out and self.plots:
             write_cameras(self.out / "compare.html", (a, b), numbers, names,
                           self._compared("First camera", "Second camera"),
                           overwrite=self.overwrite)
+        if self.out:  # after the page, which takes long and may be interrupted
+            write_json(self.out / "compare.json", facts)
         print(json.dumps(facts, indent=2) if self.json else describe_cameras(numbers, names))
         if self.out:
             print(f"written to {self.out}/", file=sys.stderr)
@@ -115,13 +115,13 @@ class Compare(Reading):
         words = describe_streams(numbers)
         facts = {"real": str(self.real), "synthetic": str(self.synthetic),
                  "grade": worst(judge_streams(numbers)), "verdict": words.splitlines(), **numbers}
-        if self.out:
-            write_json(self.out / "compare.json", facts)
         if self.out and self.plots:
             write_comparison(self.out / "compare.html", real, synthetic, numbers,
                              facts=self._compared("Real stream", "Synthetic stream"),
                              labels=(self.real.name, self.synthetic.name),
                              overwrite=self.overwrite)
+        if self.out:
+            write_json(self.out / "compare.json", facts)
         print(json.dumps(facts, indent=2) if self.json else words)
         if self.out:
             print(f"written to {self.out}/", file=sys.stderr)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 THRESHOLDS = ("theta_on", "theta_off", "mismatch", "eta_on", "eta_off")
 CIRCUIT = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz")
 MOST_THETA = 2.0  # log units; no sensor has a median above
+BEYOND_CONTRAST = 20.0  # log units
 CHOICES = ("cutoff_by_light", "noise_resets_memory")
 
 
@@ -205,5 +206,7 @@ def _doubt(camera: Camera) -> None:
     """Warn on stderr of thresholds that no sensor has."""
     theta = float(max(np.median(camera.theta_on), np.median(camera.theta_off)))
     if theta > MOST_THETA:
-        print(f"warning: a threshold of {theta:.3g} log units is {100 * np.expm1(theta):,.0f} % of "
-              "contrast: was it given in percent? 20 % is log(1.2) = 0.18.", file=sys.stderr)
+        contrast = 100 * np.expm1(min(theta, BEYOND_CONTRAST))
+        print(f"warning: a threshold of {theta:.3g} log units is {contrast:,.0f} % of contrast"
+              f"{' and more' * (theta > BEYOND_CONTRAST)}: was it given in percent? 20 % is "
+              "log(1.2) = 0.18.", file=sys.stderr)

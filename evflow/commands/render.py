@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from evflow.commands.options import (
@@ -21,6 +23,8 @@ from evflow.commands.options import (
 )
 from evflow.commands.writing import need_absent
 from evflow.notes import as_dicts
+
+LONG_US = 10_000_000  # without an event
 
 
 @own_first
@@ -80,6 +84,8 @@ class Render(Reading):
         if not seen:
             note_idle(self, "the film shows no frames without --over-frames")
         recording = print_notes(self.read(self.recording, with_frames=seen))
+        if kind != ".png" and self.window_events is None:
+            _note_pause(recording.events.t)
         if kind == ".png":
             described = write_sheet(self.out, recording, film, at_s=self.at,
                                     overwrite=self.overwrite)
@@ -92,3 +98,14 @@ class Render(Reading):
                               "notes": as_dicts(recording.notes)}))
         else:
             print(f"{described} -> {self.out}", file=sys.stderr)
+
+
+def _note_pause(t: np.ndarray) -> None:
+    """Say on stderr if most of the film, of events at t (N,) us, would show none."""
+    pauses = np.diff(t)
+    at = int(np.argmax(pauses)) if len(pauses) else 0
+    if len(pauses) and pauses[at] > max(0.5 * (t[-1] - t[0]), LONG_US):
+        begin = 1e-6 * float(t[at] - t[0])
+        print(f"note: there are no events for {1e-6 * float(pauses[at]):,.0f} s after {begin:.3f} "
+              f"s. A clock that jumped? --stop {math.ceil(1e3 * begin) / 1e3:.3f} leaves out what "
+              "comes later; evflow check says more.", file=sys.stderr)

@@ -123,11 +123,31 @@ class Simulate(Pixels, Footage, Compiling):
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": count, "frames": frames,
                  "sensor": self.sensor, "colour": self.colour, "notes": as_dicts(source.notes)}
-        if self.preview:
-            facts["preview"] = _filmed(self.out, self.preview, self.overwrite)
+        if self.preview and count:
+            facts["preview"] = self._filmed(self.preview)
+        elif self.preview:
+            print(f"note: there are no events, so {self.preview} is not made", file=sys.stderr)
         print(json.dumps(facts) if self.json else "\n".join((
             f"{count:,} events of {frames:,} frames -> {self.out}",
-            *([f"{facts['preview']} -> {self.preview}"] if self.preview else []))))
+            *([f"{facts['preview']} -> {self.preview}"] if "preview" in facts else []))))
+
+    def _filmed(self, film: Path) -> str:
+        """Make a film of the events that were written; returns a description of it."""
+        from evflow import io
+        from evflow.report.movie import SLOW, Film, write_film
+
+        recording = io.read_recording(self.out)
+        slow = min(max(1.0, PREVIEW_S * 1e6 / max(1, recording.events.duration_us)), SLOW[1])
+        rate = Film()
+        try:
+            described = write_film(film, recording, dataclasses.replace(
+                rate, slow=slow, window_us=max(1, round(rate.window_us / slow))),
+                overwrite=self.overwrite)
+        except BaseException:  # and Ctrl-C: the events are whole, and need not be made again
+            print(f"note: {self.out} is complete. The film alone: evflow render {self.out} "
+                  f"-o {film} --slow {slow:.3g}", file=sys.stderr)
+            raise
+        return f"{described}, {slow:.3g} times slower than life" if slow > 1 else described
 
     def _check(self, writer: type[EventWriter]) -> None:
         """Raise EV013, EV020 before any long work."""
@@ -222,19 +242,6 @@ def _fitting(
         return np.rint(frames).astype(whole), times
 
     return fitting
-
-
-def _filmed(events: Path, film: Path, overwrite: bool) -> str:
-    """Make a film of an event file; returns a description of it."""
-    from evflow import io
-    from evflow.report.movie import Film, write_film
-
-    recording = io.read_recording(events)
-    slow = max(1.0, PREVIEW_S * 1e6 / max(1, recording.events.duration_us))
-    rate = Film()
-    described = write_film(film, recording, dataclasses.replace(
-        rate, slow=slow, window_us=max(1, round(rate.window_us / slow))), overwrite=overwrite)
-    return f"{described}, {slow:.3g} times slower than life" if slow > 1 else described
 
 
 def _recorded(

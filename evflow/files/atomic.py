@@ -67,8 +67,9 @@ def atomic_text(path: str | os.PathLike, data: str | bytes, *, overwrite: bool =
 def written_aside(
     path: str | os.PathLike, move: Callable[[Path, Path, bool], None], *, overwrite: bool
 ) -> Iterator[Path]:
-    """`atomic_write` of a file or folder; move(temporary, path, overwrite) puts it in place."""
-    path = Path(path)
+    """`atomic_write` of a file or folder; move(temporary, path, overwrite) puts it in place. What
+    a link leads to is written, and the link stays."""
+    path = behind_links(Path(path))
     if os.path.exists(path) and not overwrite:  # False, not an error, for an impossible path
         raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite (overwrite=True).",
                               where=path)
@@ -94,6 +95,18 @@ def written_aside(
     finally:
         with uninterrupted():
             remove(temporary)
+
+
+def behind_links(path: Path) -> Path:
+    """Where a symbolic link leads, which need not exist; other paths unchanged. EV013 for a link
+    that leads to itself."""
+    if not os.path.islink(path):
+        return path
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise EvflowDataError("EV013", f"{path} is a link that leads to itself.",
+                              "Choose another output.", where=path)
+    return target
 
 
 def _move(temporary: Path, path: Path, overwrite: bool) -> None:

@@ -150,9 +150,9 @@ def estimate(
     Combines the flow's estimate with the summary and the mismatch, each weighted by its precision,
     so that the map of a camera with identical pixels is no worse than its summary. Jitted; compiles
     once per shape. One window determines a camera's thresholds to some percent and its pixels
-    hardly (in the README's example the mean is off by .027 and .031, where the std of
+    hardly (in the README's example the mean is off by .017 and .022, where the std of
     `estimate_with_std` is .025 and .034). `estimate_camera` uses a whole recording: there the
-    median is right to .006.
+    camera's thresholds are right to .008.
 
     Args:
         params: of `load_weights`.

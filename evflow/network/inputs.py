@@ -27,6 +27,7 @@ LONGEST_WINDOW_S = 10.0  # a hundred times the longest in training: more is prob
 
 def real(values: ArrayLike) -> Array:
     """Convert to float32; float64 is kept in JAX's x64 mode."""
+    values = plain("the input", values)
     values = jax.device_put(values) if isinstance(values, np.ndarray) else jnp.asarray(values)
     return values if values.dtype == jnp.float64 else values.astype(jnp.float32)
 

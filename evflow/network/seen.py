@@ -50,10 +50,10 @@ def _seen(
     path = seen_path(lin_log_inverse(log_light), steps, offset_dn, tau_s, by_light,
                      logarithmic)
     # At the ends of the parts, `delay` later; after the window the light stays constant.
-    ends = jnp.arange(0, len(path), SUBSTEPS).reshape(-1, *[1] * dt_s.ndim)
+    ends = jnp.arange(0, len(path), SUBSTEPS, dt_s.dtype).reshape(-1, *[1] * dt_s.ndim)
     at = jnp.clip(ends - (delay_s / dt_s)[None], 0.0, len(each))
-    low = jnp.minimum(jnp.floor(at).astype(jnp.int32), len(each) - 1)
-    below, above = (jnp.take_along_axis(path, low + i, 0) for i in (0, 1))
+    low = jnp.minimum(jnp.floor(at), len(each) - 1.0)
+    below, above = (jnp.take_along_axis(path, low.astype(jnp.int32) + i, 0) for i in (0, 1))
     seen = below + (at - low) * (above - below)
     darker = jnp.log1p(jnp.maximum(offset_dn, 0.0) / 255.0)  # as for simulated frames
     return jnp.moveaxis(jnp.diff(seen, axis=0), 0, -1), 0.5 * (seen[0] + seen[-1]) - darker

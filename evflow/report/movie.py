@@ -25,6 +25,7 @@ from evflow.report.video import CODECS, FPS, SCALES, Codec, check_within, enlarg
 from evflow.types import Events, Recording
 
 SUFFIXES = (".mp4", ".gif", ".png")
+SLOW = (1e-3, 1e6)  # times slower than life
 GAP = 8  # pixels between the pictures of a sheet
 
 
@@ -47,7 +48,7 @@ class Film:
     caption: bool = False
 
     def __post_init__(self) -> None:
-        for name, bounds in (("fps", FPS), ("window_us", (1, 10**9)), ("slow", (1e-3, 1e6)),
+        for name, bounds in (("fps", FPS), ("window_us", (1, 10**9)), ("slow", SLOW),
                              ("scale", SCALES), ("window_events", (1, 10**9))):
             check_within(bounds, name, getattr(self, name))
         if self.codec not in CODECS:

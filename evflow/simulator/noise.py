@@ -98,7 +98,7 @@ def next_tail(mean: Values, current: Tail) -> Tail:
     more, equal, k = current
     k = k + np.float32(1.0)
     equal = equal * mean / k
-    return (more - equal) * ((equal > 1e-12) | (k < mean)), equal, k
+    return (more - equal) * ((equal > 1e-12) | (k < mean)).astype(np.float32), equal, k
 
 
 def poisson(u: Array, mean: Array) -> Array:

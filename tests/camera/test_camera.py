@@ -30,6 +30,22 @@ from evflow.errors import EvflowDataError
 SHAPE = (4, 6)
 
 
+@pytest.mark.parametrize("prior", [CameraPrior(), CameraPrior(noise="independent", eta_spread=0.3)])
+def test_a_key_draws_the_same_camera_in_double_precision(prior: CameraPrior) -> None:
+    def drawn() -> tuple[Camera, Camera]:
+        camera = Camera.sample(jax.random.key(3), SHAPE, prior)
+        return camera, camera.drawn(jax.random.key(4), camera)
+
+    single = drawn()
+    with jax.enable_x64(True):
+        double = drawn()
+    for a, b in zip(jax.tree.leaves(single), jax.tree.leaves(double), strict=True):
+        assert b.dtype == jnp.float32
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(EvflowDataError, match=r"EV015.*\(4, 6\)"):
+        single[0].drawn(jax.random.key(0), Camera.constant((2, 4, 6)))
+
+
 def altered(name: str, value: Any, at: tuple[int, ...] | None = (1, 2)) -> Camera:
     """A valid camera but for one value, or one whole map where `at` is None."""
     camera = Camera.constant(SHAPE, eta_on=0.1, eta_off=0.1)

@@ -267,4 +267,6 @@ def test_two_cameras_beside_each_other_with_their_errors(
     assert kept["refractory_s"]["a_std"] == pytest.approx(2e-5)
     page = (out / "compare.html").read_text()
     assert "22.14 ± 0.37" in page  # percent of contrast
+    times = [(out / f"compare.{kind}").stat().st_mtime_ns for kind in ("html", "json")]
+    assert times == sorted(times)  # interrupted in the page, a command can be given again
     assert page.count("sha256 ") == 2

@@ -18,6 +18,7 @@ from evflow import Camera, read_events, read_recording, simulate
 from evflow.camera.sensors import SENSORS, SecondOrder
 from evflow.cli import main
 from evflow.commands.pixels import Pixels
+from evflow.commands.simulate import Simulate
 from evflow.io.source import open_frames
 from evflow.types import Events
 
@@ -164,6 +165,32 @@ def test_a_film_beside_the_events(video: Path, capsys: pytest.CaptureFixture[str
     capture = cv2.VideoCapture(str(film))
     assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 60  # two seconds of it
     capture.release()
+
+
+def test_without_events_there_is_no_film(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still, film = tmp_path / "still.npy", tmp_path / "out.mp4"
+    np.save(still, np.full((6, 20, 30), 90, np.uint8))
+    assert main(["simulate", str(still), "-o", str(tmp_path / "out.h5"), *BASE, "--preview",
+                 str(film)]) == 0
+    assert f"no events, so {film} is not made" in capsys.readouterr().err
+    assert not film.exists()
+
+
+def test_events_outlive_a_film_that_is_interrupted(
+    video: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("evflow.report.movie.write_film", interrupted)
+    out, film = video.with_name("out.h5"), video.with_name("out.mp4")
+    with pytest.raises(KeyboardInterrupt):
+        Simulate(video=video, out=out, fps=100.0, interpolate=False, preview=film).run()
+    told = capsys.readouterr().err
+    assert f"{out} is complete. The film alone: evflow render {out} -o {film} --slow" in told
+    assert len(read_events(out))
 
 
 def test_frames_of_light_in_a_format_of_bytes(

@@ -48,6 +48,22 @@ def test_nothing_appears_before_the_block_ends(tmp_path: Path) -> None:
     assert path.exists()
 
 
+def test_through_a_link_its_target_is_written_and_the_link_stays(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    target, link = tmp_path / "disk/kept.txt", tmp_path / "out.txt"
+    link.symlink_to(target)
+    write(link, "one")  # the target is not there yet
+    assert refusal(link).code == "EV013"
+    write(link, "two", overwrite=True)
+    assert link.is_symlink()
+    assert target.read_text() == "two"
+    assert os.listdir(target.parent) == ["kept.txt"]
+    assert sorted(os.listdir(tmp_path)) == ["disk", "out.txt"]
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    assert "leads to itself" in str(refusal(loop, overwrite=True))
+
+
 def test_overwrites_only_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     write(path, "old")

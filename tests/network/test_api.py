@@ -12,8 +12,9 @@ import pytest
 from helpers.compilation import precise
 from helpers.networks import seen, small_params
 
-from evflow import squash, unsquash
+from evflow import simulate_voxels, squash, unsquash
 from evflow.camera import PARAMETERS, Camera, Summary
+from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.network import api, inference
 from evflow.network.config import MODELS
@@ -102,6 +103,29 @@ def test_half_precision_is_taken_within_jit_and_without(dtype: Any) -> None:
         small_params(), v, d, intensity=jnp.asarray(4.0, dtype)))(*given)
     np.testing.assert_allclose(eager.theta_on, jitted.theta_on, rtol=1e-4)
     assert eager.theta_on.dtype == jnp.float32
+
+
+def test_bytes_of_another_order_are_numbers_all_the_same() -> None:
+    voxels, dL, _ = seen()
+    given = np.asarray(voxels), np.asarray(dL.sum(-1))
+    native, swapped = (api.estimate(small_params(), *(a.astype(order) for a in given))
+                       for order in ("<f4", ">f4"))
+    jax.tree.map(np.testing.assert_array_equal, native, swapped)
+    hidden = np.ma.masked_array(given[1], np.arange(given[1].size).reshape(given[1].shape) == 3)
+    with pytest.raises(EvflowDataError, match=r"EV003.*masked"):
+        api.estimate(small_params(), given[0], hidden)
+
+
+def test_nothing_rests_on_implicit_dtypes() -> None:
+    voxels, dL, camera = seen()
+    slow = SensorModel(cutoff_hz=50.0)
+    noisy = dataclasses.replace(camera, eta_on=camera.eta_on + 1.0)
+    with jax.numpy_dtype_promotion("strict"):
+        api.estimate(small_params(), voxels, dL.sum(-1))
+        code = api.code_from_video(small_params(), dL, camera, sensor=slow, intensity=4.0)
+        api.generate(small_params(), jax.random.key(1), camera, code)
+        simulate_voxels(jax.random.key(0), jnp.full((3, *camera.shape), 4.0), noisy,
+                        frame_dt_s=1e-3)
 
 
 def test_estimate_on_leading_axes_is_each_alone() -> None:

@@ -169,6 +169,20 @@ def test_render_on_the_command_line(
     assert len(pictures(tmp_path / "a.mp4")) == 9  # 300 ms at 30 pictures a second
 
 
+def test_a_film_of_a_clock_that_jumps_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t = np.append(np.arange(500, dtype=np.int64) * 1000, 15_500_000)
+    events = Events(t % 8, t % 6, t, t % 2 == 0, (8, 6))
+    for name, some, told in (("jump", events, True), ("whole", events.slice(0, 500_000), False)):
+        write_events(tmp_path / f"{name}.npz", some, format="npz")
+        assert main(["render", str(tmp_path / f"{name}.npz"), "-o", str(tmp_path / f"{name}.mp4"),
+                     "--fps", "2"]) == 0
+        said = capsys.readouterr().err
+        assert ("no events for 15 s after 0.499 s" in said) == told
+        assert ("--stop 0.499" in said) == told
+
+
 def test_a_caption_is_a_strip_of_one_size() -> None:
     """Beneath, even, of the same letters whatever the digits; the picture itself is untouched."""
     picture = np.full((96, 320, 3), 7, np.uint8)

@@ -104,7 +104,8 @@ def believed(exposure_us: int, times_us: np.ndarray) -> tuple[int, tuple[Note, .
 def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:
     """That frames have an exposure, and what follows."""
     return Note(NOTED, f"frames are exposed for {exposure_us / 1e3:g} ms, {said_by}: "
-                "estimate and simulate take out the blur (--exposure-ms 0: they leave it)")
+                "estimate and simulate take out the blur of what moves by half a pixel or more "
+                "in that time (--exposure-ms 0: they leave it)")
 
 
 def noted(notes: Iterable[Note], exposure_us: int, said_by: str = "") -> tuple[Note, ...]:

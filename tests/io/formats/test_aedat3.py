@@ -71,7 +71,8 @@ def test_frames_at_mid_exposure(tmp_path: Path) -> None:
     assert texts(found.notes) == ["frame times are mid-exposure",
                                   "1 frames marked as invalid were not read",
                                   "frames are exposed for 1 ms, as the file says: estimate and "
-                                  "simulate take out the blur (--exposure-ms 0: they leave it)"]
+                                  "simulate take out the blur of what moves by half a pixel or "
+                                  "more in that time (--exposure-ms 0: they leave it)"]
     assert read_recording(path, stop_s=0.001).frame_times.tolist() == [1500]
     alone = read_recording(path, no_frames=True)
     equal(alone.events, found.events)
