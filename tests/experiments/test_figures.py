@@ -248,11 +248,13 @@ def flow() -> dict[str, Figures]:
 
 
 def losses() -> dict[str, Figures]:
-    rows = {"L_P": ("L_P", 8), "+ L_F": (r"L_P \+ L_F", 12), "+ L_E": (r"L_P \+ L_E", 16),
-            "all |": (r"L_P \+ L_F \+ L_E", 20), "all, weights": ("the same, weights adapted", 24)}
+    rows = {"L_P |": ("L_P", 8), "+ L_F": (r"L_P \+ L_F \+ L_F'", 12),
+            "+ L_E": (r"L_P \+ L_E", 16), "all |": (r"L_P \+ L_F \+ L_F' \+ L_E", 20),
+            "all, weights": ("the same, weights adapted", 24)}
 
     def gain(source: str, name: str) -> Figures:
-        return [values(source, rf"SSIM\|{name} \(5\)", "to default", k)[0] for k in range(2)]
+        return [values(source, rf"{measure}\|{name} \(3\)", "to default", k)[0]
+                for measure in ("SSIM", "MSE") for k in range(2)]
 
     return {label: [*gain("see_better_losses", name), steps,
                     *gain("see_better_steps", f"{steps} steps")]

@@ -88,9 +88,16 @@ def table_eight() -> dict[str, Figures]:
 
 def table_nine() -> dict[str, Figures]:
     paper = (.665, .674, .688, .684, .703)
-    rows = (r"L_P \(", r"L_P \+ L_F \(", r"L_P \+ L_E", r"L_P \+ L_F \+ L_E", "the same, weights")
-    return {label: [value, values("see_better_losses", rf"SSIM\|{row}", "mean")[0]]
-            for label, row, value in zip(LOSSES, rows, paper, strict=True)}
+    rows = ("L_P (", "L_P + L_F + L_F' (", "L_P + L_E", "L_P + L_F + L_F' + L_E",
+            "the same, weights")
+
+    def here(row: str) -> Figures:
+        return [values("see_better_losses", rf"{measure}\|{re.escape(row)}", "mean")[0]
+                for measure in ("MSE", "SSIM", "LPIPS")]
+
+    return {**{label: [value, *here(row)]
+               for label, row, value in zip(LOSSES, rows, paper, strict=True)},
+            "default parameters": here("default"), "the true camera": here("oracle")}
 
 
 def table_ten() -> dict[str, Figures]:
