@@ -12,10 +12,10 @@ estimate and, for video, the thresholds of the original E2VID (e2vid), for flow 
 recordings, from whose frames EV-FlowNet learns (raw). Seeds are paired: scenes, initial parameters
 and batches are the same for all conditions of a seed, only the camera differs (not so of `raw`).
 Training events come from one sensor model, those of the targets from others (shared/targets.py);
-evflow+circuit and oracle+circuit train with the target's circuit too, estimated or true. Images
-are scored in the later windows of held-out scenes, clipped to [0, 1]: SSIM (preset evreal), MSE,
-PSNR, LPIPS where its weights are installed, and MSE of log(1 + 255 I) / log 256; flow by its error
-at pixels with events, and FWL (votes rounded to the nearest pixel) beside that of the true flow.
+evflow+circuit and oracle+circuit train with the target's circuit, and the light that its frames
+lack. Images are scored in the later windows of held-out scenes, clipped to [0, 1]: SSIM (preset
+evreal), MSE, PSNR, LPIPS where its weights are installed, and MSE of log(1 + 255 I) / log 256; flow
+by its error at pixels with events, and FWL (rounded votes) beside that of the true flow.
 --recordings NAME=PATH: real recordings, measured, and scored by their frames, or by FWL.
 
 A finished training stays in --out with its scores: the same command goes on with what is missing,

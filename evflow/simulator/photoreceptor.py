@@ -105,15 +105,29 @@ def seen_path(
     return jnp.concatenate([u[:1], s])
 
 
-def seen_log(frames: Array, dt_s: float, sensor: SensorModel) -> tuple[Array, SensorModel]:
-    """`seen_frames` on the device, of light (T, H, W) in DN at instants dt_s apart: log intensity
-    in the map of the circuit behind the photoreceptor, and that circuit."""
-    seen_by, behind = as_measured(sensor, Optics())
+def seen_log(
+    frames: Array, dt_s: float, sensor: SensorModel, offset_dn: float = 0.0
+) -> tuple[Array, SensorModel]:
+    """`seen_frames` on the device.
+
+    Args:
+        frames: (T, H, W) in DN, at instants dt_s apart.
+        dt_s: seconds.
+        sensor: the circuit, with its low-pass.
+        offset_dn: light in DN that the pixels see and the frames do not show.
+
+    Returns:
+        Log intensity (T, H, W) in the map of the circuit behind the photoreceptor, and that
+        circuit, to simulate with.
+    """
+    seen_by, behind = as_measured(sensor, Optics(offset_dn))
     if seen_by.ideal:
         return to_log(frames, behind.log_map), behind
-    s = seen_path(frames, jnp.full(len(frames) - 1, dt_s), 0.0, seen_by.tau_s, seen_by.by_light,
-                  seen_by.logarithmic)
-    return to_log(_shown(s, 0.0, seen_by.logarithmic), behind.log_map), behind
+    how = offset_dn, seen_by.tau_s, seen_by.by_light, seen_by.logarithmic
+    s = (seen_path(frames, jnp.full(len(frames) - 1, dt_s), *how) if seen_by.tau_s
+         else _light(frames, *how)[0])
+    darker = np.float32(np.log1p(max(offset_dn, 0.0) / 255.0))
+    return to_log(_shown(s, darker, seen_by.logarithmic), behind.log_map), behind
 
 
 def seen_frames(

@@ -2,7 +2,9 @@
 
 Every condition gives maps of the same number K of cameras and of one size, so that they share one
 compiled training step: drawn ones, the target's K times, or K draws from an estimate and its
-errors. Two have no maps: EventGAN's events, and the target's own recordings.
+errors. Two have no maps: EventGAN's events, and the target's own recordings. Pixels have the
+circuit of the training, so that cameras differ by their maps alone; in a `+circuit` condition they
+have that of the target, estimated or true, and see the light that its frames do not show.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import numpy as np
 from evflow import Recording, estimate_camera, load_weights
 from evflow.baselines import SYSTEMS
 from evflow.camera import THETA_MIN, Camera, Summary, sample_pixels
-from evflow.camera.optics import read_sensor
+from evflow.camera.optics import Optics, read_sensor
 from evflow.camera.sensors import SensorModel
 from evflow.downstream.prior import WidePrior
 from evflow.errors import EvflowDataError
@@ -38,6 +40,7 @@ Array = jax.Array
 Shape = tuple[int, int]
 AnyTarget = Target | Recorded
 Made = TypeVar("Made")
+Circuit = tuple[SensorModel, Optics]
 
 DEFAULT, WIDE, WIDE_LOG, E2V = "default", "wide", "wide-log", "e2vid"
 OURS, ORACLE, RAW = "evflow", "oracle", "raw"
@@ -55,8 +58,8 @@ E2V_THETA = (0.18, 0.03)  # mean and deviation over cameras (Rebecq et al., PAMI
 class Condition:
     """One condition. label: its name in the tables; name: of the run, one per training; targets:
     to test on; make: maps of K cameras (K, H, W), or None where events do not come from a simulated
-    camera; circuit: of their pixels, None for that of the training; source: digest of the file that
-    it is made from; generator: weights of EventGAN."""
+    camera; circuit: of their pixels, and the optics of their frames, None for the training's;
+    source: digest of the file that it is made from; generator: weights of EventGAN."""
 
     label: str
     name: str
@@ -64,7 +67,7 @@ class Condition:
     make: Callable[[], Camera | None]
     source: str = ""
     generator: Path | None = None
-    circuit: Callable[[], SensorModel] | None = None
+    circuit: Callable[[], Circuit] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,9 +152,9 @@ class Workshop:
         """`estimate_camera` of the target's recording."""
         return self.stored(self._estimate(target))
 
-    def circuit(self, target: AnyTarget) -> SensorModel:
+    def circuit(self, target: AnyTarget) -> Circuit:
         """That of `estimated`."""
-        return _circuit_in(self._estimate(target))
+        return read_sensor(self._estimate(target))
 
     def mapped(self, target: AnyTarget, name: str, params: Params) -> Camera:
         """Maps of the target's recording by a network alone."""
@@ -208,7 +211,7 @@ def conditions(
     found += [Condition(name, name, tuple(targets), lambda: None, digest(path), path)
               for name, path in files.generators.items()]
     return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path),
-                              circuit=_bound(_circuit_in, path))
+                              circuit=_bound(read_sensor, path))
                     for name, path in files.cameras.items()]
 
 
@@ -241,15 +244,11 @@ def _of_known(shop: Workshop, known: Sequence[Target], name: str) -> list[Condit
         return [Condition(name, f"{t.name} {name}", (t,), lambda: None) for t in known]
     if name == ORACLE_WHOLE:
         return [Condition(name, f"{t.name} {name}", (t,), _bound(shop.parts, t.camera),
-                          circuit=_bound(lambda t: t.circuit, t)) for t in known]
+                          circuit=_bound(lambda t: (t.circuit, Optics()), t)) for t in known]
     by_camera = {t.camera_name: t for t in known}
     return [Condition(name, f"{camera} {name}",
                       tuple(t for t in known if t.camera_name == camera),
                       _bound(shop.parts, one.camera)) for camera, one in by_camera.items()]
-
-
-def _circuit_in(path: Path) -> SensorModel:
-    return read_sensor(path)[0]
 
 
 def _bound(make: Callable[..., Made], *arguments: Any) -> Callable[[], Made]:

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow import Camera, Recording, load_weights
-from evflow.camera.sensors import SensorModel
 from evflow.downstream import EVFlowNet, Network
 from evflow.downstream.recorded import RecordedBank, sample_recorded
 from evflow.downstream.released import save_network
+from evflow.downstream.simulated import SequenceConfig
 from evflow.downstream.train import LearningState, init_state, make_step, optimiser
 from evflow.errors import EvflowDataError
 from evflow.network.weights import model_card
@@ -71,7 +71,7 @@ class Trainings:
         ] or [targets.target(camera, circuit, setting.shape)
               for camera in setting.cameras for circuit in setting.circuits]
         self._scored_on: dict[str, ScoredOn] = {}
-        self._steps: dict[SensorModel, Any] = {}
+        self._steps: dict[SequenceConfig, Any] = {}
         self._recorded: dict[str, RecordedBank] = {}
         self._starts: dict[tuple[int, Network], LearningState] = {}
 
@@ -183,7 +183,10 @@ class Trainings:
         `raw`, whose recordings end."""
         learning, began = self.setting.learning, time.monotonic()
         steps, camera, network = learning.steps, condition.make(), self.network(condition)
-        circuit = condition.circuit() if condition.circuit else learning.data.model
+        data = learning.data
+        if condition.circuit:
+            model, optics = condition.circuit()
+            data = dataclasses.replace(data, model=model, offset_dn=optics.offset_dn)
         bank: TextureBank | RecordedBank = self.bank
         cameras: Any = camera
         if condition.generator is not None:
@@ -191,7 +194,7 @@ class Trainings:
         elif condition.label == RAW:
             bank, step = self.recorded(condition.targets[0]), self._recorded_step
         else:
-            step = self._simulated_step(circuit)
+            step = self._simulated_step(data)
         lpips = self.lpips if self.setting.perceptual else None
         state, losses = self._start(seed, network), []
         with bar(f"{condition.name}, seed {seed}") as progress:
@@ -206,7 +209,8 @@ class Trainings:
             raise EvflowDataError("EV007", f"{condition.name}, seed {seed}: the loss is {loss}.")
         card = run_card(condition, camera, seed=seed, steps=steps, loss=loss,
                         seconds=time.monotonic() - began) | (
-                            {} if camera is None else {"circuit": repr(circuit)})
+                            {} if camera is None else
+                            {"circuit": repr(data.model), "offset_dn": data.offset_dn})
         path.parent.mkdir(parents=True, exist_ok=True)
         save_network(path, network, state.params, card,
                      normalised=self.setting.learning.normalised)
@@ -215,14 +219,12 @@ class Trainings:
     def _tx(self) -> Any:
         return optimiser(self.setting.learning)
 
-    def _simulated_step(self, circuit: SensorModel) -> Any:
-        """With pixels of this circuit."""
-        if circuit not in self._steps:
-            learning = self.setting.learning
-            learning = dataclasses.replace(
-                learning, data=dataclasses.replace(learning.data, model=circuit))
-            self._steps[circuit] = jax.jit(make_step(self.setting.network, learning, self._tx))
-        return self._steps[circuit]
+    def _simulated_step(self, data: SequenceConfig) -> Any:
+        """The step with such sequences."""
+        if data not in self._steps:
+            learning = dataclasses.replace(self.setting.learning, data=data)
+            self._steps[data] = jax.jit(make_step(self.setting.network, learning, self._tx))
+        return self._steps[data]
 
     @functools.cached_property
     def _generated_step(self) -> Any:

@@ -240,6 +240,15 @@ def longer() -> dict[str, Figures]:
         for label, name in {"default parameters": "default", **names}.items()}
 
 
+def recorded_video() -> dict[str, Figures]:
+    names = {"thresholds log-uniform": "wide-log", "estimate |": "evflow",
+             "estimate, and": r"evflow\+circuit", "LGAN": "lgan"}
+    return {label: [values("see_better_recordings", rf"{measure}\|{name} \(3\)", "to default", k,
+                           target)[0]
+                    for target in ("slider_depth", "cradle") for measure in ("SSIM", "LPIPS", "MSE")
+                    for k in range(2)] for label, name in names.items()}
+
+
 def flow() -> dict[str, Figures]:
     names = {"thresholds uniform": "wide", "thresholds log-uniform": "wide-log",
              "estimate": "evflow", "truth": "oracle", "the camera's own": "raw"}
@@ -295,6 +304,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "The middle one of three frames"): changes,
     (ACCURACY, "### Video"): video,
     (ACCURACY, "### Longer trainings"): longer,
+    (ACCURACY, "### Video of real recordings"): recorded_video,
     (ACCURACY, "### Flow"): flow,
     (ACCURACY, "### Losses and flow steps"): losses,
     (ACCURACY, "A Newton's cradle, thresholds from"): cradle,

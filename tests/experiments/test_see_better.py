@@ -185,7 +185,8 @@ def test_unclear_conditions_are_refused(tmp_path: Path) -> None:
 
 def test_a_condition_has_the_targets_circuit_where_it_says_so(tmp_path: Path) -> None:
     measured = SensorModel(cutoff_hz=70.0, eta_is_all=True, noise_resets_memory=True)
-    path = Camera.constant(SHAPE).save(tmp_path / "mine.npz", **as_arrays(measured, {}, Optics()))
+    path = Camera.constant(SHAPE).save(
+        tmp_path / "mine.npz", **as_arrays(measured, {}, Optics(5.0)))
     slow, fast = target(), target(circuit="esim")
     shop = workshop(tmp_path / "cameras")
     for seen in (slow, fast):
@@ -195,11 +196,12 @@ def test_a_condition_has_the_targets_circuit_where_it_says_so(tmp_path: Path) ->
     found = {c.name: c.circuit and c.circuit() for c in conditions(
         shop, [slow, fast], ("default", "evflow", "oracle", "evflow+circuit", "oracle+circuit"),
         Files(cameras={"mine": path}))}
-    assert found == {
+    assert {name: circuit and (circuit[0], circuit[1].offset_dn)
+            for name, circuit in found.items()} == {
         "default": None, "high noisy evflow": None, "high esim evflow": None, "high oracle": None,
-        "high noisy evflow+circuit": measured, "high esim evflow+circuit": measured,
-        "high noisy oracle+circuit": slow.circuit, "high esim oracle+circuit": fast.circuit,
-        "mine": measured}
+        "high noisy evflow+circuit": (measured, 5.0), "high esim evflow+circuit": (measured, 5.0),
+        "high noisy oracle+circuit": (slow.circuit, 0.0), "mine": (measured, 5.0),
+        "high esim oracle+circuit": (fast.circuit, 0.0)}
 
 
 def test_cameras_larger_than_a_target_are_cropped_alike_with_their_errors(tmp_path: Path) -> None:

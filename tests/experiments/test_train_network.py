@@ -105,9 +105,10 @@ def test_a_measured_camera_brings_its_circuit(tmp_path: Path) -> None:
     measured = SensorModel(cutoff_hz=60.0, cutoff_by_light=False, refractory_s=2e-3, leak_hz=0.2,
                            log_map="log_eps", eta_is_all=True, noise_resets_memory=True)
     path = Camera.constant((48, 48)).save(
-        tmp_path / "camera.npz", **as_arrays(measured, {}, Optics()))
+        tmp_path / "camera.npz", **as_arrays(measured, {}, Optics(7.0)))
     run = command.configuration(command.Options(out=Path(), camera=path))
     assert run.learning.data.model == measured
+    assert run.learning.data.offset_dn == 7.0
     assert command.configuration(command.Options(out=Path())).learning.data.model != measured
 
 

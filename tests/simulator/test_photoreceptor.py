@@ -72,13 +72,16 @@ def test_it_is_that_of_a_measured_camera() -> None:
     assert Photoreceptor.of(SensorModel(log_map="log_eps"), Optics()).logarithmic
 
 
+@pytest.mark.parametrize("offset_dn", [0.0, 12.0])
 @pytest.mark.parametrize("sensor", [
     SensorModel(cutoff_hz=80.0, leak_hz=0.1), SensorModel(cutoff_hz=40.0, cutoff_by_light=False),
     SensorModel(cutoff_hz=100.0, log_map="log_eps"), SensorModel(refractory_s=1e-3)])
-def test_on_the_device_frames_are_seen_as_on_the_host(sensor: SensorModel) -> None:
+def test_on_the_device_frames_are_seen_as_on_the_host(
+    sensor: SensorModel, offset_dn: float
+) -> None:
     frames = np.random.default_rng(1).uniform(0, 255, (9, 4, 5)).astype(np.float32)
-    made, circuit = seen_log(frames, 2e-3, sensor)
-    seen_by, behind = as_measured(sensor, Optics())
+    made, circuit = seen_log(frames, 2e-3, sensor, offset_dn)
+    seen_by, behind = as_measured(sensor, Optics(offset_dn))
     pairs = [(frame, 2000 * i) for i, frame in enumerate(frames)]
     wanted = to_log(np.stack([frame for frame, _ in seen_frames(pairs, seen_by)]), sensor.log_map)
     np.testing.assert_allclose(made, wanted, atol=2e-5)
