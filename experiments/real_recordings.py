@@ -3,11 +3,12 @@
     python -m experiments.real_recordings --preset debug
     python -m experiments.real_recordings --preset full --recordings flight.aedat4 drive.bag
 
-Of each recording, with the photoreceptor measured and with an ideal pixel in its place: theta, the
-light added, and the busiest part re-simulated from its own frames, as the report of `evflow
-estimate` does (correlation of the pixels' counts, of signed events in cubes of 2 ms and 3x3 pixels,
-and events over those recorded), and the share of the brightness at the events of the second half
-that the constants of the first explain. True thresholds of these cameras are unknown. debug: the
+Of each recording, with the photoreceptor measured, with an ideal pixel in its place, and with the
+maps of the first alone, without its low-pass and the light added: theta, that light, and the
+busiest part re-simulated from its own frames, as the report of `evflow estimate` does (correlation
+of the pixels' counts, of signed events in cubes of 2 ms and 3x3 pixels, and events over those
+recorded), and the share of the brightness at the events of the second half that the constants of
+the first explain. True thresholds of these cameras are unknown. debug: the
 first recording. Writes real_recordings.json, .md and a picture of each.
 """
 
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from evflow import load_weights, read_recording
+from evflow.camera.optics import Optics
 from evflow.estimation.pipeline import measure
 from evflow.report.plots import event_image, new_figure, save_figure
 from evflow.report.resimulate import INSTANT_US, Trial, busiest, held_out, resimulate, usable_runs
@@ -25,7 +27,8 @@ from evflow.types import Recording
 from experiments.shared.common import begin, conclude, markdown, run_script, slug
 from experiments.shared.recordings import held_recordings
 
-PIXELS: tuple[Literal["measured", "ideal"], ...] = ("measured", "ideal")
+Pixel = Literal["measured", "ideal", "maps alone"]
+PIXELS: tuple[Pixel, ...] = ("measured", "ideal", "maps alone")
 MIN_WINDOW_US = 40_000  # as `evflow estimate`
 SIDES = ("on", "off")
 HEADS = ("recording", "pixel", "θ ON / OFF", "light added", "cutoff", "r of counts ON / OFF",
@@ -45,11 +48,15 @@ class Options:
 
 
 def measured(
-    recording: Recording, params: Any, pixel: Literal["measured", "ideal"], seed: int
+    recording: Recording, params: Any, pixel: Pixel, seed: int
 ) -> tuple[dict[str, Any], Trial]:
     """A row of the table, and the stretch that was re-simulated."""
-    made = measure(recording, params, pixel=pixel, min_window_us=MIN_WINDOW_US)
+    made = measure(recording, params, pixel="ideal" if pixel == "ideal" else "measured",
+                   min_window_us=MIN_WINDOW_US)
     found, runs = made.found, usable_runs(recording)
+    if pixel == "maps alone":
+        fast = dataclasses.replace(found.sensor, cutoff_hz=0.0, cutoff_by_light=True)
+        found = dataclasses.replace(found, sensor=fast, optics=Optics())
     trial = resimulate(recording, found, busiest(recording, runs), seed)
     explained = held_out(recording, params, runs, MIN_WINDOW_US, seed, made.first)[2] if (
         pixel == "measured") else None
@@ -75,7 +82,7 @@ def cells(name: str, pixel: str, row: dict[str, Any]) -> list[str]:
 
 
 def draw(trials: dict[str, Trial], path: Path) -> None:
-    """The busiest 30 ms as recorded, and as each of the two cameras makes them."""
+    """The busiest 30 ms as recorded, and as each of the cameras makes them."""
     figure = new_figure(4.0 * (1 + len(trials)), 3.4)
     first = trials[PIXELS[0]]
     shown = {"recorded": first.real, **{f"{k} pixel": t.made for k, t in trials.items()}}

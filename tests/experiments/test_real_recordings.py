@@ -19,12 +19,13 @@ def test_a_row_for_each_pixel(tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "real_recordings.json", "real_recordings.md", "some.png"]
     rows = (tmp_path / "out" / "real_recordings.md").read_text().splitlines()[2:]
-    for row, pixel in zip(rows, ("measured", "ideal"), strict=True):
+    for row, pixel in zip(rows, real_recordings.PIXELS, strict=True):
         found = result[pixel]
         assert row.startswith(f"| some.npz | {pixel} | {found['theta_on']:.3f} ± ")
         assert 0.8 < found["events"]["on"] < 1.25
         assert found["r"]["off"] > 0.5
-    assert result["ideal"]["cutoff_hz"] == 0
+    assert result["ideal"]["cutoff_hz"] == result["maps alone"]["cutoff_hz"] == 0
+    assert result["maps alone"]["theta_on"] == result["measured"]["theta_on"]
 
 
 def test_none_is_held_where_none_lies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
