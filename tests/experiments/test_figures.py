@@ -161,7 +161,7 @@ def real_recordings() -> dict[str, Figures]:
         return [float(number) for cell in found for number in numbers(cell)]
 
     return {f"{label}, {pixel} ": of(name, pixel)
-            for label, name in rows.items() for pixel in ("measured", "ideal")}
+            for label, name in rows.items() for pixel in ("measured", "ideal", "maps alone")}
 
 
 def compare_systems() -> dict[str, Figures]:
@@ -241,8 +241,8 @@ def longer() -> dict[str, Figures]:
 
 
 def recorded_video() -> dict[str, Figures]:
-    names = {"thresholds log-uniform": "wide-log", "estimate |": "evflow",
-             "estimate, and": r"evflow\+circuit", "LGAN": "lgan"}
+    names = {"thresholds log-uniform": "wide-log", "estimate, maps": "evflow",
+             "estimate, with": r"evflow\+circuit", "LGAN": "lgan"}
     return {label: [values("see_better_recordings", rf"{measure}\|{name} \(3\)", "to default", k,
                            target)[0]
                     for target in ("slider_depth", "cradle") for measure in ("SSIM", "LPIPS", "MSE")
