@@ -240,6 +240,21 @@ def longer() -> dict[str, Figures]:
         for label, name in {"default parameters": "default", **names}.items()}
 
 
+def circuit() -> dict[str, Figures]:
+    names = {"default parameters": "default", "estimate |": "evflow",
+             "estimate, with": r"evflow\+circuit", "truth |": "oracle",
+             "truth, with": r"oracle\+circuit"}
+
+    def of(name: str) -> Figures:
+        gain = [0.0] if name == "default" else [
+            values("see_better_circuit", rf"SSIM\|{name} \(5\)", "to default", k)[0]
+            for k in range(2)]
+        return [*gain, *(values("see_better_circuit", rf"{measure}\|{name} \(5\)", "mean")[0]
+                         for measure in ("LPIPS", "MSE"))]
+
+    return {label: of(name) for label, name in names.items()}
+
+
 def recorded_video() -> dict[str, Figures]:
     names = {"thresholds log-uniform": "wide-log", "estimate, maps": "evflow",
              "estimate, with": r"evflow\+circuit", "LGAN": "lgan"}
@@ -303,6 +318,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "### The inverse direction"): generate,
     (ACCURACY, "The middle one of three frames"): changes,
     (ACCURACY, "### Video"): video,
+    (ACCURACY, "oracle oracle+circuit"): circuit,
     (ACCURACY, "### Longer trainings"): longer,
     (ACCURACY, "### Video of real recordings"): recorded_video,
     (ACCURACY, "### Flow"): flow,
