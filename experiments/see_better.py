@@ -1,29 +1,26 @@
-"""Do networks see better that were trained on events of the camera they will use (paper, Tables V,
-VI, VII and IX)?
+"""Do networks see better if trained for the camera they will use (paper, Tables V, VI, VII, IX)?
 
     python -m experiments.see_better --preset small
     python -m experiments.see_better --preset small --task flow --out out/flow_better
     python -m experiments.see_better --preset full --max-seconds 25000
 
-The same network is trained for each condition: default parameters, wide randomisation (thresholds
-uniform on .1 to 1, and log-uniform on .05 to 1), evflow's estimate of the target camera from a 2 s
-recording of it, and the target's true maps (oracle); in `full` also what the compared systems
-estimate and, for video, the thresholds of the original E2VID (e2vid), for flow the target's own
-recordings, from whose frames EV-FlowNet learns (raw). Seeds are paired: scenes, initial parameters
-and batches are the same for all conditions of a seed, only the camera differs (not so of `raw`).
-Training events come from one sensor model, those of the targets from others (shared/targets.py);
-evflow+circuit and oracle+circuit train with the target's circuit, and the light that its frames
-lack. Images are scored in the later windows of held-out scenes, clipped to [0, 1]: SSIM (preset
+The same network is trained for each condition (shared/conditions.py): default parameters, wide
+randomisation (thresholds uniform on .1 to 1, and log-uniform on .05 to 1), evflow's estimate of the
+target camera from a 2 s recording of it, and the target's true maps (oracle); in `full` also what
+the compared systems estimate and, for video, the thresholds of the original E2VID (e2vid), for flow
+the target's own recordings (raw). evflow+circuit and oracle+circuit train with the target's circuit
+and the light that its frames lack; all others with one that no target has (shared/targets.py).
+Seeds are paired: scenes, initial parameters and batches are the same for all conditions of a seed
+but raw. Images are scored in the later windows of held-out scenes, clipped to [0, 1]: SSIM (preset
 evreal), MSE, PSNR, LPIPS where its weights are installed, and MSE of log(1 + 255 I) / log 256; flow
-by its error at pixels with events, and FWL (rounded votes) beside that of the true flow.
---recordings NAME=PATH: real recordings, measured, and scored by their frames, or by FWL.
+by its error at pixels with events, and FWL beside that of the true flow. --recordings NAME=PATH:
+real recordings, measured, and scored by their frames, or by FWL.
 
 A finished training stays in --out with its scores: the same command goes on with what is missing,
-and one that asks for more adds to it. One that asks for less than the tables there have is refused.
+and one that asks for more adds to it. One that asks for less than the tables there is refused.
 Tables VII and IX: weights that `experiments.ablate` keeps, as --estimators "8 steps=PATH" ...; any
-camera file (maps and circuit) is a condition by --cameras NAME=PATH, EventGAN by --eventgan
-eventgan=PATH (generator.safetensors of `experiments.train_eventgan`). Writes see_better.json, .md,
-.png and _clips.png.
+camera file (maps and circuit) is a condition by --cameras, the generator of `train_eventgan` by
+--eventgan. Writes see_better.json, .md, .png and _clips.png.
 """
 
 from __future__ import annotations
@@ -65,8 +62,7 @@ class Options:
     recordings: tuple[str, ...] = ()
     """Real targets in place of those, NAME=PATH."""
     normalised: bool = False
-    """Event tensors of deviation 1, which hide the scale of thresholds; `small` has them for flow
-    in any case."""
+    """Event tensors of deviation 1, which hide thresholds' scale (flow's in `small` anyway)."""
     cameras: tuple[str, ...] = ()
     """More conditions, NAME=camera.npz, tested on all targets."""
     estimators: tuple[str, ...] = ()
@@ -103,9 +99,9 @@ def main(options: Options) -> dict[str, Any]:
     left = runs.complete_all(conditions, began + options.max_seconds)
     result = {k: gains.compared(scores) for k, scores in runs.scores(conditions).items()}
     untrained = runs.untrained(options.task)
-    text = "\n\n".join((
-        heading(options.task, options.preset, setting, len(options.recordings)),
-        gains.report(result, options.task, runs.camera_medians(conditions), left, untrained)))
+    head = heading(options.task, options.preset, setting, len(options.recordings))
+    text = f"{head}\n\n" + gains.report(
+        result, options.task, runs.camera_medians(conditions), left, untrained)
     write_result(
         options.out / "see_better.json",
         {"targets": result, "without_network": untrained, "missing": left,
