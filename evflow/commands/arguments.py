@@ -54,7 +54,11 @@ def _help(cls: type) -> Iterator[tuple[str, str]]:
     """Each field of a class that a string follows, and that string in one line."""
     if cls.__module__.partition(".")[0] != "evflow":
         return
-    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # type: ignore[attr-defined]
+    try:
+        source = inspect.getsource(cls)
+    except OSError:  # a class made at run time; its bases have theirs
+        return
+    body = ast.parse(textwrap.dedent(source)).body[0].body  # type: ignore[attr-defined]
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
             yield ast.unparse(field.target), " ".join(ast.literal_eval(text.value).split())
