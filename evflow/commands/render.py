@@ -24,7 +24,7 @@ from evflow.commands.options import (
 from evflow.commands.writing import need_absent
 from evflow.notes import as_dicts
 
-LONG_US = 10_000_000  # without an event
+LONG_S = 10.0  # without an event
 
 
 @own_first
@@ -102,10 +102,11 @@ class Render(Reading):
 
 def _note_pause(t: np.ndarray) -> None:
     """Say on stderr if most of the film, of events at t (N,) us, would show none."""
-    pauses = np.diff(t)
-    at = int(np.argmax(pauses)) if len(pauses) else 0
-    if len(pauses) and pauses[at] > max(0.5 * (t[-1] - t[0]), LONG_US):
-        begin = 1e-6 * float(t[at] - t[0])
-        print(f"note: there are no events for {1e-6 * float(pauses[at]):,.0f} s after {begin:.3f} "
-              f"s. A clock that jumped? --stop {math.ceil(1e3 * begin) / 1e3:.3f} leaves out what "
-              "comes later; evflow check says more.", file=sys.stderr)
+    from evflow.recordings.gaps import event_gaps
+
+    for at in event_gaps(t):
+        pause, begin = 1e-6 * float(t[at + 1] - t[at]), 1e-6 * float(t[at] - t[0])
+        if pause > max(0.5e-6 * float(t[-1] - t[0]), LONG_S):
+            print(f"note: there are no events for {pause:,.0f} s after {begin:.3f} s. A clock that "
+                  f"jumped? --stop {math.ceil(1e3 * begin) / 1e3:.3f} leaves out what comes later; "
+                  "evflow check says more.", file=sys.stderr)

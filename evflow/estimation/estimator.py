@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import estimate
@@ -78,15 +79,15 @@ class CameraEstimator:
             EvflowDataError: EV011 (fewer than two frames), EV012 (frames and events do not
                 overlap), EV015 (another size), EV020 (not a `Recording`). Earlier pieces are kept.
         """
-        if isinstance(piece, Recording) and self._size not in (None, piece.events.size):
+        need(piece, Recording, "a piece", "For a path: evflow.read_recording(path).")
+        if self._size not in (None, piece.events.size):
             raise EvflowDataError("EV015", f"a piece of {piece.events.size} pixels after "
                                   f"{self._size}.", "Add pieces of one camera only.")
-        if isinstance(piece, Recording) and piece.has_frames and not len(piece.events):
+        if piece.has_frames and not len(piece.events):
             return 0
-        if isinstance(piece, Recording):
-            piece, given = dense.thinned(without_repeats(piece)), piece.notes
-            told = {note.code for note in self._notes}
-            self._notes += tuple(n for n in piece.notes[len(given):] if n.code not in told)
+        piece, given = dense.thinned(without_repeats(piece)), piece.notes
+        told = {note.code for note in self._notes}
+        self._notes += tuple(n for n in piece.notes[len(given):] if n.code not in told)
         plan = plan_windows(piece, self._min_us)
         self._notes = tuple(dict.fromkeys((*self._notes, *condensed(plan.skipped))))[:self.NOTES]
         stretches = cut(piece, plan, path=self._refine == "auto", first=self._size is None)

@@ -23,7 +23,7 @@ from experiments.shared.held_out import Scores
 from experiments.shared.recorded import Part, part_of
 
 Params = dict[str, Any]
-WINDOW_MS = 30.0  # of flow, and of video where a recording has no frames
+WINDOW_MS = 30.0  # of flow
 
 
 class ScoredOn(Protocol):
