@@ -70,6 +70,7 @@ NOTES: dict[str, str] = {
     "scene.steps": "the light of the whole view changes in steps",
     "scene.restless": "the light varies when it should be constant",
     "theta.guessed": "thresholds depend on a network's guess of the contrast",
+    "reading.again": "a running camera was measured again, from the pieces that were kept",
     "reading.ended": "reading stopped before the end",
     "reading.part": "only part of the recording was read",
     "theta_on.drift": "θ ON changed within the recording",

@@ -15,6 +15,7 @@ from evflow.estimation.refine.stretches import most_simulated, spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, thinned
 from evflow.network import api
+from evflow.network.architecture import config_of
 from evflow.network.weights import load_weights
 from evflow.notes import Note
 from evflow.recordings import dense
@@ -27,17 +28,20 @@ class CameraEstimator:
     """Measure a camera while it records: add pieces of a recording, ask for the estimate so far.
 
     Only sums and a bounded number of pieces are kept: memory is bounded by the size of the sensor.
-    The photoreceptor and the frames' offset are measured from the first pieces. If one recording is
-    added whole, the estimate equals `estimate_camera(recording, effort="full")`.
+    The photoreceptor and the frames' offset are measured from the first pieces, and again from the
+    busiest when these have twice the events; then what is kept is read again, and `.extent` says
+    how much that is. If one recording is added whole, the estimate equals
+    `estimate_camera(recording, effort="full")`.
 
     Args:
-        params: of `load_weights`; None loads the released ones.
+        params: of `load_weights`; None loads the released ones. The paper's network, which sees
+            pixels separately, cannot be used.
         refine: as in `estimate_camera`.
         pixel: as in `estimate_camera`.
         min_window_us: as in `estimate_camera`.
 
     Raises:
-        EvflowDataError: EV020 (an unknown option).
+        EvflowDataError: EV018 (weights without a summary), EV020 (an unknown option).
 
     Example:
         >>> estimator = ef.CameraEstimator()
@@ -46,7 +50,8 @@ class CameraEstimator:
         >>> estimator.estimate().save("camera.npz")
     """
 
-    FIRST = 8  # stretches to collect before anything is measured
+    FIRST = 8  # stretches to collect before anything is measured, and the busiest that are kept
+    AGAIN = 2.0  # times the events, at which the front end is measured again
     KEPT = 32  # stretches whose quiet time is counted
     NOTES = 20  # notes on pieces that are kept
 
@@ -56,12 +61,18 @@ class CameraEstimator:
     ) -> None:
         check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")))
         self._params = load_weights() if params is None else params
+        if not config_of(self._params).pool:
+            raise EvflowDataError("EV018", "these weights see every pixel by itself, and have no "
+                                  "summary.", "Use others, or estimate_camera.")
         self._refine, self._pixel, self._min_us = refine, pixel, min_window_us
         self._state: State | None = None
         self._waiting: tuple[Stretch, ...] = ()
+        self._busiest: tuple[Stretch, ...] = ()
+        self._measured = 0.0  # events of the busiest when the front end was measured
         self._notes: tuple[Note, ...] = ()
         self._size: tuple[int, int] | None = None
-        self._seconds, self._stretches, self._apart = 0.0, 0, 1
+        self._seconds, self._left_s, self._apart = 0.0, 0.0, 1
+        self._stretches, self._left = 0, 0
 
     def add(self, piece: Recording) -> int:
         """Read one more piece of the recording.
@@ -94,44 +105,62 @@ class CameraEstimator:
         self._size = piece.events.size
         self._stretches += len(stretches)
         self._seconds += covered_s(s.span_us for s in stretches)
+        self._busiest = tuple(
+            sorted((*self._busiest, *stretches), key=_events, reverse=True)[:self.FIRST])
         if self._state is None:
             self._waiting += stretches
             if len(self._waiting) >= self.FIRST:
-                self._begin()
+                self._state = self._begun(self._waiting, self._waiting)
+                self._waiting = ()
         else:
             for stretch in stretches:
                 self._state = self._next(self._state, stretch)
+            if sum(map(_events, self._busiest)) >= self.AGAIN * self._measured:
+                self._state = self._again(self._state)
         return len(plan.pairs)
 
     def estimate(self) -> CameraEstimate:
         """Estimate the camera from everything that was added.
 
         Returns:
-            As from `estimate_camera`; more pieces can be added afterwards.
+            As from `estimate_camera`; more pieces can be added afterwards, and whether it was
+            called changes nothing of later estimates.
 
         Raises:
             EvflowDataError: EV017 (no usable window was added yet).
         """
-        if self._state is None and self._waiting:
-            self._begin()
-        if self._state is None:
+        state = self._state
+        if state is None and self._waiting:
+            state = self._begun(self._waiting, self._waiting)
+        if state is None:
             raise EvflowDataError(
                 "EV017", "no usable window was added"
                 + "".join(f" ({note})" for note in self._notes[:3]) + ".",
                 "Add pieces with frames, in which something moves.")
-        extent = Extent(self._seconds, self._seconds, self._stretches, self._stretches)
-        return estimate(self._state, extent=extent, before=self._notes)
+        extent = Extent(self._seconds - self._left_s, self._seconds,
+                        self._stretches - self._left, self._stretches, again=self._left > 0)
+        return estimate(state, extent=extent, before=self._notes)
 
-    def _begin(self) -> None:
-        """Measure the stretches collected so far."""
-        waited, self._waiting = self._waiting, ()
-        state = State(self._params, find_front_end(waited, measured=self._pixel == "measured"))
-        most = most_simulated(waited[0].recording.events.size)
-        simulated = spread([len(s.run) for s in waited], most)
-        for i, stretch in enumerate(waited):
+    def _again(self, state: State) -> State:
+        """The state of the stretches that are kept, with a front end that is measured on the
+        busiest of all."""
+        kept = {id(s): s for s in (*state.read, *self._busiest)}
+        stretches = tuple(sorted(kept.values(), key=lambda s: s.span_us))
+        self._left = self._stretches - len(stretches)
+        self._left_s = self._seconds - covered_s(s.span_us for s in stretches)
+        return self._begun(stretches, self._busiest)
+
+    def _begun(self, stretches: tuple[Stretch, ...], on: tuple[Stretch, ...]) -> State:
+        """The state of some stretches, with a front end that is measured on some."""
+        self._measured = sum(map(_events, self._busiest))
+        front_end = find_front_end(on, measured=self._pixel == "measured")
+        state = State(self._params, front_end)
+        most = most_simulated(stretches[0].recording.events.size)
+        simulated = spread([len(s.run) for s in stretches], most)
+        for i, stretch in enumerate(stretches):
             state = add(state, stretch, simulate=i in simulated)
-        self._state = state
-        self._apart = max(1, len(waited) // most)
+        self._apart = max(1, len(stretches) // most)
+        return state
 
     def _next(self, state: State, stretch: Stretch) -> State:
         """The state with a further stretch; every second simulated stretch is dropped when there
@@ -143,3 +172,8 @@ class CameraEstimator:
             self._apart *= 2
         return add(thinned(state, most if wanted else most + 1, self.KEPT), stretch,
                    simulate=wanted)
+
+
+def _events(stretch: Stretch) -> int:
+    """Number of a stretch's events."""
+    return len(stretch.recording.events.slice(*stretch.span_us))

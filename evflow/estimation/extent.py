@@ -21,6 +21,7 @@ class Extent:
         gain: relative reduction of the pixels' errors if twice as much were read; NaN if not
             evaluated.
         ended: whether reading was stopped from outside.
+        again: whether a `CameraEstimator` began again, with the pieces that it had kept.
     """
 
     read_s: float = 0.0
@@ -29,6 +30,7 @@ class Extent:
     of: int = 0
     gain: float = float("nan")
     ended: bool = False
+    again: bool = False
 
     @property
     def whole(self) -> bool:
@@ -41,6 +43,10 @@ class Extent:
             return []
         extent = (f"{self.read_s:.1f} of {self.seconds:.1f} s were read, in {self.stretches} of "
                   f"{self.of} stretches")
+        if self.again:
+            return [Note("reading.again", f"{extent}: when more moved than at first, the pixels' "
+                         "low-pass and the frames' offset were measured again, and what was kept "
+                         "of the pieces was read again. Earlier ones are not used.")]
         if self.ended:
             return [Note("reading.ended", f"{extent}: reading was stopped. The estimate uses what "
                          "was read; its errors say how well that determines the camera.")]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.networks import hidden
 
-from evflow import CameraEstimator, Recording, estimate_camera
+from evflow import CameraEstimate, CameraEstimator, Recording, estimate_camera, load_weights
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
 from evflow.estimation import estimator as estimator_module
@@ -104,6 +104,64 @@ def test_what_cannot_be_added_leaves_what_was() -> None:
     assert found.windows == 6
     assert found.summary_std.eta_on < before.summary_std.eta_on  # it shrinks as it reads
     assert found.n_events.sum() > before.n_events.sum()
+
+
+def numbers(found: CameraEstimate) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(
+        (found.camera, found.std, found.summary, found.summary_std))]
+
+
+def test_an_early_question_changes_no_later_answer() -> None:
+    recording, _ = hidden(3)
+    found = []
+    for ask in (False, True):
+        estimator = CameraEstimator()
+        for first in (0, 2, 4):
+            estimator.add(piece(recording, first, first + 2))
+            if ask:
+                estimator.estimate()
+        found.append(estimator.estimate())
+    for a, b in zip(*map(numbers, found), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def sparse(recording: Recording, share: float) -> Recording:
+    """The recording with a part of its events."""
+    e, kept = recording.events, np.random.default_rng(0).random(len(recording.events)) < share
+    return dataclasses.replace(
+        recording, events=Events(e.x[kept], e.y[kept], e.t[kept], e.p[kept], e.size))
+
+
+def test_a_camera_at_rest_at_first_is_measured_again_when_it_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recording, _ = hidden(3)
+    measured: list[int] = []
+    find = estimator_module.find_front_end
+    monkeypatch.setattr(estimator_module, "find_front_end", lambda on, **k: (
+        measured.append(sum(map(estimator_module._events, on))), find(on, **k))[1])
+    monkeypatch.setattr(CameraEstimator, "FIRST", 2)
+    monkeypatch.setattr(CameraEstimator, "KEPT", 2)
+    estimator = CameraEstimator(refine="off")
+    for first in (0, 1):
+        estimator.add(sparse(piece(recording, first, first + 1), 0.2))
+    for first in (2, 3):
+        estimator.add(sparse(piece(recording, first, first + 1), 0.3))
+    assert len(measured) == 1
+    assert estimator.estimate().extent.whole
+    for first in (4, 5):
+        estimator.add(piece(recording, first, first + 1))
+    assert len(measured) == 2
+    assert measured[1] >= 2 * measured[0]
+    found = estimator.estimate()
+    assert found.extent.stretches < found.extent.of == 6
+    assert found.extent.read_s == pytest.approx(0.04 * found.extent.stretches)
+    assert [n.code for n in found.extent.notes()] == ["reading.again"]
+
+
+def test_the_paper_s_network_cannot_be_used_piece_by_piece() -> None:
+    with pytest.raises(EvflowDataError, match="EV018"):
+        CameraEstimator(load_weights("paper"))
 
 
 def test_what_is_kept_does_not_grow() -> None:
