@@ -8,9 +8,11 @@ run continues from the one before.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +54,22 @@ class Checkpoints:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None and self._writer is not None:
             # not after an error: it may be the death of a process, which a write would wait for
-            self._writer.wait_until_finished()
-            self._writer.close()
+            with self._writing():
+                self._writer.wait_until_finished()
+                self._writer.close()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Raises EV019 where orbax cannot write, now or in the background before."""
+        try:
+            yield
+        except MemoryError:
+            raise
+        except Exception as e:  # as in `restore`
+            raise EvflowDataError(
+                "EV019", f"a checkpoint cannot be written to {self.steps} ({_first_line(e)}).",
+                "Is the disk full? With space on it the same command goes on from the last whole "
+                "checkpoint.") from e
 
     @property
     def latest(self) -> int | None:
@@ -69,7 +85,8 @@ class Checkpoints:
         """Write `state` as `step`, in the background; an existing step is left as it is."""
         manager = self._manager()
         if step not in manager.all_steps():
-            manager.save(step, args=ocp.args.StandardSave(state))
+            with self._writing():
+                manager.save(step, args=ocp.args.StandardSave(state))
 
     def _manager(self) -> Any:
         """orbax's manager, which writes steps and removes old ones. It reads all steps in the
@@ -100,7 +117,7 @@ class Checkpoints:
             except MemoryError:
                 raise
             except Exception as e:  # of orbax, tensorstore and json: a dozen kinds
-                faults[step] = (str(e).strip() or type(e).__name__).splitlines()[0][:200]
+                faults[step] = _first_line(e)
             if devices.agree(step in faults):
                 faults.setdefault(step, "another process cannot read it")
             else:
@@ -156,12 +173,16 @@ class Checkpoints:
 
     def check_config(self, config: dict[str, Any]) -> None:
         """Raise EV013, naming the fields, where the saved configuration is not `config`; EV009
-        where it is damaged, EV016 where none is saved, EV018 where another version saved it."""
+        where it is damaged or missing beside steps, EV016 where none is saved, EV018 where another version saved it."""
         path = self.folder / "config.json"
+        if not is_there(path) and self.latest is not None:
+            raise EvflowDataError(
+                "EV009", f"{path} is missing, without which the run there cannot be identified.",
+                f"Restore it from a copy, or {ANEW}.")
         if not is_there(path):
             raise EvflowDataError("EV016", f"no run in {self.folder} (no config.json).",
                                   "Start the run with --resume auto.")
-        saved, given = _flat(_read(path)), _flat(_as_json(config))
+        saved, given = ({"start": None, **_flat(of)} for of in (_read(path), _as_json(config)))
         if unknown := sorted(saved.keys() - given.keys()):
             raise EvflowDataError(
                 "EV018", f"{path} has options that this version does not know "
@@ -180,6 +201,10 @@ class Checkpoints:
         """Save the configuration beside the steps."""
         atomic_text(self.folder / "config.json", json.dumps(_as_json(config), indent=2) + "\n",
                     overwrite=True)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def _sound(step: Path) -> Path:

@@ -186,8 +186,22 @@ class TrainConfig:
              "(of no more sensors than cameras)"),
             ("block", self.block, patch <= min(self.block) and max(self.block) <= self.crop,
              f"at least {patch}, the largest patch, to {self.crop}, the crop"),
-            ("steps_per_window", self.steps_per_window, self.steps_per_window % changes == 0,
+            ("steps_per_window", self.steps_per_window,
+             self.steps_per_window > 0 and self.steps_per_window % changes == 0,
              f"a multiple of the model's {changes} changes"),
+            ("windows", self.windows, self.windows > 0, "at least 1"),
+            ("window_s", self.window_s, 0 < self.window_s[0] <= self.window_s[1] < math.inf,
+             "a shortest and a longest length, above 0"),
+            ("textures", self.textures, self.textures > 0, "at least 1"),
+            ("ema", self.ema, 0 <= self.ema < 1, "from 0 to below 1"),
+            ("clip", self.clip, self.clip > 0, "above 0; math.inf clips nothing"),
+            ("seed", self.seed, -2**31 <= self.seed < 2**32, "one of at most 32 bits"),
+            *((name, value, 0 <= value < math.inf, "0 or more, and finite") for name, value in (
+                (name, getattr(self, name)) for name in (
+                    "learning_rate", "summary_rate", "flow_rate", "summary_noise"))),
+            *((f"model.{name}", value, value > 0, "at least 1") for name, value in (
+                ("encoder_hidden", self.model.encoder_hidden),
+                ("summary_hidden", self.model.summary_hidden))),
         ):
             if not good:
                 raise EvflowDataError("EV020", f"TrainConfig: {name} {value!r}.",

@@ -31,7 +31,7 @@ class Log:
     """metrics.jsonl and the bar; only the main process has them. A context manager.
 
     path: of metrics.jsonl. Lines beyond `step`, from which the run continues, are dropped, so that
-    no step is logged twice. headline: text of the bar; "compiling" before the first step.
+    no step is logged twice, and count among the recent ones. headline: text of the bar; "compiling" before the first step.
     """
 
     def __init__(self, path: Path, steps: int, step: int, headline: Headline) -> None:
@@ -43,6 +43,7 @@ class Log:
         self._progress(step, steps)
         if self._main:
             kept = list(lines_until(path, step))
+            self._recent = [_metrics(line) for line in kept[-RECENT:]]
             atomic_text(path, "".join(f"{line}\n" for line in kept), overwrite=True)
             # By lines: a step is logged before its checkpoint is written.
             self._file = self._open.enter_context(path.open("a", buffering=1))
@@ -81,9 +82,15 @@ class Log:
 
     @property
     def figures(self) -> Metrics:
-        """Mean metrics of the recent steps of this process."""
+        """Mean metrics of the recent steps."""
         names = self._recent[-1] if self._recent else {}
-        return {k: sum(r[k] for r in self._recent) / len(self._recent) for k in names}
+        alike = [r for r in self._recent if r.keys() == names.keys()]
+        return {k: sum(r[k] for r in alike) / len(alike) for k in names}
+
+
+def _metrics(line: str) -> Metrics:
+    """Of a line of the log."""
+    return {k: v for k, v in parse_json(line).items() if k not in ("step", "time")}
 
 
 def lines_until(path: Path, step: int) -> Iterator[str]:

@@ -35,12 +35,13 @@ Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
 
 @dataclass(frozen=True)
 class Ended(Generic[State]):
-    """Result of a run: its last state, the mean metrics of its last hundred steps, and a message if
-    a signal to any process stopped it."""
+    """Result of a run: its last state, the mean metrics of its last hundred steps, a message if
+    a signal to any process stopped it, and the steps that were made now."""
 
     state: State
     figures: Metrics
     stopped: str = ""
+    steps: int = 0
 
     def completed(self) -> State:
         """The state; KeyboardInterrupt where a signal ended the run."""
@@ -51,7 +52,7 @@ class Ended(Generic[State]):
 
 def train(
     begin: Callable[[], tuple[Advance[State], State]], config: Any, options: RunOptions,
-    headline: Headline = lambda _: "training",
+    headline: Headline = lambda _: "training", start: str | None = None,
 ) -> Ended[State]:
     """Train for config.steps steps, from a fresh state or the run in options.out.
 
@@ -62,6 +63,7 @@ def train(
         config: a dataclass that identifies the run; one in the folder must be equal.
         options: where and how long to run.
         headline: text of the progress bar from metrics.
+        start: digest of the weights that the fresh state starts from; identifies the run too.
 
     Raises:
         EvflowDataError: EV007 where a metric is not finite (that state is not saved), EV013 where
@@ -73,12 +75,13 @@ def train(
         raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
                               "Check --out, or pass --resume auto.")
     with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
-        resumed = goes_on(checkpoints, as_dict(config), options)
+        identity = as_dict(config) | ({} if start is None else {"start": start})
+        resumed = goes_on(checkpoints, identity, options)
         advance, state = begin()
         if resumed:
             state = checkpoints.restore(state)
-        path = options.out / "metrics.jsonl"
-        with Log(path, config.steps, int(state.step), headline) as log:
+        path, begun = options.out / "metrics.jsonl", int(state.step)
+        with Log(path, config.steps, begun, headline) as log:
             state, lost = _steps(advance, state, config.steps, options, checkpoints, log, requests)
     # Raised after the checkpoints have been written.
     if lost:
@@ -86,7 +89,7 @@ def train(
                               "train at a lower rate.")
     stopped = (f"stopped after step {int(state.step)} of {config.steps}; a checkpoint is saved, "
                "and the same command goes on." if agree(bool(requests)) else "")
-    return Ended(state, log.figures, stopped)
+    return Ended(state, log.figures, stopped, int(state.step) - begun)
 
 
 def goes_on(checkpoints: Checkpoints, config: dict[str, Any], options: RunOptions) -> bool:

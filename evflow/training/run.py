@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 
 from evflow.errors import EvflowDataError
 from evflow.network.config import MODELS, ModelConfig
-from evflow.network.weights import load_weights, save_weights
+from evflow.network.weights import load_weights, model_card, save_weights, weights_hash
 from evflow.process import devices
 from evflow.process.provenance import provenance
 from evflow.scenes import TextureBank, make_bank, own_bank
@@ -40,19 +41,27 @@ def train_network(options: TrainOptions) -> Metrics:
         step = devices.parallel(make_run_step(config, tx), mesh)
         return lambda state: step(state, bank), state
 
+    start = None if options.start is None else weights_hash(options.start)
     with devices.compiled_quickly(small):
-        ended = train(begin, config, options, _headline)
-    steps = int(ended.state.step)
+        ended = train(begin, config, options, _headline, start)
+    steps, path = int(ended.state.step), options.out / "weights.safetensors"
     card = {"preset": options.preset, "steps": steps, "seed": config.seed,
             "devices": mesh.size, "training_figures": ended.figures, "config": as_dict(config),
-            **provenance()}
-    if devices.is_main():
-        save_weights(options.out / "weights.safetensors", ended.state.average, card, overwrite=True)
+            "start": options.start, "start_sha256": start, **provenance()}
+    if devices.is_main() and (ended.steps or not _holds(path, steps)):
+        save_weights(path, ended.state.average, card, overwrite=True)
     devices.leave_together()
     if ended.stopped:
-        raise KeyboardInterrupt(
-            f"{ended.stopped} {options.out / 'weights.safetensors'} is of that step.")
+        raise KeyboardInterrupt(f"{ended.stopped} {path} is of that step.")
     return ended.figures
+
+
+def _holds(path: Path, steps: int) -> bool:
+    """Whether there are weights of that step, as of a run that is only repeated."""
+    try:
+        return model_card(path).get("steps") == steps
+    except EvflowDataError:
+        return False
 
 
 def bank_of(config: TrainConfig, photos: bool) -> TextureBank:

@@ -80,5 +80,6 @@ def made(
         prepare(setup)
         yield from map(partial(one, score), jobs)
         return
+    prepare(setup)  # what cannot be loaded is told here, not by the death of a worker
     with worker_pool(workers, prepare, setup) as pool:
         yield from pool.map(partial(one, score), jobs)

@@ -145,6 +145,22 @@ def test_a_configuration_that_is_not_this_one(run: Path, text: str, code: str, s
     assert str(run) in str(caught.value)
 
 
+def test_a_run_whose_configuration_is_lost_is_told_from_none(run: Path) -> None:
+    (run / "config.json").unlink(missing_ok=True)
+    with Checkpoints(run) as checkpoints, pytest.raises(EvflowDataError, match="EV009.*missing"):
+        checkpoints.check_config({})
+
+
+def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise ValueError("INTERNAL: Error writing file: No space left on device\n[more]")
+
+    with pytest.raises(EvflowDataError, match=r"EV019.*No space left on device\)"), (
+            Checkpoints(tmp_path)) as checkpoints:
+        monkeypatch.setattr(checkpoints._manager(), "save", full)
+        checkpoints.save(1, state(1))
+
+
 def test_steps_that_are_a_file(tmp_path: Path) -> None:
     (tmp_path / "steps").write_text("x")
     with pytest.raises(EvflowDataError, match=r"EV019.*steps is a file"):

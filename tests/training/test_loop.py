@@ -85,6 +85,26 @@ def test_it_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert straight.figures["at"] == pytest.approx(np.mean([row["at"] for row in logs[0]]))
 
 
+def test_a_finished_run_that_is_repeated_makes_no_step_and_has_the_same_figures(
+    tmp_path: Path
+) -> None:
+    first, again = (train(lambda: (advance, start()), Plan(), given(tmp_path)) for _ in range(2))
+    assert (first.steps, again.steps) == (7, 0)
+    assert again.figures == pytest.approx(first.figures)
+
+
+def test_weights_to_start_from_identify_a_run(tmp_path: Path) -> None:
+    begin = lambda: (advance, start())  # noqa: E731
+    train(begin, Plan(), given(tmp_path / "a", max_seconds=0.0), start="abc")
+    train(begin, Plan(), given(tmp_path / "a"), start="abc")
+    for there, here in (("abc", None), ("abc", "def")):
+        with pytest.raises(EvflowDataError, match=f"EV013.*start: {there} there, {here} here"):
+            train(begin, Plan(), given(tmp_path / "a"), start=here)
+    train(begin, Plan(), given(tmp_path / "b"))
+    with pytest.raises(EvflowDataError, match="EV013.*start: None there, abc here"):
+        train(begin, Plan(), given(tmp_path / "b"), start="abc")
+
+
 def test_it_stops_in_time_and_keeps_runs_apart(tmp_path: Path) -> None:
     none = given(tmp_path / "a", max_seconds=0.0)
     assert int(train(lambda: (advance, start()), Plan(), none).completed().step) == 0

@@ -175,9 +175,17 @@ def test_unknown_preset() -> None:
 @pytest.mark.parametrize("change", [
     {"parts": ("summary", "foo")}, {"parts": ()}, {"steps": 0}, {"cameras": 0}, {"cameras": 5},
     {"sensors": configs.TrainConfig.sensors[:3]}, {"sensors": ()}, {"steps_per_window": 10},
+    {"windows": 0}, {"steps_per_window": 0}, {"window_s": (0.0, 0.1)}, {"window_s": (0.1, 0.05)},
+    {"ema": float("nan")}, {"ema": 1.0}, {"clip": 0.0}, {"seed": 5_000_000_000}, {"textures": 0},
+    {"flow_rate": float("nan")}, {"summary_rate": -1e-3},
     {"block": (4, 16)}, {"block": (8, 80)}, {"sequences": 15}, {"sequences": 300}],
     ids=str)
 def test_impossible_configurations_are_refused(change: dict[str, Any]) -> None:
     name, = change
     with pytest.raises(EvflowDataError, match=f"EV020.*TrainConfig: {name}"):
         configs.TrainConfig(**change)
+
+
+def test_a_network_without_width_is_refused() -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*model\.encoder_hidden 0"):
+        configs.TrainConfig(model=dataclasses.replace(configs.ModelConfig(), encoder_hidden=0))
