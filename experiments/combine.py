@@ -56,6 +56,9 @@ def main(options: Options) -> None:
     if options.pixels:
         given = [{part: taken(w, name)[part] for part in PIXELS if part in net}
                  for w in options.pixels]
+        if len({str(jax.tree.map(np.shape, one)) for one in given}) > 1:
+            raise EvflowDataError("EV018", f"{', '.join(options.pixels)} are networks of several "
+                                  "sizes.", "Average weights of one.")
         net = net | jax.tree.map(lambda *leaves: np.mean(leaves, 0), *given)
         last = model_card(options.pixels[-1])
         others = [model_card(w) for w in options.pixels[:-1]]

@@ -31,7 +31,7 @@ from experiments.shared import real_scores as scores
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
 from experiments.shared.kept import Row, kept, resumed
 from experiments.shared.many import Setup, made
-from experiments.shared.real_cameras import BASE, CHANGES
+from experiments.shared.real_cameras import BASE, CHANGES, known
 
 FEW = ("ideal", "cutoff 30.0 Hz", "black level +16 DN")
 BESIDE = 5  # cameras of a row that are also taken for ideal
@@ -61,7 +61,7 @@ def measured(options: Options, names: Sequence[str], count: int) -> dict[str, li
     setup = Setup(options.weights, options.seed, photos=True)
     origin = [weights_hash(options.weights), options.seed]
     if options.as_it_is:
-        return scores.gathered(kept(options.rows, origin), names)
+        return scores.gathered(kept(scores.need_rows(options.rows), origin), names)
     cameras = [(i, name) for i in range(count) for name in names]
     beside = [(i, name) for i, name in cameras if i < BESIDE]
     jobs: list[tuple[Any, int, str]] = [(scores.score, *job) for job in cameras]
@@ -100,7 +100,7 @@ def main(options: Options) -> dict[str, Any]:
     begin(options, "real_pixels")
     estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=1, full=40)
-    names = options.conditions or (FEW if options.preset == "debug" else tuple(CHANGES))
+    names = known(options.conditions) or (FEW if options.preset == "debug" else tuple(CHANGES))
     rows = measured(options, names, count)
     real = [line for path in options.recordings_at if (line := halves(path))]
     text = "\n\n".join((

@@ -97,8 +97,10 @@ def _windows(
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray, np.ndarray, tuple[Note, ...]]:
     """The frames that bound each window, window starts and lengths (N,) int64 us, and notes.
 
-    Raises EV001, EV011, EV012 as `plan_windows`, EV017 if no window is left.
+    Raises EV001, EV011, EV012 as `plan_windows`, EV017 if no window is left, EV026 for more
+    than 10 million windows of equal length.
     """
+    from evflow.downstream.sync import need_few_windows
     from evflow.recordings.windows import condensed, plan_windows
 
     t = recording.events.t
@@ -110,6 +112,7 @@ def _windows(
     else:
         if not len(t):
             raise EvflowDataError("EV001", "the recording has no events.")
+        need_few_windows(t, window_us)
         starts = np.arange(t[0], t[-1] + 2 - window_us, window_us)
         pairs, lengths = (), np.full(len(starts), window_us)
         notes = (Note("frames.none", "no frames: windows of equal length, without dlogI."),)

@@ -58,6 +58,8 @@ class DatasetConfig:
         for name, least in (("train", 0), ("test", 0), ("width", 8), ("height", 8),
                             ("textures", 0), ("photos", 0), ("texture_px", 16), ("cutout_px", 16)):
             require(self, name, getattr(self, name) >= least, f">= {least}")
+        for name in ("width", "height"):
+            require(self, name, getattr(self, name) <= 1 << 16, "<= 65536")
         require(self, "train", self.train + self.test > 0, "> 0 if test is 0")
         require(self, "textures", self.textures + self.photos > 0, "> 0 if photos is 0")
         for name in ("lead_s", "frame_noise_dn"):

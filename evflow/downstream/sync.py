@@ -52,14 +52,18 @@ def sync_times(
     if not _counts(window_us):
         raise EvflowDataError("EV020", f"windows of {window_us!r} us.",
                               "Give whole microseconds, 1 or more.")
-    span = int(t[-1]) - int(t[0])
-    windows = max(1, span // window_us)
+    return t[0] + window_us * np.arange(1, max(1, need_few_windows(t, window_us)) + 1)
+
+
+def need_few_windows(t: np.ndarray, window_us: int) -> int:
+    """Number of whole windows of a length in event times t (N,); EV026 beyond 10 million."""
+    windows = (int(t[-1]) - int(t[0])) // window_us
     if windows > MOST_WINDOWS:
         raise EvflowDataError(
             "EV026", f"events from {t[0]:,} to {t[-1]:,} us, {windows:,} windows of "
             f"{window_us:,} us.", "Does the clock jump (read the parts separately: --start, "
             "--stop), or is the time unit wrong (--time-unit)?")
-    return t[0] + window_us * np.arange(1, windows + 1)
+    return windows
 
 
 def _counts(value: object) -> bool:

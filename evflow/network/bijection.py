@@ -216,8 +216,10 @@ def generate(
 
     The code's summary is replaced by the camera's. The camera is assumed to have been running: its
     pixels' memories lie anywhere between the thresholds, whereas a simulation that starts at the
-    window's first frame gives about a tenth fewer events (a fifth for high thresholds). Values are
-    not clipped: noise of the latents leaves small negative weights.
+    window's first frame gives about a tenth fewer events (a fifth for high thresholds). Where
+    nothing moves there is too much noise: in 50 ms .1 events of a pixel and polarity for .005 at
+    .1 Hz, .3 for .05 at 1 Hz. Values are not clipped: noise of the latents leaves small negative
+    weights.
 
     Args:
         params: of `load_weights`.

@@ -17,6 +17,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io.images.folder import decode, list_images
 from evflow.io.images.frames import existing
+from evflow.io.images.values import opaque
 from evflow.light.colour import luma
 from evflow.scenes.bank import TextureBank, make_bank
 from evflow.scenes.coco import Coco, CocoObject, read_coco
@@ -82,7 +83,7 @@ def coco_bank(
         mask = item.mask()
         if not mask.any():
             raise EvflowDataError("EV009", f"{item.where} has a mask without a pixel.",
-                                  "Raise min_area, or drop it.")
+                                  "Drop it from the json (or raise min_area of coco_bank).")
         planes, diameter = cut_out(pictures[item.image], mask, cutout_size, extent)
         cut.append(_finished(planes))
         diameters.append(diameter)
@@ -102,9 +103,11 @@ def join_banks(*banks: TextureBank) -> TextureBank:
 
 def read_picture(path: Path) -> np.ndarray:
     """One image as luma, float32 (H, W) in [0, 1]; 16-bit data on the smallest scale of 8, 10,
-    12, 14 or 16 bits that holds it. Raises EV003 (dtype, floats beyond [0, 1]), EV009, EV016."""
+    12, 14 or 16 bits that holds it; what is transparent is laid over black. Raises EV003 (dtype,
+    floats beyond [0, 1]), EV009, EV016."""
     image = decode(path)
-    image = image[..., :3] if image.ndim == 3 else image
+    if image.ndim == 3:
+        image = opaque(image, "black")[0] if image.shape[-1] == 4 else image[..., :3]
     if image.dtype in (np.uint8, np.uint16):
         least = 8 if image.dtype == np.uint8 else 10
         white = next(2**b - 1 for b in BIT_DEPTHS if b >= least and image.max() < 2**b)

@@ -30,6 +30,7 @@ from evflow.simulator.sensor import simulable
 from evflow.types import Events
 
 Array = jax.Array
+MOST_SIDE = 1 << 16  # pixels; coordinates of events have 16 bits
 Labelled = tuple[Events, np.ndarray]
 
 
@@ -175,4 +176,8 @@ def _checked_camera(camera: Camera) -> Camera:
         raise EvflowDataError(
             "EV002", f"the camera's maps have shape {camera.shape}.",
             "Expected (H, W); simulate one camera at a time, or vmap simulate_voxels.")
+    if max(camera.shape) > MOST_SIDE:
+        raise EvflowDataError(
+            "EV002", f"a sensor of {camera.shape[1]:,}x{camera.shape[0]:,} pixels.",
+            f"Coordinates of events have 16 bits: at most {MOST_SIDE:,} pixels a side.")
     return jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), simulable(camera))

@@ -38,6 +38,11 @@ class Keys:
     @classmethod
     def of(cls, pixels: int, length_us: int) -> Keys:
         bits = (pixels - 1).bit_length()
+        if length_us << bits + 2 >= 2**64:
+            raise EvflowDataError(
+                "EV004", f"a block of frames lasts {length_us / 8.64e10:,.0f} days, too long for "
+                f"the event times of {pixels:,} pixels.", "Are the times in another unit? Simulate "
+                "parts of a time lapse separately.")
         return cls(bits, np.uint32 if length_us << bits + 2 < 2**32 else np.uint64)
 
     @property

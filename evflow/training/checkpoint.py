@@ -173,7 +173,8 @@ class Checkpoints:
 
     def check_config(self, config: dict[str, Any]) -> None:
         """Raise EV013, naming the fields, where the saved configuration is not `config`; EV009
-        where it is damaged or missing beside steps, EV016 where none is saved, EV018 where another version saved it."""
+        where it is damaged or missing beside steps, EV016 where none is saved, EV018 where another
+        version saved it."""
         path = self.folder / "config.json"
         if not is_there(path) and self.latest is not None:
             raise EvflowDataError(

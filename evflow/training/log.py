@@ -30,8 +30,9 @@ Headline = Callable[[Metrics], str]
 class Log:
     """metrics.jsonl and the bar; only the main process has them. A context manager.
 
-    path: of metrics.jsonl. Lines beyond `step`, from which the run continues, are dropped, so that
-    no step is logged twice, and count among the recent ones. headline: text of the bar; "compiling" before the first step.
+    path: of metrics.jsonl. Lines up to `step`, from which the run continues, count among the recent
+    ones; those beyond are dropped, so that no step is logged twice. headline: text of the bar;
+    "compiling" before the first step.
     """
 
     def __init__(self, path: Path, steps: int, step: int, headline: Headline) -> None:

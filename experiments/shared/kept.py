@@ -42,7 +42,7 @@ def kept(path: Path | None, of: Sequence[Any]) -> dict[str, Row]:
     try:
         held = json.loads(path.read_text())
         was, rows = held["of"], dict(held["rows"])
-    except (ValueError, KeyError, TypeError) as e:
+    except (ValueError, KeyError, TypeError, OSError) as e:
         raise EvflowDataError("EV009", f"{path} holds no rows of this script ({e}).",
                               "Choose another --rows.") from e
     if was != json.loads(json.dumps(list(of))):

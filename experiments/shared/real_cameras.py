@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SENSORS, SecondOrder, SensorModel
+from evflow.errors import EvflowDataError
 from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.scenes.config import SceneConfig
 from experiments.shared.cameras import Hidden, Protocol
@@ -48,6 +50,14 @@ CHANGES: dict[str, dict[str, Any]] = {
     "as a real camera": {"model": REAL, "exposure_ms": 10, "frame_noise_dn": 2.0, "black_dn": 4.0},
     "DVS-Voltmeter's DVS346": {"model": SENSORS["dvs346"].model},
 }
+
+
+def known(conditions: Sequence[str]) -> Sequence[str]:
+    """The names of conditions; EV020 where there is no such one."""
+    if unknown := sorted(set(conditions) - set(CHANGES)):
+        raise EvflowDataError("EV020", f"no condition {', '.join(unknown)}.",
+                              f"There are: {', '.join(CHANGES)}.")
+    return conditions
 
 
 def added_light(protocol: Protocol) -> float:

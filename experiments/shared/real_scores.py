@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from evflow import CameraEstimate, estimate_camera
 from evflow.camera.optics import MEASURED
+from evflow.errors import EvflowDataError
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.kept import Row
 from experiments.shared.real_cameras import CHANGES, added_light, shot_rates
@@ -19,6 +21,13 @@ SLOW = [name for name, change in CHANGES.items()
 HEADS = ("condition", "cameras", "ideal: median error of θ", "68 / 95 % hold",
          "measured: median error", "68 / 95 % hold", "median std")
 OTHER_HEADS = ("what else", "condition", "true", "found in", "median error", "68 / 95 % hold")
+
+
+def need_rows(path: Path | None) -> Path:
+    """The file of the rows; EV020 where none was named."""
+    if path is None:
+        raise EvflowDataError("EV020", "--as-it-is without --rows.", "Name the file of the rows.")
+    return path
 
 
 def thresholds(found: CameraEstimate, truth: np.ndarray) -> Row:

@@ -264,7 +264,12 @@ def test_voxels_without_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_voxel_errors(tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_recording(tmp_path / "bare.npz", Recording.of_events(make(50).events))
     write_recording(tmp_path / "none.npz", Recording.of_events(Events([], [], [], [], SIZE)))
+    events = make(50).events
+    jump = Events(events.x, events.y, np.where(np.arange(len(events)) < 9, 0, 1 << 51), events.p,
+                  events.size)
+    write_recording(tmp_path / "jump.npz", Recording.of_events(jump))
     for code, command in (
+        ("EV026", [tmp_path / "jump.npz"]),
         ("EV020", [flight, "--bins", "1"]), ("EV020", [flight, "--window-ms", "0"]),
         ("EV020", [flight, "--window-ms", "nan"]), ("EV017", [flight, "--window-ms", "900"]),
         ("EV017", [tmp_path / "bare.npz", "--window-ms", "900"]),

@@ -40,3 +40,5 @@ def test_rows_of_something_else_are_refused(tmp_path: Path, held: str, code: str
     with pytest.raises(EvflowDataError, match=code):
         resumed(path, ["seed", 1], ["a"], lambda left: [{} for _ in left], "rows")
     assert path.read_text() == held
+    with pytest.raises(EvflowDataError, match="EV009"):
+        resumed(tmp_path, ["seed", 1], ["a"], lambda left: [{} for _ in left], "rows")

@@ -15,6 +15,7 @@ from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.simulator import simulate, simulate_stream, simulate_voxels
+from evflow.simulator.pack import Keys
 
 SHAPE = (4, 6)
 KEY = jax.random.key(0)
@@ -60,6 +61,8 @@ TIMES = np.array([0, 1000, 2000])
     ({"times_us": np.array([0, 2000, 1000])}, "EV004", "the one before at 2000 us"),
     ({"camera": Camera.constant((6, 4))}, "EV015", "(4, 6)"),
     ({"camera": Camera.constant((2, *SHAPE))}, "EV002", "one camera at a time"),
+    ({"camera": Camera.constant((1, 70_000)), "frames": np.zeros((3, 1, 70_000), np.uint8)},
+     "EV002", "a sensor of 70,000x1 pixels"),
     ({"camera": dataclasses.replace(CAMERA, theta_on=CAMERA.theta_on.at[1, 1].set(0))}, "EV014",
      "theta_on is 0 at index (1, 1)"),
     ({"camera": dataclasses.replace(CAMERA, theta_off=-CAMERA.theta_off)}, "EV014", "theta_off"),
@@ -94,6 +97,13 @@ def test_more_events_than_memory_holds_are_refused(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("evflow.simulator.pack.MOST_EVENTS", events - 1)
     with pytest.raises(EvflowDataError, match=r"EV014.* events between 3 frames, up to 5\.54e\+03"):
         simulate(KEY, flash, TIMES, camera)
+
+
+def test_a_block_that_is_too_long_for_its_times_is_refused() -> None:
+    year_us = 365 * 86_400_000_000
+    assert len(Keys.of(1280 * 720, 50 * 86_400_000_000)(np.zeros(1), np.zeros(1))) == 1
+    with pytest.raises(EvflowDataError, match=r"EV004.*lasts 365 days.*921,600 pixels"):
+        Keys.of(1280 * 720, year_us)
 
 
 def test_simulate_cannot_be_traced() -> None:

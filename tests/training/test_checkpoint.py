@@ -147,7 +147,7 @@ def test_a_configuration_that_is_not_this_one(run: Path, text: str, code: str, s
 
 def test_a_run_whose_configuration_is_lost_is_told_from_none(run: Path) -> None:
     (run / "config.json").unlink(missing_ok=True)
-    with Checkpoints(run) as checkpoints, pytest.raises(EvflowDataError, match="EV009.*missing"):
+    with Checkpoints(run) as checkpoints, pytest.raises(EvflowDataError, match=r"EV009.*missing"):
         checkpoints.check_config({})
 
 
@@ -155,10 +155,10 @@ def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     def full(*_: object, **__: object) -> None:
         raise ValueError("INTERNAL: Error writing file: No space left on device\n[more]")
 
-    with pytest.raises(EvflowDataError, match=r"EV019.*No space left on device\)"), (
-            Checkpoints(tmp_path)) as checkpoints:
+    with Checkpoints(tmp_path) as checkpoints:
         monkeypatch.setattr(checkpoints._manager(), "save", full)
-        checkpoints.save(1, state(1))
+        with pytest.raises(EvflowDataError, match=r"EV019.*No space left on device\)"):
+            checkpoints.save(1, state(1))
 
 
 def test_steps_that_are_a_file(tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ def test_weights_to_start_from_identify_a_run(tmp_path: Path) -> None:
         with pytest.raises(EvflowDataError, match=f"EV013.*start: {there} there, {here} here"):
             train(begin, Plan(), given(tmp_path / "a"), start=here)
     train(begin, Plan(), given(tmp_path / "b"))
-    with pytest.raises(EvflowDataError, match="EV013.*start: None there, abc here"):
+    with pytest.raises(EvflowDataError, match=r"EV013.*start: None there, abc here"):
         train(begin, Plan(), given(tmp_path / "b"), start="abc")
 
 
