@@ -250,9 +250,9 @@ def advance_second_order(
     in its middle."""
     assert state.inner is not None
     lp, inner = second_order.follow(model.photoreceptor, state.lp, state.inner, log_i, i01, dt)
-    base = state.base - (0.0 if leaked is None else leaked)
     fired = second_order.fire(
-        model, theta_on, theta_off, base, inner.amplified, state.last, state.lp, lp, dt)
+        model, theta_on, theta_off, state.base, inner.amplified, state.last, state.lp, lp, dt,
+        leaked)
     inner = dataclasses.replace(inner, amplified=fired.amplified)
     return (PixelState(lp, fired.base, fired.last, inner),
             Spikes(fired.count, fired.first, fired.spacing, None))

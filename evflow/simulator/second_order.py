@@ -8,7 +8,7 @@ An event resets the amplifier: during the dead time y follows lp, then starts wi
 changes of light in a dead time are lost. Within an interval u is linear and the rates are those of
 its middle; photoreceptor and follower are solved exactly for any length. For the amplifier lp is
 taken as linear, which is solved exactly too: after the first reset, the distance of events is dead
-time plus rise time.
+time plus rise time. Leak lowers base steadily, from each reset on.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NO_TIME = 1e-9  # seconds
 TINY = 1e-9  # a rise that reaches no threshold, with a nonzero square for gradients
 APART = 1e-3  # least |(1 - tau_f p1)(1 - tau_f p2)| of the poles p; closer ones are moved apart
 LEAST_DELAY = 1e-3  # of the amplifier, in intervals
-SEARCH, RISE = 4, 4  # steps of Newton's method
+SEARCH, RISE, LEAKING = 4, 4, 12  # steps of Newton's method
 
 
 @jax.tree_util.register_dataclass
@@ -128,18 +128,33 @@ def rise_time(theta: Array, rise: Array, delay: Array) -> Array:
     return jnp.minimum(x * delay, NEVER)
 
 
+def leaking_rise_time(theta: Array, rise: Array, delay: Array, leak: Array) -> Array:
+    """`rise_time` where base falls by `leak` an interval, negative for OFF:
+    rise delay (x - 1 + exp(-x)) + leak delay x = theta. NEVER where both together do not rise."""
+    rises = rise + leak > TINY
+    # From the asymptote's root, which lies beyond that of a convex curve and before that of a
+    # concave one (falling light): either way Newton's method comes nearer from one side.
+    x = jnp.maximum(theta + rise * delay, 0.0) / (jnp.where(rises, rise + leak, 1.0) * delay)
+    for _ in range(LEAKING):
+        value = delay * (rise * (x + jnp.expm1(-x)) + leak * x) - theta
+        slope = delay * (leak - rise * jnp.expm1(-x))
+        x = jnp.maximum(x - value / jnp.where(jnp.abs(slope) > TINY, slope, 1.0), 0.0)
+    return jnp.where(rises, jnp.minimum(x * delay, NEVER), NEVER)
+
+
 def first_time(
-    y: Array, start: Array, rise: Array, delay: Array, level: Array, left: Array
+    y: Array, start: Array, rise: Array, delay: Array, level: Array, left: Array,
+    leak: Array | float = 0.0,
 ) -> Array:
-    """First time at which y meets `level`, given that it is beyond after `left`: Newton's method,
-    starting from a straight line."""
-    end = amplified(y, start, rise, delay, left)
+    """First time at which y, and `leak` an interval, meet `level`, given that they are beyond after
+    `left`: Newton's method, starting from a straight line."""
+    end = amplified(y, start, rise, delay, left) + leak * left
     low = jnp.where(jnp.abs(end - y) > 1e-12, (level - y) / jnp.where(end == y, 1.0, end - y), 1.0)
     at = jnp.clip(low, 0.0, 1.0) * left
     for _ in range(SEARCH):
         value = amplified(y, start, rise, delay, at)
-        slope = rise - (value - start - rise * at + rise * delay) / delay
-        step = (level - value) / jnp.where(jnp.abs(slope) > 1e-9, slope, 1e9)
+        slope = rise - (value - start - rise * at + rise * delay) / delay + leak
+        step = (level - value - leak * at) / jnp.where(jnp.abs(slope) > 1e-9, slope, 1e9)
         at = jnp.clip(at + step, 0.0, left)
     return at
 
@@ -160,9 +175,10 @@ class Fired:
 
 def fire(
     model: Constants, theta_on: Array, theta_off: Array, base: Array, y: Array, last: Array,
-    start: Array, end: Array, dt: Array,
+    start: Array, end: Array, dt: Array, leaked: Array | None = None,
 ) -> Fired:
-    """The events of an interval of dt seconds in which lp moves from start to end."""
+    """The events of an interval of dt seconds in which lp moves from start to end. leaked: by how
+    much base falls in it, None without leak."""
     long, delay = jnp.maximum(dt, NO_TIME), _delay(model, dt)
     dead = jnp.zeros_like(last) if model.refractory_s is None else model.refractory_s / long
     rise = end - start
@@ -170,19 +186,23 @@ def fire(
     begin = start + rise * waits
     base, y = (jnp.where(waits > 0, begin, value) for value in (base, y))
     left = 1.0 - waits
-    contrast = amplified(y, begin, rise, delay, left) - base
+    leak = 0.0 if leaked is None else leaked
+    contrast = amplified(y, begin, rise, delay, left) + leak * left - base
     up = contrast > 0
     sign = jnp.where(up, 1.0, -1.0)
     theta = jnp.where(up, theta_on, theta_off)
     fires = sign * contrast >= theta
-    first = waits + first_time(y, begin, rise, delay, base + sign * theta, left)
-    spacing = dead + jnp.where(sign * rise > 0, rise_time(theta, sign * rise, delay), NEVER)
+    first = waits + first_time(y, begin, rise, delay, base + sign * theta, left, leak)
+    if leaked is None:
+        spacing = dead + jnp.where(sign * rise > 0, rise_time(theta, sign * rise, delay), NEVER)
+    else:
+        spacing = dead + leaking_rise_time(theta, sign * rise, delay, sign * leaked)
     count = jnp.where(fires, 1.0 + jnp.floor(jnp.maximum(1.0 - first, 0.0) / spacing), 0.0)
     at = first + (count - 1.0) * spacing
     reset = jnp.minimum(at + dead, 1.0)
     anew = start + rise * reset
     return Fired(
-        jnp.where(fires, anew, base),
+        jnp.where(fires, anew - leak * (1.0 - reset), base - leak * left),
         jnp.where(fires, amplified(anew, anew, rise, delay, 1.0 - reset),
                   amplified(y, begin, rise, delay, left)),
         jnp.where(fires, (1.0 - at) * dt, last + dt), sign * count, first, spacing)

@@ -87,10 +87,13 @@ def test_steps_of_light_in_the_dark_and_in_white() -> None:
     assert most > 1.3
 
 
-@pytest.mark.parametrize(("refractory_s", "amplifier_s"), [
-    (0.0, 1.6e-4), (7e-4, 1.6e-4), (0.0, 3e-3), (5e-3, 1e-3), (0.0, 0.0)])
-def test_events_are_those_of_short_steps(refractory_s: float, amplifier_s: float) -> None:
-    """Of an amplifier behind straight pieces."""
+@pytest.mark.parametrize(("refractory_s", "amplifier_s", "leak"), [
+    (0.0, 1.6e-4, 0.0), (7e-4, 1.6e-4, 0.0), (0.0, 3e-3, 0.0), (5e-3, 1e-3, 0.0), (0.0, 0.0, 0.0),
+    (0.0, 1.6e-4, 90.0), (7e-4, 1e-3, 90.0), (0.0, 3e-3, 300.0)])
+def test_events_are_those_of_short_steps(
+    refractory_s: float, amplifier_s: float, leak: float
+) -> None:
+    """Of an amplifier behind straight pieces, whose base falls by `leak` a second."""
     ends, dt, fine = np.array([0.0, 0.7, 0.75, 1.9, 0.9, 0.2, 0.2, 1.4]), 4e-3, 10_000
     model = SensorModel(refractory_s=refractory_s, photoreceptor=SecondOrder(
         amplifier_s=amplifier_s))
@@ -106,6 +109,7 @@ def test_events_are_those_of_short_steps(refractory_s: float, amplifier_s: float
                 continue
             share = 1 - np.exp(-dt / fine / amplifier_s) if amplifier_s else 1.0
             y += share * (x - y)
+            base -= leak * dt / fine
             if abs(y - base) >= (0.13 if y > base else 0.17):
                 count += 1 if y > base else -1
                 base, y, last = x, x, 0.0
@@ -115,12 +119,24 @@ def test_events_are_those_of_short_steps(refractory_s: float, amplifier_s: float
     step = jax.jit(fire)
     for begin, end in itertools.pairwise(ends):
         out = step(Constants.of(model), jnp.float32(0.13), jnp.float32(0.17), *state,
-                   jnp.float32(begin), jnp.float32(end), jnp.float32(dt))
+                   jnp.float32(begin), jnp.float32(end), jnp.float32(dt),
+                   jnp.float32(leak * dt) if leak else None)
         state = [out.base, out.amplified, out.last]
         found.append(int(out.count))
     assert sum(map(abs, expected)) > 3
     assert np.abs(np.subtract(found, expected)).max() <= 1
     assert abs(sum(map(abs, found)) - sum(map(abs, expected))) <= 1
+
+
+@pytest.mark.parametrize("distance_us", [10_000, 1_000_000])
+def test_leak_does_not_depend_on_the_frames_distance(distance_us: int) -> None:
+    times = np.arange(0, 4_000_001, distance_us)
+    still = np.full((len(times), 2, 2), 100, np.uint8)
+    model = SensorModel(photoreceptor=DEFAULT.at(200.0), leak_hz=5.1)
+    events = simulate(KEY, still, times, Camera.constant((2, 2), 0.2, 0.2), model=model)
+    assert events.p.all()
+    np.testing.assert_array_equal(events.count_map()[0], 20)
+    assert np.diff(events.t[(events.x == 0) & (events.y == 0)]).std() < 5
 
 
 @pytest.mark.parametrize("model", [
