@@ -56,7 +56,7 @@ def known(conditions: Sequence[str]) -> Sequence[str]:
     """The names of conditions; EV020 where there is no such one."""
     if unknown := sorted(set(conditions) - set(CHANGES)):
         raise EvflowDataError("EV020", f"no condition {', '.join(unknown)}.",
-                              f"There are: {', '.join(CHANGES)}.")
+                              f"There are: {'; '.join(CHANGES)}.")
     return conditions
 
 

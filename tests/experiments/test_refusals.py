@@ -32,6 +32,7 @@ from experiments import (
     noise_rates,
     one_polarity,
     quickstart,
+    real_pixels,
     see_better,
     tell_apart,
     true_video,
@@ -68,6 +69,33 @@ def test_weights_without_a_summary_or_errors(script: Any, tmp_path: Path) -> Non
     given = {"weights": str(path), "out": tmp_path / ("a.safetensors" if script in FITS else "out")}
     with pytest.raises(EvflowDataError, match=r"EV018.*no part .*sees every pixel alone"):
         script.main(script.Options(**given))
+
+
+@pytest.mark.parametrize(("given", "seen"), [
+    ({"conditions": ("wet",)}, "EV020.*no condition wet"),
+    ({"as_it_is": True}, "EV020.*--as-it-is without --rows")])
+def test_conditions_and_rows_that_are_not_there(
+    given: dict[str, Any], seen: str, tmp_path: Path
+) -> None:
+    with pytest.raises(EvflowDataError, match=seen):
+        real_pixels.main(real_pixels.Options(out=tmp_path, **given))
+
+
+def test_weights_that_workers_cannot_load_are_named_by_the_parent(tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV016.*no weights at .*nowhere"):
+        evaluate.main(evaluate.Options(
+            weights=str(tmp_path / "nowhere.safetensors"), workers=2, out=tmp_path))
+
+
+def test_the_mean_of_networks_of_several_sizes_is_refused(tmp_path: Path) -> None:
+    paper, paths = MODELS["paper"], []
+    for hidden in (8, 16):
+        small = dataclasses.replace(
+            paper, flow=dataclasses.replace(paper.flow, steps=1, hidden=hidden))
+        paths.append(str(save_weights(tmp_path / f"{hidden}.safetensors",
+                                      random_params(small, "paper"), {})))
+    with pytest.raises(EvflowDataError, match=r"EV018.*networks of several sizes"):
+        combine.main(combine.Options(paths[0], tmp_path / "a.safetensors", pixels=tuple(paths)))
 
 
 def test_a_result_of_other_options_is_not_replaced(tmp_path: Path) -> None:
