@@ -8,7 +8,7 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import estimate
-from evflow.estimation.front_end import find_front_end
+from evflow.estimation.front_end import FrontEnd, agree, find_front_end
 from evflow.estimation.pipeline import check_options
 from evflow.estimation.refine import Stretch, cut
 from evflow.estimation.refine.stretches import most_simulated, spread
@@ -29,8 +29,8 @@ class CameraEstimator:
 
     Only sums and a bounded number of pieces are kept: memory is bounded by the size of the sensor.
     The photoreceptor and the frames' offset are measured from the first pieces, and again from the
-    busiest when these have twice the events; then what is kept is read again, and `.extent` says
-    how much that is. If one recording is added whole, the estimate equals
+    busiest when these have twice the events. If they differ, what is kept is read again, and
+    `.extent` says how much that is. If one recording is added whole, the estimate equals
     `estimate_camera(recording, effort="full")`.
 
     Args:
@@ -68,7 +68,7 @@ class CameraEstimator:
         self._state: State | None = None
         self._waiting: tuple[Stretch, ...] = ()
         self._busiest: tuple[Stretch, ...] = ()
-        self._measured = 0.0  # events of the busiest when the front end was measured
+        self._measured = 0  # events of the busiest when the front end was measured
         self._notes: tuple[Note, ...] = ()
         self._size: tuple[int, int] | None = None
         self._seconds, self._left_s, self._apart = 0.0, 0.0, 1
@@ -110,7 +110,8 @@ class CameraEstimator:
         if self._state is None:
             self._waiting += stretches
             if len(self._waiting) >= self.FIRST:
-                self._state = self._begun(self._waiting, self._waiting)
+                self._measured = sum(map(_events, self._busiest))
+                self._state = self._read(self._waiting, self._front_end(self._waiting))
                 self._waiting = ()
         else:
             for stretch in stretches:
@@ -131,7 +132,7 @@ class CameraEstimator:
         """
         state = self._state
         if state is None and self._waiting:
-            state = self._begun(self._waiting, self._waiting)
+            state = self._read(self._waiting, self._front_end(self._waiting))
         if state is None:
             raise EvflowDataError(
                 "EV017", "no usable window was added"
@@ -142,18 +143,23 @@ class CameraEstimator:
         return estimate(state, extent=extent, before=self._notes)
 
     def _again(self, state: State) -> State:
-        """The state of the stretches that are kept, with a front end that is measured on the
-        busiest of all."""
+        """The state, or where its front end is not that of the busiest stretches, a new one of the
+        stretches that are kept."""
+        self._measured = sum(map(_events, self._busiest))
+        front_end = self._front_end(self._busiest)
+        if agree(state.front_end, front_end):
+            return state
         kept = {id(s): s for s in (*state.read, *self._busiest)}
         stretches = tuple(sorted(kept.values(), key=lambda s: s.span_us))
         self._left = self._stretches - len(stretches)
         self._left_s = self._seconds - covered_s(s.span_us for s in stretches)
-        return self._begun(stretches, self._busiest)
+        return self._read(stretches, front_end)
 
-    def _begun(self, stretches: tuple[Stretch, ...], on: tuple[Stretch, ...]) -> State:
-        """The state of some stretches, with a front end that is measured on some."""
-        self._measured = sum(map(_events, self._busiest))
-        front_end = find_front_end(on, measured=self._pixel == "measured")
+    def _front_end(self, stretches: tuple[Stretch, ...]) -> FrontEnd:
+        return find_front_end(stretches, measured=self._pixel == "measured")
+
+    def _read(self, stretches: tuple[Stretch, ...], front_end: FrontEnd) -> State:
+        """The state of some stretches."""
         state = State(self._params, front_end)
         most = most_simulated(stretches[0].recording.events.size)
         simulated = spread([len(s.run) for s in stretches], most)

@@ -50,6 +50,17 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
     return FrontEnd(seen_by, noise_dn, blur_s, found, dead, silent, films)
 
 
+def agree(before: FrontEnd, now: FrontEnd) -> bool:
+    """Whether a later measurement leaves an earlier one as it is: where it finds nothing, or the
+    same laws, and constants within two of its standard deviations."""
+    if before.found is None or now.found is None:
+        return now.found is None
+    one, other = before.seen_by, now.seen_by
+    away = [getattr(one, name) - getattr(other, name) for name in ("offset_dn", "tau_s", "delay_s")]
+    return (one.log_map, one.by_light) == (other.log_map, other.by_light) and bool(
+        (np.abs(away) <= 2.0 * now.found.std).all())
+
+
 def _silent(stretches: Sequence[Stretch]) -> np.ndarray | None:
     """`silent_lines` of a few stretches; None if there are none."""
     few = [stretches[i] for i in np.unique(np.linspace(0, len(stretches) - 1, STRETCHES).round())

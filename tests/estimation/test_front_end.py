@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from evflow.estimation.front_end import find_front_end
+from evflow.estimation.front_end import FrontEnd, agree, find_front_end
 from evflow.estimation.refine import Stretch
+from evflow.simulator.photoreceptor import Photoreceptor
 from evflow.types import Events, Recording
 
 
@@ -21,3 +24,18 @@ def test_the_exposure_is_the_mean_of_the_stretches() -> None:
     for recordings, expected in (((told,), 0.02), ((untold,), 0.0), ((told, untold), 0.01)):
         stretches = [Stretch(recording, (0, 1), ()) for recording in recordings]
         assert find_front_end(stretches, measured=False).blur_s == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("change", "same"), [
+    ({}, True), ({"offset_dn": 13.0, "tau_s": 1.5e-3}, True), ({"offset_dn": 15.0}, False),
+    ({"tau_s": 3e-3}, False), ({"delay_s": 3e-3}, False), ({"by_light": False}, False),
+    ({"log_map": "log_eps"}, False)])
+def test_what_is_measured_again_agrees_within_its_errors(
+    change: dict[str, Any], same: bool
+) -> None:
+    seen = Photoreceptor(offset_dn=10.0, tau_s=1e-3)
+    found: Any = SimpleNamespace(std=np.array([2.0, 5e-4, 1e-3]))
+    now = FrontEnd(dataclasses.replace(seen, **change), found=found)
+    assert agree(FrontEnd(seen, found=found), now) is same
+    assert not agree(FrontEnd(seen), now)
+    assert agree(FrontEnd(seen, found=found), FrontEnd())
