@@ -62,8 +62,8 @@ class CameraEstimator:
         check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")))
         self._params = load_weights() if params is None else params
         if not config_of(self._params).pool:
-            raise EvflowDataError("EV018", "these weights see every pixel by itself, and have no "
-                                  "summary.", "Use others, or estimate_camera.")
+            raise EvflowDataError("EV018", "these weights estimate every pixel separately and have "
+                                  "no summary.", "Use others, or estimate_camera.")
         self._refine, self._pixel, self._min_us = refine, pixel, min_window_us
         self._state: State | None = None
         self._waiting: tuple[Stretch, ...] = ()

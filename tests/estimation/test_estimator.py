@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.networks import hidden
 
-from evflow import CameraEstimate, CameraEstimator, Recording, estimate_camera, load_weights
+from evflow import CameraEstimate, CameraEstimator, Recording, estimate_camera
 from evflow.errors import EvflowDataError
 from evflow.estimation import drift, reading
 from evflow.estimation import estimator as estimator_module
@@ -162,11 +162,6 @@ def test_a_camera_at_rest_at_first_is_measured_again_when_it_moves(
     assert found.extent.stretches < found.extent.of == 6
     assert found.extent.read_s == pytest.approx(0.04 * found.extent.stretches)
     assert [n.code for n in found.extent.notes()] == ["reading.again"]
-
-
-def test_the_paper_s_network_cannot_be_used_piece_by_piece() -> None:
-    with pytest.raises(EvflowDataError, match="EV018"):
-        CameraEstimator(load_weights("paper"))
 
 
 def test_what_is_kept_does_not_grow() -> None:
