@@ -15,7 +15,7 @@ from evflow.estimation.refine.stretches import most_simulated, spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, thinned
 from evflow.network import api
-from evflow.network.architecture import config_of
+from evflow.network.summary import pooling_parts
 from evflow.network.weights import load_weights
 from evflow.notes import Note
 from evflow.recordings import dense
@@ -61,9 +61,7 @@ class CameraEstimator:
     ) -> None:
         check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")))
         self._params = load_weights() if params is None else params
-        if not config_of(self._params).pool:
-            raise EvflowDataError("EV018", "these weights estimate every pixel separately and have "
-                                  "no summary.", "Use others, or estimate_camera.")
+        pooling_parts(self._params)  # EV018
         self._refine, self._pixel, self._min_us = refine, pixel, min_window_us
         self._state: State | None = None
         self._waiting: tuple[Stretch, ...] = ()
