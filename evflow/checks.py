@@ -17,6 +17,7 @@ Size = tuple[int, int]
 
 COLUMNS = ("x", "y", "t", "p")
 LATEST_US = 1 << 62
+MOST_SIDE = 1 << 16  # pixels; coordinates of events have 16 bits
 RESET_US = 1_000_000  # a step back by more than this is another clock, not a late packet
 
 
@@ -67,7 +68,7 @@ def check_size(size: Any) -> Size:
         width, height = (operator.index(v) for v in size)
     except (TypeError, ValueError):
         width = height = 0
-    if not (0 < width <= 65536 and 0 < height <= 65536):
+    if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
         raise EvflowDataError(
             "EV020", f"size is {size!r}.", "Give (width, height) in pixels, e.g. (346, 260).")
     return width, height

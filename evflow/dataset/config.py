@@ -12,7 +12,7 @@ from typing import Any
 
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SensorModel
-from evflow.checks import require
+from evflow.checks import MOST_SIDE, require
 from evflow.dataset.sequence import sequence_names
 from evflow.scenes.config import SceneConfig
 
@@ -59,7 +59,7 @@ class DatasetConfig:
                             ("textures", 0), ("photos", 0), ("texture_px", 16), ("cutout_px", 16)):
             require(self, name, getattr(self, name) >= least, f">= {least}")
         for name in ("width", "height"):
-            require(self, name, getattr(self, name) <= 1 << 16, "<= 65536")
+            require(self, name, getattr(self, name) <= MOST_SIDE, f"<= {MOST_SIDE}")
         require(self, "train", self.train + self.test > 0, "> 0 if test is 0")
         require(self, "textures", self.textures + self.photos > 0, "> 0 if photos is 0")
         for name in ("lead_s", "frame_noise_dn"):

@@ -114,7 +114,7 @@ class CameraEstimator:
         else:
             for stretch in stretches:
                 self._state = self._next(self._state, stretch)
-            if sum(map(_events, self._busiest)) >= self.AGAIN * self._measured:
+            if sum(map(_events, self._busiest)) > self.AGAIN * self._measured:
                 self._state = self._again(self._state)
         return len(plan.pairs)
 

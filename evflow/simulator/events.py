@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
-from evflow.checks import COLUMNS, plain
+from evflow.checks import COLUMNS, MOST_SIDE, plain
 from evflow.errors import EvflowDataError
 from evflow.simulator import pack
 from evflow.simulator.active import BLOCK
@@ -30,7 +30,6 @@ from evflow.simulator.sensor import simulable
 from evflow.types import Events
 
 Array = jax.Array
-MOST_SIDE = 1 << 16  # pixels; coordinates of events have 16 bits
 Labelled = tuple[Events, np.ndarray]
 
 

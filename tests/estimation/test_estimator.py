@@ -164,6 +164,18 @@ def test_a_camera_at_rest_at_first_is_measured_again_when_it_moves(
     assert [n.code for n in found.extent.notes()] == ["reading.again"]
 
 
+def test_pieces_with_as_few_events_as_the_first_are_not_measured_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recording, _ = hidden(3)
+    monkeypatch.setattr(CameraEstimator, "FIRST", 1)
+    monkeypatch.setattr(estimator_module, "_events", lambda _: 0)
+    estimator = CameraEstimator(refine="off")
+    estimator.add(piece(recording, 0, 1))
+    monkeypatch.setattr(estimator, "_again", None)
+    assert estimator.add(piece(recording, 1, 2)) == 1
+
+
 def test_what_is_kept_does_not_grow() -> None:
     state = State({}, FrontEnd(), chunks=tuple(range(8)), read=tuple(range(32)))
     less = thinned(state, 8, 32)
