@@ -25,6 +25,7 @@ from rich.console import Console
 
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
+from evflow.files.folders import need_writable
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -80,6 +81,7 @@ def main(options: Options) -> int:
     out = options.out or default_out("json" if options.device == "gpu" else "jsonl")
     if out.exists():
         raise EvflowDataError("EV013", f"{out} exists.", "Give another --out.")
+    need_writable(out.parent)
     if options.device == "gpu":
         return on_gpu(options, out)
     cases, run_facts = select(options.only), facts() | {"quick": options.quick}

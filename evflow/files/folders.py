@@ -66,9 +66,7 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     stage = aside(folder / "stage", "tmp")
     new = not folder.exists()
     try:
-        with atomic_write(folder / ".probe", overwrite=True) as probe:  # before any long work
-            probe.touch()
-        (folder / ".probe").unlink(missing_ok=True)
+        need_writable(folder)  # before any long work
         clear_leftovers(folder / "stage")
         stage.mkdir()
         yield stage
@@ -80,6 +78,13 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
             if new:
                 with contextlib.suppress(OSError):  # unless something was written
                     folder.rmdir()
+
+
+def need_writable(folder: Path) -> None:
+    """Make the folder, and raise EV019 where no file can be written into it."""
+    with atomic_write(folder / ".probe", overwrite=True) as probe:
+        probe.touch()
+    (folder / ".probe").unlink(missing_ok=True)
 
 
 def _unstage(stage: Path, folder: Path, names: Sequence[str], *, overwrite: bool) -> None:

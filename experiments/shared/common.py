@@ -19,6 +19,7 @@ import tyro
 
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_text
+from evflow.files.folders import need_writable
 from evflow.network.architecture import config_of
 from evflow.network.weights import load_weights, weights_hash
 from evflow.process.provenance import provenance
@@ -101,10 +102,12 @@ def slug(name: str) -> str:
 
 def begin(options: Any, name: str) -> None:
     """Before the work of a script that will write NAME.json into options.out: EV020 where a count
-    among its options is less than 1, EV013 where that file is the result of other options."""
+    among its options is less than 1, EV013 where that file is the result of other options, EV019
+    where it cannot be written."""
     at_least(1, **{field.name: value for field in dataclasses.fields(options)
                    if type(value := getattr(options, field.name)) is int and field.name != "seed"})
     path = options.out / f"{name}.json"
+    need_writable(options.out)
     if not path.is_file():
         return
     before = json.loads(path.read_text())["config"]

@@ -15,6 +15,7 @@ from evflow.camera import CameraPrior
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.io import open_writer
+from experiments.shared.common import slug
 
 SPEED = 90.0  # pixels per second
 BLUR = 0.8  # pixels: of the lens
@@ -69,8 +70,8 @@ def film(pan: Pan) -> Iterator[np.ndarray]:
 def recorded(pan: Pan, folder: Path) -> tuple[Path, Camera]:
     """The recording's file, written now or kept in the folder before, and its camera."""
     width, height = pan.size
-    path = folder / (f"{width}x{height}_{pan.seconds:g}s_{pan.frames_hz}hz_{pan.mismatch:g}_"
-                     f"{pan.seed}.h5")
+    path = folder / (f"{slug(pan.images.resolve().name)}_{width}x{height}_{pan.seconds:g}s_"
+                     f"{pan.frames_hz}hz_{pan.mismatch:g}_{pan.seed}.h5")
     k_camera, k_events = jax.random.split(jax.random.key(pan.seed))
     prior = CameraPrior(theta=(0.2, 0.3), mismatch=(pan.mismatch, pan.mismatch))
     camera = Camera.sample(k_camera, (height, width), prior)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.networks import random_params
 
+from benchmarks import __main__ as benchmarks
 from evflow.errors import EvflowDataError
 from evflow.network.config import MODELS
 from evflow.network.weights import save_weights
@@ -35,6 +36,7 @@ from experiments import (
     real_pixels,
     see_better,
     tell_apart,
+    template,
     true_video,
 )
 from experiments.shared.common import begin, estimator, write_result
@@ -111,6 +113,16 @@ def test_a_result_of_other_options_is_not_replaced(tmp_path: Path) -> None:
     workers = evaluate.Options(out=tmp_path, workers=2)
     write_result(tmp_path / "evaluate.json", {}, dataclasses.asdict(workers))
     begin(dataclasses.replace(workers, workers=1), "evaluate")
+
+
+def test_results_that_cannot_be_written_are_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    for out in (tmp_path / "file", tmp_path / "file/results"):
+        with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
+            template.main(template.Options(out=out))
+    with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
+        benchmarks.main(benchmarks.Options(out=tmp_path / "file/times.jsonl"))
+    assert (tmp_path / "file").read_text() == "kept"
 
 
 @pytest.mark.parametrize("script", FITS, ids=lambda s: s.__name__)
