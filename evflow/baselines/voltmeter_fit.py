@@ -56,12 +56,13 @@ def _at_rest(light: Array, k2: float) -> tuple[tuple[float, ...], tuple[str, ...
     events, seconds = light[:, 0], light[:, 1]
     used = (events.sum(0) >= LEAST_LIGHT) & (seconds.min(0) > 0)
     dn = np.clip((np.arange(LIGHTS) + 0.5) / LIGHTS * 275.0 - 20.0, 1.0, 255.0)[used]
-    few = events.sum() < LEAST_EVENTS
-    if few or used.sum() < FEW_LIGHTS or dn.max() < CONTRAST * dn.min():
-        rates = (events.sum(1) + 0.5) / np.maximum(seconds.sum(1), 1e-9) * 1e-6  # per us
-        drift, sigma = passage_rates(np.full((2, 1), rates.mean()) if few else rates[:, None])
-        undetermined = ("k3", "k4", "k5", "k6") if few else ("k3", "k5")
-        return (0.0, float(drift[0]), 0.0, float(sigma[0])), undetermined
+    if events.sum() < LEAST_EVENTS:  # without quiet pixels not even their mean rate is known
+        rate = events.sum() / seconds.sum() * 1e-6 if seconds.sum() else 0.0  # per us
+        return (0.0, 0.0, 0.0, float(np.sqrt(2 * rate))), ("k3", "k4", "k5", "k6")
+    if used.sum() < FEW_LIGHTS or dn.max() < CONTRAST * dn.min():
+        rates = (events.sum(1) + 0.5) / np.maximum(seconds.sum(1), 1e-9) * 1e-6
+        drift, sigma = passage_rates(rates[:, None])
+        return (0.0, float(drift[0]), 0.0, float(sigma[0])), ("k3", "k5")
     rates = (events[:, used] + 0.5) / seconds[:, used] * 1e-6
     drift, sigma = passage_rates(rates)
     root = np.sqrt(events.sum(0)[used])  # in units of the largest, as k's are 1e-4 and less

@@ -35,7 +35,14 @@ V2E = {  # options of v2e by another name here, in `evflow simulate`
     "dvs1024": "--sensor-size 1024x768", "output-width": "--sensor-size WxH",
     "output-height": "--sensor-size WxH", "input-frame-rate": "--fps",
     "input-slowmotion-factor": "--slow-motion", "start-time": "--start", "stop-time": "--stop",
-    "disable-slomo": "--no-interpolate"}
+    "disable-slomo": "--no-interpolate", "label-signal-noise": "--labels",
+    "timestamp-resolution": "--max-motion-px, as far as anything moves,",
+    "auto-timestamp-resolution": "--max-motion-px, as far as anything moves,"}
+NOT_HERE = {  # options of v2e without a counterpart, though other names are like theirs
+    "dvs-exposure", "avi-frame-rate", "batch-size", "hdr", "cs-lambda-pixels", "cs-tau-p-ms",
+    "photoreceptor-noise", "scidvs", "slomo-model", "synthetic-input", "skip-video-output",
+    "vid-orig", "vid-slomo", "slomo-stats-plot", "show-dvs-model-state",
+    "record-single-pixel-states", "save-dvs-model-state", "ddd-output"}
 
 
 def reflowed(command: type) -> type:
@@ -91,6 +98,8 @@ def _instead(verb: str, typed: str, name: str, known: set[str]) -> str:
     """What to type instead of an option that the command lacks; "" if nothing is near."""
     if verb == "simulate" and name in V2E:
         return f"v2e's {typed} is {V2E[name]} here."
+    if verb == "simulate" and name in NOT_HERE:
+        return f"v2e's {typed} has no counterpart here."
     names = sorted(option.lstrip("-") for option in known)
     near = [k for k in names if f"-{name}-" in f"-{k}-" or name.startswith(f"{k}-")]
     near = near or difflib.get_close_matches(name, names, n=1, cutoff=LIKE)

@@ -142,6 +142,8 @@ def _cameras(*paths: Path) -> list[tuple[Camera, Camera | None]]:
         return [Camera.load_with_std(path) for path in paths]
     if any(found):
         camera, other = (paths[found.index(kind)] for kind in (True, False))
+        if not other.exists():
+            raise EvflowDataError("EV016", f"no file or folder at {other}.", where=other)
         raise EvflowDataError(
             "EV020", f"{camera} is a camera, {other} is not.",
             "Compare two cameras or two event streams. To see whether the camera fits a recording: "

@@ -62,7 +62,7 @@ def estimate_camera(
         params: of `load_weights`; None loads the released ones. For the paper's network, which sees
             pixels separately, the maps are the mean over windows, which are shorter (25 ms at
             least), and standard deviations are NaN.
-        refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .011).
+        refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .010).
         pixel: "measured" measures the photoreceptor and the frames' offset; "ideal" assumes ideal
             pixels and frames.
         effort: how much is read. "normal": of a long recording, stretches spread over it, until the

@@ -71,6 +71,9 @@ def test_what_the_recording_does_not_tell_is_said() -> None:
     few = measured_constants(data, rested(NOISY, 1.0))
     assert few.undetermined == ("k3", "k4", "k5", "k6")
     assert few.voltmeter.k3 == few.voltmeter.k5 == 0
+    none = measured_constants(data, np.zeros((2, 3, LIGHTS)))  # nothing was quiet
+    assert none.undetermined == few.undetermined
+    assert none.voltmeter.k4 == none.voltmeter.k6 == 0
     one_light = rested(NOISY, 4000.0) * (np.arange(LIGHTS) == 3)
     assert measured_constants(data, one_light).undetermined == ("k3", "k5")
     bright = data._replace(dn=data.dn + 1e4)  # where log(L + k2) is the same for all k2

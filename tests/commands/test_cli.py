@@ -109,6 +109,8 @@ def test_usage_errors_exit_2() -> None:
 @pytest.mark.parametrize(("line", "said"), [
     ("simulate -i r.mp4 --pos_thres .2 --dvs346", "v2e's -i is VIDEO without an option here. v2e's "
      "--pos_thres is --theta-on here. v2e's --dvs346 is --sensor-size davis346 here."),
+    ("simulate r.mp4 --timestamp_resolution .001 --dvs_exposure duration", "--max-motion-px, as "
+     "far as anything moves, here. v2e's --dvs_exposure has no counterpart here."),
     ("simulate r.mp4 -o r.h5 --sensr=v2e", "no option --sensr. Did you mean --sensor?"),
     ("render r.h5 -o r.png --slow-motion 3", "Did you mean --slow?"),
     ("render r.h5 -o r.mp4 --events 9", "Did you mean --events-topic or --window-events?"),

@@ -202,6 +202,9 @@ def test_scripts_see_the_light_that_evflow_sees(
     monkeypatch.setattr(sys, "argv", ["run", video, "50", str(tmp_path / "out"),
                                       *(["--linear"] if response == "linear" else [])])
     exec(at[0].scripts[f"run_{to}.py"], {"__file__": str(tmp_path / f"run_{to}.py")})
+    larger = export_camera(Camera.constant((60, 80)), to)[0].scripts[f"run_{to}.py"]
+    with pytest.raises(SystemExit, match="64x48 pixels, the camera 80x60"):
+        exec(larger, {"__file__": str(tmp_path / f"run_{to}.py")})
     seen = np.stack(fake.frames) / (1e4 / 255 if to == "iebcs" else 1)
     assert len(seen) == 3
     light = np.stack([frame for frame, _ in open_frames(video, fps=50, response=response).open()])
@@ -215,16 +218,16 @@ def test_images_for_esim_are_made_linear(
     script = export_camera(Camera.constant((4, 4)), "esim")[0].scripts["linear_images.py"]
     there, out = tmp_path / "images", tmp_path / "linear"
     there.mkdir()
-    image = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
-    for name in ("b.bmp", "a.png"):
+    images = np.random.default_rng(0).integers(0, 256, (2, 16, 16, 3), dtype=np.uint8)
+    for name, image in zip(("10.bmp", "2.png"), images, strict=True):
         cv2.imwrite(str(there / name), image)
     (there / "times.txt").write_text("0\n")
     monkeypatch.setattr(sys, "argv", ["linear", str(there), str(out)])
     exec(script, {})
-    assert sorted(path.name for path in out.iterdir()) == ["a.png", "b.png"]
+    names = sorted(path.name for path in out.iterdir())  # as ESIM reads them
     light = [frame for frame, _ in open_frames(there, fps=50, response="srgb").open()]
-    for name, want in zip("ab", light, strict=True):
-        found = cv2.imread(str(out / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+    for name, want in zip(names, light, strict=True):
+        found = cv2.imread(str(out / name), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found, np.rint(want))
 
 

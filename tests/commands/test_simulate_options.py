@@ -153,6 +153,7 @@ def test_noise_is_told_from_signal(video: Path, suffix: str) -> None:
         with h5py.File(out) as f:
             labels = f["events/noise"][:].astype(bool)
     np.testing.assert_array_equal(labels, noise)
+    assert [n.code for n in read_recording(out).notes if "labels" in n.text] == ["events.unread"]
     assert 0 < noise.sum() < len(noise)
     again = read_events(out)
     np.testing.assert_array_equal(again.t, events.t)

@@ -26,6 +26,11 @@ SRGB = '''The script undoes the sRGB of the video, as evflow simulate does; with
 as the last word it takes the video's bytes as light.
 '''
 
+# of an image read from the first argument
+SIZE = '''    if image.shape[:2] != ({height}, {width}):
+        sys.exit(f"{{sys.argv[1]}} has {{image.shape[1]}}x{{image.shape[0]}} pixels, the camera "
+                 "{width}x{height}: scale or crop the video first.")'''
+
 NOISE = '''"""Adds the measured noise to simulated events: Poisson, per pixel and polarity."""
 
 import numpy as np
@@ -115,6 +120,11 @@ class Settings:
         dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
         leak = f", leak {self.leak_hz:.3f} Hz (part of the ON noise)" if self.leak_hz else ""
         return f"{cutoff}, {dead}{leak}"
+
+    @property
+    def same_size(self) -> str:
+        """Lines of a script that refuse an image of another size."""
+        return SIZE.format(width=self.width, height=self.height)
 
     @property
     def sigma(self) -> float:

@@ -12,10 +12,14 @@ SCRIPT = '''"""Images through esim_py with the nearest scalars, and the measured
 import sys
 from pathlib import Path
 
+import cv2
 import esim_py
 import numpy as np
 from add_noise import add_noise
 
+for path in sorted(Path(sys.argv[1]).iterdir())[:1]:
+    image = cv2.imread(str(path))
+{same_size}
 maps = np.load(Path(__file__).with_name("maps.npz"))
 simulator = esim_py.EventSimulator({theta_on:.5f}, {theta_off:.5f}, {dead_s:.6f}, 1e-3, True)
 x, y, t, p = simulator.generateFromFolder(sys.argv[1], sys.argv[2]).reshape(-1, 4).T
@@ -26,11 +30,15 @@ np.savez(sys.argv[3], t=t, x=x.astype(np.uint16), y=y.astype(np.uint16), p=p > 0
          size=np.array([{width}, {height}]))
 '''
 
-LINEAR = f'''"""Images in sRGB -> grey images that are linear in light, of the same names, as PNG.
+LINEAR = f'''"""Images in sRGB -> grey images that are linear in light, as PNG.
 
     python linear_images.py IMAGES OUT
+
+They are numbered in the order of the numbers in their names: ESIM sorts names letter by letter, 10
+before 2.
 """
 
+import re
 import sys
 from pathlib import Path
 
@@ -38,13 +46,20 @@ import cv2
 import numpy as np
 
 {LIGHT}
-out = Path(sys.argv[2])
+out, number = Path(sys.argv[2]), 0
 out.mkdir(parents=True)
-for path in sorted(Path(sys.argv[1]).iterdir()):
+
+
+def natural(path):
+    return [int(part) if part.isdigit() else part for part in re.split("([0-9]+)", path.name)]
+
+
+for path in sorted(Path(sys.argv[1]).iterdir(), key=natural):
     image = cv2.imread(str(path))
     if image is not None:
         grey = np.rint(cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY)).astype(np.uint8)
-        cv2.imwrite(str(out / f"{{path.stem}}.png"), grey)
+        cv2.imwrite(str(out / f"{{number:08d}}.png"), grey)
+        number += 1
 '''
 
 TEXT = '''The camera for ESIM (https://github.com/uzh-rpg/rpg_vid2e)
@@ -56,6 +71,9 @@ esim_py, noise added:
 esim_torch, without noise:
     python esim_torch/scripts/generate_events.py -i FRAMES -o OUT \\
         -cp {theta_on:.4f} -cn {theta_off:.4f} -rp {dead_ns}
+
+ESIM reads a folder in the order of the letters of its names, 10.png before 2.png, and meets the
+times in that order. linear_images.py numbers the images so that both orders are one.
 
 What ESIM cannot represent
 - The response of the images: evflow simulate undoes the sRGB of a video, ESIM reads its bytes as
@@ -75,7 +93,8 @@ What ESIM cannot represent
 
 def export(maps: Maps, s: Settings) -> Export:
     """The medians, and a script that adds the noise."""
-    values = vars(s) | {"circuit": s.circuit, "dead_ns": round(s.dead_s * 1e9)}
+    values = vars(s) | {"circuit": s.circuit, "dead_ns": round(s.dead_s * 1e9),
+                        "same_size": s.same_size}
     return Export(TEXT.format(**values),
-                  {"run_esim.py": SCRIPT.format(**vars(s)), "add_noise.py": NOISE,
+                  {"run_esim.py": SCRIPT.format(**values), "add_noise.py": NOISE,
                    "linear_images.py": LINEAR})

@@ -44,6 +44,7 @@ while True:
     more, image = video.read()
     if not more:
         break
+{same_size}
     light = cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY).astype(float) / 255.0 * 1e4
     # IEBCS draws a threshold anew, around one mean, after each event: the maps are put back
     sensor.cur_th_pos[...], sensor.cur_th_neg[...] = maps["theta_on"], -maps["theta_off"]
@@ -83,7 +84,8 @@ def export(maps: Maps, s: Settings) -> Export:
     slowest = float(FREQUENCIES[0])  # IEBCS divides by the rate
     rates = {"bgnp": max(s.eta_on, slowest), "bgnn": max(s.eta_off, slowest)}
     values = vars(s) | rates | {
-        "light": LIGHT + SWITCH, "srgb": SRGB, "sigma": s.sigma, "circuit": s.circuit,
+        "light": LIGHT + SWITCH, "srgb": SRGB, "same_size": s.same_size, "sigma": s.sigma,
+        "circuit": s.circuit,
         "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}
     return Export(TEXT.format(**values), {"run_iebcs.py": SCRIPT.format(**values)}, arrays)

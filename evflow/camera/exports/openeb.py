@@ -30,6 +30,7 @@ while True:
     more, image = video.read()
     if not more:
         break
+{same_size}
     simulator.image_callback(cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY), round(frame * step))
     found.append(simulator.get_events())
     simulator.event_maker.num = 0  # flush_events would zero its buffer of 1.6 GB for each frame
@@ -73,6 +74,7 @@ def export(maps: Maps, s: Settings) -> Export:
     values = vars(s) | {
         "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
         "clipped": clipped, "light": LIGHT + SWITCH, "srgb": SRGB,
+        "same_size": s.same_size,
         "shot": (s.eta_on + s.eta_off) / GREY}
     return Export(TEXT.format(**values),
                   {"run_openeb.py": SCRIPT.format(**values), "add_noise.py": NOISE})

@@ -32,6 +32,7 @@ while True:
     more, image = video.read()
     if not more:
         break
+{same_size}
     grey = cv2.cvtColor(light_of[image], cv2.COLOR_BGR2GRAY)
     events = emulator.generate_events(grey, frame * step)
     if frame == 0:  # v2e draws its thresholds at the first frame: here they are replaced
@@ -99,5 +100,6 @@ def export(maps: Maps, s: Settings) -> Export:
         "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess,
         "srgb": SRGB, "log": LOG if s.log_eps else ""}
     source = SCRIPT.format(**vars(s) | {
-        "gain": gain, "leak_seen": s.leak_seen, "light": LIGHT + SWITCH})
+        "gain": gain, "leak_seen": s.leak_seen, "light": LIGHT + SWITCH,
+        "same_size": s.same_size})
     return Export(TEXT.format(**values), {"run_v2e.py": source})

@@ -225,9 +225,9 @@ def _restless(rest: Events) -> list[Note]:
     if len(rest) < LEAST_EVENTS or coincidence_excess(rest, hot) <= MOVING:
         return []
     return [Note(
-        "scene.restless", "neighbouring pixels fire together while the frames rest: a light that "
-        "flickers or still settles, or a camera that regulates its exposure? Then noise rates, and "
-        "thresholds, are wrong.")]
+        "scene.restless", "neighbouring pixels fire together while the light should rest: does it "
+        "flicker or still settle, are its edges not where frames or triggers say, or does the "
+        "camera regulate its exposure? Then noise rates, and thresholds, are wrong.")]
 
 
 def _levels(

@@ -21,7 +21,7 @@ MOVING, MOST_MOVING = 0.1, 0.1  # log units against the median pixel; share of p
 LEAST_TOGETHER = 0.5  # share of pixels that step by half to twice the median pixel's change
 LOOKED, ROWS = 400, 32  # frames, and rows of them, that are checked
 LEAST_RESTS, LEAST_RESTING = 3, 0.7  # rests of a bench, and share of its frames in them
-EDGE_US = 50_000  # longest edge of the light after its trigger
+BEFORE_US, EDGE_US = 10_000, 50_000  # longest part of a light's edge before its trigger, and after
 FILL_THE_VIEW = ("Steps of light need a screen, or a card, that fills the view, all of it at one "
                  "level and then at another. For a scene that moves leave --protocol out.")
 
@@ -74,8 +74,9 @@ def steps_of_light(recording: Recording) -> int:
 
 
 def rests_between(edges_us: np.ndarray, events: Events, count: int) -> list[tuple[int, int]]:
-    """The rests (begin, end) in us between the light's edges (N,), which last up to `EDGE_US`;
-    edges closer together are one. Raises EV020 if there are not `count`."""
+    """The rests (begin, end) in us between the light's edges (N,), which begin up to BEFORE_US
+    earlier, as a photodiode says half-way up, and last up to EDGE_US; edges closer together are
+    one. Raises EV020 if there are not `count`."""
     last = int(events.t[-1])
     edges = np.unique(edges_us)
     edges = edges[edges < last]
@@ -87,7 +88,8 @@ def rests_between(edges_us: np.ndarray, events: Events, count: int) -> list[tupl
             "EV020", f"{count} values of lux, {len(edges)} edges of light until the last event.",
             f"Without frames, give the light of each of the {len(edges) + 1} rests, in order of "
             "time.")
-    return list(zip([first, *(e + EDGE_US for e in edges)], [*edges, last], strict=True))
+    return list(zip([first, *(e + EDGE_US for e in edges)], [*(e - BEFORE_US for e in edges), last],
+                    strict=True))
 
 
 def _rests(level: np.ndarray) -> list[tuple[int, int]]:

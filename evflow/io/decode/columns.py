@@ -23,6 +23,9 @@ NAMES = {  # column names, without their units
     **dict.fromkeys(("x", "xs", "col", "column", "u"), "x"),
     **dict.fromkeys(("y", "ys", "row", "v"), "y"),
     **dict.fromkeys(("p", "ps", "pol", "polarity", "polarities", "on"), "p")}
+LABEL = "noise"  # which events are, as `evflow simulate --labels` writes it
+LABELS_UNREAD = Note("events.unread", f"the labels `{LABEL}`, which events are noise, were not "
+                     "read: no other command uses or keeps them")
 BRACKETS = re.compile(r"[\[(].*?[\])]")
 UNIT = re.compile(r"_(?:[mnuµμ]?s(?:ecs?)?|(?:milli|micro|nano)?seconds?|px|pixels?)$")
 SIDE = re.compile(r"@(\d{1,5})$")  # faery's x@640

@@ -78,7 +78,7 @@ def _in_group(
         of = {c: found[name] for c, name in chosen.items()}
         if len({max(data.shape) for data in of.values()}) == 1:
             of = {c: tables.dataset(path, group, name, (None,)) for c, name in chosen.items()}
-            yield 0, arrays.named(group.name, of, len(of["t"]), _unit(
+            yield 0, arrays.named(group.name, of, len(of["t"]), unit_of(
                 f, chosen["t"], of["t"]))
     for name, data in found.items():
         if len(data.shape) == 1 and data.dtype.fields and (table := arrays.structured(
@@ -89,7 +89,7 @@ def _in_group(
             yield 2, table
 
 
-def _unit(f: Any, name: str, data: Any) -> str:
+def unit_of(f: Any, name: str, data: Any) -> str:
     """The unit of times from their attributes, else their name, else the file."""
     for key in ("unit", "units"):
         if isinstance(written := columns.text(data.attrs.get(key)), str) and written:

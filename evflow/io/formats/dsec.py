@@ -22,12 +22,13 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
+from evflow.io.decode.columns import LABEL, LABELS_UNREAD
 from evflow.io.decode.hdf5 import MAGIC, Hdf5Writer, plausible
 from evflow.io.decode.hdf5_search import (
     declared_offset,
     declared_size,
-    declared_unit,
     images_beside,
+    unit_of,
 )
 from evflow.io.decode.images_beside import are_images
 from evflow.io.decode.stream import Chunk, gather
@@ -76,7 +77,9 @@ def read(path: Path, hints: Hints) -> Recording:
     with tables.opened(path) as f:
         columns = _columns(path, f)
         if hints.time_unit == "auto":
-            hints = dataclasses.replace(hints, time_unit=declared_unit(f))
+            hints = dataclasses.replace(hints, time_unit=unit_of(f, "t", f["events/t"]))
+        if LABEL in f["events"]:
+            notes += (LABELS_UNREAD,)
         size, assumed = _size(f)
         if assumed and hints.size is None:
             notes += (assumed,)
@@ -152,9 +155,9 @@ class DsecWriter(Hdf5Writer):
         self._extend("frame_times", times)
 
     def _write_labels(self, noise: np.ndarray) -> None:
-        if "noise" not in self._file["events"]:
-            self._create("events/noise", (), "u1", self.CHUNK)
-        self._extend("events/noise", noise)
+        if LABEL not in self._file["events"]:
+            self._create(f"events/{LABEL}", (), "u1", self.CHUNK)
+        self._extend(f"events/{LABEL}", noise)
 
     def _write(self, events: Events) -> None:
         t = events.t - self.offset_us

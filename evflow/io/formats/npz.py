@@ -9,6 +9,7 @@ columns are decompressed in parallel, in blocks.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import shutil
 import zipfile
@@ -57,21 +58,29 @@ def read(path: Path, hints: Hints) -> Recording:
     and `Recording` raise.
     """
     with members(path) as found:
-        chosen = columns.by_name(found)
-        size = _size(found)
-        if chosen:
-            events = _events(path, {c: found[name] for c, name in chosen.items()}, hints, size,
-                             written_unit(chosen["t"]) if chosen["t"] != "t" else "us")
-        else:
-            events = _table(path, found).gather(path, hints, size)
-        if _own_frames(found):
-            return _with_frames(path, found, events, hints)
-        if "frames" in found and not (hints.no_frames or times_of("frames", found)):
-            with events_alone():
-                raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.",
-                                      where=path)
-        return beside(path, found, lambda name: found[name].whole(),
-                      lambda name, part: found[name].spooled()[part], events, hints)
+        recording = _recording(path, found, hints)
+        if columns.LABEL in found:
+            recording = dataclasses.replace(
+                recording, notes=(*recording.notes, columns.LABELS_UNREAD))
+        return recording
+
+
+def _recording(path: Path, found: dict[str, Member], hints: Hints) -> Recording:
+    chosen = columns.by_name(found)
+    size = _size(found)
+    if chosen:
+        events = _events(path, {c: found[name] for c, name in chosen.items()}, hints, size,
+                         written_unit(chosen["t"]) if chosen["t"] != "t" else "us")
+    else:
+        events = _table(path, found).gather(path, hints, size)
+    if _own_frames(found):
+        return _with_frames(path, found, events, hints)
+    if "frames" in found and not (hints.no_frames or times_of("frames", found)):
+        with events_alone():
+            raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.",
+                                  where=path)
+    return beside(path, found, lambda name: found[name].whole(),
+                  lambda name, part: found[name].spooled()[part], events, hints)
 
 
 def _own_frames(found: dict[str, Member]) -> bool:
@@ -205,9 +214,9 @@ class NpzWriter(EventWriter):
         self._columns["frame_times"].append(times)
 
     def _write_labels(self, noise: np.ndarray) -> None:
-        if "noise" not in self._columns:
-            self._columns["noise"] = self._column("noise", "?", self._stack)
-        self._columns["noise"].append(noise)
+        if columns.LABEL not in self._columns:
+            self._columns[columns.LABEL] = self._column(columns.LABEL, "?", self._stack)
+        self._columns[columns.LABEL].append(noise)
 
     def _finish(self) -> None:
         for name, column in self._columns.items():

@@ -92,6 +92,9 @@ def _scaled(
     white = full_scale or white_of(pixels.dtype, where)
     if pixels.dtype == np.uint8 and white == 255:
         return pixels, True
+    if pixels.dtype == np.uint8 and white > 255:
+        raise EvflowDataError("EV003", f"--full-scale {white:g} with 8-bit frames, which end at "
+                              "255.", "Leave it out.", where=where)
     _check_finite(pixels, where)
     low, high = float(pixels.min()), float(pixels.max())
     floats = pixels.dtype == np.float32

@@ -21,7 +21,8 @@ from evflow.recordings.windows import plan_windows
 from evflow.types import Events, Recording
 
 MIN_STEP_US = 20_000  # frames closer than that change too little
-MOST_STEPS = 24  # frame intervals examined, evenly spread
+MOST_STEPS = 24  # frame intervals examined: of so many parts of the recording the busiest of each
+MOST_NEAR, STRIDE = 16, 4  # pairs near the busiest of a part, and the pixels of theirs, looked at
 CELLS = 160  # along the longer side: pooling averages out quantisation by the thresholds
 DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, log changes are unreliable
 LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer are not enough to decide
@@ -135,8 +136,7 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
         return None
     if not pairs:
         return None
-    if len(pairs) > MOST_STEPS:
-        pairs = tuple(pairs[round(i)] for i in np.linspace(0, len(pairs) - 1, MOST_STEPS))
+    pairs = _busiest(recording, pairs)
     cell = max(1, round(max(recording.events.size) / CELLS))
     width, height = recording.events.size
     changes: dict[str, list[np.ndarray]] = collections.defaultdict(list)
@@ -150,6 +150,33 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
     interval = float(np.median(np.diff(recording.frame_times)))
     return Steps(recording.events, {k: np.stack(v) for k, v in changes.items()}, bounds, cell,
                  interval)
+
+
+def _busiest(
+    recording: Recording, pairs: tuple[tuple[int, int], ...]
+) -> tuple[tuple[int, int], ...]:
+    """Of each of MOST_STEPS parts the pair whose frames change most, near the one with the most
+    events: evenly spread ones may all lie between the steps of a light."""
+    if len(pairs) <= MOST_STEPS:
+        return pairs
+    bounds = recording.frame_times[np.array(pairs)]
+    begin, end = np.searchsorted(recording.events.t, bounds).T
+    forget(recording.events.t)
+    chosen = []
+    for part in np.array_split(np.arange(len(pairs)), MOST_STEPS):
+        busiest = part[np.argmax((end - begin)[part])]
+        near = part[np.abs(bounds[part, 0] - bounds[busiest, 0]) <= SWEEP_US]
+        near = near[np.argsort(np.abs(near - busiest), kind="stable")][:MOST_NEAR]
+        changes = [_seen_change(recording, *pairs[k]) for k in near]
+        chosen.append(pairs[near[int(np.argmax(changes))]])
+    return tuple(chosen)
+
+
+def _seen_change(recording: Recording, first: int, last: int) -> float:
+    """Mean absolute change of every few pixels from one frame to another."""
+    some = np.s_[::STRIDE, ::STRIDE]
+    before, after = (recording.frames[i][some].astype(np.float32) for i in (first, last))
+    return float(np.abs(after - before).mean())
 
 
 def displacement(steps: Steps) -> tuple[float, float, int, int]:

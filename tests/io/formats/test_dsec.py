@@ -114,6 +114,18 @@ def test_dsec_without_attributes_is_640x480(tmp_path: Path) -> None:
     assert read_events(tmp_path / "a.h5", size=SIZE).size == SIZE
 
 
+def test_an_attribute_of_the_times_names_their_unit(tmp_path: Path) -> None:
+    events = make(300).events
+    with h5py.File(tmp_path / "a.h5", "w") as f:
+        for name in "xyp":
+            f[f"events/{name}"] = getattr(events, name)
+        f["events/t"] = events.t * 1000
+        f["events/t"].attrs["unit"] = "ns"
+        f.attrs.update(width=SIZE[0], height=SIZE[1])
+    equal(read_events(tmp_path / "a.h5"), events)
+    equal(read_events(tmp_path / "a.h5", time_unit="ns"), events)
+
+
 def test_dsec_folders_have_a_rectify_map_that_is_told(tmp_path: Path) -> None:
     events = make().events
     write_events(tmp_path / "events.h5", events)
