@@ -23,6 +23,7 @@ from evflow.files.atomic import atomic_text
 from evflow.files.json_text import parse_json
 from evflow.files.limits import read_whole
 from evflow.network import tensors
+from evflow.network.config import MODELS
 from evflow.process.provenance import sha256
 
 Params = dict[str, Any]
@@ -46,9 +47,13 @@ def weights_path(name_or_path: str | os.PathLike = "default") -> Path:
                                   "weights.safetensors that evflow train writes.", where=path)
         path = FOLDER / f"{name_or_path}.safetensors"
     if not path.is_file():
-        known = sorted(p.stem for p in FOLDER.glob("*.safetensors"))
-        raise EvflowDataError("EV016", f"no weights at {path}.",
-                              f"Released names: {known}; or give a .safetensors path.")
+        names = sorted(p.stem for p in FOLDER.glob("*.safetensors"))
+        kinds = {kind: [n for n in names if (n in MODELS) == (kind == "estimators")]
+                 for kind in ("estimators", "networks for video and flow")}
+        raise EvflowDataError(
+            "EV016", f"no weights at {path}.", "Released names: "
+            + "; ".join(f"{', '.join(of)} ({kind})" for kind, of in kinds.items())
+            + "; or give a .safetensors path.")
     return path
 
 

@@ -107,6 +107,7 @@ def write_sheet(
     end = begin + film.window_us
     if film.window_events is not None:
         begin, end = _around(events, begin + film.window_us // 2, film.window_events)
+    begin, end = max(begin, span[0]), min(end, span[1])
     middle = (begin + end) // 2
     shown = event_image(events, begin, end)
     parts = [shown]
