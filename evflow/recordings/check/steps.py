@@ -22,7 +22,7 @@ from evflow.types import Events, Recording
 
 MIN_STEP_US = 20_000  # frames closer than that change too little
 MOST_STEPS = 24  # frame intervals examined: of so many parts of the recording the busiest of each
-MOST_NEAR, STRIDE = 16, 4  # pairs near the busiest of a part, and the pixels of theirs, looked at
+STRIDE = 4  # every 4th pixel of every 4th row tells how much a frame changes
 CELLS = 160  # along the longer side: pooling averages out quantisation by the thresholds
 DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, log changes are unreliable
 LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer are not enough to decide
@@ -165,8 +165,7 @@ def _busiest(
     chosen = []
     for part in np.array_split(np.arange(len(pairs)), MOST_STEPS):
         busiest = part[np.argmax((end - begin)[part])]
-        near = part[np.abs(bounds[part, 0] - bounds[busiest, 0]) <= SWEEP_US]
-        near = near[np.argsort(np.abs(near - busiest), kind="stable")][:MOST_NEAR]
+        near = part[np.abs(part - busiest) <= SWEEP_INTERVALS]  # as the clocks may differ
         changes = [_seen_change(recording, *pairs[k]) for k in near]
         chosen.append(pairs[near[int(np.argmax(changes))]])
     return tuple(chosen)

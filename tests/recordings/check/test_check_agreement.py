@@ -7,10 +7,12 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
+from helpers.benches import SHAPE, screen
 
-from evflow import Events, Recording, check
+from evflow import Camera, Events, Recording, check, simulate
 from evflow.recordings.adjust import flipped, shifted
 from evflow.recordings.check import frames_offset
 from evflow.recordings.check.contents import BLOCK, BLOCKS, repeated
@@ -150,3 +152,19 @@ def test_a_clock_of_few_digits_may_repeat_events(sound: Recording) -> None:
     assert len(np.unique(np.stack([coarse.events.t, coarse.events.x]), axis=1).T) < len(
         coarse.events)
     assert "EV038" not in codes_of(coarse)
+
+
+@pytest.mark.parametrize("noise_dn", [0.0, 0.7])
+def test_a_light_that_rests_most_of_the_time_is_checked_at_its_steps(noise_dn: float) -> None:
+    """Evenly spread frame intervals may all lie within rests, where nothing but noise changes."""
+    dn = screen([40.0, 100.0, 55.0, 220.0] * 6, rest=250, ramp=1)
+    shown = np.flatnonzero(np.diff(dn, prepend=0.0, append=0.0)[:-1] != 0)
+    shown = np.union1d(np.union1d(shown - 1, shown)[1:], np.arange(10, len(dn), 25))
+    video = np.broadcast_to(dn[shown, None, None], (len(shown), *SHAPE))
+    events = simulate(jax.random.key(0), video, 1000 * shown,
+                      Camera.constant(SHAPE, 0.25, 0.25, 2.0, 2.0))
+    kept = np.arange(10, len(dn), 25)
+    noise = np.random.default_rng(1).normal(0.0, noise_dn, (len(kept), *SHAPE))
+    frames = np.rint(dn[kept, None, None] + noise).clip(0, 255).astype(np.uint8)
+    found = check(Recording(events, frames, 1000 * kept))
+    assert not {"EV024", "EV034"} & {f.code for f in found.findings}
