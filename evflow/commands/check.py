@@ -34,6 +34,8 @@ class Check(Reading):
         try:
             recording = self.read(self.recording)
         except EvflowDataError as error:
+            if error.code == "EV020":  # of the command line, not of the recording
+                raise
             report, what = Report((Finding.of(error),)), str(self.recording)
         else:
             report, what = check(recording), repr(recording)

@@ -116,6 +116,7 @@ class Flow(Windowed):
     ) -> str:
         from evflow.report.caption import captioned
         from evflow.report.flow import flow_image
+        from evflow.report.page import short
         from evflow.report.video import enlarged, write_video
 
         def pictures() -> Iterator[np.ndarray]:
@@ -124,7 +125,7 @@ class Flow(Windowed):
                 picture = enlarged(flow_image(flow, events, full_px), self.scale)
                 at_s = (int(edges[i]) + int(edges[i + 1])) / 2e6 - int(recording.events.t[0]) / 1e6
                 window_ms = (int(edges[i + 1]) - int(edges[i])) / 1e3
-                yield captioned(picture, f"{at_s:.3f} s   {window_ms:.3g} ms   full colour: "
+                yield captioned(picture, f"{at_s:.3f} s   {short(window_ms)} ms   full colour: "
                                 f"{full_px:.1f} px")
 
         count = len(edges) - 1

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from evflow.commands.options import Reading, own_first
+from evflow.errors import EvflowDataError
 from evflow.notes import as_dicts
 
 if TYPE_CHECKING:
@@ -58,7 +59,10 @@ def _facts(recording: Recording) -> dict[str, Any]:
         "frame_dtype": str(recording.frames.dtype), "notes": as_dicts(recording.notes),
     }
     if len(times) > 1 and len(events):
-        plan = plan_windows(recording)
+        try:
+            plan = plan_windows(recording)
+        except EvflowDataError as error:  # as where frames and events do not overlap
+            return facts | {"windows": 0, "skipped": [{"code": error.code, "text": str(error)}]}
         facts["windows"] = len(plan.pairs)
         facts["skipped"] = as_dicts(condensed(plan.skipped))
     return facts

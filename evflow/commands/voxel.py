@@ -104,7 +104,7 @@ def _windows(
     from evflow.recordings.windows import condensed, plan_windows
 
     t = recording.events.t
-    if recording.has_frames:
+    if len(recording.frames) > 1:
         plan = plan_windows(recording, window_us)
         ends = recording.frame_times[np.array(plan.pairs, int).reshape(-1, 2)]
         pairs, starts, lengths = plan.pairs, ends[:, 0], ends[:, 1] - ends[:, 0]

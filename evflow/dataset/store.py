@@ -128,11 +128,11 @@ def _write_npy(path: Path, sequence: EventSequence) -> None:
 
 def _save(path: Path, array: np.ndarray) -> None:
     """numpy.save, except that a full disk raises with its errno, which tofile loses."""
-    npy = np.lib.format
+    npy, array = np.lib.format, np.asarray(array, order="C")
     with open(path, "wb") as file:
         npy.write_array_header_1_0(file, npy.header_data_from_array_1_0(array))
         size = file.tell() + array.nbytes
-        file.write(np.ascontiguousarray(array).data)
+        file.write(array.data)
     need_size(path, size)
 
 

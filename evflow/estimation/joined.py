@@ -17,6 +17,8 @@ from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.files.archives import load_npz
 from evflow.notes import Note
 
+CIRCUIT = ("cutoff_hz", "refractory_s")  # what a scene at rest does not show
+
 
 def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEstimate:
     """The estimate with the thresholds, circuit and optics of the camera.npz at `path`.
@@ -38,7 +40,10 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
     sensor, optics = read_sensor(path)
     sensor = dataclasses.replace(
         sensor, leak_hz=found.sensor.leak_hz, shot_hz=found.sensor.shot_hz)
-    valid = load_npz(Path(path)).get("valid", np.ones(camera.shape, bool)).astype(bool)
+    held = load_npz(Path(path))
+    sensor_std = {**found.sensor_std, **{
+        name: float(held.get(f"sensor_{name}_std", np.nan)) for name in CIRCUIT}}
+    valid = held.get("valid", np.ones(camera.shape, bool)).astype(bool)
     maps = {name: getattr(camera, name) for name in THRESHOLDS}
     errors = {name: getattr(std, name) for name in THRESHOLDS}
     used = valid if valid.any() else np.ones_like(valid)
@@ -62,5 +67,6 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
         std=dataclasses.replace(found.std, **errors),
         summary=dataclasses.replace(found.summary, **scalars(values)),
         summary_std=dataclasses.replace(found.summary_std, **scalars(value_errors)),
-        valid=valid & ~found.hot, undetermined=(), sensor=sensor, optics=optics,
+        valid=valid & ~found.hot, undetermined=(), sensor=sensor, sensor_std=sensor_std,
+        optics=optics,
         notes=(*(n for n in found.notes if n.code not in ("scene.static", "frames.none")), note))

@@ -116,13 +116,15 @@ def _columns(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Events as floats, but for p. Times of NumPy count from the first event: an epoch's seconds
     would be rounded to minutes."""
+    t = t if hasattr(t, "ndim") else np.asarray(t)
     x, y, t, p, weight = map(as_array, (x, y, t, p, weight))
     shapes = [a.shape for a in (x, y, t, p, weight)]
     if t.ndim != 1 or len(set(shapes)) > 1:
         raise EvflowDataError("EV002", f"x, y, t, p, weight are {', '.join(map(str, shapes))}.",
                               "Expected five of (N,); vmap takes several windows.")
     if isinstance(t, np.ndarray) and t.size:
-        real = np.asarray(weight, bool) if isinstance(weight, np.ndarray) else np.ones(len(t), bool)
+        traced = isinstance(weight, jax.core.Tracer)
+        real = np.ones(len(t), bool) if traced else np.asarray(weight, bool)
         t = t - t[real].min() if real.any() else t
     x, y, t, weight = (a if jnp.issubdtype(a.dtype, jnp.floating) else a.astype(float)
                        for a in map(_on_device, (x, y, t, weight)))

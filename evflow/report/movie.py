@@ -15,10 +15,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from evflow.downstream.sync import need_few_windows
 from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import Progress
 from evflow.files.atomic import atomic_write
 from evflow.report.caption import captioned
+from evflow.report.page import short
 from evflow.report.plots import event_image
 from evflow.report.resimulate import busiest_instant
 from evflow.report.video import CODECS, FPS, SCALES, Codec, check_within, enlarged, write_video
@@ -98,8 +100,9 @@ def write_sheet(
     film.check_target(path, overwrite=overwrite)
     _check(recording, film)
     span = (int(events.t[0]), int(events.t[-1]) + 1)
-    begin = busiest_instant(events, span, film.window_us)
-    if at_s is not None:
+    if at_s is None:
+        begin = busiest_instant(events, span, film.window_us)
+    else:
         if not 0 <= at_s <= events.duration_us / 1e6:
             raise EvflowDataError("EV020", f"at={at_s} s.", "The recording covers 0 to "
                                   f"{events.duration_us / 1e6:.3f} s from its first event.")
@@ -154,7 +157,7 @@ def _pictures(
 def _caption(events: Events, begin: int, end: int, more: str = "") -> str:
     """When, for how long, and what the colours are."""
     at_s = ((begin + end) / 2 - int(events.t[0])) / 1e6
-    return (f"{at_s:.3f} s   {(end - begin) / 1e3:.3g} ms   ON red, OFF blue: full at 3 events"
+    return (f"{at_s:.3f} s   {short((end - begin) / 1e3)} ms   ON red, OFF blue: full at 3 events"
             f"{more}")
 
 
@@ -163,6 +166,7 @@ def _windows(recording: Recording, film: Film) -> list[tuple[int, int]]:
     events by number (including others at the time of the last one)."""
     t = recording.events.t
     if film.window_events is None:
+        need_few_windows(t, max(1, int(film.step_us)))
         count = max(1, math.ceil(recording.events.duration_us / film.step_us))
         middles = [int(t[0]) + round((i + 0.5) * film.step_us) for i in range(count)]
         return [(m - film.window_us // 2, m - film.window_us // 2 + film.window_us)

@@ -201,10 +201,13 @@ def drawing(svg: bytes, alt: str) -> str:
 
 
 def blocks(values: np.ndarray, widest: int = WIDEST) -> tuple[np.ndarray, int]:
-    """(H, W, ...) as means of k x k blocks, so that no side exceeds `widest`; and k."""
+    """(H, W, ...) as means of k x k blocks, so that no side exceeds `widest`; and k. The last ones
+    are filled up by their edge."""
     k = -(-max(values.shape[:2]) // widest)
     if k == 1:
         return values, 1
-    height, width = (side - side % k for side in values.shape[:2])
-    parts = values[:height, :width].reshape(height // k, k, width // k, k, *values.shape[2:])
+    more = [(0, -side % k) for side in values.shape[:2]] + [(0, 0)] * (values.ndim - 2)
+    values = np.pad(values, more, mode="edge")
+    height, width = values.shape[:2]
+    parts = values.reshape(height // k, k, width // k, k, *values.shape[2:])
     return parts.mean((1, 3)), k

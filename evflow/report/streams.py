@@ -38,7 +38,7 @@ def rate_panel(numbers: dict[str, Any], names: Names, note: str = "") -> Panel:
     drawn = [figure(page.drawing(figures.rates(numbers, key, names), f"{key.upper()} rate"))
              for key in ("on", "off")]
     return Panel("rates", "Event rate over time", note + grid(drawn, 22) + paragraph(
-        f"Coloured: {names[0]}. Black, dashed: {names[1]}. Steps of {step:.3g} ms.", "note")
+        f"Coloured: {names[0]}. Black, dashed: {names[1]}. Steps of {page.short(step)} ms.", "note")
         + table(["events / pixel / s", *names, "ratio", "r over time"], rows))
 
 

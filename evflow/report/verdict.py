@@ -131,6 +131,8 @@ def judge_stream(
     was."""
     name, matter = key.upper(), f"rate {where} / recorded"
     ratio = numbers["rate_hz"]["ratio"][key]
+    if not any(numbers["rate_hz"][side][key] for side in ("real", "synthetic")):
+        return []  # a polarity that neither has
     if not ratio:
         who = "recorded" if ratio is None else "synthetic"
         return [Judged("poor", name, 9.0, f"No {who} {name} events ({where}).", matter, "none",

@@ -34,6 +34,7 @@ HEIGHT = 4096  # ...if it is not so narrow that more rows are made than codecs t
 SCALES = (1, 32)
 FINE_FPS = 65.0  # OpenCV counts rates in thousandths, MPEG-4 no more than 65535 of them a second
 GIF_TICK_S = 0.01  # GIF counts time in hundredths of a second
+LEAST_TICKS = 2  # browsers slow down shorter pictures
 GIF_FRAMES = 600  # a GIF is held in memory and grows large: more are refused
 
 
@@ -135,9 +136,16 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], count: int, fps: floa
     if count > GIF_FRAMES:
         raise EvflowDataError("EV020", f"the GIF would have {count:,} pictures.",
                               f"At most {GIF_FRAMES}: show less (--start, --stop), or .mp4.")
-    images = [Image.fromarray(p).quantize(64, dither=Image.Dither.NONE) for p in pictures]
-    ticks = max(2, round(1 / (fps * GIF_TICK_S)))  # faster ones are slowed down by browsers
+    edges = [round(i / (fps * GIF_TICK_S)) for i in range(count + 1)]
+    images: list[Image.Image] = []
+    begins: list[int] = []
+    for begin, picture in zip(edges, pictures, strict=False):
+        if not begins or begin - begins[-1] >= LEAST_TICKS:
+            images.append(Image.fromarray(picture).quantize(64, dither=Image.Dither.NONE))
+            begins.append(begin)
+    ticks = np.maximum(np.diff([*begins, edges[-1]]), LEAST_TICKS)
     images[0].save(path, save_all=True, append_images=images[1:], loop=0, optimize=False,
-                   duration=1000 * ticks * GIF_TICK_S)
+                   duration=(1000 * GIF_TICK_S * ticks).astype(int).tolist())
     width, height = images[0].size
-    return f"{width}x{height}, shown at {1 / (ticks * GIF_TICK_S):.0f} fps"
+    some = f", {len(images)} of them, as a GIF shows at most 50 a second" * (len(images) < count)
+    return f"{width}x{height}{some}"

@@ -109,6 +109,17 @@ def test_rsat_is_its_definition() -> None:
                                squares(7.0) / squares(0.0), rtol=1e-3)
 
 
+def test_times_of_any_origin_with_weights_of_any_kind() -> None:
+    x, y, t, p, weight = (np.pad(column, (0, 9)) for column in edge())
+    t = np.where(weight > 0, t.astype(float) + 1.7e9, 0.0)
+    wanted = metrics.fwl(*edge(), constant(9.0))
+    for given in (weight, jnp.asarray(weight)):
+        found = metrics.fwl(x, y, t, p, given, constant(9.0))
+        np.testing.assert_allclose(found, wanted, rtol=1e-3)
+    lists = [column.tolist() for column in (x, y, t, p, weight)]
+    np.testing.assert_allclose(metrics.fwl(*lists, constant(9.0)), wanted, rtol=1e-3)
+
+
 def test_padding_weighs_nothing() -> None:
     padded = [np.pad(column, (0, 500), constant_values=99.0) for column in edge()]
     padded[4][-500:] = 0

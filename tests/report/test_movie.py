@@ -16,6 +16,7 @@ from evflow.report import movie
 from evflow.report.caption import captioned
 from evflow.report.movie import Film, write_film, write_sheet
 from evflow.report.plots import new_figure, save_figure
+from evflow.report.video import write_video
 
 
 def two_corners() -> Recording:
@@ -99,6 +100,26 @@ def test_a_sheet_has_frame_events_and_both(tmp_path: Path) -> None:
     bare = Recording.of_events(recording.events)
     write_sheet(tmp_path / "bare.png", bare, Film(scale=1))
     assert cv2.imread(str(tmp_path / "bare.png")).shape == (48, 64, 3)
+
+
+def test_a_gif_lasts_as_long_as_it_says(tmp_path: Path) -> None:
+    """A browser shows no more than 50 pictures a second, and times are hundredths of a second."""
+    for fps, said, lasts in ((40.0, "40 pictures, 1.0 s", 1000), (100.0, "50 of them", 1000)):
+        path = tmp_path / f"{fps}.gif"
+        images = (np.full((16, 16, 3), 2 * i, np.uint8) for i in range(round(fps)))
+        assert said in write_video(path, images, round(fps), fps=fps)
+        with Image.open(path) as film:
+            times = [film.seek(i) or film.info["duration"] for i in range(film.n_frames)]
+        assert sum(times) == lasts
+        assert set(times) <= {20, 30}
+
+
+def test_a_clock_that_jumps_takes_no_memory(tmp_path: Path) -> None:
+    t = np.append(np.arange(500, dtype=np.int64) * 1000, 1_700_000_000_000_000)
+    recording = Recording.of_events(Events(t % 8, t % 6, t, t % 2 == 0, (8, 6)))
+    assert "33 events of 33 ms" in write_sheet(tmp_path / "a.png", recording, Film())
+    with pytest.raises(EvflowDataError, match=r"EV026.*clock jump"):
+        write_film(tmp_path / "a.mp4", recording, Film())
 
 
 def test_odd_sizes_become_even(tmp_path: Path) -> None:

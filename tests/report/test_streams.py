@@ -14,7 +14,7 @@ import evflow
 from evflow import Events, EvflowDataError, Recording, read_recording, write_events
 from evflow.cli import main
 from evflow.metrics.streams import distances
-from evflow.report.page import write_page
+from evflow.report.page import WIDEST, blocks, write_page
 from evflow.report.verdict import (
     Judged,
     advice,
@@ -67,6 +67,22 @@ def test_a_stream_is_like_itself() -> None:
     assert numbers["active"]["common"] == 1.0
     assert worst(judge_streams(numbers)) == "good"
     assert describe_streams(numbers).startswith("Alike.\n")
+
+
+def test_a_polarity_that_neither_has_is_not_missing() -> None:
+    events = noise(1, share_on=1.0)
+    assert worst(judge_streams(evflow.compare(events, events))) == "good"
+    lost = evflow.compare(noise(1), events)
+    assert worst(judge_streams(lost)) == "poor"
+
+
+@pytest.mark.parametrize("size", [(640, 1), (1280, 2), (1, 640), (1281, 7)])
+def test_a_flat_sensor_has_pictures(size: tuple[int, int]) -> None:
+    values = np.arange(size[0] * size[1], dtype=float).reshape(size[::-1])
+    small, k = blocks(values)
+    assert max(small.shape) <= WIDEST
+    assert small.shape == tuple(-(-side // k) for side in values.shape)
+    assert small[0, 0] == values[:k, :k].mean() or min(size) < k
 
 
 def test_shuffled_pixels_keep_the_rates_and_lose_the_places() -> None:

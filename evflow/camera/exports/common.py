@@ -122,6 +122,12 @@ class Settings:
         return f"{cutoff}, {dead}{leak}"
 
     @property
+    def refers_to(self) -> str:
+        """The log map that the thresholds refer to, in words."""
+        return ("the camera's thresholds refer to log(I / 255 + .001)" if self.log_eps else
+                "the camera's thresholds refer to v2e's map,\n  linear below 20 DN")
+
+    @property
     def same_size(self) -> str:
         """Lines of a script that refuse an image of another size."""
         return SIZE.format(width=self.width, height=self.height)

@@ -86,15 +86,19 @@ What ESIM cannot represent
   at the median pixel, to its output; noise events do not reset the pixels' memories.
 - The photoreceptor's low-pass (measured: {circuit}): it has none. ESIM discards contrast changes
   within the dead time; the pixels of v2e and evflow keep them for later.
-- The log map: ESIM uses log(I / 255 + eps), evflow's thresholds refer to v2e's map, linear below
-  20 DN. Dark scenes give other counts: 22 % fewer on one video, with eps = 1e-3.
+{log}'''
+
+
+LOG = '''- The log map: ESIM uses log(I / 255 + eps), {refers_to}.
+  Dark scenes give other counts: 22 % fewer on one video, with eps = 1e-3.
 '''
 
 
 def export(maps: Maps, s: Settings) -> Export:
     """The medians, and a script that adds the noise."""
     values = vars(s) | {"circuit": s.circuit, "dead_ns": round(s.dead_s * 1e9),
-                        "same_size": s.same_size}
+                        "same_size": s.same_size,
+                        "log": "" if s.log_eps else LOG.format(refers_to=s.refers_to)}
     return Export(TEXT.format(**values),
                   {"run_esim.py": SCRIPT.format(**values), "add_noise.py": NOISE,
                    "linear_images.py": LINEAR})

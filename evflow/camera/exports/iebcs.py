@@ -74,8 +74,7 @@ What IEBCS cannot represent
   silent pixel fires once in 1000 s. A noise event stores the present intensity.
 - Latency, time constant and jitter (lat, tau, jit) are those of IEBCS's examples, and so is the
   dead time (ref, microseconds) if none was measured (here: {circuit}). Its latency is no low-pass.
-- The log map is log(I + 1) with white at 1e4; evflow's thresholds refer to v2e's map, linear below
-  20 DN.
+- The log map is log(I + 1) with white at 1e4; {refers_to}.
 '''
 
 
@@ -85,6 +84,7 @@ def export(maps: Maps, s: Settings) -> Export:
     rates = {"bgnp": max(s.eta_on, slowest), "bgnn": max(s.eta_off, slowest)}
     values = vars(s) | rates | {
         "light": LIGHT + SWITCH, "srgb": SRGB, "same_size": s.same_size, "sigma": s.sigma,
+        "refers_to": s.refers_to,
         "circuit": s.circuit,
         "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}

@@ -61,7 +61,7 @@ What OpenEB cannot represent
   intervals in which some pixel has an event, none in a static scene. So the script turns it off and
   add_noise.py adds the measured maps; noise events do not reset the pixels' memories.
 - Its low-pass has two poles; one pole was measured ({circuit}).
-- The log map is log(I / 255 + 1e-7); evflow's thresholds refer to v2e's map, linear below 20 DN:
+- The log map is log(I / 255 + 1e-7); {refers_to}:
   dark scenes give other counts.
 '''
 
@@ -74,7 +74,7 @@ def export(maps: Maps, s: Settings) -> Export:
     values = vars(s) | {
         "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
         "clipped": clipped, "light": LIGHT + SWITCH, "srgb": SRGB,
-        "same_size": s.same_size,
+        "same_size": s.same_size, "refers_to": s.refers_to,
         "shot": (s.eta_on + s.eta_off) / GREY}
     return Export(TEXT.format(**values),
                   {"run_openeb.py": SCRIPT.format(**values), "add_noise.py": NOISE})

@@ -110,11 +110,13 @@ def calibrate_step(
             step), EV017 (fewer than two rests in the frames, or no screen that steps), EV020, EV021
             (polarities swapped).
     """
-    metered = False
+    metered, lux = False, () if lux is None else tuple(map(float, lux))
+    if not len(recording.events):
+        raise EvflowDataError("EV001", "the recording has no events.")
     if lux and triggers_us is not None and rests_us is None and not recording.has_frames:
         rests_us = rests_between(np.asarray(triggers_us), recording.events, len(lux))
-        metered, light, lux = True, lux, None
-    steps = _steps(recording, rests_us, light, tuple(lux or ()))
+        metered, light, lux = True, lux, ()
+    steps = _steps(recording, rests_us, light, lux)
     if metered:
         steps = dataclasses.replace(steps, unit="lux")
     _check_polarity(steps)
@@ -184,13 +186,12 @@ def _steps(
     lux: tuple[float, ...],
 ) -> Steps:
     events, times = recording.events, recording.frame_times
-    if len(events) == 0:
-        raise EvflowDataError("EV001", "the recording has no events.")
     frames = None if rests_us is not None else find_rests(recording)
     spans = ([(int(times[a]), int(times[b])) for a, b in frames] if frames is not None
              else [(int(a), int(b)) for a, b in rests_us or ()])
     flat = [t for span in spans for t in span]
-    if len(spans) < 2 or any(b < a for a, b in itertools.pairwise(flat)):
+    if (len(spans) < 2 or any(b < a for a, b in itertools.pairwise(flat))
+            or any(b == a for a, b in spans)):
         raise EvflowDataError("EV020", f"rests_us={spans}.",
                               "Give two or more (begin, end) in us, in order of time.")
     if lux and light is not None:

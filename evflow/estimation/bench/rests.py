@@ -76,11 +76,11 @@ def steps_of_light(recording: Recording) -> int:
 def rests_between(edges_us: np.ndarray, events: Events, count: int) -> list[tuple[int, int]]:
     """The rests (begin, end) in us between the light's edges (N,), which begin up to BEFORE_US
     earlier, as a photodiode says half-way up, and last up to EDGE_US; edges closer together are
-    one. Raises EV020 if there are not `count`."""
+    one, those before the events none. Raises EV020 if there are not `count`."""
     last = int(events.t[-1])
     edges = np.unique(edges_us)
-    edges = edges[edges < last]
-    edges = edges[np.diff(edges, prepend=-np.inf) > EDGE_US].tolist()
+    edges = edges[(edges > int(events.t[0]) - EDGE_US) & (edges < last)]
+    edges = edges[np.diff(edges, prepend=-np.inf) > BEFORE_US + EDGE_US].tolist()
     first = min([int(events.t[0]), *(e - EDGE_US for e in edges)])
     last = max([last, *(e + 2 * EDGE_US for e in edges)])
     if count != len(edges) + 1:

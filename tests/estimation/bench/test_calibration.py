@@ -353,3 +353,17 @@ def test_triggers_and_light_of_each_rest_take_the_place_of_frames() -> None:
     assert (found.bench.unit, found.bench.levels[0].light) == ("lux", pytest.approx(7.5))
     with pytest.raises(EvflowDataError, match=r"EV020.*10 edges of light.*each of the 11 rests"):
         calibrate_step(alone, lux=[1, 2], triggers_us=triggers)
+    # in the middle of each edge, and of a part of the recording
+    lux = 0.3 * np.array(STAIRS)
+    late = calibrate_step(alone, lux=lux, triggers_us=edges + 8000, fresh=True)
+    assert float(late.summary.theta_on) == pytest.approx(float(found.summary.theta_on), rel=1e-4)
+    begin, end = int(edges[2]) + 60_000, int(alone.events.t[-1])
+    part = Recording.of_events(alone.events.slice(begin, end))
+    some, own = (calibrate_step(part, lux=lux[3:], triggers_us=of) for of in (triggers, edges[3:]))
+    np.testing.assert_array_equal(some.camera.theta_on, own.camera.theta_on)
+    np.testing.assert_array_equal(some.camera.eta_on, own.camera.eta_on)
+    none = Recording.of_events(alone.events.slice(0, 0))
+    with pytest.raises(EvflowDataError, match="EV001"):
+        calibrate_step(none, lux=lux, triggers_us=triggers)
+    with pytest.raises(EvflowDataError, match="EV020"):
+        calibrate_step(alone, light=[1, 2], rests_us=[(0, 0), (100_000, 200_000)])
