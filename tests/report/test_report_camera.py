@@ -255,7 +255,8 @@ def test_what_is_refused(measured: tuple[CameraEstimate, Recording], tmp_path: P
 
 def stream(ratio: float | None, r: float | None) -> dict[str, Any]:
     both = {"on": ratio, "off": ratio}
-    return {"rate_hz": {"ratio": both}, "counts": {"r": {"on": r, "off": r}}}
+    rates = {"real": {p: both[p] is not None for p in both}, "synthetic": {p: 1.0 for p in both}}
+    return {"rate_hz": {"ratio": both, **rates}, "counts": {"r": {"on": r, "off": r}}}
 
 
 @pytest.mark.parametrize(("ratio", "r", "grades"), [
