@@ -103,8 +103,8 @@ def test_frames_from_elsewhere(folder: Path, capsys: pytest.CaptureFixture[str])
     assert found(capsys) == {}
     assert run(*bare, "--frames-fps", 25, "--frames-offset-ms", 20, "--flip-frames", "both") == 1
     assert found(capsys) == {"errors": ["EV029"]}
-    assert run("check", folder / "bare.npz", "--timestamps", folder / "times.txt") == 1
-    assert "Pass --frames too" in capsys.readouterr().out
+    assert run("check", folder / "bare.npz", "--timestamps", folder / "times.txt") == 2
+    assert "Pass --frames too" in capsys.readouterr().err
 
 
 def test_frames_without_a_clock_join_events_of_wall_clock_time(

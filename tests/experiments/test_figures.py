@@ -266,8 +266,8 @@ def recorded_video() -> dict[str, Figures]:
 
 def flow() -> dict[str, Figures]:
     names = {"thresholds uniform": "wide", "thresholds log-uniform": "wide-log",
-             "estimate": "evflow", "truth": "oracle", "the camera's own": "raw"}
-    return {label: [values("see_better_flow", rf"AEE \[px\]\|{name} \(5\)", *at)[0]
+             "estimate": "evflow", "truth": "oracle", "LGAN": "lgan", "the camera's own": "raw"}
+    return {label: [values("see_better_flow", rf"AEE \[px\]\|{name} \(3\)", *at)[0]
                     for at in ((2, 0), (3, 0), (3, 1))] for label, name in names.items()}
 
 

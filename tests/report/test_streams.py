@@ -113,7 +113,8 @@ def numbers_of(rate: float, own: float, around: float) -> dict[str, Any]:
                     "median_s": {"real": 0.01, "synthetic": 0.01 * ratio}}
              for kind, ratio in (("intervals", own), ("neighbours", around))}
     times["neighbours"]["alone"] = {"real": 0.1, "synthetic": 0.1}
-    return {"rate_hz": {"ratio": {"on": rate, "off": rate}}, "net_r": 0.9,
+    rates = {"real": {"on": 1.0, "off": 1.0}, "synthetic": {"on": rate, "off": rate}}
+    return {"rate_hz": {**rates, "ratio": rates["synthetic"]}, "net_r": 0.9,
             "counts": {"r": {"on": 0.9, "off": 0.9}}, **times}
 
 
