@@ -230,6 +230,21 @@ def video() -> dict[str, Figures]:
     return {label: of(name) for label, name in names.items()}
 
 
+def other_cameras() -> dict[str, Figures]:
+    names = {"default parameters": "default", "thresholds uniform": "wide", "estimate": "evflow",
+             "truth": "oracle", "LGAN": "lgan"}
+
+    def of(name: str, target: str) -> Figures:
+        at = "see_better_cameras"
+        gain = [0.0] if name == "default" else [
+            values(at, rf"SSIM\|{name} \(3\)", "to default", k, target)[0] for k in range(2)]
+        return gain + [values(at, rf"{measure}\|{name} \(3\)", "mean", 0, target)[0]
+                       for measure in ("LPIPS", "MSE")]
+
+    return {label: [*of(name, "middle noisy"), *of(name, "low noisy")]
+            for label, name in names.items()}
+
+
 def longer() -> dict[str, Figures]:
     names = {"estimate": "evflow", "truth": "oracle", "LGAN": "lgan"}
     gains = {label: [values("see_better_long", rf"SSIM\|{name} \(3\)", "to default", k)[0]
@@ -319,6 +334,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "The middle one of three frames"): changes,
     (ACCURACY, "### Video"): video,
     (ACCURACY, "oracle oracle+circuit"): circuit,
+    (ACCURACY, "### Video of two other cameras"): other_cameras,
     (ACCURACY, "### Longer trainings"): longer,
     (ACCURACY, "### Video of real recordings"): recorded_video,
     (ACCURACY, "### Flow"): flow,
