@@ -107,7 +107,11 @@ def begin(options: Any, name: str) -> None:
     at_least(1, **{field.name: value for field in dataclasses.fields(options)
                    if type(value := getattr(options, field.name)) is int and field.name != "seed"})
     path = options.out / f"{name}.json"
+    new = not options.out.exists()
     need_writable(options.out)
+    if new:  # nothing is left of what is refused later
+        with contextlib.suppress(OSError):
+            options.out.rmdir()
     if not path.is_file():
         return
     before = json.loads(path.read_text())["config"]
