@@ -110,7 +110,7 @@ def _events(key: Array, film: Film, camera: Camera, config: DatasetConfig) -> Ev
     """Events from the first kept frame to just before the last."""
     times, length = _times_us(config), block_length(config)
     blocks = (times[first : first + length] for first in range(0, len(times), length))
-    parts = simulate_stream(key, film, blocks, camera, model=config.model)
+    parts = simulate_stream(key, film, blocks, camera, model=config.model, full_scale=255)
     return Events.concatenate([part.slice(0, int(times[-1])) for part in parts])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 DARKEST_DN = 8.0  # if no frame exceeds it, they are not DN
 MOST_LOG = 6.0  # the logarithm of 255 DN is 5.54
 LOG_MEDIAN = 1.0  # logarithms of DN are mostly above it, radiance mostly below
-AS_THEY_ARE = "if they are really that dark: --full-scale 255, or in Python uint16, frames * 257"
+AS_THEY_ARE = "if they are really that dark: --full-scale 255 (full_scale=255)"
 
 
 class Meaning(NamedTuple):

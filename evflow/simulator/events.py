@@ -37,15 +37,17 @@ Labelled = tuple[Events, np.ndarray]
 def simulate(
     key: Array, frames: ArrayLike, times_us: ArrayLike, camera: Camera, *,
     model: SensorModel | None = None, labels: Literal[False] = False,
+    full_scale: float | None = None,
 ) -> Events: ...
 @overload
 def simulate(
     key: Array, frames: ArrayLike, times_us: ArrayLike, camera: Camera, *,
     model: SensorModel | None = None, labels: Literal[True],
+    full_scale: float | None = None,
 ) -> Labelled: ...
 def simulate(
     key: Array, frames: ArrayLike, times_us: ArrayLike, camera: Camera, *,
-    model: SensorModel | None = None, labels: bool = False,
+    model: SensorModel | None = None, labels: bool = False, full_scale: float | None = None,
 ) -> Events | Labelled:
     """Events of a video seen by a camera.
 
@@ -61,6 +63,8 @@ def simulate(
         camera: maps (H, W).
         model: the pixel circuit; None is `SensorModel()`.
         labels: also return which events are noise.
+        full_scale: value of white in float frames. None is 255; float frames of which none exceeds
+            8 are then refused, as they mostly are fractions, logarithms or radiance.
 
     Returns:
         Sorted `Events`, integer microseconds in (times_us[0], times_us[-1]]. With `labels`, also
@@ -90,7 +94,8 @@ def simulate(
             "Expected (T, H, W) frames and T times in microseconds."
             + (" Colour? evflow.light.colour.luma(frames[..., ::-1]) of R, G, B." if
                frames.ndim == 4 and frames.shape[-1] == 3 else ""))
-    video = blocks([frames], [times_us], camera.shape, BLOCK, copy=False)
+    video = blocks([frames], [times_us], camera.shape, BLOCK, copy=False,
+                   full_scale=full_scale)
     parts = list(_packed(key, video, camera, Constants.of(model or SensorModel())))
     height, width = camera.shape
     x, y, t, p = (np.concatenate([getattr(part, name) for part, _ in parts]) for name in COLUMNS)
@@ -102,15 +107,18 @@ def simulate(
 def simulate_stream(
     key: Array, frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     camera: Camera, *, model: SensorModel | None = None, labels: Literal[False] = False,
+    full_scale: float | None = None,
 ) -> Iterator[Events]: ...
 @overload
 def simulate_stream(
     key: Array, frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     camera: Camera, *, model: SensorModel | None = None, labels: Literal[True],
+    full_scale: float | None = None,
 ) -> Iterator[Labelled]: ...
 def simulate_stream(
     key: Array, frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
     camera: Camera, *, model: SensorModel | None = None, labels: bool = False,
+    full_scale: float | None = None,
 ) -> Iterator[Events] | Iterator[Labelled]:
     """Events of a streamed video, in bounded memory.
 
@@ -122,6 +130,7 @@ def simulate_stream(
         camera: maps (H, W).
         model: the pixel circuit; None is `SensorModel()`.
         labels: also return which events are noise.
+        full_scale: as in `simulate`.
 
     Returns:
         An iterator over `Events` of eight frames each, in order of time, 8 or 16 frames behind the
@@ -138,7 +147,8 @@ def simulate_stream(
         ...         out.append(events)
     """
     check_arguments(key, camera, model)
-    video = blocks(frames_iter, times_iter, camera.shape, BLOCK, copy=True)
+    video = blocks(frames_iter, times_iter, camera.shape, BLOCK, copy=True,
+                   full_scale=full_scale)
     packed = _packed(key, video, camera, Constants.of(model or SensorModel()))
     return packed if labels else (events for events, _ in packed)
 

@@ -15,7 +15,7 @@ from evflow.light.ranges import DARKEST_DN, meaning
 
 def blocks(
     frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
-    shape: tuple[int, ...], length: int, *, copy: bool,
+    shape: tuple[int, ...], length: int, *, copy: bool, full_scale: float | None = None,
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
     """Validated flat frames (bytes or float32 DN) and int64 times, in blocks independent of the
     input's chunks: first the first frame alone, then `length` frames at a time.
@@ -25,13 +25,15 @@ def blocks(
         shape: (H, W).
         length: frames of a block.
         copy: copy frames on arrival, for sources that reuse one buffer.
+        full_scale: value of white in float frames; None is 255, and frames that never exceed
+            DARKEST_DN are then refused.
 
     Raises:
         EvflowDataError: EV001 for less than two frames; EV002, EV003, EV004, EV007 and EV015 for
             bad ones.
     """
     pairs = ((_flat(frame, copy), t)
-             for frame, t in _single_frames(frames_iter, times_iter, shape))
+             for frame, t in _single_frames(frames_iter, times_iter, shape, full_scale))
     taken = list(itertools.islice(pairs, 1))
     if not taken:
         raise EvflowDataError("EV001", "the video has no frames.", "Give at least two frames.")
@@ -54,10 +56,12 @@ def _flat(frame: np.ndarray, copy: bool) -> np.ndarray:
 
 def _single_frames(
     frames_iter: Iterable[ArrayLike], times_iter: Iterable[ArrayLike],
-    shape: tuple[int, ...],
+    shape: tuple[int, ...], full_scale: float | None,
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Validated (frame, time) pairs, from single frames or blocks."""
-    dtype, last, index, doubt, bright = None, None, 0, None, False
+    if full_scale is not None and not 0 < full_scale < np.inf:
+        raise EvflowDataError("EV020", f"full_scale={full_scale}.", "Give the value of white.")
+    dtype, last, index, doubt, bright = None, None, 0, None, full_scale is not None
     for block, times in itertools.zip_longest(frames_iter, times_iter):
         if block is None or times is None:
             raise EvflowDataError(
@@ -66,6 +70,8 @@ def _single_frames(
         block = np.asarray(plain("frames", block))
         times = np.atleast_1d(np.asarray(plain("times", times)))
         block = block[None] if block.ndim == 2 else block
+        if full_scale not in (None, 255) and block.dtype.kind == "f":
+            block = block * block.dtype.type(255 / full_scale)
         _check_block(block, times, shape, dtype, index)
         if block.dtype.kind == "f" and not bright:
             doubt, bright = doubt or meaning(block), float(block.max(initial=0)) > DARKEST_DN

@@ -128,7 +128,8 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
     times = np.arange(length) * 1000
     lit = np.minimum(frames + np.float32(protocol.dark_dn), 255) if protocol.dark_dn else frames
     lit, model = low_passed(lit, times, protocol)
-    events, labels = simulate(k_events, lit, times, camera, model=model, labels=True)
+    events, labels = simulate(k_events, lit, times, camera, model=model, labels=True,
+                              full_scale=255)
     if protocol.off == "dropped":
         on = events.p
         labels = labels[on]

@@ -21,7 +21,6 @@ from evflow.camera.perturb import with_faults
 from evflow.camera.sensors import SensorModel
 from evflow.downstream.simulated import SequenceConfig, scene_clock
 from evflow.downstream.tensor import BINS, event_tensor, windows_between
-from evflow.light.ranges import DARKEST_DN
 from evflow.scenes import Scene, TextureBank, make_bank, watch
 from evflow.scenes.config import SceneConfig
 from evflow.scenes.motion import optical_flow
@@ -128,16 +127,9 @@ def clips(
         video = np.concatenate(list(watch.film(scene, instants, shape)))
         times = STEP_US * np.arange(len(video))
         k_events = jax.random.fold_in(_key("events", seen.name, *others), i)
-        events = simulate(k_events, _in_dn(video), times, seen.camera, model=seen.circuit)
+        events = simulate(k_events, video, times, seen.camera, model=seen.circuit, full_scale=255)
         yield clip_of(events, times[LEAD::steps], video[LEAD::steps] / 255.0,
                       flows(scene, clock[::steps], shape))
-
-
-def _in_dn(video: np.ndarray) -> np.ndarray:
-    """A video whose values are taken as DN however dark its scene is; others unchanged."""
-    if video.max() > DARKEST_DN:
-        return video
-    return np.rint(video * 257).astype(np.uint16)
 
 
 def clip_of(events: Events, edges: np.ndarray, borders: np.ndarray, flow: np.ndarray) -> Clip:

@@ -31,6 +31,7 @@ from evflow.dataset.sequence import CAMERA
 from evflow.dataset.store import _save
 from evflow.io import read_recording
 from evflow.recordings import iter_windows
+from evflow.scenes.config import SceneConfig
 from evflow.types import Events
 from experiments import make_dataset
 
@@ -206,3 +207,11 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     (tmp_path / "train/00001.h5").unlink()
     assert make_dataset.main(check) == 1
     assert "train/00001: 00001.h5 is missing" in capsys.readouterr().out
+
+
+def test_scenes_of_the_night_are_simulated_as_they_are() -> None:
+    """Whose frames look like fractions of white, which `simulate` otherwise refuses."""
+    dark = SceneConfig(foregrounds=0, contrast=(0.1, 0.15), gamma=(8.0, 8.0),
+                       brightness=(0.0, 0.02))
+    found = make_sequence(dataclasses.replace(CONFIG, scene=dark), 0, 0)
+    assert found.frames.max() <= 8

@@ -21,7 +21,7 @@ from evflow.recordings.windows import plan_windows
 from evflow.types import Events, Recording
 
 MIN_STEP_US = 20_000  # frames closer than that change too little
-MOST_STEPS = 24  # frame intervals examined: of so many parts of the recording the busiest of each
+MOST_STEPS = 24  # frame intervals examined, one of each of so many parts of the recording
 STRIDE = 4  # every 4th pixel of every 4th row tells how much a frame changes
 CELLS = 160  # along the longer side: pooling averages out quantisation by the thresholds
 DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, log changes are unreliable
@@ -136,7 +136,7 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
         return None
     if not pairs:
         return None
-    pairs = _busiest(recording, pairs)
+    pairs = _most_telling(recording, pairs)
     cell = max(1, round(max(recording.events.size) / CELLS))
     width, height = recording.events.size
     changes: dict[str, list[np.ndarray]] = collections.defaultdict(list)
@@ -152,7 +152,7 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
                  interval)
 
 
-def _busiest(
+def _most_telling(
     recording: Recording, pairs: tuple[tuple[int, int], ...]
 ) -> tuple[tuple[int, int], ...]:
     """Of each of MOST_STEPS parts the pair whose frames change most, near the one with the most

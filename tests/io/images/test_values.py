@@ -160,6 +160,13 @@ def test_what_the_messages_tell_to_do_gives_the_light(tmp_path: Path) -> None:
     dark = (light / 50).astype(np.float32)  # insisted on
     np.testing.assert_allclose(read(stack(tmp_path / "s", dark), fps=1, full_scale=255)[0], dark)
     assert len(simulate(KEY, np.rint(dark * 257).astype(np.uint16), milliseconds(4), CAMERA)) >= 0
+    assert len(simulate(KEY, dark, milliseconds(4), CAMERA, full_scale=255)) >= 0
+    with pytest.raises(EvflowDataError, match="EV020"):
+        simulate(KEY, dark, milliseconds(4), CAMERA, full_scale=0)
+    bright = np.float32(8) * dark
+    np.testing.assert_array_equal(
+        simulate(KEY, np.float32(0.25) * bright, milliseconds(4), CAMERA, full_scale=63.75).t,
+        simulate(KEY, bright, milliseconds(4), CAMERA).t)
     black = np.zeros((4, *SHAPE), np.float32)  # and nothing is wrong with the night
     assert len(simulate(KEY, black, milliseconds(4), CAMERA)) == 0
     late = np.concatenate([dark[:2], light[2:]])  # nor with a video that begins in the dark
