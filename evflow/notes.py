@@ -20,6 +20,7 @@ NOTES: dict[str, str] = {
     "events.partial": "only the part before the damage was read",
     "events.timeless": "events before the first timestamp word were left out",
     "events.turned": "polarity was inverted",
+    "events.turns": "high bits of the event times are missing and were inferred",
     "events.unended": "the last line of a text file is incomplete",
     "events.unit": "another unit of the event times is more likely",
     "events.unread": "part of the file was not read",

@@ -3,9 +3,10 @@
 
 0: row y [10:0]. 2: an event at x [10:0], polarity [11]. 3: vector base, x and polarity the same.
 4, 5: events at base + i where bit i of 12 (8) is set; the base advances by 12 (8). 6, 8: low and
-high 12 bits of time in us, which wraps every 16.8 s; a new high word starts at low 0. A: trigger;
-7, E, F: other: not read. 1, 9, B, C, D are reserved, and pad some recordings (0x9999): counted and
-skipped, as are events before the first row, time or base.
+high 12 bits of time in us, which wraps every 16.8 s; a new high word starts at low 0. expelliarmus
+1.1 writes one high word in all: low bits that begin anew mean the next. A: trigger; 7, E, F: other:
+not read. 1, 9, B, C, D are reserved, and pad some recordings (0x9999): counted and skipped, as are
+events before the first row, time or base.
 """
 
 from __future__ import annotations
@@ -82,6 +83,7 @@ class Decoder:
         self.clock, self.unit = Clock(12), unit
         self.time, self.row, self.base, self.on = NEVER, UNKNOWN, UNKNOWN, False
         self.stateless = self.triggers = 0
+        self.turns = self.turned = 0  # of the low bits: since the last high word, and in all
         self.reserved = Reserved(RESERVED, "EVT3")
 
     def chunks(self, source: Iterator[tuple[int, np.ndarray]]) -> Iterator[Chunk]:
@@ -116,13 +118,34 @@ class Decoder:
         # a high word that repeats the last keeps the low bits; a new one starts at 0
         renews = ~is_high | (np.diff(high, prepend=-1 if known is None else known) != 0)
         last = np.maximum.accumulate(np.where(renews, np.arange(len(marks)), -1))
-        low = 0 if self.time == NEVER else self.time & 0xFFF
-        time = (high << 12) + np.where(last < 0, low, np.where(is_high, 0, value)[last])
+        before_low = 0 if self.time == NEVER else self.time & 0xFFF
+        low = np.where(last < 0, before_low, np.where(is_high, 0, value)[last])
+        falls = np.append(before_low, low[:-1]) - low
+        if known is None:
+            falls[turn == 0] = 0
+        turns = self._turns(falls, is_high & renews)
+        time = (high + turns << 12) + low
         if known is None:
             time[turn == 0] = NEVER
         out = hold(self.time, time, before[marks], n)
         self.time = int(time[-1]) if len(time) else self.time
         return out
+
+    def _turns(self, falls: np.ndarray, new: np.ndarray) -> np.ndarray:
+        """How often the low bits began anew since the last new high word, (n,). falls: (n,) by how
+        much each time word lowers them; new: (n,) whether it is a new high word."""
+        falls = falls * ~new
+        if not len(falls) or (falls.max() <= 0 and not self.turns):
+            return np.zeros(len(falls), np.int64)
+        epoch = np.cumsum(new)
+        carried = np.where(epoch == 0, self.turns, 0)
+        far = np.cumsum(falls > 1 << 11)
+        since = far - np.append(0, far[new])[epoch] + carried
+        # A small fall is time that goes back, unless high words are known to be missing here.
+        turn = np.cumsum((falls > 0) & (since > 0))
+        turns = turn - np.append(0, turn[new])[epoch] + carried
+        self.turns, self.turned = int(turns[-1]), self.turned + int(turn[-1])
+        return turns
 
     def _rows(self, table: np.ndarray, kind: np.ndarray, before: np.ndarray, n: int) -> np.ndarray:
         """y (n,) int32 of each emitting word."""
@@ -168,4 +191,12 @@ class Decoder:
                      lambda i: byte + 2 * int(rows[of[i]]), self.unit)
 
     def notes(self) -> tuple[Note, ...]:
-        return (*self.reserved.notes(), *leftovers(self.stateless, self.triggers))
+        return (*self._said_of_turns(), *self.reserved.notes(),
+                *leftovers(self.stateless, self.triggers))
+
+    def _said_of_turns(self) -> tuple[Note, ...]:
+        if not self.turned:
+            return ()
+        return (Note("events.turns", f"{self.turned:,} times the low 12 bits of time began anew "
+                     "without a high word, as expelliarmus writes EVT3: each counts as 4096 us, "
+                     "and what a pause was longer than that is lost"),)

@@ -108,6 +108,27 @@ def test_new_high_word_starts_at_low_zero(tmp_path: Path) -> None:
     assert read_events(path).t.tolist() == [0x1FFF, 0x2000, 0x2001, 0x2001]
 
 
+@pytest.mark.parametrize("chunk", [2, 34, 1 << 18])
+def test_low_bits_that_begin_anew_without_a_high_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int
+) -> None:
+    """As expelliarmus writes: one high word in all. A later one counts as it stands, and where none
+    is known to be missing a small step back stays one."""
+    monkeypatch.setattr("evflow.io.decode.stream.CHUNK", chunk)
+    path = tmp_path / "a.raw"
+    times = np.cumsum(np.random.default_rng(0).integers(0, 900, 400)) + 5000
+    words = [0x8001, 7, *(w for t in times.tolist() for w in (0x6000 | t & 0xFFF, 0x2003))]
+    path.write_bytes(HEADER + struct.pack(f"<{len(words)}H", *words))
+    got = read_recording(path)
+    assert got.events.t.tolist() == times.tolist()
+    assert [n.code for n in got.notes] == ["events.turns"]
+    more = [0x8000 | times[-1] // 4096 + 2, 0x2003, 0x6005, 0x2003]
+    path.write_bytes(HEADER + struct.pack(f"<{len(words) + 4}H", *words, *more))
+    assert (read_events(path).t[-2:] & 0xFFF).tolist() == [0, 5]
+    path.write_bytes(HEADER + struct.pack("<6H", 0x8001, 7, 0x6010, 0x2003, 0x6008, 0x2003))
+    assert refused(path).code == "EV004"
+
+
 def test_vectors_that_never_end_leave_the_sensor(tmp_path: Path) -> None:
     """70,000 masks after one base reach x = 840,000: refused, not wrapped into 16 bits."""
     path = tmp_path / "a.raw"
