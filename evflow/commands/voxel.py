@@ -100,8 +100,7 @@ def _windows(
     Raises EV001, EV011, EV012 as `plan_windows`, EV017 if no window is left, EV026 for more
     than 10 million windows of equal length.
     """
-    from evflow.downstream.sync import need_few_windows
-    from evflow.recordings.windows import condensed, plan_windows
+    from evflow.recordings.windows import condensed, need_few_windows, plan_windows
 
     t = recording.events.t
     if len(recording.frames) > 1:

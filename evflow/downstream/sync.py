@@ -8,13 +8,13 @@ from typing import Literal, get_args
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.recordings.windows import need_few_windows
 from evflow.types import Recording
 
 Sync = Literal["auto", "frames", "events", "ms"]
 
 PER_PIXEL = 0.35  # events per pixel in a window, as published for E2VID
 WINDOW_US = 33_000
-MOST_WINDOWS = 10_000_000  # four days of them; a clock that jumps to Unix time makes 5e10
 
 
 def sync_times(
@@ -53,17 +53,6 @@ def sync_times(
         raise EvflowDataError("EV020", f"windows of {window_us!r} us.",
                               "Give whole microseconds, 1 or more.")
     return t[0] + window_us * np.arange(1, max(1, need_few_windows(t, window_us)) + 1)
-
-
-def need_few_windows(t: np.ndarray, window_us: int) -> int:
-    """Number of whole windows of a length in event times t (N,); EV026 beyond 10 million."""
-    windows = (int(t[-1]) - int(t[0])) // window_us
-    if windows > MOST_WINDOWS:
-        raise EvflowDataError(
-            "EV026", f"events from {t[0]:,} to {t[-1]:,} us, {windows:,} windows of "
-            f"{window_us:,} us.", "Does the clock jump (read the parts separately: --start, "
-            "--stop), or is the time unit wrong (--time-unit)?")
-    return windows
 
 
 def _counts(value: object) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 from evflow.checks import need
@@ -19,7 +20,7 @@ from evflow.network.summary import pooling_parts
 from evflow.network.weights import load_weights
 from evflow.notes import Note
 from evflow.recordings import dense
-from evflow.recordings.repeats import without_repeats
+from evflow.recordings.repeats import ends_stale, without_repeats
 from evflow.recordings.windows import condensed, plan_windows
 from evflow.types import Recording
 
@@ -69,6 +70,7 @@ class CameraEstimator:
         self._measured = 0  # events of the busiest when the front end was measured
         self._notes: tuple[Note, ...] = ()
         self._size: tuple[int, int] | None = None
+        self._stale_us: int | None = None  # time of the last piece's last frame, if that repeats
         self._seconds, self._left_s, self._apart = 0.0, 0.0, 1
         self._stretches, self._left = 0, 0
 
@@ -78,7 +80,8 @@ class CameraEstimator:
         Args:
             piece: events and at least two frames around them, from the same camera. Its last frame
                 is the next piece's first. Of frames less than 10 ms apart every nth is used, and
-                repeated ones are left out, as in `estimate_camera`.
+                repeated ones are left out, as in `estimate_camera`; where a piece ends with one, so
+                is the next piece's time up to its second frame.
 
         Returns:
             How many usable windows between frames it had; 0 for a piece in which nothing happens,
@@ -94,6 +97,12 @@ class CameraEstimator:
                                   f"{self._size}.", "Add pieces of one camera only.")
         if piece.has_frames and not len(piece.events):
             return 0
+        stale_us, self._stale_us = self._stale_us, ends_stale(piece)
+        if stale_us is not None and piece.has_frames and piece.frame_times[0] == stale_us:
+            piece = dataclasses.replace(
+                piece, frames=piece.frames[1:], frame_times=piece.frame_times[1:])
+            if len(piece.frames) == 1:
+                return 0
         piece, given = dense.thinned(without_repeats(piece)), piece.notes
         told = {note.code for note in self._notes}
         self._notes += tuple(n for n in piece.notes[len(given):] if n.code not in told)

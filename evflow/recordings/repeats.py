@@ -60,6 +60,13 @@ def without_repeats(recording: Recording) -> Recording:
         notes=(*recording.notes, note))
 
 
+def ends_stale(recording: Recording) -> int | None:
+    """Time of the last frame in us if it repeats the one before while pixels fire; else None."""
+    last = dataclasses.replace(
+        recording, frames=recording.frames[-2:], frame_times=recording.frame_times[-2:])
+    return int(last.frame_times[-1]) if len(repeated_frames(last)) else None
+
+
 def _evenly(recording: Recording, kept: Array) -> Array | None:
     """Times (K,) of the kept frames if a converter repeated frames at regular positions, else None
     (`cadence`)."""

@@ -28,6 +28,7 @@ EDGE_US = 5_000  # events may begin or end this far inside the first or last fra
 EDGE_EVENTS = 10  # or this many of the local intervals between events
 BEYOND = 0.1  # share of the recording's time with events before the first or after the last frame
 NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
+MOST_WINDOWS = 10_000_000  # four days of 33 ms; a clock that jumps to Unix time makes 5e10
 DROPPED = 3.0  # a frame interval of more than this many medians means missing frames
 
 
@@ -240,3 +241,14 @@ def check_overlap(recording: Recording) -> None:
             if large else
             "Are both on one clock and in one unit? If they begin together, --frames-offset-ms "
             f"{(int(t[0]) - int(times[0])) / 1e3:.3f}; in another unit, --time-unit.")
+
+
+def need_few_windows(t: np.ndarray, window_us: int) -> int:
+    """Number of whole windows of a length in event times t (N,); EV026 beyond 10 million."""
+    windows = (int(t[-1]) - int(t[0])) // window_us
+    if windows > MOST_WINDOWS:
+        raise EvflowDataError(
+            "EV026", f"events from {t[0]:,} to {t[-1]:,} us, {windows:,} windows of "
+            f"{window_us:,} us.", "Does the clock jump (read the parts separately: --start, "
+            "--stop), or is the time unit wrong (--time-unit)?")
+    return windows

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from evflow.downstream.sync import need_few_windows
 from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import Progress
 from evflow.files.atomic import atomic_write
+from evflow.recordings.windows import need_few_windows
 from evflow.report.caption import captioned
 from evflow.report.page import short
 from evflow.report.plots import event_image
