@@ -220,7 +220,8 @@ def _float_frames(frames: np.ndarray) -> None:
                 "Frames must be linear DN; a logarithm of pixels <= 0, or missing pixels?")
     low, high = float(frames.min()), float(frames.max())
     if low < 0 or high > 255 or 0 < high <= 1:
-        fix = "Multiply by 255." if low >= 0 and high <= 1 else "Rescale, or pass uint16."
+        fix = ("Multiply by 255, if 1 is white. Frames that are really so dark tell nothing: leave "
+               "them out (--no-frames)." if low >= 0 and high <= 1 else "Rescale, or pass uint16.")
         raise EvflowDataError(
             "EV003", f"float frames span {low:g}..{high:g}; expected DN 0..255.", fix)
 

@@ -113,7 +113,8 @@ class Simulate(Pixels, Footage, Compiling):
                 pairs = _clocked(_recorded(
                     made, lambda *pair: later(writer.append_frames, *fits(*pair))), seen)
                 for events, noise in simulate_stream(jax.random.key(self.seed), *unzip(pairs),
-                                                     camera, model=sensor, labels=True):
+                                                     camera, model=sensor, labels=True,
+                                                     full_scale=255):
                     later(writer.append, events)
                     if self.labels:
                         later(writer.append_labels, noise)

@@ -87,9 +87,10 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 @contextlib.contextmanager
-def members(path: Path) -> Iterator[dict[str, Member]]:
-    """The arrays of an .npz by key, readable within the block; EV009 as in `unzipped`."""
-    with unzipped(path) as archive:
+def members(path: Path, streamed: Collection[str] = ()) -> Iterator[dict[str, Member]]:
+    """The arrays of an .npz by key, readable within the block; streamed and EV009 as in
+    `unzipped`."""
+    with unzipped(path, streamed) as archive:
         found = {info.filename.removesuffix(".npy"): Member(archive, info)
                  for info in archive.infolist()}
         try:

@@ -26,6 +26,8 @@ from evflow.io.images.stacks import is_stack, open_stack
 from evflow.io.registry import find_format, read_recording
 from evflow.notes import Note, why_no_frames
 
+OF_EVENTS = ("--size", "--polarity", "--drop-outside", "--events-topic", "--late")
+
 
 def open_frames(path: str | os.PathLike, **hints: Any) -> FrameSource:
     """The frames of any source, in bounded memory (a recording is read as a whole).
@@ -118,9 +120,16 @@ def _recording(path: Path, asked: FrameHints) -> FrameSource:
             "EV020", f"{path} is a recording, whose frames have their own times.",
             "Leave out --fps and --timestamps, or pass only its images.", where=path)
     # Only the frames of the recording are used, so the order of its events does not matter.
-    recording = read_recording(path, time_unit=asked.time_unit, partial=asked.partial,
-                               start_s=asked.start_s, stop_s=asked.stop_s, late="drop",
-                               frames_topic=asked.frames_topic, colour=asked.colour)
+    try:
+        recording = read_recording(path, time_unit=asked.time_unit, partial=asked.partial,
+                                   start_s=asked.start_s, stop_s=asked.stop_s, late="drop",
+                                   frames_topic=asked.frames_topic, colour=asked.colour)
+    except EvflowDataError as e:
+        if not any(option in e.fix for option in OF_EVENTS):
+            raise
+        raise EvflowDataError(e.code, e.seen, f"{e.fix} These are options of events: evflow "
+                              "convert takes them, and what it writes can be simulated.",
+                              where=e.where) from e
     if not recording.has_frames:
         raise EvflowDataError(
             "EV011", f"{path} has events but no frames{why_no_frames(recording.notes)}.",

@@ -47,6 +47,34 @@ def test_frames_too_far_apart_for_the_low_pass_are_told(
     assert ("frames.coarse" in [note["code"] for note in facts["notes"]]) == told
 
 
+@pytest.mark.parametrize(("frames", "options"), [
+    (np.uint8(40) * (drifting(6, (24, 32)) > 99), []),
+    ((4 * drifting(6, (24, 32))).astype(np.uint16), ["--full-scale", "65535"])])
+def test_a_night_has_events(tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                            frames: np.ndarray, options: list[str]) -> None:
+    """Images whose light stays below 8 DN; what floats may be was settled when they were read."""
+    (tmp_path / "night").mkdir()
+    for i, frame in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "night" / f"{i}.png"), frame)
+    events = run(tmp_path / "night", *BASE, *options, capsys=capsys)[0]
+    assert len(events) > 20
+
+
+def test_a_recording_whose_sensor_is_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as f:
+        for name, values in (("t", [1000, 2000]), ("x", [3, 4]), ("y", [5, 6]), ("p", [0, 1])):
+            f[name] = values
+        f["images"], f["image_ts"] = drifting(3, (24, 32)).astype(np.uint8), [0, 1500, 3000]
+    assert main(["simulate", str(path), "-o", str(tmp_path / "o.h5")]) == 1
+    assert "evflow convert takes them" in capsys.readouterr().err
+    whole = str(tmp_path / "whole.h5")
+    assert main(["convert", str(path), whole, "--size", "32x24"]) == 0
+    assert main(["simulate", whole, "-o", str(tmp_path / "o.h5")]) == 0
+
+
 def test_the_circuit_from_the_command_line() -> None:
     """Each option is that field of the sensor's model, and no other."""
     told = {"cutoff_hz": 80.0, "refractory_s": 0.002, "leak_hz": 0.5, "leak_jitter": 0.2,

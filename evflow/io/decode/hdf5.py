@@ -36,11 +36,12 @@ def load_h5py() -> Any:
     return h5py
 
 
-def plausible(path: Path, data: Any) -> Any:
+def plausible(path: Path, data: Any, *, spooled: bool = False) -> Any:
     """The data set; EV009 if it claims more than the file can hold, or if blocks of it are missing
-    or expand too far."""
+    or expand too far. spooled: it is read block by block to disk, and may be of any size."""
     from evflow.io.decode.hdf5_blocks import check_blocks
-    check_expansion(data.nbytes, os.path.getsize(path), f"{path}: {data.name} {data.shape}")
+    if not spooled:
+        check_expansion(data.nbytes, os.path.getsize(path), f"{path}: {data.name} {data.shape}")
     if data.nbytes > MAX_RATIO * os.path.getsize(path):
         raise EvflowDataError(
             "EV009", f"{path}: {data.name} claims {data.shape} {data.dtype} in a file of "

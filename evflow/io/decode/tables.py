@@ -65,10 +65,11 @@ def _file(path: Path) -> Any:
 
 
 def dataset(
-    path: Path, group: Any, name: str, shape: tuple[int | None, ...], own_filter: int | None = None
+    path: Path, group: Any, name: str, shape: tuple[int | None, ...],
+    own_filter: int | None = None, *, spooled: bool = False,
 ) -> Any:
     """Data set `name` of that shape (None: any length); EV008 (absent), EV009, EV010. own_filter:
-    a compression that the caller undoes itself."""
+    a compression that the caller undoes itself; spooled: as in `plausible`."""
     if name not in group:
         raise EvflowDataError(
             "EV008", f"{path}: {group.name} holds {sorted(group)[:8]} but not {name!r}.",
@@ -82,7 +83,7 @@ def dataset(
         raise EvflowDataError(
             "EV009", f"{path}: {name} of {group.name} has shape {found}; expected {shape}.",
             "Write the file again.", where=path)
-    need_filters(path, plausible(path, data), own_filter)
+    need_filters(path, plausible(path, data, spooled=spooled), own_filter)
     block = math.prod(data.chunks or (0,)) * data.dtype.itemsize
     if block > MAX_RATIO * os.path.getsize(path) + (1 << 20):  # HDF5 decodes whole blocks
         raise EvflowDataError(
@@ -206,7 +207,7 @@ def dataset_images(path: Path, group: Any, name: str, times: str) -> Images:
     """Frames in data set `name` of an HDF5 group, and their times in another; an attribute of
     either may state their exposure."""
     def load() -> Loaded:
-        frames = dataset(path, group, name, (None, None, None))
+        frames = dataset(path, group, name, (None, None, None), spooled=True)
         clock = dataset(path, group, times, (len(frames),))
         stamps = Stamps(clock[:], stated_us=stated_by(frames, clock))
         return stamps, lambda keep: stored_frames(frames, keep)

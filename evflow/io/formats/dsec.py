@@ -233,11 +233,13 @@ def _range(t: Any, hints: Hints) -> tuple[int, int]:
         near = np.sort(t[max(at - AROUND, 0) : at + AROUND + 1])  # a single time may be wrong
         return hints.instant(near[len(near) // 2], "us")
 
-    first, last = (bisect.bisect_left(range(len(t)), value, key=us)
-                   for value in hints.span_us(hints.instant(t[0], "us")))
-    if first >= last:
+    start, stop = hints.span_us(hints.instant(t[0], "us"))
+    first, last = (bisect.bisect_left(range(len(t)), value, key=us) for value in (start, stop))
+    begin, end = max(first - 2 * AROUND, 0), min(last + 2 * AROUND, len(t))
+    near = hints.microseconds(t[begin:end], "us") if first >= last else np.array([start])
+    if not ((near >= start) & (near < stop)).any():
         raise hints.empty(us(len(t) - 1) - us(0))
-    return max(first - 2 * AROUND, 0), min(last + 2 * AROUND, len(t))
+    return begin, end
 
 
 def _rises(t: Any) -> bool:

@@ -8,6 +8,7 @@ found by name.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
@@ -40,5 +41,7 @@ def read(path: Path, hints: Hints) -> Recording:
         name, notes = hints.camera([table.name for _, table in found])
         group, table = next(pair for pair in found if pair[1].name == name)
         size = hdf5_search.declared_size(f, group)
-        gathered = table.gather(path, hints, size, hdf5_search.declared_offset(hints, group))
+        unit = table.unit if hints.time_unit == "auto" else hints.time_unit
+        offset = hdf5_search.declared_offset(dataclasses.replace(hints, time_unit=unit), group)
+        gathered = table.gather(path, hints, size, offset)
         return hdf5_search.images_beside(path, f, gathered, hints, name, notes)

@@ -57,7 +57,7 @@ def read(path: Path, hints: Hints) -> Recording:
     Raises EV002 (shapes), EV008 (a column is missing), EV009 (damaged), and what `stream.gather`
     and `Recording` raise.
     """
-    with members(path) as found:
+    with members(path, streamed=["frames.npy"]) as found:
         recording = _recording(path, found, hints)
         if columns.LABEL in found:
             recording = dataclasses.replace(

@@ -28,12 +28,14 @@ from evflow.light.colour import (
     parse_pattern,
     seen_note,
 )
-from evflow.light.ranges import DARKEST_DN
+from evflow.light.ranges import DARKEST_DN, meaning
 from evflow.notes import Note
 
 Frames = Iterator[tuple[np.ndarray, int]]
 
 Array = np.ndarray
+
+DOUBTED = 100  # frames
 
 
 class Image(NamedTuple):
@@ -146,9 +148,10 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
     does not advance), EV007 (NaN), EV015 (the size changes); each message names the frame.
     """
     first: tuple[np.ndarray, np.dtype] | None = None
-    last, bright, peak = 0, False, 0
+    last, peak, doubt = 0, 0, _Doubt(hints)
     for image in images:
-        frame, bright = _seen(image, hints, bright, notes)
+        doubt.look(image)
+        frame = _seen(image, hints, notes)
         depth = image.pixels.dtype
         peak = max(peak, int(image.pixels.max(initial=0))) if depth == np.uint16 else peak
         if first is None:
@@ -175,14 +178,43 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
                 "All frames must have one bit depth and number of channels.", where=image.where)
         last = image.time_us
         yield frame, last
+    doubt.settle()
     if hints.full_scale is None and 0 < peak <= DARKEST_DN * 257:
         raise EvflowDataError(
             "EV003", f"no value of the 16-bit frames is above {peak}, where white is 65535.",
             f"Pass the value of white: --full-scale {values.likely_white(peak):g} (full_scale=).")
 
 
-def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> tuple[Array, bool]:
-    """The frame as light, and the updated `bright` (see `values.as_dn`)."""
+class _Doubt:
+    """Whether float frames are in DN: refused where none exceeds DARKEST_DN in all, or in the first
+    DOUBTED, for a video that fades in from black."""
+
+    def __init__(self, hints: FrameHints) -> None:
+        self.open = hints.full_scale is None and hints.response != "log"
+        self.error: EvflowDataError | None = None
+        self.seen = 0
+
+    def look(self, image: Image) -> None:
+        """Take one more frame into account; EV003."""
+        if not self.open:
+            return
+        pixels = image.pixels
+        self.open = pixels.dtype.kind == "f" and not pixels.max(initial=0) > DARKEST_DN
+        meant = meaning(pixels) if self.open and self.error is None else None
+        if meant:
+            self.error = values.misread(meant, image.where, pixels, 255)
+        self.seen += 1
+        if self.seen == DOUBTED:
+            self.settle()
+
+    def settle(self) -> None:
+        """Raise EV003 if no frame was bright."""
+        if self.open and self.error is not None:
+            raise self.error
+
+
+def _seen(image: Image, hints: FrameHints, notes: list[Note]) -> Array:
+    """The frame as light."""
     pixels, where = image.pixels, image.where
     if hints.bayer is not None:
         pixels = mosaic_luma(pixels, hints.bayer, where)
@@ -201,10 +233,9 @@ def _seen(image: Image, hints: FrameHints, bright: bool, notes: list[Note]) -> t
         if through and not any(note.code == "frames.alpha" for note in notes):
             notes.append(Note("frames.alpha", f"images are partly transparent: laid over "
                               f"{hints.background} (--background black|white)."))
-    frame, bright = values.as_dn(
-        np.ascontiguousarray(pixels), where, full_scale=hints.full_scale,
-        response=hints.response, colour=hints.colour, bright=bright)
-    return frame if hints.flip == "none" else np.flip(frame, response.FLIPS[hints.flip]), bright
+    frame = values.as_dn(np.ascontiguousarray(pixels), where, full_scale=hints.full_scale,
+                         response=hints.response, colour=hints.colour)
+    return frame if hints.flip == "none" else np.flip(frame, response.FLIPS[hints.flip])
 
 
 def _seen_first(image: Image, frame: np.ndarray, hints: FrameHints) -> list[Note]:

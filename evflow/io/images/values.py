@@ -12,7 +12,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.light.colour import luma
-from evflow.light.ranges import meaning
+from evflow.light.ranges import Meaning, meaning
 from evflow.light.response import linear_light
 from evflow.notes import Note
 
@@ -23,10 +23,8 @@ BACKGROUNDS = {"black": 0.0, "white": 1.0}
 
 def as_dn(
     pixels: np.ndarray, where: str, *, full_scale: float | None, response: str, colour: str,
-    bright: bool,
-) -> tuple[np.ndarray, bool]:
-    """The frame (H, W), or (H, W, 3) unless colour is "luma"; and whether any float frame so far
-    was clearly in DN (`bright` says so for earlier ones).
+) -> np.ndarray:
+    """The frame (H, W), or (H, W, 3) unless colour is "luma".
 
     pixels: (H, W) or (H, W, 3) in B, G, R, of a dtype in `WHITE`; where: names it in messages.
     Raises EV003 (range), EV007 (NaN).
@@ -34,12 +32,10 @@ def as_dn(
     seen: Callable[[np.ndarray], np.ndarray] = (
         luma if pixels.ndim == 3 and colour == "luma" else _as_it_is)
     if response == "linear":  # integers are rounded as by OpenCV
-        return _scaled(seen(pixels), where, full_scale, bright)
+        return _scaled(seen(pixels), where, full_scale)
     if response == "log":
-        light = _exponential(pixels, where, full_scale)
-        return seen(light), True
-    dn, bright = _scaled(pixels, where, full_scale, bright)
-    return seen(linear_light(dn, response)), bright
+        return seen(_exponential(pixels, where, full_scale))
+    return seen(linear_light(_scaled(pixels, where, full_scale), response))
 
 
 def white_of(dtype: np.dtype, where: str) -> float:
@@ -85,30 +81,32 @@ def _as_it_is(pixels: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def _scaled(
-    pixels: np.ndarray, where: str, full_scale: float | None, bright: bool
-) -> tuple[np.ndarray, bool]:
-    """Pixels as DN on 0..255, checked, and the updated `bright` (see `as_dn`)."""
+def _scaled(pixels: np.ndarray, where: str, full_scale: float | None) -> np.ndarray:
+    """Pixels as DN on 0..255, checked."""
     white = full_scale or white_of(pixels.dtype, where)
     if pixels.dtype == np.uint8 and white == 255:
-        return pixels, True
+        return pixels
     if pixels.dtype == np.uint8 and white > 255:
         raise EvflowDataError("EV003", f"--full-scale {white:g} with 8-bit frames, which end at "
                               "255.", "Leave it out.", where=where)
     _check_finite(pixels, where)
     low, high = float(pixels.min()), float(pixels.max())
     floats = pixels.dtype == np.float32
-    meant = meaning(pixels) if (floats and full_scale is None and not bright) or low < 0 else None
-    if meant:
-        raise EvflowDataError("EV003", f"{where} spans {low:g}..{high:g}, with white at "
-                              f"{white:g}: {meant.what}?", meant.fix, where=where)
+    if low < 0 and (meant := meaning(pixels)):
+        raise misread(meant, where, pixels, white)
     if high > white * 1.001:
         likely = high if floats else likely_white(high)
         raise EvflowDataError(
             "EV003", f"{where} reaches {high:g}, beyond white at {white:g}.",
             f"Pass the value of white: --full-scale {likely:g} (full_scale=).",
             where=where)
-    return pixels.astype(np.float32) * np.float32(255 / white), bright or high > 0
+    return pixels.astype(np.float32) * np.float32(255 / white)
+
+
+def misread(meant: Meaning, where: str, pixels: np.ndarray, white: float) -> EvflowDataError:
+    """EV003 for values that are probably something else than DN."""
+    return EvflowDataError("EV003", f"{where} spans {pixels.min():g}..{pixels.max():g}, with white "
+                           f"at {white:g}: {meant.what}?", meant.fix, where=where)
 
 
 def _exponential(pixels: np.ndarray, where: str, full_scale: float | None) -> np.ndarray:

@@ -13,9 +13,9 @@ import pytest
 from helpers.recordings import SIZE, T0, equal, make, refused
 
 from evflow.errors import EvflowDataError
-from evflow.io import DsecWriter, read_events, read_recording, write_events
+from evflow.io import DsecWriter, read_events, read_recording, write_events, write_recording
 from evflow.io.decode.hdf5 import Disk
-from evflow.types import Events
+from evflow.types import Events, Recording
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 300])
@@ -53,6 +53,33 @@ def test_dsec_time_widens_past_71_minutes(tmp_path: Path, monkeypatch: pytest.Mo
         assert f["events/t"].dtype == np.int64
         assert sorted(f["events"]) == ["p", "t", "x", "y"]
         assert f["ms_to_idx"][-1] == 4
+
+
+def test_a_range_of_a_single_event(tmp_path: Path) -> None:
+    """Between neighbours as irregular as these, the range of smoothed times is empty."""
+    t = np.array([0, 1000, 1001, 1002, 9000, 9001, 20_000, 20_001, 20_002, 20_003])
+    events = Events(np.arange(10), np.arange(10), t, np.ones(10, bool), SIZE)
+    write_events(tmp_path / "a.h5", events)
+    for start in t.tolist()[1:]:
+        got = read_events(tmp_path / "a.h5", start_s=start / 1e6, stop_s=(start + 1) / 1e6)
+        assert got.t.tolist() == [start]
+    with pytest.raises(EvflowDataError, match="EV001"):
+        read_events(tmp_path / "a.h5", start_s=0.002, stop_s=0.008)
+
+
+@pytest.mark.parametrize("name", ["a.h5", "a.npz"])
+def test_frames_that_compress_well_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """They go to disk block by block; 64-fold is the limit of what is held in memory."""
+    recording = make(200)
+    frames = np.zeros((300, *SIZE[::-1]), np.uint8)
+    frames[:, 3, 5] = np.arange(300) % 256
+    times = recording.events.t[0] + 100 * np.arange(300)
+    write_recording(tmp_path / name, Recording(recording.events, frames, times))
+    monkeypatch.setattr("evflow.files.limits.FREE", 1 << 19)
+    monkeypatch.setattr("evflow.files.limits.RATIO", 4)
+    np.testing.assert_array_equal(read_recording(tmp_path / name).frames, frames)
 
 
 def test_dsec_writer_refuses_what_does_not_follow(tmp_path: Path) -> None:

@@ -76,6 +76,14 @@ def offset(f: Any) -> None:
     f["dvs/size"] = SIZE
 
 
+def offset_in_ns(f: Any) -> None:
+    """The offset has the unit of the times."""
+    group(f.create_group("dvs"), t=(EVENTS.t - EVENTS.t[0]) * 1000)
+    f["dvs/t"].attrs["unit"] = "ns"
+    f["dvs/t_offset"] = EVENTS.t[0] * 1000
+    f["dvs/size"] = SIZE
+
+
 def compound(f: Any) -> None:
     kind = [("t", "i8"), ("x", "u2"), ("y", "u2"), ("on", "?")]
     f["events"] = np.array(list(zip(EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p, strict=True)), kind)
@@ -102,8 +110,8 @@ def across(f: Any) -> None:
 
 
 LAYOUTS: dict[str, Callable[[Any], None]] = {make.__name__: make for make in (
-    rvt, m3ed, flat, words, nanoseconds, milliseconds, eventcv, eventcv_group, offset, compound,
-    matrix, xypt, across)}
+    rvt, m3ed, flat, words, nanoseconds, milliseconds, eventcv, eventcv_group, offset,
+    offset_in_ns, compound, matrix, xypt, across)}
 
 
 def write(folder: Path, kind: str) -> Path:

@@ -171,6 +171,10 @@ def test_what_the_messages_tell_to_do_gives_the_light(tmp_path: Path) -> None:
     assert len(simulate(KEY, black, milliseconds(4), CAMERA)) == 0
     late = np.concatenate([dark[:2], light[2:]])  # nor with a video that begins in the dark
     assert len(simulate(KEY, late, milliseconds(4), CAMERA)) > 0
+    seen = read(stack(tmp_path / "s", late), fps=1)[0]
+    np.testing.assert_allclose(seen, late)
+    assert "--full-scale" in message(  # but not after a hundred dark frames
+        lambda: read(stack(tmp_path / "s", np.concatenate([*[dark] * 25, light])), fps=1))
     assert "--response log" in message(  # bytes are no logarithms
         lambda: read(stack(tmp_path / "s", light.astype(np.uint8)), fps=1, response="log"))
     assert code_of(lambda: open_frames(tmp_path / "s.npy", fps=1, response="log2")) == "EV020"
