@@ -22,6 +22,7 @@ STEP = 1.03  # ratio of successive candidates
 ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # relative ranges with many, few intervals
 ENOUGH = 200  # intervals just above
 SHARP = 8.0  # ratio of densities above and below; a slow pixel's only double over this distance
+PIXELS = 20  # with intervals at the edge: a hot pixel may fire as regularly as a clock
 LATTICE = 20  # distinct intervals within an octave: coarse times have an edge at each step
 FEW_SHORTER = 0.05  # maximum share of shorter intervals: from noise that ignores the dead time
 
@@ -40,7 +41,9 @@ class DeadTime:
 
 def dead_time(events: Events) -> DeadTime:
     """The dead time of a stream's pixels, if at least ENOUGH intervals lie at its edge."""
-    intervals = np.sort(own_intervals(events))
+    intervals, pixel = own_intervals(events)
+    order = np.argsort(intervals, kind="stable")
+    intervals, pixel = intervals[order], pixel[order]
     edges = SHORTEST_US * STEP ** np.arange(int(np.log(LONGEST_US / SHORTEST_US) / np.log(STEP)))
 
     def between(low: float, high: float) -> np.ndarray:
@@ -52,17 +55,20 @@ def dead_time(events: Events) -> DeadTime:
     best = int(np.argmax(sharpness))
     if sharpness[best] < SHARP:
         return DeadTime()
-    near = intervals[slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.1])))]
+    at_edge = slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.1])))
+    near = intervals[at_edge]
     octave = intervals[slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.9])))]
     shorter = np.searchsorted(intervals, 0.95 * edges[best]) / len(intervals)
-    if len(np.unique(octave)) < LATTICE or shorter > FEW_SHORTER:
+    few_pixels = len(np.unique(pixel[at_edge])) < PIXELS
+    if len(np.unique(octave)) < LATTICE or shorter > FEW_SHORTER or few_pixels:
         return DeadTime()
     low, middle = np.quantile(near, [0.05, 0.5])
     return DeadTime(float(low) * 1e-6, float(max(middle - low, 0.02 * low)) * 1e-6)
 
 
-def own_intervals(events: Events) -> np.ndarray:
-    """(N,) int64, microseconds between successive events of a pixel, of either polarity."""
+def own_intervals(events: Events) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) int64, microseconds between successive events of a pixel, of either polarity; and (N,)
+    that pixel."""
     width, height = events.size
     # Every k-th pixel in a shuffled order: rows and columns of a sensor may differ.
     share = max(1, -(-len(events) // MOST_EVENTS))
@@ -75,11 +81,12 @@ def own_intervals(events: Events) -> np.ndarray:
         parts.append((pixel[kept], events.t[part][kept]))
         forget(events.x, events.y, events.t)
     if not parts:
-        return np.zeros(0, np.int64)
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     pixel, t = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(pixel, kind="stable")
     pixel, t = pixel[order], t[order]
-    return np.diff(t)[np.diff(pixel) == 0]
+    same = np.diff(pixel) == 0
+    return np.diff(t)[same], pixel[1:][same]
 
 
 def first_events(events: Events) -> Events:

@@ -22,6 +22,7 @@ from evflow.estimation.refine.chunk import without_evidence
 from evflow.estimation.refine.path import STEPS, of_place
 from evflow.network import api
 from evflow.process.memory import give_back
+from evflow.recordings.faulty_pixels import hot_in_stretch
 from evflow.recordings.windows import window_at
 from evflow.types import Window, release
 
@@ -108,9 +109,11 @@ def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
     chunk = make_chunk(*place, STEPS, seen_by, state.front_end.noise_dn, first=stretch.first,
                        film=state.front_end.films.pop(of_place(*place), None))
     kept = simulated_part(chunk, place, seen_by) if simulate else None
+    hot = hot_in_stretch(chunk.quiet, np.asarray(chunk.recorded.counts).sum((0, 1)),
+                         float(chunk.dt_s.sum()))
     added = State(state.params, state.front_end, evidence=chunk.evidence, quiet=chunk.quiet,
                   chunks=(without_evidence(kept),) if kept else (),
-                  parts=(drift.part(stretch.span_us, chunk.evidence),))
+                  parts=(drift.part(stretch.span_us, chunk.evidence.without(hot)),))
     del chunk  # a film of the whole sensor
     return state + added
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 HOT_FACTOR, HOT_EVENTS = 3.0, 3.0  # noise rates differ by some tens of per cent between pixels
+LEAST_HZ = 0.1  # noise rate that is taken where less was seen
 AROUND = 5  # pixels: side of the neighbourhood of a pixel
 PASSES = 10
 MOVING_FACTOR = 10.0  # edges and thresholds make neighbours differ more than noise rates do
@@ -70,6 +71,13 @@ def hot_pixels(
     comparable = _around(seconds_quiet) >= QUIET_NEAR * seconds_quiet
     return hot & ((usual <= _restless(rate_hz * seconds)) | stands_out
                   | (lasting & comparable & (at_rest | (fired >= MANY_FIRED))))
+
+
+def hot_in_stretch(quiet: np.ndarray, counts: np.ndarray, seconds: float) -> np.ndarray:
+    """`hot_pixels` of a short stretch by itself, whose noise rate is not yet known. Arguments as
+    there, of that stretch."""
+    rate_hz = float(quiet[0].sum()) / max(float(quiet[1].sum()), 1e-9)
+    return hot_pixels(quiet, max(rate_hz, LEAST_HZ), counts, seconds)
 
 
 def _restless(noise: Any) -> Any:

@@ -226,7 +226,7 @@ def _dead_time(events: Events, changes: np.ndarray, during: list[Events]) -> Dea
     if not found.measured or not len(smaller):
         return found
     waits = [own_intervals(Events.concatenate([
-        during[k] for k in np.flatnonzero(np.abs(sizes - size) < SAME)]))
+        during[k] for k in np.flatnonzero(np.abs(sizes - size) < SAME)]))[0]
         for size in (sizes.max(), smaller.max())]
     if not all(map(len, waits)):
         return found

@@ -14,6 +14,7 @@ import numpy as np
 from evflow.estimation.refine.path import STEPS, Film, Place, as_seen, interpolated
 from evflow.estimation.refine.pixels import PixelEvidence, evidence_of
 from evflow.estimation.refine.sightings import Sightings, no_sightings, sight
+from evflow.estimation.refine.still_noise import quiet_maps
 from evflow.estimation.refine.stretches import BAND, LARGE, PART, plan_chunks, plan_runs
 from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.files.spool import put_aside
@@ -25,7 +26,6 @@ from evflow.types import Events, Recording
 
 Box = tuple[slice, slice]
 WHOLE: Box = (slice(None), slice(None))
-QUIET = 0.05  # log units: below the thresholds of usable cameras
 DARK_DN = 15.0  # below it, half a DN of noise is .03 log units
 
 
@@ -37,8 +37,7 @@ class Chunk:
     bright: (H, W) bool, pixels whose frames are neither near black nor saturated;
     dt_s: (K,) interval lengths; motion_px: (K,) fast motion per interval;
     recorded: the events' Trace; evidence: about each pixel's thresholds;
-    quiet: (4, H, W) over intervals in which the pixel's path stays within QUIET and no frame is
-    saturated or black: events, seconds, number of intervals, number of intervals with events;
+    quiet: (4, H, W), `quiet_maps` of its intervals;
     sightings: the events beside the path; empty for large sensors until `simulated_part`;
     box: rows and columns of the sensor.
     """
@@ -162,7 +161,4 @@ def without_evidence(chunk: Chunk) -> Chunk:
 def _quiet(path: np.ndarray, trace: Trace, dt_s: np.ndarray, shown: np.ndarray) -> np.ndarray:
     steps = (len(path) - 1) // len(dt_s)
     inner = path[1:].reshape(len(dt_s), steps, *path.shape[1:])
-    still = (inner.max(1) - inner.min(1) < QUIET) & shown
-    events = np.asarray(trace.counts).sum(1) * still
-    return np.stack([events.sum(0), (dt_s[:, None, None] * still).sum(0), still.sum(0),
-                     (events > 0).sum(0)])
+    return quiet_maps(inner.max(1) - inner.min(1), np.asarray(trace.counts).sum(1), dt_s, shown)

@@ -6,11 +6,9 @@ it, so the regression's constant of a pixel differs before and after.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
-from evflow.estimation.refine.sightings import Sightings
+from evflow.estimation.refine.sightings import Sightings, those
 from evflow.recordings.bunches import Bunch
 
 Array = np.ndarray
@@ -34,8 +32,4 @@ def without_readouts(
     there = (((after >= found.begin_us) & (after < found.end_us))
              | ((before >= found.begin_us) & (before < found.end_us)))
     kept, disturbed = ~there, np.cumsum(there)
-    pixel = s.pixel[kept]
-    others = {name: getattr(s, name)[kept]
-              for name in ("number", "interval", "fraction", "on", "path")}
-    first = np.flatnonzero(np.diff(pixel, prepend=-1))
-    return dataclasses.replace(s, pixel=pixel, first=first, **others), disturbed[kept]
+    return those(s, kept), disturbed[kept]

@@ -82,6 +82,15 @@ def sight(
         flat[::steps], parts.max(1) - parts.min(1), everything.reshape(k + 1, -1), (height, width))
 
 
+def those(s: Sightings, kept: Array) -> Sightings:
+    """The sightings of some events only; kept: (N,) bool."""
+    pixel = s.pixel[kept]
+    others = {name: getattr(s, name)[kept]
+              for name in ("number", "interval", "fraction", "on", "path")}
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    return dataclasses.replace(s, pixel=pixel, first=first, **others)
+
+
 def no_sightings(seen: Array) -> Sightings:
     """Sightings without events and path. seen: (K + 1, H, W) bool."""
     none, shape = np.zeros(0, np.int64), seen.shape[1:]
