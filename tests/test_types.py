@@ -203,6 +203,16 @@ def test_full_scale_is_that_of_the_converter(dtype: Any, peak: int, full: int) -
     assert scaled[2, 3] == pytest.approx(peak * 255 / full, rel=1e-6)
 
 
+def test_parts_of_a_recording_keep_its_full_scale() -> None:
+    stack = np.zeros((2, 4, 6), np.uint16)
+    stack[1] = 4000
+    recording = Recording(events(), stack, [1, 2])
+    part = dataclasses.replace(recording, frames=stack[:1], frame_times=[1])
+    assert part.full_scale == 4095
+    assert Recording(events(), stack[:1], [1], full_scale=4095).full_scale == 4095
+    assert Recording(events(), stack, [1, 2], full_scale=1023).full_scale == 4095
+
+
 def test_recording_without_frames() -> None:
     recording = Recording.of_events(events())
     assert not recording.has_frames

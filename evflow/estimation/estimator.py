@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+import numpy as np
+
 from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent, covered_s
@@ -70,9 +72,11 @@ class CameraEstimator:
         self._measured = 0  # events of the busiest when the front end was measured
         self._notes: tuple[Note, ...] = ()
         self._size: tuple[int, int] | None = None
+        self._white = 0  # of uint16 frames
         self._stale_us: int | None = None  # time of the last piece's last frame, if that repeats
         self._seconds, self._left_s, self._apart = 0.0, 0.0, 1
         self._stretches, self._left = 0, 0
+        self._frames = 0  # used of earlier pieces, whose last is the next one's first
 
     def add(self, piece: Recording) -> int:
         """Read one more piece of the recording.
@@ -89,7 +93,8 @@ class CameraEstimator:
 
         Raises:
             EvflowDataError: EV011 (fewer than two frames), EV012 (frames and events do not
-                overlap), EV015 (another size), EV020 (not a `Recording`). Earlier pieces are kept.
+                overlap), EV003 (uint16 frames with a higher white than those before), EV015
+                (another size), EV020 (not a `Recording`). Earlier pieces are kept.
         """
         need(piece, Recording, "a piece", "For a path: evflow.read_recording(path).")
         if self._size not in (None, piece.events.size):
@@ -97,6 +102,7 @@ class CameraEstimator:
                                   f"{self._size}.", "Add pieces of one camera only.")
         if piece.has_frames and not len(piece.events):
             return 0
+        piece = self._as_bright(piece)
         stale_us, self._stale_us = self._stale_us, ends_stale(piece)
         if stale_us is not None and piece.has_frames and piece.frame_times[0] == stale_us:
             piece = dataclasses.replace(
@@ -107,7 +113,9 @@ class CameraEstimator:
         told = {note.code for note in self._notes}
         self._notes += tuple(n for n in piece.notes[len(given):] if n.code not in told)
         plan = plan_windows(piece, self._min_us)
-        self._notes = tuple(dict.fromkeys((*self._notes, *condensed(plan.skipped))))[:self.NOTES]
+        skipped = tuple(s.moved(self._frames) for s in plan.skipped)
+        self._frames += len(piece.frames) - 1
+        self._notes = tuple(dict.fromkeys((*self._notes, *condensed(skipped))))[:self.NOTES]
         stretches = cut(piece, plan, path=self._refine == "auto", first=self._size is None)
         self._size = piece.events.size
         self._stretches += len(stretches)
@@ -149,13 +157,28 @@ class CameraEstimator:
                         self._stretches - self._left, self._stretches, again=self._left > 0)
         return estimate(state, extent=extent, before=self._notes)
 
+    def _as_bright(self, piece: Recording) -> Recording:
+        """The piece with the white of those before; EV003 if it has a higher one."""
+        if piece.frames.dtype != np.uint16 or not piece.has_frames:
+            return piece
+        white = self._white or piece.full_scale
+        if piece.full_scale > white:
+            raise EvflowDataError(
+                "EV003", f"a piece whose frames are on 0..{piece.full_scale}, after pieces on "
+                f"0..{white}.", "A piece shows only how bright its own frames are: give all of "
+                f"them the camera's white, Recording(..., full_scale={piece.full_scale}).")
+        self._white = white
+        return dataclasses.replace(piece, full_scale=white)
+
     def _again(self, state: State) -> State:
         """The state, or where its front end is not that of the busiest stretches, a new one of the
         stretches that are kept."""
         self._measured = sum(map(_events, self._busiest))
         front_end = self._front_end(self._busiest)
         if agree(state.front_end, front_end):
-            return state
+            dead = front_end.dead if front_end.dead.measured else state.front_end.dead
+            return dataclasses.replace(
+                state, front_end=dataclasses.replace(state.front_end, dead=dead))
         kept = {id(s): s for s in (*state.read, *self._busiest)}
         stretches = tuple(sorted(kept.values(), key=lambda s: s.span_us))
         self._left = self._stretches - len(stretches)

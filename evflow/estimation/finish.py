@@ -16,7 +16,12 @@ from evflow.estimation import drift, maps
 from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.leak import Leak, measured_leak
-from evflow.estimation.one_polarity import no_more_than_all, undetermined, with_prior
+from evflow.estimation.one_polarity import (
+    no_more_than_all,
+    undetermined,
+    with_prior,
+    without_those,
+)
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
 from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
@@ -91,12 +96,13 @@ def estimate(
     assert state.stats is not None
     need_shown(state.n_events, state.n_shown)
     stage("refining")
-    front_end, stats = state.front_end, state.stats
-    n_events = state.n_events.astype(np.uint32)
+    front_end, n_events = state.front_end, state.n_events.astype(np.uint32)
     refined = refine(state)
     hot, dead, summary, std = refined.hot, refined.dead, refined.summary, refined.std
+    stats = without_those(state.stats, state.sent[:, hot].sum(1))
+    alone: tuple[str, ...] = ()
     if lacking := undetermined(stats, summary):
-        summary, std = with_prior(lacking, list(refined.chunks), summary, std)
+        summary, std, alone = with_prior(lacking, list(refined.chunks), summary, std)
     summary, std = no_more_than_all(stats, summary, std)
     stage("noise rates and maps")
     quiet = quiet_times(
@@ -114,12 +120,12 @@ def estimate(
     else:
         again = _counted(windows_of(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
-    camera, error = maps.with_rates(camera, error, sent, hot, summary, std)
+    camera, error, summary, std = maps.with_rates(camera, error, sent, hot, summary, std)
     extent, thirds = extent or EVERYTHING, drift.thirds(state.parts)
     return CameraEstimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
-        (*before, *camera_notes(stats, lacking, n_events, summary, hot, dead),
+        (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead),
          *receptor_notes(front_end.found, refined.optics, summary, std), *noise_notes(shot), *after,
          *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),

@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import numpy as np
+
 from evflow.estimation.dead_time import dead_time, first_events
 from evflow.estimation.finish import estimate
 from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
@@ -19,6 +21,7 @@ from evflow.estimation.refine.stretches import spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add
 from evflow.simulator.photoreceptor import IDEAL
+from evflow.types import Recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +42,13 @@ class FirstPart:
     state: State
     searched: tuple[Stretch, ...]
     rest: tuple[int, int]
+
+    def rest_of(self, recording: Recording) -> tuple[int, int]:
+        """(first, last) frame of the rest in the recording as it was handed in: frames may have
+        been left out of the one that was read."""
+        times = self.state.read[0].recording.frame_times[list(self.rest)]
+        first, last = np.searchsorted(recording.frame_times, times, side="left").tolist()
+        return first, min(last, len(recording.frame_times) - 1)
 
     def estimate(self) -> CameraEstimate:
         """The camera, estimated from the first part alone."""

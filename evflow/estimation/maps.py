@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -70,20 +71,25 @@ def by_regression(
 def with_rates(
     camera: Camera, std: Camera, quiet: np.ndarray, hot: np.ndarray, summary: Summary,
     summary_std: Summary,
-) -> tuple[Camera, Camera]:
+) -> tuple[Camera, Camera, Summary, Summary]:
     """The maps with each pixel's noise rates from its quiet time: a window contains too little
-    noise of a pixel for the network to improve on the camera's rate."""
+    noise of a pixel for the network to improve on the camera's rate. And the summary, in which the
+    camera's rates are those of the maps where noise follows the thresholds."""
     rates, errors = {}, {}
+    means: dict[str, Any] = {}
+    mean_errors: dict[str, Any] = {}
     law = threshold_law(quiet, np.stack([camera.theta_on, camera.theta_off]), hot)
     for p, (name, (events, seconds)) in enumerate(zip(("eta_on", "eta_off"), quiet, strict=True)):
         mean, error = (float(getattr(s, name)) for s in (summary, summary_std))
         error = error / mean
         if law is not None:
             mean, error = uneven_rate(events, seconds, mean, error, hot, law[p])
+            means[name], mean_errors[name] = jnp.float32(mean), jnp.float32(mean * error)
         rate, own = pixel_rates(events, seconds, mean, hot, 1.0 if law is None else law[p])
         rates[name] = jax.device_put(rate.astype(np.float32))
         errors[name] = jax.device_put(np.hypot(own, rate * error).astype(np.float32))
-    return dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors)
+    return (dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors),
+            dataclasses.replace(summary, **means), dataclasses.replace(summary_std, **mean_errors))
 
 
 def with_unquiet_error(

@@ -20,6 +20,13 @@ ALLOWED = 2.0  # the same, by which noise may exceed a polarity's events
 UNREFINED = (0.5, 1.0)  # relative errors of theta, eta from the network alone
 
 
+def without_those(stats: Stats, hot: np.ndarray) -> Stats:
+    """The statistics without the events (2,), ON and OFF, that hot pixels sent."""
+    left = {f"events_{name}": jnp.maximum(getattr(stats, f"events_{name}") - jnp.float32(n), 0.0)
+            for name, n in zip(POLARITIES, hot, strict=True)}
+    return dataclasses.replace(stats, **left) if hot.any() else stats
+
+
 def undetermined(stats: Stats, summary: Summary) -> tuple[str, ...]:
     """The polarities, "on" and "off", with no more events than noise explains."""
     found = []
@@ -46,25 +53,27 @@ def no_more_than_all(stats: Stats, summary: Summary, std: Summary) -> tuple[Summ
 
 def with_prior(
     names: tuple[str, ...], chunks: list[Chunk], summary: Summary, std: Summary
-) -> tuple[Summary, Summary]:
+) -> tuple[Summary, Summary, tuple[str, ...]]:
     """The summary and its std with the prior's thresholds for undetermined polarities. Re-estimates
     the other polarity by itself, unless a high threshold in the summary already explains the
-    missing events."""
+    missing events. Also returns the polarities that were re-estimated."""
     known = {f"theta_{n}": _theta_prior() for n in names}
+    alone: list[str] = []
     for side, name in enumerate(POLARITIES):
         if name in names or (chunks and high_threshold_explains(chunks, summary, std, side)):
             continue
         theta, eta = (float(getattr(summary, f"{p}_{name}")) for p in ("theta", "eta"))
         if chunks:
-            *alone, noise = refine_alone(
+            theta, error, noise = refine_alone(
                 chunks, *_changed(summary, std, known), side, _theta_prior())
-            known[f"theta_{name}"] = alone[0], alone[1]
+            known[f"theta_{name}"] = theta, error
+            alone.append(name)
             if not noise:
                 known[f"eta_{name}"] = _eta_prior()
         else:
             known[f"theta_{name}"] = theta, UNREFINED[0] * theta
             known[f"eta_{name}"] = eta, UNREFINED[1] * eta
-    return _changed(summary, std, known)
+    return *_changed(summary, std, known), tuple(alone)
 
 
 def _theta_prior() -> tuple[float, float]:

@@ -71,7 +71,7 @@ def pool_recording(
         stats = window_stats(params, window)
         counts, shown = window_counts(window)
         total = stats if total is None else total + stats
-        n_events, n_shown = n_events + counts, n_shown + shown
+        n_events, n_shown = n_events + counts.sum(0), n_shown + shown
     assert total is not None  # iter_windows raises EV017 rather than yield nothing
     need_shown(n_events, n_shown)
     return total, n_events.astype(np.uint32)
@@ -86,9 +86,9 @@ def need_shown(n_events: np.ndarray, n_shown: np.ndarray) -> None:
 
 
 def window_counts(window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """All events (H, W) of a window, and those that its frames show."""
-    counts = window.events.count_map().sum(0).astype(np.uint32)
-    return counts, counts * exposed(window.frame0, window.frame1)
+    """All events (2, H, W) of a window, ON and OFF, and those (H, W) that its frames show."""
+    counts = window.events.count_map().astype(np.uint32)
+    return counts, counts.sum(0, dtype=np.uint32) * exposed(window.frame0, window.frame1)
 
 
 def window_stats(

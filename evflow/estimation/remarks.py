@@ -18,9 +18,11 @@ FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
 
 def camera_notes(
-    stats: Stats, undetermined: tuple[str, ...], n_events: np.ndarray, summary: Summary,
-    hot: np.ndarray, dead: np.ndarray,
+    stats: Stats, undetermined: tuple[str, ...], alone: tuple[str, ...], n_events: np.ndarray,
+    summary: Summary, hot: np.ndarray, dead: np.ndarray,
 ) -> list[Note]:
+    """Notes on pixels and thresholds. stats: without the events of hot pixels; undetermined, alone:
+    polarities without a threshold, and measured by themselves."""
     found = _faulty(
         "hot", hot, "they fire while nothing moves and were left out of the refinement.")
     found += dead_notes(dead)
@@ -30,8 +32,9 @@ def camera_notes(
         if name in undetermined:
             found.append(Note(
                 f"theta_{name}.undetermined", f"only {int(events)} {name.upper()} events, no more "
-                f"than noise: theta_{name} is undetermined and has the prior's value; the other "
-                "threshold was measured by itself, less precisely."))
+                f"than noise: theta_{name} is undetermined and has the prior's value"
+                + "".join(f"; theta_{other} was measured by itself, less precisely"
+                          for other in alone) + "."))
         elif float(events) < FEW_EVENTS:
             found.append(Note(
                 f"theta_{name}.uncertain",

@@ -32,14 +32,15 @@ Advance = Callable[[], None]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """params: of the network. stats, n_events, n_shown (H, W), evidence, quiet (4, H, W): sums over
-    all that was read; chunks: stretches to simulate; read: stretches whose quiet time is counted at
-    the end; windows, seconds: amounts read; parts: of each stretch, what drift.py compares."""
+    """params: of the network. stats, sent (2, H, W), n_shown (H, W), evidence, quiet (4, H, W):
+    sums over all that was read; chunks: stretches to simulate; read: stretches whose quiet time is
+    counted at the end; windows, seconds: amounts read; parts: of each stretch, what drift.py
+    compares."""
 
     params: api.Params
     front_end: FrontEnd
     stats: api.Stats | None = None
-    n_events: Array = dataclasses.field(default_factory=lambda: np.zeros(()))
+    sent: Array = dataclasses.field(default_factory=lambda: np.zeros((2, 1, 1)))
     n_shown: Array = dataclasses.field(default_factory=lambda: np.zeros(()))
     evidence: PixelEvidence | None = None
     quiet: Array | None = None
@@ -48,6 +49,11 @@ class State:
     windows: int = 0
     seconds: float = 0.0
     parts: tuple[drift.Part, ...] = ()
+
+    @property
+    def n_events(self) -> Array:
+        """(H, W) events of both polarities."""
+        return np.asarray(self.sent.sum(0))
 
     def __add__(self, more: State) -> State:
         """The sum of this and of what was read after it, with the same front end."""
@@ -81,17 +87,17 @@ def read_stretch(
         advance: called after every window, and after the stretch.
     """
     give_back()
-    stats, n_events, n_shown = None, np.zeros(()), np.zeros(())
+    stats, sent, n_shown = None, np.zeros((2, 1, 1)), np.zeros(())
     for number, window in enumerate(windows_of([stretch])):
         if number % every == 0:
             front_end = state.front_end
             more = window_stats(state.params, window, front_end.seen_by, front_end.silent)
             stats = more if stats is None else stats + more
         counts, shown = window_counts(window)
-        n_events, n_shown = n_events + counts, n_shown + shown
+        sent, n_shown = sent + counts, n_shown + shown
         advance()
     read = State(
-        state.params, state.front_end, stats, n_events, n_shown, read=(stretch,),
+        state.params, state.front_end, stats, sent, n_shown, read=(stretch,),
         windows=len(stretch.windows), seconds=1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
     if not stretch.run:
         return read

@@ -53,7 +53,7 @@ def estimate_unpooled(
         total += np.where(shown, values, 0.0)
         times += shown
         counts, seen = window_counts(window)
-        n_events, n_shown, count = n_events + counts, n_shown + seen, count + 1
+        n_events, n_shown, count = n_events + counts.sum(0, np.uint32), n_shown + seen, count + 1
         advance()
     need_shown(n_events, n_shown)
     maps, below = _within(total, times)

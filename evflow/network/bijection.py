@@ -125,15 +125,15 @@ def seen_code(code: Code, sensor: SensorModel | None, optics: Optics | None) -> 
     """The code of the light as the pixels see it. EV020 if that depends on an intensity that is
     unknown; if it is unknown at some pixels, 55 DN is assumed there."""
     seen_by = photoreceptor(sensor, optics)
-    if seen_by.ideal:
+    if seen_by.ideal and not seen_by.logarithmic:
         return code
     window_s, intensity = pooling.given_features(code.context)
     traced = isinstance(code.context, jax.core.Tracer)
     if not traced and not np.asarray(code.context)[..., 2].any():
         raise EvflowDataError(
-            "EV020", "a slow pixel, or one that sees additional light, but no intensity.",
-            "The speed of its low-pass depends on the light: pass intensity to code_from_video, "
-            "the mean lin-log of the frames.")
+            "EV020", "a slow pixel, one that sees additional light, or one that is logarithmic in "
+            "dark light too, but no intensity.", "What it sees depends on the light: pass "
+            "intensity to code_from_video, the mean lin-log of the frames.")
     rise, fall = jnp.split(code.changes, 2, -1)
     changes, intensity = seen_changes(seen_by, rise - fall, intensity, window_s)
     known = code.context[..., 2]

@@ -1,5 +1,5 @@
-"""Regions of a sensor: events and frames within a rectangle of pixels, and bands of rows for large
-sensors."""
+"""Regions of a sensor: events and frames within a rectangle of pixels, bands of rows for large
+sensors, and the events of all but some pixels."""
 
 from __future__ import annotations
 
@@ -28,6 +28,15 @@ def inside(events: Events, rows: slice, columns: slice) -> Events:
         kept &= (events.x >= x) & (events.x < columns.stop)
     return Events.unchecked(events.x[kept] - np.uint16(x), events.y[kept] - np.uint16(y),
                             events.t[kept], events.p[kept], (columns.stop - x, rows.stop - y))
+
+
+def outside(events: Events, pixels: np.ndarray) -> Events:
+    """The events of other pixels than these, (H, W) bool."""
+    if not pixels.any():
+        return events
+    kept = ~pixels[events.y, events.x]
+    return Events.unchecked(events.x[kept], events.y[kept], events.t[kept], events.p[kept],
+                            events.size)
 
 
 def rows_of(window: Window, rows: slice) -> Window:

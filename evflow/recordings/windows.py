@@ -48,6 +48,10 @@ class Skipped:
     def frames(self) -> str:
         return f"frames {self.first}-{self.last}"
 
+    def moved(self, frames: int) -> Skipped:
+        """The same, of a recording that begins with so many frames more."""
+        return Skipped(self.first + frames, self.last + frames, self.why)
+
 
 @dataclasses.dataclass(frozen=True)
 class WindowPlan:

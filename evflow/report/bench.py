@@ -157,9 +157,14 @@ def _from(found: CameraEstimate) -> str:
 
 def _thetas(found: CameraEstimate) -> bench_figures.Sides:
     """Thresholds of the pixels that were measured individually."""
-    used = found.valid if found.valid.any() else ~found.hot
+    used = _used(found)
     return {side: np.asarray(getattr(found.camera, f"theta_{side}"))[used]
             for side in ("on", "off") if known(found, side) and used.any()}
+
+
+def _used(found: CameraEstimate) -> np.ndarray:
+    """(H, W) bool: pixels that were measured individually; if none was, all but hot ones."""
+    return found.valid if found.valid.any() else ~found.hot
 
 
 def _contrast(found: CameraEstimate, thetas: bench_figures.Sides) -> Panel:
@@ -172,9 +177,8 @@ def _contrast(found: CameraEstimate, thetas: bench_figures.Sides) -> Panel:
                     "half of them.")]
     rows = [[side.upper(), *(number(float(bench_figures.contrast(np.quantile(theta, q))), 3)
                              for q in (0.1, 0.5, 0.9)),
-             number(float(np.median(np.asarray(getattr(found.std, f"theta_{side}"))
-                                    * np.exp(np.asarray(getattr(found.camera, f"theta_{side}"))))
-                          * 100), 2)]
+             number(float(np.median(np.asarray(getattr(found.std, f"theta_{side}"))[_used(found)]
+                                    * np.exp(theta))) * 100, 2)]
             for side, theta in thetas.items()]
     return Panel("contrast", "Contrast thresholds and S-curves", grid(drawn, 22) + table(
         ["contrast in %", "a tenth of the pixels respond", "half", "nine tenths",

@@ -50,16 +50,15 @@ from evflow.report.streams import (
     verdict_rows,
 )
 from evflow.report.verdict import (
-    GRADES,
     HEADLINES,
     RULE,
     Judged,
     advice,
     judge_estimate,
     known,
+    overall,
     poorer,
     sentences,
-    worst,
 )
 from evflow.types import Recording
 
@@ -150,8 +149,9 @@ def write_report(
         panels.insert(-1, others.simulators_panel(tried, why_not))
         rivals = {"simulators": others.as_dicts(tried), "nearest": others.verdict(tried, why_not)}
     step()
-    numbers = {"grade": worst(judged), "verdict": sentences(judged),
-               "trial": _numbers(evidence.trial), "held_out": _numbers(evidence.held), **rivals}
+    numbers = {"grade": overall(judged, tested=evidence.trial is not None),
+               "verdict": sentences(judged), "trial": _numbers(evidence.trial),
+               "held_out": _numbers(evidence.held), **rivals}
     name = Path(source).name if source else "an event camera"
     page.write_page(path, f"Camera report: {name}", repr(recording), panels, numbers,
                     overwrite=overwrite)
@@ -193,7 +193,7 @@ def _numbers(trial: Trial | None) -> dict[str, Any] | None:
 
 
 def _verdict(found: CameraEstimate, evidence: Evidence, judged: list[Judged]) -> Panel:
-    grade = worst(judged)
+    grade = overall(judged, tested=evidence.trial is not None)
     if evidence.trial:
         worse = poorer(judged)
         gravest = max((j for j in judged if j.about == worse), key=lambda j: j.badness)
@@ -203,7 +203,6 @@ def _verdict(found: CameraEstimate, evidence: Evidence, judged: list[Judged]) ->
         headline = ("Measured, but not tested." if known(found, "on")
                     and known(found, "off") else "Not all of the camera is known.")
         tail = f"The estimate could not be tested: {evidence.why_not}"
-        grade = max(grade, "fair", key=GRADES.index)
     body = (f'<div class="verdict {grade}"><strong class="grade">{headline}</strong>'
             f"{paragraph(f'{_measured(found)} {tail}')}</div>" + verdict_rows(judged)
             + "<h3>What to do</h3>" + bullets(advice(judged) or [

@@ -69,10 +69,10 @@ def histogram(values: np.ndarray, summary: float, colour: Any, unit: str) -> byt
     return svg(draw, 3.0, 1.5, (0.1, 0.1, 0.45, 0.06))
 
 
-def explained(curve: np.ndarray, ideal: float, found_hz: float) -> bytes:
+def explained(curve: np.ndarray, ideal: float, found_hz: float, where: str) -> bytes:
     """Share of the brightness that events explain, over the cutoff: curve (K, 2) of cutoff in Hz
     (inf at the right edge) and share; ideal: for an ideal pixel and ideal frames, dashed; found_hz:
-    the measured cutoff, 0 for none."""
+    the measured cutoff, 0 for none; where: the light for which it holds."""
     def draw(axis: Any) -> None:
         finite = curve[np.isfinite(curve[:, 0])]
         edge = 3.0 * finite[:, 0].max()
@@ -84,7 +84,7 @@ def explained(curve: np.ndarray, ideal: float, found_hz: float) -> bytes:
         ticks = [20, 50, 100, 200, 500, edge]
         axis.set_xticks(ticks, [*(str(t) for t in ticks[:-1]), "none"], minor=False)
         axis.set_xticks([], minor=True)
-        axis.set_xlabel("cutoff of the photoreceptor [Hz at 255 DN]")
+        axis.set_xlabel(f"cutoff of the photoreceptor [Hz {where}]")
         axis.set_ylabel("share explained")
 
     return svg(draw, 3.6, 2.2)

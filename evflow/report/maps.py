@@ -21,7 +21,7 @@ LISTED = 60  # faulty pixels that are listed, the rest are in camera.json
 def map_panel(found: CameraEstimate) -> Panel:
     """Four maps, their std, their distribution."""
     pale = ("Pale pixels have no events of their own (fewer than three in the windows used) and "
-            "show the camera's summary." if found.valid.any() else "")
+            "show the camera's summary, or are hot." if found.valid.any() else "")
     body = paragraph(
         "Thresholds θ in natural-log units of brightness, noise rates η in Hz per pixel, each "
         "above its standard deviation. Colours span the central 98 % of a map's pixels, "

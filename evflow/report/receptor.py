@@ -18,11 +18,11 @@ def receptor_panel(found: CameraEstimate, held_out_shares: tuple[float, float] |
         return Panel("receptor", TITLE, paragraph(
             "Absent: not measured, or too little happens to measure it.", "note"))
     sensor, std, optics = found.sensor, found.sensor_std, found.optics
+    where = "at 255 DN" if receptor.seen.by_light else "in any light"
     drawn = page.drawing(
-        figures.explained(receptor.curve, receptor.explained[0], sensor.cutoff_hz),
+        figures.explained(receptor.curve, receptor.explained[0], sensor.cutoff_hz, where),
         "share explained over the cutoff")
     fast = f"above {receptor.least_cutoff_hz:.0f}"
-    where = "at 255 DN" if sensor.cutoff_by_light else "in any light"
     rows = [[f"cutoff [Hz {where}]", spread(sensor.cutoff_hz, std["cutoff_hz"])
              if sensor.cutoff_hz else fast],
             ["light added [DN]", spread(optics.offset_dn, optics.offset_dn_std)],
@@ -32,7 +32,7 @@ def receptor_panel(found: CameraEstimate, held_out_shares: tuple[float, float] |
             *([f"{label} [Hz per pixel]", spread(value, std[name]) if value else "not separated"]
               for label, name, value in (("leak", "leak_hz", sensor.leak_hz),
                                          ("shot noise in the dark", "shot_hz", sensor.shot_hz)))]
-    shares = [["all that was read", *(number(v, 3) for v in receptor.explained)]]
+    shares = [["pixels that were searched", *(number(v, 3) for v in receptor.explained)]]
     if held_out_shares is not None:
         shares.append(["second half, by the first", *(number(v, 3) for v in held_out_shares)])
     conclusion = ("The estimate assumes pixels with these constants." if receptor.needed else

@@ -26,6 +26,7 @@ from evflow.metrics.streams import compare, correlations
 from evflow.notes import Note
 from evflow.process.memory import give_back
 from evflow.recordings.bunches import beside, bunch
+from evflow.recordings.region import outside
 from evflow.recordings.windows import plan_windows
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, Seen, notes_on, unzip, upsample
@@ -142,19 +143,22 @@ def resimulate(
     pictures: Pictures | None = None,
 ) -> Trial:
     """Simulate the frames of `run` twice, interpolated by `upsample` and seen by the measured
-    camera, and compare, without the bunches of events at frames, which no simulation makes.
+    camera, and compare, without hot pixels, whose rates alone would agree anywhere, and without the
+    bunches of events at frames, which no simulation makes.
     pictures: of the recording, if another part of it is simulated as well."""
     pictures = pictures or Pictures(recording)
     seen_by, model = as_measured(found.sensor, found.optics)
     streams = [
-        simulate_stream(key, *unzip(shown), found.camera, model=model) for key, shown in zip(
+        simulate_stream(key, *unzip(shown), found.camera, model=model, full_scale=255)
+        for key, shown in zip(
             jax.random.split(jax.random.key(seed)),
             itertools.tee(seen_frames(pictures.of(run), seen_by)), strict=True)]
     parts = list(zip(*streams, strict=True))  # in parallel, so that few frames are buffered
     begin = run[0] + 1 if run[1] - run[0] >= SETTLING else run[0]
     span = (int(recording.frame_times[begin]), int(recording.frame_times[run[1]]))
-    made, again = (Events.concatenate(p).slice(*span) for p in zip(*parts, strict=True))
-    real = recording.events.slice(*span)
+    made, again = (outside(Events.concatenate(p).slice(*span), found.hot)
+                   for p in zip(*parts, strict=True))
+    real = outside(recording.events.slice(*span), found.hot)
     disturbed = bunch(recording)
     if disturbed is not None:
         real, made, again = (beside(e, recording.frame_times, disturbed)
@@ -189,7 +193,7 @@ def held_out(
     there. first: what an estimate computed; without it, the first part is the last LEARNT_SECONDS
     of the first half of the longest run. Raises EV017 if a half is too short to estimate from."""
     if first is not None:
-        found, rest = first.estimate(), first.rest
+        found, rest = first.estimate(), first.rest_of(recording)
     else:
         half, rest = _halved(recording, runs)
         found = estimate_camera(half, params, min_window_us=min_window_us)

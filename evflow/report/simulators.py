@@ -26,6 +26,7 @@ from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.result import CameraEstimate
 from evflow.metrics.space_time import space_time_r
 from evflow.metrics.streams import compare
+from evflow.recordings.region import outside
 from evflow.recordings.windows import iter_windows
 from evflow.report.page import Panel, number, paragraph, table
 from evflow.report.resimulate import LEARNT_SECONDS, Trial, usable_runs
@@ -63,15 +64,17 @@ class Tried:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Film:
     """Frames (T, H, W) in DN, interpolated by optical flow, at times_us (T,); real: what was
-    recorded in that span, which begins a frame later if there is room."""
+    recorded in that span, which begins a frame later if there is room; hot: (H, W) bool, pixels
+    whose events are left out, here and of simulations."""
 
     frames: Array
     times_us: Array
     real: Events
     span_us: tuple[int, int]
+    hot: Array
 
     @staticmethod
-    def of(recording: Recording, run: Run, most: int) -> Film:
+    def of(recording: Recording, run: Run, most: int, hot: Array) -> Film:
         """The busiest frame intervals of a run, at most `most`."""
         times = recording.frame_times
         before = np.searchsorted(recording.events.t, times)
@@ -83,7 +86,7 @@ class Film:
             *upsample(pairs, exposure_us=recording.exposure_us), strict=True)
         span = int(times[first + (n > 1)]), int(times[first + n])
         return Film(np.stack([np.asarray(f, np.float32) for f in frames]), np.array(instants),
-                    recording.events.slice(*span), span)
+                    outside(recording.events.slice(*span), hot), span, hot)
 
     def simulated(
         self, key: jax.Array, camera: Camera, model: SensorModel, seen_by: Photoreceptor = IDEAL
@@ -99,8 +102,8 @@ class Film:
         both = np.asarray(camera.theta_on) + np.asarray(camera.theta_off)
         memory = np.exp(np.asarray(camera.theta_off) - share * both)
         video[0] = np.clip((video[0] + added) * memory - added, 0.0, 255.0)
-        events = simulate(k_events, video, np.array(times), camera, model=model)
-        return events.slice(*self.span_us)
+        events = simulate(k_events, video, np.array(times), camera, model=model, full_scale=255)
+        return outside(events.slice(*self.span_us), self.hot)
 
 
 def which_simulator(
@@ -111,7 +114,8 @@ def which_simulator(
     run = tuple(range(*first))
     data = receptor_sample([(recording, run[k:k + INTERVALS])
                             for k in range(0, len(run), INTERVALS)])
-    learnt, tried = Film.of(recording, first, LEARNT), Film.of(recording, second, TRIED)
+    learnt, tried = (Film.of(recording, run, most, found.hot)
+                     for run, most in ((first, LEARNT), (second, TRIED)))
     if data is None or not len(learnt.real) or not len(tried.real):
         raise EvflowDataError("EV017", "too little happens to distinguish simulators.",
                               "Record more motion.")
@@ -187,8 +191,10 @@ def _constants(found: CameraEstimate, scale: Array) -> dict[str, float]:
 def quiet_light(recording: Recording, run: Run, found: CameraEstimate) -> Array:
     """(2, 3, LIGHTS), of `by_light`, of the windows between the frames of a run."""
     begin, end = (int(recording.frame_times[i]) for i in run)
-    part = Recording(recording.events.slice(begin, end), recording.frames[run[0]:run[1] + 1],
-                     recording.frame_times[run[0]:run[1] + 1])
+    part = dataclasses.replace(
+        recording, events=recording.events.slice(begin, end), notes=(),
+        frames=recording.frames[run[0]:run[1] + 1],
+        frame_times=recording.frame_times[run[0]:run[1] + 1])
     return quiet_times(iter_windows(part), found.summary, found.hot, IDEAL).light
 
 

@@ -71,6 +71,12 @@ def worst(judged: list[Judged]) -> Grade:
     return max((j.grade for j in judged), key=GRADES.index, default="good")
 
 
+def overall(judged: list[Judged], *, tested: bool) -> Grade:
+    """The worst grade; "fair" at best where the estimate could not be tested."""
+    grade = worst(judged)
+    return grade if tested or grade != "good" else "fair"
+
+
 def poorer(judged: list[Judged]) -> str:
     """"ON" or "OFF", whichever is the further from ideal."""
     return max(("ON", "OFF"), key=lambda p: sum(j.badness for j in judged if j.about == p))

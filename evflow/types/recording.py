@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 
@@ -27,6 +26,10 @@ class Recording:
             as int64.
         notes: what a reader assumed, left out or converted.
         exposure_us: exposure time of the frames, the median if it changes; 0 if it is unknown.
+        full_scale: the DN of a saturated pixel. Of uint8 and float32 frames it is 255; of uint16
+            ones the maximum of the smallest converter (8, 10, 12, 14 or 16 bits: 255, 1023, 4095,
+            16383, 65535) that covers all frames, unless a higher one is given. A part of a
+            recording made by `dataclasses.replace` keeps it.
 
     Raises:
         EvflowDataError: EV002 (shape, or colour), EV003 (dtype, or range of float frames), EV004
@@ -44,6 +47,7 @@ class Recording:
     frame_times: np.ndarray
     notes: tuple[Note, ...] = ()
     exposure_us: int = 0
+    full_scale: int = 0
 
     def __post_init__(self) -> None:
         need(self.events, Events, "events", "For a path: evflow.read_recording(path).")
@@ -58,6 +62,7 @@ class Recording:
         for note in self.notes:
             need(note, Note, "a note", "For a sentence: evflow.notes.Note(code, sentence).")
         object.__setattr__(self, "exposure_us", check_exposure(self.exposure_us))
+        object.__setattr__(self, "full_scale", _white(frames, self.full_scale))
         object.__setattr__(self, "frames", read_only(frames))
         object.__setattr__(self, "frame_times", read_only(times))
 
@@ -94,16 +99,6 @@ class Recording:
         """Whether there is at least one frame."""
         return len(self.frames) > 0
 
-    @functools.cached_property
-    def full_scale(self) -> int:
-        """The DN of a saturated pixel: 255 for uint8 and, by convention, float32; for uint16 the
-        maximum of the smallest converter (8, 10, 12, 14 or 16 bits: 255, 1023, 4095, 16383, 65535)
-        that covers all frames."""
-        if self.frames.dtype != np.uint16 or not self.has_frames:
-            return 255
-        peak = int(self.frames.max())
-        return next(2**bits - 1 for bits in BIT_DEPTHS if peak < 2**bits)
-
     def frame_dn(self, index: int) -> np.ndarray:
         """One frame on the common scale.
 
@@ -114,6 +109,14 @@ class Recording:
             float32 (H, W), scaled so that `full_scale` is 255 DN.
         """
         return self.frames[index].astype(np.float32) * np.float32(255 / self.full_scale)
+
+
+def _white(frames: np.ndarray, given: int) -> int:
+    """The DN of a saturated pixel of frames (T, H, W): that of a converter, or a higher given one."""
+    if frames.dtype != np.uint16 or not len(frames):
+        return 255
+    peak = max(int(frame.max(initial=0)) for frame in frames)  # one by one: they may be mapped
+    return max(given, next(2**bits - 1 for bits in BIT_DEPTHS if peak < 2**bits))
 
 
 def release(recording: Recording) -> None:

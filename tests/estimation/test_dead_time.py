@@ -61,6 +61,13 @@ def test_without_an_edge_nothing_is_said(intervals: np.ndarray) -> None:
     assert np.isnan(found.std_s)
 
 
+def test_a_hot_pixel_that_fires_like_a_clock_is_no_dead_time() -> None:
+    """Neither are a few of them."""
+    whole = np.random.default_rng(3).exponential(40_000.0, (PIXELS, EACH))
+    whole[:8] = np.random.default_rng(4).uniform(2000.0, 2100.0, (8, EACH))
+    assert not dead_time(stream(whole)).measured
+
+
 def test_intervals_are_a_pixel_s_own() -> None:
     events = Events(np.array([1, 2, 1, 1]), np.zeros(4, int), np.array([0, 5, 30, 100]),
                     np.array([1, 0, 1, 0], bool), (4, 2))

@@ -63,6 +63,36 @@ def test_of_dense_frames_pieces_use_every_nth(monkeypatch: pytest.MonkeyPatch) -
     assert [n.code for n in estimator._notes].count("frames.dense") == 1
 
 
+def test_pieces_have_one_white() -> None:
+    """A dark piece of a 12-bit camera does not show its white; a brighter one after it is refused,
+    as what was read before would be too bright."""
+    recording, _ = hidden(3)
+    deep = dataclasses.replace(recording, frames=recording.frames.astype(np.uint16) * 16)
+    dark = dataclasses.replace(deep, frames=deep.frames // 8, full_scale=0)
+    assert (deep.full_scale, dark.full_scale) == (4095, 1023)
+    estimator = CameraEstimator()
+    estimator.add(deep)
+    estimator.add(dark)
+    assert estimator._busiest[-1].recording.full_scale == 4095
+    other = CameraEstimator()
+    other.add(dark)
+    with pytest.raises(EvflowDataError, match=r"full_scale=4095"):
+        other.add(deep)
+    other.add(dataclasses.replace(dark, full_scale=1023))
+
+
+def test_windows_left_out_are_told_by_the_recording_s_frames() -> None:
+    recording, _ = hidden(3)
+    frames = recording.frames.copy()
+    frames[5] = 255 - frames[5]  # a glitch
+    estimator = CameraEstimator()
+    for first in (0, 3):
+        estimator.add(piece(dataclasses.replace(recording, frames=frames), first, first + 3))
+    told = [n.text for n in estimator._notes if n.code == "windows.skipped"]
+    assert told
+    assert "frames 4-5" in told[0]
+
+
 def test_a_repeated_last_frame_does_not_begin_the_next_piece() -> None:
     """Its time is not that of its content: with it, a threshold was a fifth too high here."""
     recording, camera = hidden(1, 1000)

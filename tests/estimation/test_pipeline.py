@@ -157,6 +157,21 @@ def test_polarity_without_events_is_said_to_be_undetermined(
     assert float(found.summary_std.eta_off) <= float(found.summary.eta_off)
 
 
+def test_a_hot_pixel_does_not_determine_a_threshold(watched: tuple[Recording, Camera]) -> None:
+    """OFF is switched off, but one pixel sends OFF events at rest."""
+    events = watched[0].events
+    on = events.p
+    t = np.arange(int(events.t[0]), int(events.t[-1]), 2000)
+    columns = [np.concatenate([getattr(events, name)[on], more]) for name, more in (
+        ("x", np.full(len(t), 7)), ("y", np.full(len(t), 9)), ("t", t), ("p", t < 0))]
+    order = np.argsort(columns[2], kind="stable")
+    hot = Events(*(column[order] for column in columns), events.size)
+    found = estimate_camera(dataclasses.replace(watched[0], events=hot))
+    assert found.hot[9, 7]
+    assert found.undetermined == ("theta_off",)
+    assert any("theta_on was measured by itself" in note.text for note in found.notes)
+
+
 def test_a_dead_pixel_is_listed(watched: tuple[Recording, Camera]) -> None:
     events = watched[0].events
     around = ndimage.median_filter(events.count_map().sum(0), 5)

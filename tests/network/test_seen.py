@@ -108,6 +108,18 @@ def test_ideal_pixels_change_nothing() -> None:
         api.generate(params, KEY, CAMERA, code, sensor=SensorModel(), optics=Optics()))
 
 
+def test_a_logarithm_in_dark_light_alone_is_seen() -> None:
+    """As by a pixel so fast that its low-pass changes nothing."""
+    params, (changes, intensity) = small_params(), light(pattern())
+    dark = intensity - 2.0
+    alone, fast = (api.code_from_video(
+        params, changes, CAMERA, intensity=dark, sensor=SensorModel(log_map="log_eps", cutoff_hz=hz)
+    ).changes for hz in (0.0, 1e6))
+    lin_log = api.code_from_video(params, changes, CAMERA, intensity=dark).changes
+    np.testing.assert_allclose(alone, fast, atol=2e-3)
+    assert float(jnp.abs(alone - lin_log).max()) > 0.01
+
+
 def test_brightness_must_be_known() -> None:
     params, (changes, intensity) = small_params(), light(pattern())
     unlit = api.code_from_video(params, changes, CAMERA)

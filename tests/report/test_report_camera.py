@@ -31,7 +31,7 @@ from evflow.recordings.bunches import Bunch
 from evflow.report import camera, page, plots, resimulate
 from evflow.report.extent import extent_panel
 from evflow.report.resimulate import busiest, usable_runs
-from evflow.report.verdict import judge_estimate, judge_stream, known, poorer, worst
+from evflow.report.verdict import judge_estimate, judge_stream, known, overall, poorer, worst
 
 PANELS = ("verdict", "maps", "on-off", "rates", "images", "counts", "intervals", "receptor",
           "faults", "extent", "held-out", "assumptions")
@@ -284,6 +284,24 @@ def test_motion_that_is_lost_comes_before_all_other_reasons() -> None:
                   for gone in (False, True))
     assert "clocks" in clocked
     assert "higher frame rate, comes first" in lost
+
+
+def test_what_could_not_be_tested_is_fair_at_best() -> None:
+    assert [overall([], tested=tested) for tested in (True, False)] == ["good", "fair"]
+
+
+def test_hot_pixels_are_not_compared(measured: tuple[CameraEstimate, Recording]) -> None:
+    """Their own rates agree wherever the frames are: r of counts would be theirs."""
+    found, recording = measured
+    hot = np.zeros_like(found.hot)
+    hot[4:8, 3] = True
+    eta = jnp.where(hot, 2000.0, found.camera.eta_on)
+    noisy = dataclasses.replace(
+        found, hot=hot, camera=dataclasses.replace(found.camera, eta_on=eta))
+    trial = resimulate.resimulate(recording, noisy, (0, 4), seed=0)
+    assert not trial.made.count_map()[:, hot].any()
+    assert not trial.real.count_map()[:, hot].any()
+    assert trial.made.count_map()[:, ~hot].any()
 
 
 def test_the_poorer_polarity_is_named(measured: tuple[CameraEstimate, Recording]) -> None:

@@ -48,9 +48,11 @@ class Changes(NamedTuple):
     block: Array
 
 
-def changes(dn: Array, s: Sightings, block: Array, rng: np.random.Generator) -> tuple[Changes, ...]:
+def changes(
+    dn: Array, s: Sightings, block: Array, hot: Array, rng: np.random.Generator
+) -> tuple[Changes, ...]:
     """Changes of a stretch for each of LAGS, of at most CHANGES random visible pixels. dn: (K + 1,
-    H, W) denoised frames; block: (H * W,)."""
+    H, W) denoised frames; block, hot: (H * W,)."""
     intervals, pixels = s.inner.shape
     place = (s.interval * pixels + s.pixel, s.on)
     sums = [np.concatenate([np.zeros((1, pixels), int), np.bincount(
@@ -67,6 +69,7 @@ def changes(dn: Array, s: Sightings, block: Array, rng: np.random.Generator) -> 
         which = np.flatnonzero(used)
         if len(which) > CHANGES:
             which = np.sort(rng.choice(which, CHANGES, replace=False))
+        which = which[~hot[which % len(hot)]]
         columns = (before, after, on, off, np.broadcast_to(block, used.shape))
         found.append(Changes(*(np.ravel(c)[which] for c in columns)))
     return tuple(found)

@@ -10,10 +10,10 @@ import numpy as np
 
 from evflow.estimation.refine.path import STEPS, Films, Place, as_seen, interpolated, of_place
 from evflow.estimation.refine.readouts import without_readouts
-from evflow.estimation.refine.receptor_data import Sample, sample
+from evflow.estimation.refine.receptor_data import Part, Sample, sample
 from evflow.estimation.refine.receptor_result import Found
 from evflow.estimation.refine.receptor_search import find
-from evflow.estimation.refine.sightings import Sightings, sight, those
+from evflow.estimation.refine.sightings import sight
 from evflow.estimation.refine.still_noise import hot_ones
 from evflow.estimation.refine.stretches import LARGE, most_simulated, spread
 from evflow.process.memory import give_back
@@ -45,19 +45,16 @@ def receptor_sample(
     Returns:
         The sample; None with too few events.
     """
-    def parts() -> Iterator[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]]:
+    def parts() -> Iterator[Part]:
         for recording, run in receptor_places(places):
             film = interpolated(recording, run, STEPS, noise_dn)
             s = sight(recording.events, film.times_us, as_seen(film, IDEAL), STEPS, film.shown)
             s, disturbed = without_readouts(s, film.times_us, bunch(recording))
-            # One that fires regularly beside a constant path outweighs thousands of others.
-            if (hot := hot_ones(s, film.dt_s)).any():
-                others = ~hot.ravel()[s.pixel]
-                s, disturbed = those(s, others), disturbed[others]
             if films is not None and len(places) <= STRETCHES and film.dn[0].size <= LARGE:
                 films[of_place(recording, run)] = film
-            yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s, disturbed
-            del film, s, disturbed
+            hot = hot_ones(s, film.dt_s)
+            yield film.dn, np.repeat(film.dt_s / STEPS, STEPS), s, disturbed, hot.ravel()
+            del film, s, disturbed, hot
             give_back()
 
     return sample(parts())

@@ -24,6 +24,12 @@ MAPS: tuple[LogMap, ...] = ("linlog", "log_eps")  # that are distinguished
 LEAST = 20  # usable ones of these: most may lie beside saturated or black frames
 
 
+# A stretch: path (T + 1, H, W) in DN, dt_s (T,) of its fine steps, its sightings, the number of
+# readouts before each in its pixel, and (H * W,) bool, its hot pixels: one that fires regularly
+# beside a constant path outweighs thousands of others.
+Part = tuple[np.ndarray, np.ndarray, Sightings, np.ndarray, np.ndarray]
+
+
 class Sample(NamedTuple):
     """C stretches of one length, stacked.
 
@@ -49,14 +55,12 @@ class Sample(NamedTuple):
 
 
 def sample(
-    parts: Iterable[tuple[np.ndarray, np.ndarray, Sightings, np.ndarray]], seed: int = 0
+    parts: Iterable[Part], seed: int = 0
 ) -> Sample | None:
     """Choose pixels and events of each stretch.
 
     Args:
-        parts: per stretch, all of one length: path (T + 1, H, W) in DN, dt_s (T,) of its fine
-            steps, its sightings, and the number of readouts before each in its pixel. Read one at
-            a time.
+        parts: all of one length, read one at a time.
         seed: of the random choice.
 
     Returns:
@@ -66,11 +70,11 @@ def sample(
     rows: list[tuple[np.ndarray, ...]] = []
     nets: list[tuple[Changes, ...]] = []
     seen = 0
-    for dn, dt_s, s, disturbed in parts:
+    for dn, dt_s, s, disturbed, hot in parts:
         if len(s.pixel):
-            row, used = _row(dn, dt_s, s, disturbed, rng, len(rows))
+            row, used = _row(dn, dt_s, s, disturbed, hot, rng, len(rows))
             rows.append(row)
-            nets.append(_changes(dn, s, rng, len(nets)))
+            nets.append(_changes(dn, s, hot, rng, len(nets)))
             seen += s.inner.size
             count += _of_both(s.on)
             usable += _of_both(used)
@@ -84,12 +88,12 @@ def sample(
 
 
 def _changes(
-    dn: np.ndarray, s: Sightings, rng: np.random.Generator, number: int
+    dn: np.ndarray, s: Sightings, hot: np.ndarray, rng: np.random.Generator, number: int
 ) -> tuple[Changes, ...]:
     """`net_changes.changes` of a stretch."""
     steps = (len(dn) - 1) // (len(s.frames) - 1)
     block = _block(np.arange(dn[0].size), s.shape, number)
-    return changes(dn[::steps], s, block, rng)
+    return changes(dn[::steps], s, block, hot, rng)
 
 
 def _block(where: np.ndarray, shape: tuple[int, int], number: int) -> np.ndarray:
@@ -117,7 +121,7 @@ def smeared_sample(data: Sample, seconds: float) -> Sample:
 
 
 def _row(
-    dn: np.ndarray, dt_s: np.ndarray, s: Sightings, disturbed: np.ndarray,
+    dn: np.ndarray, dt_s: np.ndarray, s: Sightings, disturbed: np.ndarray, hot: np.ndarray,
     rng: np.random.Generator, number: int,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
     """Fields of `Sample` for one stretch, and (N,) bool: which of its events are ON."""
@@ -129,6 +133,7 @@ def _row(
     chosen = np.flatnonzero(np.bincount(group, weight > 0, len(pixels)) >= 2)
     if len(chosen) > PIXELS:
         chosen = np.sort(rng.choice(chosen, PIXELS, replace=False))
+    chosen = chosen[~hot[pixels[chosen]]]
     place = np.full(len(pixels), -1)
     place[chosen] = np.arange(len(chosen))
     kept = np.flatnonzero((place[group] >= 0) & (weight > 1e-6))[:EVENTS]

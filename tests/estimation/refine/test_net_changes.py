@@ -66,11 +66,15 @@ def test_changes_are_those_of_shown_pixels_with_their_events() -> None:
                                                                        38_000]),
                     np.array([True, True, True, False]), (3, 1))
     s = sight(events, times, path, 2)
-    short, long = changes(light[:, None], s, np.arange(3), np.random.default_rng(0))
+    short, long = changes(
+        light[:, None], s, np.arange(3), np.zeros(3, bool), np.random.default_rng(0))
     assert short.before.tolist() == [50, 60, 70]
     assert short.after.tolist() == [70, 80, 90]
     assert (short.on.tolist(), short.off.tolist()) == ([2, 1, 0], [0, 0, 1])
     assert [v.tolist() for v in long] == [[50], [90], [2], [1], [0]]
+    of_first = np.arange(3) == 0
+    rest = changes(light[:, None], s, np.arange(3), of_first, np.random.default_rng(0))
+    assert [len(c.on) for c in rest] == [0, 0]
     twice = joined([(short, long), (short, long)])
     assert len(twice) == len(LAGS)
     assert twice[0].on.tolist() == [2, 1, 0] * 2

@@ -106,6 +106,9 @@ def test_the_path_is_that_of_a_plain_integration(
     assert np.abs(np.asarray(got) - want).max() < (5e-3 if tau_s else 0.02)
 
 
+NONE_HOT = np.zeros(SHAPE[0] * SHAPE[1], bool)
+
+
 def no_readouts(s: Sightings) -> np.ndarray:
     """How many events of their pixel that come with a readout precede those sighted: none."""
     return np.zeros(len(s.pixel), int)
@@ -122,7 +125,8 @@ def looked_at(
     events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2, noise_hz)
     times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
     s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
-    data = sample([(dn.astype(np.float32), np.full(INTERVALS * STEPS, dt_s), s, no_readouts(s))])
+    steps_s = np.full(INTERVALS * STEPS, dt_s)
+    data = sample([(dn.astype(np.float32), steps_s, s, no_readouts(s), NONE_HOT)])
     assert data is not None
     return data
 
@@ -210,7 +214,8 @@ def test_where_little_happens_nothing_is_looked_for() -> None:
     events = Events(np.array([1]), np.array([1]), np.array([30_000]), np.array([True]), SHAPE[::-1])
     times = 10_000 + 20_000 * np.arange(INTERVALS + 1)
     s = sight(events, times, lin_log(dn), STEPS)
-    assert sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s, no_readouts(s))]) is None
+    steps_s = np.full(INTERVALS * STEPS, FRAME_S / STEPS)
+    assert sample([(dn, steps_s, s, no_readouts(s), NONE_HOT)]) is None
     assert sample([]) is None
 
 
@@ -224,7 +229,8 @@ def test_events_that_no_frame_shows_tell_nothing(shown: bool) -> None:
     events = Events(x, y, t, rng.random(n) < 0.5, SHAPE[::-1])
     times = 10_000 + 20_000 * np.arange(INTERVALS + 1)
     s = sight(events, times, lin_log(dn), STEPS, np.full((INTERVALS + 1, *SHAPE), shown))
-    found = sample([(dn, np.full(INTERVALS * STEPS, FRAME_S / STEPS), s, no_readouts(s))])
+    steps_s = np.full(INTERVALS * STEPS, FRAME_S / STEPS)
+    found = sample([(dn, steps_s, s, no_readouts(s), NONE_HOT)])
     assert (found is not None) == shown
 
 
