@@ -112,7 +112,7 @@ class Recording:
 
 
 def _white(frames: np.ndarray, given: int) -> int:
-    """The DN of a saturated pixel of frames (T, H, W): that of a converter, or a higher given one."""
+    """The DN of a saturated pixel of frames (T, H, W): a converter's, or a higher given one."""
     if frames.dtype != np.uint16 or not len(frames):
         return 255
     peak = max(int(frame.max(initial=0)) for frame in frames)  # one by one: they may be mapped

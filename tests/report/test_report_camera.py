@@ -176,7 +176,9 @@ def test_it_is_simulated_as_the_command_simulates_it(
     path = found.save(tmp_path / "camera.npz")
     models = []
 
-    def watched(key: Any, frames: Any, times: Any, camera: Any, *, model: SensorModel) -> Any:
+    def watched(key: Any, frames: Any, times: Any, camera: Any, *, model: SensorModel,
+                full_scale: float) -> Any:
+        assert full_scale == 255  # frames in DN, however dark
         models.append(model)
         return iter([recording.events])
 

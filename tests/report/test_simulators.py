@@ -40,7 +40,7 @@ def test_what_is_the_same_is_no_distance_away_and_nothing_is_far() -> None:
         assert distance({**SAME, name: value}) > 0.04
     events = Events(np.array([1, 2]), np.array([1, 1]), np.array([5, 9]), np.array([1, 0], bool),
                     (4, 3))
-    film = Film(np.zeros((2, 3, 4), np.float32), np.array([0, 20]), events, (0, 20))
+    film = Film(np.zeros((2, 3, 4), np.float32), np.array([0, 20]), events, (0, 20), np.zeros((3, 4), bool))
     nothing = likeness(film, events.slice(0, 0), events)
     assert distance(nothing) > 1
     alike = likeness(film, events, events)
@@ -80,7 +80,7 @@ def test_recordings_of_a_simulator_choose_it(kind: str, others: tuple[str, ...])
         even = dataclasses.replace(even, theta_on=0.8 * even.theta_on,
                                    theta_off=0.5 * even.theta_off)
     film = Film.of(Recording(recording.events, frames.astype(np.uint8), recording.frame_times),
-                   (0, len(frames) - 1), len(frames))
+                   (0, len(frames) - 1), len(frames), np.zeros(frames.shape[1:], bool))
     uneven = dataclasses.replace(camera, eta_on=0.0 * camera.eta_on, eta_off=0.0 * camera.eta_off)
     events = simulate(jax.random.key(3), film.frames, film.times_us,
                       uneven if kind == "v2e" else even, model=models[kind])
