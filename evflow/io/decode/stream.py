@@ -78,7 +78,8 @@ def words(path: Path, start: int, dtype: Any) -> Iterator[tuple[int, np.ndarray]
         f.seek(start)
         while data := f.read(CHUNK // size * size):
             n = len(data) // size
-            yield start, np.frombuffer(data, dtype, n)
+            if n:
+                yield start, np.frombuffer(data, dtype, n)
             if len(data) % size:
                 raise Damage(start + n * size, f"the file ends {len(data) % size} bytes into a "
                              f"word of {size} bytes")

@@ -9,6 +9,7 @@ from helpers.recordings import refused
 from helpers.streams import listed
 
 from evflow.io import read_events, read_recording
+from evflow.io.decode.stream import CHUNK
 from evflow.notes import texts
 
 
@@ -45,6 +46,19 @@ def test_the_larger_size_and_chunks(tmp_path: Path, monkeypatch: object) -> None
     back[4000, 2:] = 0
     path.write_bytes(back.tobytes())
     assert (refused(path).code, "at byte 20,000" in str(refused(path))) == ("EV004", True)
+
+
+def test_a_few_bytes_behind_a_whole_chunk(tmp_path: Path) -> None:
+    """What is read last is less than an event."""
+    n = CHUNK // 5
+    rows = np.zeros((n, 5), np.uint8)
+    t = np.arange(n) // 2
+    rows[:, 2:] = np.stack([t >> 16, t >> 8 & 255, t & 255], 1)
+    path = tmp_path / "00001.bin"
+    path.write_bytes(rows.tobytes() + b"\1\2")
+    error = refused(path)
+    assert (error.code, "the file ends 2 bytes into a word" in str(error)) == ("EV009", True)
+    assert read_events(path, partial=True).t.tolist() == t.tolist()
 
 
 def test_other_files_of_that_name(tmp_path: Path) -> None:
