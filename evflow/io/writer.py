@@ -119,10 +119,12 @@ class EventWriter(abc.ABC):
         check_times(np.append(self._last_us, events.t[:1]), "t", strict=False)
         self._check_times(events.t[[0, -1]], "events")
         self._check(events)
-        self._last_us = events.t[-1:]
+        self._last_us = events.t[-1:].copy()
         self._waiting.append(events)
         if sum(map(len, self._waiting)) >= FLUSH:
             self._flush()
+        else:
+            self._waiting[-1] = _copied(events)  # the caller may reuse the arrays
 
     def append_labels(self, noise: np.ndarray) -> None:
         """Add labels, bool (N,), True = noise, one for each event in order, in parts of any length;
@@ -152,7 +154,7 @@ class EventWriter(abc.ABC):
             return
         check_times(np.append(self._last_frame_us, times), "frame_times", strict=True)
         self._check_times(times[[0, -1]], "frames")
-        self._depth, self._last_frame_us = frames.dtype, times[-1:]
+        self._depth, self._last_frame_us = frames.dtype, times[-1:].copy()
         for first in range(0, len(frames), FRAMES):
             part = slice(first, first + FRAMES)
             with self._guard():
@@ -260,6 +262,11 @@ def blocks(events: Events, rows: int) -> Iterator[Events]:
     """The events in parts of up to `rows`, as views."""
     for first in range(0, len(events), rows):
         yield _part(events, first, first + rows)
+
+
+def _copied(events: Events) -> Events:
+    x, y, t, p = (getattr(events, name).copy() for name in COLUMNS)
+    return Events.unchecked(x, y, t, p, events.size)
 
 
 def _part(events: Events, first: int, last: int) -> Events:

@@ -154,6 +154,27 @@ def test_parts_of_any_size(
 
 
 @each
+@pytest.mark.parametrize("flush", [25, 1 << 20])
+def test_arrays_that_the_caller_reuses(
+    tmp_path: Path, kind: str, flush: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each part is written as it was when it was appended."""
+    monkeypatch.setattr("evflow.io.writer.FLUSH", flush)
+    want, path = fitting(kind, make(60)), place(tmp_path, kind)
+    x, y, t, p = (getattr(want.events, name)[:10].copy() for name in "xytp")
+    frame, time = want.frames[:1].copy(), want.frame_times[:1].copy()
+    with open_writer(path, SIZE, kind) as out:
+        for k in range(6):
+            for name, buffer in zip("xytp", (x, y, t, p), strict=True):
+                buffer[:] = getattr(want.events, name)[10 * k : 10 * k + 10]
+            out.append(Events(x, y, t, p, SIZE))
+            if want.has_frames:
+                frame[:], time[:] = want.frames[k], want.frame_times[k]
+                out.append_frames(frame, time)
+    same(read_recording(path), want)
+
+
+@each
 def test_frames_behind_all_events(tmp_path: Path, kind: str) -> None:
     """Appended last: the indices of events at the images are those of the whole."""
     want, path = make(3000), place(tmp_path, kind)
