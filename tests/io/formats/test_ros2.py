@@ -52,6 +52,21 @@ def test_event_packets(tmp_path: Path, encoding: str) -> None:
     assert got.has_frames == encoding.startswith("libcaer")
 
 
+@pytest.mark.parametrize(("storage", "compression"), [
+    ("SQLITE3", None), ("SQLITE3", "FILE"), ("MCAP", None), ("MCAP", "STORAGE")])
+def test_images_without_header_stamps_are_at_their_time_of_recording(
+    tmp_path: Path, storage: str, compression: str | None
+) -> None:
+    want, store = make(), Store.new()
+    images = store.images(want)
+    for _, _, image in images:
+        image.header.stamp = store.time(0)
+    path = store.write(tmp_path / "bag", {
+        "/dvs/events": store.arrays(want.events), "/dvs/image_raw": images}, storage, compression)
+    holds(path, want)
+    assert "at which /dvs/image_raw was recorded" in read_recording(path).notes[0].text
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_few_events_are_packed_as_in_ros_1(count: int) -> None:
     """An event takes 13 bytes, or 16 behind another."""

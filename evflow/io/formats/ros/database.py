@@ -54,14 +54,14 @@ class Database:
     def close(self) -> None:
         self._open.close()
 
-    def messages(self, topics: Collection[str]) -> Iterator[bytes]:
-        """Messages of the topics, in order of time."""
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[int, bytes]]:
+        """(time of recording in ns, message) of the topics, in order of time."""
         wanted = [number for number, (name, _) in self._topics.items() if name in topics]
         rows = self._open.execute(
-            "SELECT data FROM messages WHERE topic_id IN "
+            "SELECT timestamp, data FROM messages WHERE topic_id IN "
             f"({','.join(map(str, wanted))}) ORDER BY timestamp")
-        for (data,) in rows:
-            yield data
+        for row in rows:  # noqa: UP028 (`yield from` would close a cursor of a closed database)
+            yield row
 
     def _bound(self, looks: int) -> None:
         """Stop with an error whatever takes more steps: pages that are their own children yield

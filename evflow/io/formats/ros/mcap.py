@@ -65,13 +65,13 @@ class Mcap:
     def close(self) -> None:
         self._file.close()
 
-    def messages(self, topics: Collection[str]) -> Iterator[bytes]:
-        """Messages of the topics, in order of time."""
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[int, bytes]]:
+        """(log time in ns, message) of the topics, in order of time."""
         wanted = {channel for channel, (topic, _) in self._channels.items() if topic in topics}
         parts = [self._part(chunk, wanted) for chunk in self._chunks]
-        for _, raw in heapq.merge(self._single(wanted), *parts, key=operator.itemgetter(0)):
+        for time, raw in heapq.merge(self._single(wanted), *parts, key=operator.itemgetter(0)):
             if raw is not None:
-                yield raw
+                yield time, raw
 
     def _single(self, wanted: set[int]) -> Iterator[Timed]:
         """The messages outside chunks, in order."""

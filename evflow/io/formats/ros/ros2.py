@@ -87,13 +87,13 @@ class Reader:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection | None, int, bytes]]:
-        """(None, 0, message) for each message, in the form that `Bag` expects."""
+        """(None, time of recording in ns, message), in the form that `Bag` expects."""
         topics = {connection.topic for connection in connections}
         for storage in self.storages:
-            for raw in storage.messages(topics):
+            for time, raw in storage.messages(topics):
                 if raw.startswith(ZSTD):  # messages of ROS 2 begin with 0
                     raw = unpack(raw, "zstd", LARGEST_MESSAGE + RATIO * len(raw))
-                yield None, 0, raw
+                yield None, time, raw
 
 
 def _files(folder: Path) -> list[Path]:
