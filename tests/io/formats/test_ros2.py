@@ -3,6 +3,10 @@ data errors."""
 
 from __future__ import annotations
 
+import contextlib
+import re
+import shutil
+import sqlite3
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -106,6 +110,30 @@ def test_a_database_that_is_cut_off_is_refused(tmp_path: Path) -> None:
     error = refused(file)
     assert error.code == "EV009"
     assert f"has {len(whole) - 4096:,} of {len(whole):,} bytes" in str(error)
+
+
+def test_messages_that_wait_in_a_log_beside_the_database(tmp_path: Path) -> None:
+    """As an interrupted recording of rosbag2 leaves them; the advice mends the bag."""
+    store, want = Store.new(), make()
+    folder = store.write(tmp_path / "bag", {"/dvs/events": store.arrays(want.events)})
+    file, = folder.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file, isolation_level=None)) as database:
+        rows = database.execute("SELECT * FROM messages ORDER BY timestamp DESC LIMIT 3").fetchall()
+        database.executemany("DELETE FROM messages WHERE id = ?", [row[:1] for row in rows])
+        database.execute("PRAGMA journal_mode = WAL")
+        places = ",".join("?" * len(rows[0]))
+        database.executemany(f"INSERT INTO messages VALUES ({places})", rows)
+        shutil.copytree(folder, tmp_path / "cut")
+    cut, = (tmp_path / "cut").glob("*.db3")
+    for path in (cut, cut.parent):
+        error = refused(path)
+        assert (error.code, "-wal holds" in str(error)) == ("EV009", True)
+    command = re.search('sqlite3 (.*) "(PRAGMA .*)"', error.fix)
+    assert command
+    assert command[1] == str(cut)
+    with contextlib.closing(sqlite3.connect(cut)) as database:
+        database.execute(command[2])
+    equal(read_events(cut.parent), want.events)
 
 
 @pytest.mark.parametrize("storage", SUFFIX)

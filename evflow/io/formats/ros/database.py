@@ -2,18 +2,21 @@
 
 A database is a program as well: views, generated columns and virtual tables produce rows that are
 not in the file. Only plain tables are queried, and types and lengths are checked before values are
-read. ValueError and sqlite3.Error if it is not a bag.
+read. ValueError and sqlite3.Error if it is not a bag; EV009 if messages wait in a file beside it.
 """
 
 from __future__ import annotations
 
 import itertools
 import os
+import shlex
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from urllib.parse import quote
+
+from evflow.errors import EvflowDataError
 
 MAGIC = b"SQLite format 3\0"
 LARGEST = 1 << 28  # bytes of one message
@@ -27,6 +30,7 @@ class Database:
     """An open database. counts: messages by (topic, type)."""
 
     def __init__(self, path: Path) -> None:
+        _check_log(path)
         _check_whole(path)
         # Immutable: SQLite opens and creates nothing beside the file. Quoted for `?` and `%`.
         self._open = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1",
@@ -112,3 +116,15 @@ def _check_whole(path: Path) -> None:
     claimed = pages * (LARGEST_PAGE if page == 1 else page)
     if changed == valid and path.stat().st_size < claimed:
         raise ValueError(f"{path.name} has {path.stat().st_size:,} of {claimed:,} bytes")
+
+
+def _check_log(path: Path) -> None:
+    """EV009 if a write-ahead log beside the database holds messages: where a recording ended
+    without closing it, the last ones are only there, and an immutable database does not look."""
+    log = path.with_name(f"{path.name}-wal")
+    if log.is_file() and log.stat().st_size:
+        raise EvflowDataError(
+            "EV009", f"{log} holds {log.stat().st_size:,} bytes that were not written into "
+            f"{path.name} yet: its recording was interrupted, or still runs.",
+            f'Write them into it: sqlite3 {shlex.quote(str(path))} "PRAGMA '
+            'wal_checkpoint(TRUNCATE)".', where=path)
