@@ -227,8 +227,8 @@ class Camera:
             The camera, maps (..., H, W).
 
         Raises:
-            EvflowDataError: EV002, EV014, EV015 (its maps make no valid camera), EV008 (no .npz, or
-                one without these maps), EV009 (damaged), EV016 (no such file).
+            EvflowDataError: EV002, EV014, EV015 (its maps make no valid camera), EV008 (no .npz,
+                one without these maps, or with pickled ones), EV009 (damaged), EV016 (no such file).
         """
         return Camera.load_with_std(path)[0]
 

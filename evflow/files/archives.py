@@ -25,6 +25,10 @@ DAMAGE = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOF
           OSError)  # what zipfile raises on a damaged archive
 
 
+class Pickled(ValueError):
+    """An array of Python objects, which only a pickle could load."""
+
+
 def is_zip(path: Path) -> bool:
     """Whether a file is a zip archive, or a damaged one, for which `unzipped` raises."""
     try:
@@ -36,7 +40,7 @@ def is_zip(path: Path) -> bool:
 @contextlib.contextmanager
 def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.ZipFile]:
     """Open an archive; EV016 without the file, EV009 if it, or anything the block reads from it, is
-    damaged or a bomb.
+    damaged or a bomb, EV008 if an array that it reads is pickled.
 
     streamed: members that are read in pieces and may therefore be of any size."""
     try:
@@ -50,15 +54,20 @@ def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.Zip
             yield archive
     except FileNotFoundError as e:
         raise EvflowDataError("EV016", f"no file at {path}.", where=path) from e
+    except Pickled as e:
+        raise EvflowDataError("EV008", f"{path} cannot be read: {e}.", "Save it as numbers.",
+                              where=path) from e
     except DAMAGE as e:
         raise EvflowDataError(
             "EV009", f"{path} is damaged ({e or type(e).__name__}).", "Copy it again.",
             where=path) from e
 
 
-def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, Fortran order and dtype from the header of the .npy at f; ValueError if it is damaged
-    or holds Python objects."""
+def npy_header(
+    f: IO[bytes], pickled: bool = False
+) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, Fortran order and dtype from the header of the .npy at f; ValueError if it is damaged,
+    Pickled if it holds Python objects. pickled: whether it may."""
     begin = f.read(8)  # magic and version
     first = begin[6:7] == b"\x01"
     length = f.read(2 if first else 4)
@@ -72,24 +81,24 @@ def npy_header(f: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
         shape, fortran, dtype = read(whole)
     except Exception as e:  # many types: tokenize's, MemoryError for deeply nested brackets
         raise ValueError(str(e) or f"its header is damaged ({type(e).__name__})") from None
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects: pickles are refused")
+    if dtype.hasobject and not pickled:
+        raise Pickled("it holds Python objects: pickles are refused")
     if min(shape, default=0) < 0:
         raise ValueError(f"its shape is {shape}")
     return shape, fortran, dtype
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz by key; EV016 without the file, EV009 if any of them is damaged or
-    pickled."""
+    """All arrays of an .npz by key; EV016 without the file, EV009 if any of them is damaged, EV008
+    if one is pickled."""
     with members(path) as found:
         return {name: member.whole() for name, member in found.items()}
 
 
 @contextlib.contextmanager
 def members(path: Path, streamed: Collection[str] = ()) -> Iterator[dict[str, Member]]:
-    """The arrays of an .npz by key, readable within the block; streamed and EV009 as in
-    `unzipped`."""
+    """The arrays of an .npz by key, readable within the block; streamed, EV008 and EV009 as
+    in `unzipped`."""
     with unzipped(path, streamed) as archive:
         found = {info.filename.removesuffix(".npy"): Member(archive, info)
                  for info in archive.infolist()}
@@ -102,7 +111,7 @@ def members(path: Path, streamed: Collection[str] = ()) -> Iterator[dict[str, Me
 
 class Member:
     """An array of an open .npz, read whole or in order by rows; ValueError or zipfile's errors if
-    it is damaged. The checksum is verified at its end."""
+    it is damaged, Pickled if it holds Python objects. The checksum is verified at its end."""
 
     def __init__(self, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
         if not info.filename.endswith(".npy"):  # skipping it could silently lose the frames
@@ -110,9 +119,19 @@ class Member:
         self._archive, self._info = archive, info
         self._file: IO[bytes] | None = None  # opened when read: an open one takes 50 kB
         with archive.open(info) as f:
-            self.shape, self.fortran, self.dtype = npy_header(f)
-        if math.prod(self.shape) * self.dtype.itemsize > info.file_size:
+            self.shape, self.fortran, self.dtype = npy_header(f, pickled=True)
+        if not self.pickled and math.prod(self.shape) * self.dtype.itemsize > info.file_size:
             raise ValueError(f"{info.filename} is cut off: {self.dtype} {self.shape}")
+
+    @property
+    def pickled(self) -> bool:
+        """Whether it holds Python objects, which are never loaded."""
+        return self.dtype.hasobject
+
+    def need_numbers(self) -> None:
+        if self.pickled:
+            raise Pickled(f"{self._info.filename.removesuffix('.npy')} holds Python objects, and "
+                          "pickles are never loaded")
 
     def take(self, count: int) -> np.ndarray:
         """The next `count` values, (count,), in file order."""
@@ -149,6 +168,7 @@ class Member:
             self._file = None
 
     def _data(self) -> IO[bytes]:
+        self.need_numbers()
         if self._file is None:
             self._file = self._archive.open(self._info)
             npy_header(self._file)

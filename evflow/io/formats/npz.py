@@ -1,6 +1,7 @@
 """evflow's own .npz: t (int64 us), x, y, p, size = (width, height), and optionally frames,
 frame_times and exposure_us. Other names of these (`decode.columns`) and a single array of records
-or N x 4 numbers (`decode.arrays`) are read too. Pickles are never loaded.
+or N x 4 numbers (`decode.arrays`) are read too. Pickles are never loaded: members that are not
+needed may be Python objects, and a note names them.
 
 Members are checked against the bytes that the archive really holds before memory is allocated, and
 columns are decompressed in parallel, in blocks.
@@ -35,6 +36,7 @@ from evflow.io.images.recorded import cut, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
 from evflow.io.images.times import beside_events
 from evflow.io.writer import EventWriter
+from evflow.notes import Note
 from evflow.types import Events, Recording
 
 NAME = "npz"
@@ -54,20 +56,26 @@ def sniff(path: Path, head: bytes) -> bool:
 def read(path: Path, hints: Hints) -> Recording:
     """Events are read to the end even if stop_s comes before it, to verify their checksums.
 
-    Raises EV002 (shapes), EV008 (a column is missing), EV009 (damaged), and what `stream.gather`
-    and `Recording` raise.
+    Raises EV002 (shapes), EV008 (a column is missing or pickled), EV009 (damaged), and what
+    `stream.gather` and `Recording` raise.
     """
     with members(path, streamed=["frames.npy"]) as found:
         recording = _recording(path, found, hints)
+        notes = [*recording.notes]
         if columns.LABEL in found:
-            recording = dataclasses.replace(
-                recording, notes=(*recording.notes, columns.LABELS_UNREAD))
-        return recording
+            notes.append(columns.LABELS_UNREAD)
+        if pickled := ", ".join(name for name, member in found.items() if member.pickled):
+            notes.append(Note("events.unread", "Python objects were not read, as pickles are never "
+                              f"loaded: {pickled}"))
+        return dataclasses.replace(recording, notes=tuple(notes))
 
 
 def _recording(path: Path, found: dict[str, Member], hints: Hints) -> Recording:
-    chosen = columns.by_name(found)
-    size = _size(found)
+    plain = {name: member for name, member in found.items() if not member.pickled}
+    chosen = columns.by_name(plain) or columns.by_name(found)
+    for name in chosen.values():
+        found[name].need_numbers()
+    size = _size(plain)
     if chosen:
         events = _events(path, {c: found[name] for c, name in chosen.items()}, hints, size,
                          written_unit(chosen["t"]) if chosen["t"] != "t" else "us")
@@ -75,7 +83,8 @@ def _recording(path: Path, found: dict[str, Member], hints: Hints) -> Recording:
         events = _table(path, found).gather(path, hints, size)
     if _own_frames(found):
         return _with_frames(path, found, events, hints)
-    if "frames" in found and not (hints.no_frames or times_of("frames", found)):
+    images = plain.get("frames")
+    if images and images.shape and not (hints.no_frames or times_of("frames", found)):
         with events_alone():
             raise EvflowDataError("EV008", f"{path} holds frames but no frame_times.",
                                   where=path)
@@ -108,7 +117,7 @@ def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
     fit = []
     for name, member in found.items():
         many = len(member.shape) == 2 and 4 in member.shape and member.dtype.kind in "biuf"
-        if many or (len(member.shape) == 1 and member.dtype.fields):
+        if many or (len(member.shape) == 1 and member.dtype.fields and not member.pickled):
             data = member.whole()
             table = arrays.matrix(name, data) if many else arrays.structured(name, data)
             fit += [table] if table else []
@@ -120,12 +129,14 @@ def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
             "--camera` or `evflow export`, or compare two of them with `evflow compare`.",
             where=path)
     held = ", ".join(f"{name} {member.dtype} {member.shape}" for name, member in found.items())
+    pickled = any(member.pickled for member in found.values())
     missing = [c for c in ("t", "x", "y", "p") if c not in map(columns.meaning, found)]
     raise EvflowDataError(
         "EV008", f"{path} holds {held[:400] or 'nothing'}, but not {missing}." if not fit else
         f"{path} holds several arrays that may be events: {', '.join(t.name for t in fit)}.",
         "Expected the keys t, x, y, p, size, and optionally frames, frame_times; or one array of "
-        "events only.", where=path)
+        "events only." + (" Save objects as numbers: pickles are never loaded." if pickled else ""),
+        where=path)
 
 
 def _with_frames(

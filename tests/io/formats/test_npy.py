@@ -11,6 +11,7 @@ from helpers.recordings import SIZE, equal, make, refused
 
 from evflow.io import read_events, read_recording
 from evflow.io.registry import find_format
+from evflow.notes import texts
 from evflow.types import Events
 
 EVENTS = make(300, 0).events
@@ -108,6 +109,33 @@ def test_several_arrays_are_not_chosen_from(tmp_path: Path) -> None:
     names = [f"{kind}_{side}" for kind in ("theta", "eta") for side in ("on", "off")]
     np.savez(tmp_path / "a.npz", **dict.fromkeys(names, np.ones((4, 6))))
     assert "is a camera, not a recording" in str(refused(tmp_path / "a.npz"))
+
+
+def test_objects_that_are_not_needed_are_not_read(tmp_path: Path) -> None:
+    """Images of several shapes, a dict; a column of objects; and a number named frames."""
+    path = tmp_path / "a.npz"
+    known = {name: getattr(EVENTS, name) for name in "txyp"} | {"size": SIZE}
+    images = np.array([np.zeros(5), np.zeros(6)], object)
+    np.savez(path, **known, meta={"lens": "6 mm"}, frames=images, time={"zone": "UTC"})
+    got = read_recording(path)
+    equal(got.events, EVENTS)
+    assert texts(got.notes) == [
+        "images were not read as frames: frames (of variable length, as encoded images are: save "
+        "them as arrays, or as files for --frames)",
+        "Python objects were not read, as pickles are never loaded: meta, frames, time"]
+    np.savez(path, **known, frames=6)
+    assert read_recording(path).notes == ()
+
+
+@pytest.mark.parametrize("held", [
+    {"t": EVENTS.t, "x": EVENTS.x.astype(object), "y": EVENTS.y, "p": EVENTS.p},
+    {"events": matrix("txyp", object)}, {"events": RECORDS["tonic"].astype(
+        [("x", "O"), ("y", "i2"), ("t", "i8"), ("p", "?")])}])
+def test_events_that_are_objects(tmp_path: Path, held: dict[str, Any]) -> None:
+    np.savez(tmp_path / "a.npz", **held, size=SIZE)
+    error = refused(tmp_path / "a.npz")
+    assert (error.code, "as numbers" in error.fix) == ("EV008", True)
+    assert "damaged" not in str(error)
 
 
 @pytest.mark.parametrize(("values", "code"), [
