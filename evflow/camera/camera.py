@@ -228,7 +228,7 @@ class Camera:
 
         Raises:
             EvflowDataError: EV002, EV014, EV015 (its maps make no valid camera), EV008 (no .npz,
-                one without these maps, or with pickled ones), EV009 (damaged), EV016 (no such file).
+                one without these maps, or a pickled one), EV009 (damaged), EV016 (no such file).
         """
         return Camera.load_with_std(path)[0]
 

@@ -40,6 +40,77 @@ def test_size_does_not_change_the_layout_of_a_named_chip(tmp_path: Path) -> None
     assert listed(read_events(path, size=(128, 128))) == [(121, 122, 9, 1)]
 
 
+V2E = (b"#!AER-DAT2.0\r\n# This is a raw AE data file created by AEDat2Output in v2e (see https://"
+       b"github.com/SensorsINI/v2e) as specified at https://inivation.com\r\n")
+LABELS = b"# noise events are labeled when the --label_signal_noise option is selected\r\n"
+
+
+def addressed(header: bytes, events: Events, shifts: tuple[int, int, int], noise: int = 0) -> bytes:
+    """As v2e writes: x from the right, y from the bottom, ON = 1; every `noise`-th event marked."""
+    width, height = events.size
+    to_x, to_y, to_p = shifts
+    return header + b"".join(
+        struct.pack(">2I", (width - 1 - x) << to_x | (height - 1 - y) << to_y | p << to_p
+                    | (0x400 if noise and not i % noise else 0), t)
+        for i, (x, y, t, p) in enumerate(listed(events)))
+
+
+def over(size: tuple[int, int], n: int = 300) -> Events:
+    rng = np.random.default_rng(0)
+    width, height = size
+    return Events(rng.integers(0, width, n), rng.integers(0, height, n),
+                  np.sort(rng.integers(0, 10**6, n)), rng.integers(0, 2, n), size)
+
+
+@pytest.mark.parametrize(("header", "size", "shifts"), [
+    (V2E, (640, 480), (1, 11, 0)), (V2E, (346, 260), (12, 22, 11)), (V2E, (240, 180), (12, 22, 11)),
+    (b"#!AER-DAT2.0\r\n# AEChip: ch.unizh.ini.jaer.chip.retina.DVS640\r\n", (640, 480), (1, 11, 0)),
+    (b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis640\r\n", (640, 480),
+     (12, 22, 11)),
+    (b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis128\r\n", (128, 128),
+     (12, 22, 11))])
+def test_the_layout_is_that_of_the_chip_or_v2e(
+    tmp_path: Path, header: bytes, size: tuple[int, int], shifts: tuple[int, int, int]
+) -> None:
+    path, want = tmp_path / "a.aedat", over(size)
+    path.write_bytes(addressed(header, want, shifts))
+    got = read_recording(path, **({"size": size} if header == V2E else {}))
+    equal(got.events, want)
+    assert got.notes == ()
+    if header == V2E:
+        assert "v2e writes 346x260, 240x180, 640x480" in str(refused(path))
+
+
+def test_events_that_v2e_labels_as_noise_are_kept(tmp_path: Path) -> None:
+    """At 640x480 its label is a bit of x."""
+    path, want = tmp_path / "a.aedat", over((346, 260))
+    path.write_bytes(addressed(V2E + LABELS, want, (12, 22, 11), noise=3))
+    got = read_recording(path, size=want.size)
+    equal(got.events, want)
+    assert texts(got.notes) == ["v2e's labels, by which 100 events are noise, were not read: no "
+                                "command uses or keeps them"]
+    large = over((640, 480))
+    path.write_bytes(addressed(V2E + LABELS, large, (1, 11, 0), noise=3))
+    error = refused(path, size=large.size)
+    assert (error.code, "--label_signal_noise" in error.fix) == ("EV003", True)
+
+
+@pytest.mark.parametrize(("size", "shifts", "chip"), [
+    ((346, 260), (12, 22, 11), b""), ((128, 128), (1, 8, 0), b"# AEChip: a.DVS999\r\n")])
+def test_a_layout_that_is_assumed_is_told(
+    tmp_path: Path, size: tuple[int, int], shifts: tuple[int, int, int], chip: bytes
+) -> None:
+    path, want = tmp_path / "a.aedat", over(size)
+    stored = Events(want.x, want.y, want.t, ~want.p, size) if chip else want  # the DVS128's is OFF
+    path.write_bytes(addressed(b"#!AER-DAT2.0\r\n" + chip, stored, shifts))
+    got = read_recording(path, size=size)
+    equal(got.events, want)
+    note, = got.notes
+    assert note.code == "events.layout"
+    assert ("of a DVS128, by the size 128x128: the header names the chip 'DVS999'" if chip else
+            "of a DAVIS, by the size 346x260: the header names no chip") in note.text
+
+
 def test_words_beside_the_events(tmp_path: Path) -> None:
     path = tmp_path / "a.aedat"
     words = [(1 << 31, 5), (1 << 31 | 1 << 10, 6), (0xC00 | 1 << 31, 7), (0x400, 8),
@@ -136,6 +207,11 @@ def test_frames_of_a_davis(
     assert got.exposure_us == (100 if rolling else 10_000 - 470)
     assert f"exposed for {got.exposure_us / 1e3:g} ms" in notes[-2] + notes[-1]
     assert len(read_recording(path, size=SMALL, stop_s=0.02).frames) == 1
+    named = read_recording(path, size=SMALL, frames_topic="aps")
+    assert "frames are from aps" in texts(named.notes)
+    assert "--late join" in texts(read_recording(path, size=SMALL, late="join").notes)[0]
+    assert "has no images" in str(refused(davis(tmp_path, [(EVENT, 0)]), frames_topic="aps"))
+    davis(tmp_path, words)
     assert not read_recording(path, size=SMALL, no_frames=True).has_frames
 
 
