@@ -5,13 +5,15 @@ A packet: i16 type, i16 source, i32 size of an event, offset and overflow of its
 << 31 | time), capacity, number and valid. Type 1: u32 x [31:17], y [16:2], ON [1], valid [0]; i32
 us. Type 2, a frame: u32 valid [0], channels [3:1], colour filter [7:4]; i32 begin and end of the
 frame and of its exposure; width, height and position x, y; u16 pixels on 0..65535. Other types are
-counted but not read. The size is that of the chip named in `#Source`. Version 3.0 has the origin at
+counted but not read. Of several sources (cameras) with events one is read, and its own frames. The
+size is that of the chip named in its `#Source`, else in another. Version 3.0 has the origin at
 the bottom and no end-of-header line.
 """
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import os
 import re
 import struct
@@ -43,7 +45,7 @@ HEADER = struct.Struct("<hhiiiiii")
 FRAME = struct.Struct("<Iiiiiiiii")
 EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
 POLARITY, IMAGE = 1, 2
-TYPES = {0: "special events", 3: "IMU samples", 4: "IMU samples"}
+TYPES = {0: "special events", IMAGE: "frames", 3: "IMU samples", 4: "IMU samples"}
 COMPRESSED = 0x8000  # flag in the type, for formats other than RAW
 MOST_TYPES, MOST_BYTES = 64, 1 << 26  # of types; of one event
 
@@ -77,34 +79,64 @@ def read(path: Path, hints: Hints) -> Recording:
     `Aside.collect` raises."""
     with open(path, "rb") as f:
         head = f.read(MAX_HEADER)
+    start, chips = _header(head)
+    cameras, filmed = _sources(path, start)
+    names = {f"source{number}/events": number for number in cameras}
+    camera, notes = hints.camera([*names] or ["events"])
+    source = names.get(camera)
+    sizes: dict[int | None, Size | None] = {number: chip_size(chip) for number, chip in chips}
+    size = hints.size or sizes.get(source) or next(filter(None, sizes.values()), None)
+    if size is None:
+        raise EvflowDataError(
+            "EV015", f"the header of {path} names the sources "
+            f"{[chip for _, chip in chips] or 'none'}, of unknown size.",
+            f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.", where=path)
+    streams = {f"source{number}/frames": number for number in filmed}
+    chosen = choose([ImageStream(name, size if number == source else sizes.get(number))
+                     for name, number in streams.items()], hints, size, camera)
+    reading = _Reading(Aside(path, hints, size), size, head.startswith(FIRST), source,
+                       streams[chosen.stream.name] if chosen.stream else None)
+    with open(path, "rb") as f:
+        f.seek(start)
+        return reading.aside.collect(
+            reading.chunks(path, f), lambda: (*notes, *chosen.notes, *reading.notes()))
+
+
+def _header(head: bytes) -> tuple[int, list[tuple[int, str]]]:
+    """Where the packets begin, and the number and name of each source in the header."""
     start, chips = 0, []
     while line := LINE.match(head, start):
         start = line.end()
         if source := SOURCE.match(line[0]):
-            chips.append(source[2].decode("latin-1").strip())
+            chips.append((int(source[1]), source[2].decode("latin-1").strip()))
         if line[0].startswith(b"#!END-HEADER"):
             break
-    size = hints.size or next(filter(None, map(chip_size, chips)), None)
-    if size is None:
-        raise EvflowDataError(
-            "EV015", f"the header of {path} names the sources {chips or 'none'}, of unknown size.",
-            f"Pass size=(width, height), --size WxH; known chips: {', '.join(CHIPS)}.", where=path)
-    chosen = choose([ImageStream("frames", size)], hints, size)
-    reading = _Reading(Aside(path, hints, size), size, head.startswith(FIRST),
-                       chosen.stream is not None)
-    with open(path, "rb") as f:
+    return start, chips
+
+
+def _sources(path: Path, start: int) -> tuple[list[int], list[int]]:
+    """The numbers of the sources with events, and of those with frames, each in order of their
+    first packets, up to any damage."""
+    found: dict[int, dict[int, None]] = {POLARITY: {}, IMAGE: {}}
+    with open(path, "rb") as f, contextlib.suppress(Damage, EvflowDataError):
         f.seek(start)
-        return reading.aside.collect(reading.chunks(path, f), reading.notes)
+        while packet := _next(path, f):
+            if packet.kind in found and packet.number:
+                found[packet.kind][packet.source] = None
+            _pass(path, f, packet)
+    return [*found[POLARITY]], [*found[IMAGE]]
 
 
 class _Reading:
-    """Decodes packets in order: events become chunks, frames are collected. turned: y counts from
-    the bottom; frames: whether they are wanted."""
+    """Decodes packets in order: events of one source become chunks, frames of another, or the same,
+    are collected. turned: y counts from the bottom; frames: None if they are not wanted."""
 
-    def __init__(self, aside: Aside, size: Size, turned: bool, frames: bool) -> None:
-        self.aside, self.size, self.turned, self.frames = aside, size, turned, frames
+    def __init__(
+        self, aside: Aside, size: Size, turned: bool, source: int | None, frames: int | None
+    ) -> None:
+        self.aside, self.size, self.turned = aside, size, turned
+        self.source, self.frames = source, frames
         self.left: collections.Counter[str] = collections.Counter()
-        self.source: int | None = None  # of the events
         self.mosaic = False
 
     def chunks(self, path: Path, f: IO[bytes]) -> Iterator[Chunk]:
@@ -131,14 +163,13 @@ class _Reading:
             return False
         if packet.kind == POLARITY and packet.size != EVENT.itemsize:
             raise Damage(packet.begin - HEADER.size, f"events of {packet.size} bytes; expected 8")
-        if packet.kind == POLARITY and packet.number and self.source in (None, packet.source):
-            self.source = packet.source
+        if packet.kind == POLARITY and packet.number and packet.source == self.source:
             body = f.read(min(packet.number * packet.size, os.path.getsize(path)))
             events = np.frombuffer(body, EVENT, len(body) // EVENT.itemsize)
             if len(events):
                 found.append(Part(events, packet.overflow, packet.begin))
                 self.aside.follow(_times(events["t"][-1:], packet.overflow))
-        elif packet.kind == IMAGE and self.frames:
+        elif packet.kind == IMAGE and packet.source == self.frames:
             self._take(f, packet)
         elif packet.number:
             self.left[TYPES.get(packet.kind, "other events")] += packet.number

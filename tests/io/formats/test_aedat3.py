@@ -50,7 +50,45 @@ def test_bits_by_hand(tmp_path: Path) -> None:
     assert found.events.size == (240, 180)
     assert set(texts(found.notes)) == {
         "1 events marked as invalid were not read", "1 other events were not read",
-        "2 IMU samples were not read", "3 special events were not read"}
+        "2 IMU samples were not read", "3 special events were not read",
+        "events of source1/events were read; not read: source2/events; --events-topic NAME reads "
+        "another"}
+
+
+def test_each_camera_has_its_own_frames(tmp_path: Path) -> None:
+    """Two in one file, of two sizes; the frames of the second come first."""
+    size = 36 + 2 * 240 * 180
+    dark, light = (np.full((180, 240), value) for value in (65535 // 5, 65535))
+    header = HEADER.replace(b"#!END", b"#Source 2: DAVIS346\r\n#!END")
+    path = write(tmp_path, aedat3_packet(2, size, frame(light, (900, 3000, 1000, 2000)), source=2),
+                 aedat3_packet(1, 8, event(3, 4, 1000)),
+                 aedat3_packet(1, 8, event(300, 200, 1000), source=2),
+                 aedat3_packet(2, size, frame(dark, (900, 3000, 1000, 2000))),
+                 aedat3_packet(1, 8, event(5, 6, 9000)), header=header)
+    got = read_recording(path)
+    assert (listed(got.events), got.events.size) == ([(3, 4, 1000, 1), (5, 6, 9000, 1)], (240, 180))
+    np.testing.assert_allclose(got.frames, np.full((1, 180, 240), 51), rtol=1e-5)
+    assert {"events of source1/events were read; not read: source2/events; --events-topic NAME "
+            "reads another", "frames are from source1/frames; not used: source2/frames (346x260, "
+            "the sensor has 240x180); --frames-topic NAME uses another"} < set(texts(got.notes))
+    other = read_recording(path, events_topic="source2/events")
+    assert (listed(other.events), other.events.size) == ([(300, 200, 1000, 1)], (346, 260))
+    assert not other.has_frames
+    assert "2 image streams" in str(refused(path, frames_topic="frames"))
+    assert "2 event streams" in str(refused(path, events_topic="events"))
+
+
+def test_frames_by_name(tmp_path: Path) -> None:
+    size = 36 + 2 * 240 * 180
+    events = aedat3_packet(1, 8, event(3, 4, 1000))
+    path = write(tmp_path, events, aedat3_packet(
+        2, size, frame(np.full((180, 240), 9999), (900, 3000, 1000, 2000))))
+    got = read_recording(path, frames_topic="frames")
+    assert len(got.frames) == 1
+    assert "frames are from source1/frames" in texts(got.notes)
+    assert "frames.unused" in [note.code for note in read_recording(path, late="join").notes]
+    assert "1 frames were not read" in texts(read_recording(path, no_frames=True).notes)
+    assert "There are: none" in str(refused(write(tmp_path, events), frames_topic="frames"))
 
 
 def test_frames_at_mid_exposure(tmp_path: Path) -> None:
