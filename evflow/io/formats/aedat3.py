@@ -142,15 +142,17 @@ class _Reading:
     def chunks(self, path: Path, f: IO[bytes]) -> Iterator[Chunk]:
         found: list[Part] = []
         damage: Damage | None = None
-        more = True
+        more, count = True, 0
         while more and not self.aside.done:
+            before = len(found)
             try:
                 more = self._packet(path, f, found)
             except Damage as e:
                 damage, more = e, False
-            if sum(len(part.events) for part in found) >= tables.ROWS:
+            count += sum(len(part.events) for part in found[before:])
+            if count >= tables.ROWS:
                 yield self._decode(found)
-                found = []
+                found, count = [], 0
         if found:
             yield self._decode(found)
         if damage:
