@@ -21,7 +21,7 @@ from helpers.bags import (
     packet_messages,
     write,
 )
-from helpers.recordings import SIZE, damage, equal, make, refused
+from helpers.recordings import SIZE, T0, damage, equal, make, refused
 from helpers.streams import survives
 
 from evflow.errors import EvflowDataError
@@ -30,7 +30,8 @@ from evflow.io.decode.stream import Damage
 from evflow.io.formats.ros import libcaer_words
 from evflow.io.formats.ros.messages import Packet
 from evflow.io.triggers import read_triggers
-from evflow.notes import Note
+from evflow.notes import Note, texts
+from evflow.types import Events, Recording
 
 
 @needs_rosbags
@@ -57,6 +58,25 @@ def test_event_packets(
         got = read_recording(path)
         equal(got.events, as_sent(want, encoding))
         assert got.has_frames == encoding.startswith("libcaer")
+
+
+@needs_rosbags
+def test_a_unit_of_the_events_alone(tmp_path: Path) -> None:
+    """Those of EVT3 are in us; header times are in ns, unless all times share a wrong unit."""
+    want = make()
+    path = write(tmp_path / "a.bag", packet_messages(want.events, "evt3")
+                 + image_messages(want, "/cam/image_raw"))
+    got = read_recording(path, time_unit="us", frames_topic="/cam/image_raw")
+    equal(got.events, as_sent(want.events, "evt3"))
+    np.testing.assert_array_equal(got.frame_times, want.frame_times)
+    assert "frame times of /cam/image_raw were read in ns." in texts(got.notes)
+    early = Recording(
+        Events(*(getattr(want.events, n) - (T0 if n == "t" else 0) for n in "xyt"), want.events.p,
+               SIZE), want.frames, want.frame_times - T0)
+    path = write(tmp_path / "b.bag", array_messages(early.events) + image_messages(early))
+    got = read_recording(path, time_unit="us")
+    np.testing.assert_array_equal(got.frame_times, early.frame_times * 1000)
+    np.testing.assert_array_equal(got.events.t, early.events.t * 1000)
 
 
 @needs_rosbags

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
 from evflow.io.decode.stream import Damage, gather
@@ -31,11 +30,13 @@ from evflow.io.formats.ros.messages import (
 from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded, triggers
 from evflow.io.hints import Hints
 from evflow.io.images import encodings
+from evflow.io.images.exposures import Stamps
 from evflow.io.images.pictures import claimed_size
 from evflow.io.images.recorded import FrameStack
 from evflow.io.images.streams import ImageStream, choose, events_alone
+from evflow.io.images.times import FrameTimes, beside_events
 from evflow.notes import Note
-from evflow.types import Recording
+from evflow.types import Events, Recording
 
 LOOKED = 16  # messages examined for encoding and size
 
@@ -66,8 +67,8 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
         notes += chosen.notes
         if chosen.stream is None:
             return Recording.of_events(events, notes)
-        stack = bag.stack(chosen.stream.name, events.size, hints, None if own_clock else span)
-        return stack.beside(events, hints, (bag.clock(chosen.stream.name), *notes))
+        stack, more = bag.stack(chosen.stream.name, events, hints, None if own_clock else span)
+        return stack.beside(events, hints, (bag.clock(chosen.stream.name), *notes, *more))
 
 
 def triggers_of(bag: Bag, topic: str | None) -> np.ndarray:
@@ -215,21 +216,32 @@ class Bag:
             where=self.path)
 
     def stack(
-        self, topic: str, size: Size, hints: Hints, span: tuple[int, int] | None
-    ) -> FrameStack:
-        """The images of a topic whose times lie in [start, stop) us."""
-        found = FrameStack(topic, size, hints.colour)
+        self, topic: str, events: Events, hints: Hints, span: tuple[int, int] | None
+    ) -> tuple[FrameStack, tuple[Note, ...]]:
+        """The images of a topic whose times lie in [start, stop) us, and notes on their unit."""
+        found = FrameStack(topic, events.size, hints.colour)
         kind = next(c.msgtype for c in self.reader.connections if c.topic == topic)
         stamped = self.stamped(topic)
         try:
-            for message in self.messages(topic):
-                ns = message.stamp_ns()
-                stamp = hints.instant(ns if stamped else message.recorded_ns, "ns")
+            times = self._times(topic, hints, events, stamped)
+            for index, message in enumerate(self.messages(topic)):
+                ns = _stamp(message, stamped)
+                stamp = hints.instant(ns, "ns") if times is None else int(times.us[index])
                 if span is None or span[0] <= stamp < span[1]:
                     found.append(message.image(kind, hints.colour), stamp)
         except Damage as e:
             raise self._wrong(topic, e) from e
-        return found
+        return found, times.notes if times else ()
+
+    def _times(
+        self, topic: str, hints: Hints, events: Events, stamped: bool
+    ) -> FrameTimes | None:
+        """The times of all images of a topic where a unit is asked for, which may be that of the
+        events alone; None if none is."""
+        if hints.time_unit == "auto":
+            return None
+        ns = np.array([_stamp(message, stamped) for message in self.messages(topic)])
+        return beside_events(Stamps(ns), topic, "ns", hints, events)
 
     def stamped(self, topic: str) -> bool:
         """Whether headers of a topic have times (the first alone may be 0, in simulations)."""
@@ -240,3 +252,9 @@ class Bag:
         return Note("frames.clock", f"frame times are the header times of {topic}"
                     if self.stamped(topic) else f"frame times are those at which {topic} was "
                     "recorded: its headers have none")
+
+
+def _stamp(message: Message, stamped: bool) -> int:
+    """The time of an image in ns, after which its pixels are read."""
+    ns = message.stamp_ns()
+    return ns if stamped else message.recorded_ns
