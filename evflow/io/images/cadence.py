@@ -93,7 +93,7 @@ def _regular(times: Array, changes: Array, frame_us: float) -> bool:
     gaps = np.rint(np.diff(times) / frame_us)
     long = gaps > gaps.min(initial=np.inf)
     few = len(gaps) < LEAST_FRAMES or (gaps - 1).clip(0).sum() < LEAST_REPEATS
-    if few or not long.any():
+    if few or not long.any() or gaps.min() < 1:  # a converter shows each for a frame at least
         return False
     more = np.median(gaps[long]) / np.median(gaps[~long])
     return bool(np.median(changes[long]) <= (1 + more) / 2 * np.median(changes[~long]))

@@ -57,6 +57,12 @@ def test_repeated_frames_are_counted_and_dropped(
             assert times == [10_000 * i for i in range(len(order))]
 
 
+def test_frames_closer_than_any_that_are_shown_have_no_cadence() -> None:
+    """As where the times are those of a recording."""
+    times = np.cumsum(np.append(0, np.tile([100, 66_000], 16)))
+    assert evened(times, np.ones(32), 33_333.0) is None
+
+
 @pytest.mark.parametrize(("show", "film"), [(30, 24), (60, 24), (30, 25), (60, 50), (30, 20),
                                             (60, 23.976), (25, 24)])
 @pytest.mark.parametrize("late", [0.0, 0.5, 0.999])
