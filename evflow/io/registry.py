@@ -157,7 +157,7 @@ def read_events(path: str | os.PathLike, **hints: Unpack[HintArguments]) -> Even
 
     Args:
         path: as in `read_recording`.
-        **hints: as in `read_recording`.
+        **hints: as in `read_recording`; frames_topic and no_frames change nothing.
 
     Returns:
         The events.
@@ -166,6 +166,7 @@ def read_events(path: str | os.PathLike, **hints: Unpack[HintArguments]) -> Even
         EvflowDataError: EV001, EV008, EV009, EV010, EV016, EV020, EV023 and others, as in
             `read_recording`.
     """
+    hints["frames_topic"], hints["no_frames"] = None, True
     return read_recording(path, **hints).events
 
 

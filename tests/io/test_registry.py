@@ -49,6 +49,15 @@ def test_round_trip(sources: dict[str, Path], kind: str) -> None:
     np.testing.assert_array_equal(want.frame_times, got.frame_times + shift)
 
 
+def test_events_are_read_without_their_frames(tmp_path: Path) -> None:
+    """Whatever is wrong with one, and whichever are named."""
+    folder = write_ijrr(tmp_path / "a", make())
+    (folder / "images" / "frame_00000003.png").write_bytes(b"no image")
+    assert "--no-frames" in refused(folder).fix
+    equal(read_events(folder, frames_topic="images.txt"), read_recording(
+        folder, no_frames=True).events)
+
+
 @pytest.mark.parametrize("kind", ["dsec", "npz"])
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
 def test_frames_keep_their_depth(tmp_path: Path, kind: str, dtype: Any) -> None:
