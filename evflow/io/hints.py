@@ -14,6 +14,7 @@ import numpy as np
 
 from evflow.checks import Size, beyond, check_polarity, check_size
 from evflow.errors import EvflowDataError
+from evflow.io.decode.columns import whole
 from evflow.io.decode.units import UNITS_US, since_1970
 from evflow.light.colour import COLOURS
 from evflow.notes import Note
@@ -175,9 +176,10 @@ class Hints:
             t, unit = t.astype(f"{t.dtype.kind}8[us]").astype(np.int64), "us"
         if t.dtype.kind == "f":
             if self.time_unit == "auto" and native != "s":
+                unit = native if whole(t) else "s"  # no camera counts whole seconds
                 raise EvflowDataError(
                     "EV003", f"times are {t.dtype} (first {t[0]}), but {native} must be integers.",
-                    "Are they seconds? Pass time_unit='s' (--time-unit s).")
+                    f"Are they {unit}? Pass time_unit={unit!r} (--time-unit {unit}).")
             if not np.isfinite(t).all():
                 raise EvflowDataError("EV007", f"{(~np.isfinite(t)).sum():,} times are not finite.")
             with np.errstate(over="ignore"):  # an overflow is refused below
@@ -189,10 +191,10 @@ class Hints:
             raise EvflowDataError("EV003", f"times have dtype {t.dtype}.", "Expected numbers.")
         if beyond(*(int(end) * max(UNITS_US[unit], 1) for end in (t.min(), t.max()))):
             raise _too_late(t, unit)
-        whole = t.astype(np.int64, copy=False)
+        counts = t.astype(np.int64, copy=False)
         if unit == "ns":
-            return (whole + 500) // 1000
-        return whole if unit == "us" else whole * np.int64(UNITS_US[unit])
+            return (counts + 500) // 1000
+        return counts if unit == "us" else counts * np.int64(UNITS_US[unit])
 
     def instant(self, t: Any, native: str) -> int:
         """One time, converted as by `microseconds`."""
