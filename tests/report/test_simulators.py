@@ -40,7 +40,8 @@ def test_what_is_the_same_is_no_distance_away_and_nothing_is_far() -> None:
         assert distance({**SAME, name: value}) > 0.04
     events = Events(np.array([1, 2]), np.array([1, 1]), np.array([5, 9]), np.array([1, 0], bool),
                     (4, 3))
-    film = Film(np.zeros((2, 3, 4), np.float32), np.array([0, 20]), events, (0, 20), np.zeros((3, 4), bool))
+    film = Film(np.zeros((2, 3, 4), np.float32), np.array([0, 20]), events, (0, 20),
+                np.zeros((3, 4), bool))
     nothing = likeness(film, events.slice(0, 0), events)
     assert distance(nothing) > 1
     alike = likeness(film, events, events)
