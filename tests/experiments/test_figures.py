@@ -286,6 +286,20 @@ def flow() -> dict[str, Figures]:
                     for at in ((2, 0), (3, 0), (3, 1))] for label, name in names.items()}
 
 
+def recorded_flow() -> dict[str, Figures]:
+    names = {"default parameters": "default", "thresholds log-uniform": "wide-log",
+             "estimate, with": r"evflow\+circuit"}
+
+    def of(name: str, target: str) -> Figures:
+        row, source = rf"FWL\|{name} \(3\)", "see_better_flow_recordings"
+        mean = values(source, row, "mean", 0, target)[0]
+        return [mean, *([0.0] if name == "default" else (
+            values(source, row, "to default", k, target)[0] for k in range(2)))]
+
+    return {label: [*of(name, "slider_depth"), *of(name, "cradle")]
+            for label, name in names.items()}
+
+
 def losses() -> dict[str, Figures]:
     rows = {"L_P |": ("L_P", 8), "+ L_F": (r"L_P \+ L_F \+ L_F'", 12),
             "+ L_E": (r"L_P \+ L_E", 16), "all |": (r"L_P \+ L_F \+ L_F' \+ L_E", 20),
@@ -337,6 +351,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "### Video of two other cameras"): other_cameras,
     (ACCURACY, "### Longer trainings"): longer,
     (ACCURACY, "### Video of real recordings"): recorded_video,
+    (ACCURACY, "### Flow of real recordings"): recorded_flow,
     (ACCURACY, "### Flow"): flow,
     (ACCURACY, "### Losses and flow steps"): losses,
     (ACCURACY, "A Newton's cradle, thresholds from"): cradle,
