@@ -245,6 +245,7 @@ def _ticks(spikes: Spikes, dt_us: Array) -> Array:
     at = spikes.first if spikes.earliest is None else jnp.maximum(spikes.first, spikes.earliest)
     length = dt_us.astype(at.dtype)[:, None]
     within = jnp.clip(jnp.ceil(at * length), 1, length).astype(jnp.uint32)
+    within = jnp.minimum(within, dt_us[:, None])  # float32 rounds lengths above 2^24 us
     when = (jnp.cumsum(dt_us) - dt_us)[:, None] + within
     on, more = (flag.astype(jnp.uint32) for flag in (spikes.count > 0, abs(spikes.count) > 1))
     return jnp.maximum((when << 2) | (on << 1) | more, 1)

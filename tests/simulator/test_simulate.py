@@ -183,9 +183,22 @@ def test_events_of_very_long_intervals_stay_in_them() -> None:
         events = simulate(KEY, frames, edges, QUIET, model=model)
         assert len(events) > 200
         parts = [simulate(KEY, frames[:n], edges[:n], QUIET, model=model) for n in (2, 3)]
-        assert [part.t[-1] <= edge for part, edge in zip(parts, edges[1:], strict=False)]
+        assert all(part.t[-1] <= edge for part, edge in zip(parts, edges[1:], strict=False))
         equal(events.slice(0, int(edges[1]) + 1), parts[0])
         equal(events.slice(0, int(edges[2]) + 1), parts[1])
+
+
+def test_a_slot_at_a_frame_is_not_after_it() -> None:
+    """With one event per pixel and interval, v2e's only slot is the frame itself. The lengths are
+    such that float32 rounds them up, by 1 and 3 us."""
+    edges = np.cumsum([7, 20_000_003, 100_000_005, 60_000_001])
+    frames = np.array([50, 65, 50, 65], np.uint8)[:, None, None] * np.ones(SHAPE, np.uint8)
+    events = simulate(KEY, frames, edges, Camera.constant(SHAPE, 0.2, 0.15),
+                      model=SensorModel(timestamps="v2e"))
+    times, count = np.unique(events.t, return_counts=True)
+    assert (count == SHAPE[0] * SHAPE[1]).all()
+    assert (times <= edges[1:]).all()
+    assert (edges[1:] - times <= 1).all()
 
 
 def test_video_length_does_not_recompile() -> None:
