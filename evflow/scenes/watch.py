@@ -53,7 +53,8 @@ def exposures(
     key: Array, times_s: Array, count: int, exposure_s: float, jitter_s: float
 ) -> Array:
     """Times (T, count) over which the frames at times_s (T,) are averaged: exposures of up to
-    exposure_s, with time stamps off by a std of up to jitter_s. Half of the scenes have neither."""
+    exposure_s, with time stamps off by a std of up to jitter_s. Half of the scenes have no
+    exposure, and, independently, half no jitter."""
     k_some, k_span, k_late, k_frame = jax.random.split(key, 4)
     some = jax.random.bernoulli(k_some, 0.5, (2,))
     span = some[0] * exposure_s * jax.random.uniform(k_span)
