@@ -24,6 +24,7 @@ CIRCUIT = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_deca
 MOST_THETA = 2.0  # log units; no sensor has a median above
 BEYOND_CONTRAST = 20.0  # log units
 CHOICES = ("cutoff_by_light", "noise_resets_memory")
+MISMATCH = 1000  # folded into the seed's key; the simulation splits that same key into 0, 1, 2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -199,7 +200,8 @@ class Pixels:
         values = {"theta_on": known.theta, "theta_off": known.theta, "eta_on": 0.0, "eta_off": 0.0,
                   **given, "sigma_on": self.mismatch, "sigma_off": self.mismatch}
         nominal = Summary(**{name: jnp.float32(number) for name, number in values.items()})
-        return sample_pixels(key, nominal, shape).validate()
+        # Thresholds of the simulation's own key would be its leak pattern and its noise again.
+        return sample_pixels(jax.random.fold_in(key, MISMATCH), nominal, shape).validate()
 
 
 def _doubt(camera: Camera) -> None:

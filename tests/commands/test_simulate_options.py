@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import h5py
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers.videos import drifting
@@ -20,6 +21,8 @@ from evflow.cli import main
 from evflow.commands.pixels import Pixels
 from evflow.commands.simulate import Simulate
 from evflow.io.source import open_frames
+from evflow.simulator.constants import Constants
+from evflow.simulator.sensor import start
 from evflow.types import Events
 
 Run = tuple[Events, dict[str, Any]]
@@ -105,6 +108,20 @@ def test_thresholds_that_differ_from_pixel_to_pixel() -> None:
     assert abs(np.corrcoef(np.ravel(uneven.theta_on), np.ravel(uneven.theta_off))[0, 1]) < 0.05
     assert float(np.median(uneven.eta_off)) == 2.0
     assert float(np.max(uneven.eta_on)) == 0.0
+
+
+@pytest.mark.parametrize("mismatch", [None, 0.05])
+def test_thresholds_are_drawn_apart_from_leak_and_noise(mismatch: float | None) -> None:
+    """Correlations over 5,000 pixels: 4 standard deviations are .057."""
+    options = Pixels(sensor="noisy", mismatch=mismatch, seed=3)
+    camera, model = options.pixels((100, 50)), options.model()
+    whole, _ = start(jax.random.key(options.seed), jnp.full((50, 100), 4.0), camera,
+                     Constants.of(model), None)
+    assert whole.leaking is not None
+    pattern = np.log(whole.leaking / camera.theta_on.ravel())
+    for theta in (camera.theta_on, camera.theta_off):
+        for drawn in (pattern, whole.words.astype(jnp.float32)):
+            assert abs(np.corrcoef(drawn, np.ravel(theta))[0, 1]) < 0.057
 
 
 def test_a_sensor_s_size_and_slow_motion(
