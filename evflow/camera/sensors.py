@@ -36,6 +36,7 @@ WITHOUT = {
 
 
 NUMBERS = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz")
+SWITCHES = ("cutoff_by_light", "eta_is_all", "eta_intensity", "noise_resets_memory")
 
 
 def is_off(value: Any) -> bool:
@@ -181,8 +182,8 @@ class SensorModel(_Numbers):
             crossing times. Light changes within the refractory period are then lost.
 
     Raises:
-        EvflowDataError: EV020 (an unknown choice, a negative value, or an option that does not
-            apply to this kind).
+        EvflowDataError: EV020 (an unknown choice, a negative value, a field of another type, or an
+            option that does not apply to this kind).
 
     Example:
         >>> model = ef.SensorModel(cutoff_hz=200.0, refractory_s=5e-4, leak_hz=0.1)
@@ -227,6 +228,13 @@ class SensorModel(_Numbers):
                     "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
         for name in NUMBERS:
             _settle(self, name, 0.0, ">= 0")
+        for name in SWITCHES:
+            value = getattr(self, name)
+            require(self, name, isinstance(value, bool | int | np.bool_) and value in (0, 1),
+                    "True or False")
+        require(self, "voltmeter", isinstance(self.voltmeter, Voltmeter), "a Voltmeter")
+        require(self, "photoreceptor", isinstance(self.photoreceptor, SecondOrder | None),
+                "a SecondOrder, or None")
         on = tuple(name for name in NUMBERS if not is_off(getattr(self, name)))
         voltmeter = ("voltmeter",) if self.kind == "voltmeter" else ()
         second = ("photoreceptor",) if self.photoreceptor is not None else ()

@@ -23,6 +23,7 @@ from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.simulator import noise, pixel, sensor
+from evflow.simulator.arguments import check_arguments, check_interval, number
 from evflow.simulator.constants import Constants
 from evflow.simulator.grids import as_log
 from evflow.simulator.pixel import PixelState
@@ -55,8 +56,9 @@ def simulate_counts(
     Raises:
         EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
             range, or more noise than an interval holds), EV015 (frames and camera of different
-            size), EV020 (options, or a model that has no such counts).
+            size), EV020 (no key, camera or model; options; a model that has no such counts).
     """
+    check_arguments(key, camera, model)
     model = model or SensorModel()
     law = Constants.of(model)
     log_frames = as_log(law, jnp.asarray(plain("log_frames", log_frames)))
@@ -68,8 +70,9 @@ def simulate_counts(
     if camera.shape != log_frames.shape[1:]:
         raise EvflowDataError(
             "EV015", f"the camera is {camera.shape}, the frames {log_frames.shape[1:]}.")
-    if not 0 <= smooth <= 1:
-        raise EvflowDataError("EV020", f"smooth={smooth}.", "Choose 0 (exact) to 1.")
+    if not 0 <= number(smooth) <= 1:
+        raise EvflowDataError("EV020", f"smooth={smooth!r:.60}.",
+                              "Choose a number from 0 (exact) to 1, not traced.")
     unsmooth = (law.refractory_s, law.leak_jitter, law.photoreceptor)
     if law.kind == "voltmeter" or (smooth and any(part is not None for part in unsmooth)):
         raise EvflowDataError(
@@ -78,13 +81,11 @@ def simulate_counts(
             "Its dead time, jitter and second order have no gradient: dataclasses.replace(model, "
             "refractory_s=0, leak_jitter=0, photoreceptor=None).")
     check_log("log_frames", log_frames)
-    timed = not isinstance(frame_dt_s, jax.core.Tracer)
-    if timed and not 0 < float(frame_dt_s) < math.inf:
-        raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}.", "A length in seconds, > 0.")
+    seconds = check_interval(frame_dt_s)
     camera = jax.tree.map(lambda m: jnp.asarray(m, log_frames.dtype), sensor.simulable(camera))
     nominal = noise.nominal_thresholds(law, camera) if noise.is_noisy(law, camera) else None
-    if nominal is not None and timed:
-        noise.check_rate(noise.most_rate(law, camera, nominal), float(frame_dt_s))
+    if nominal is not None and seconds is not None:
+        noise.check_rate(noise.most_rate(law, camera, nominal), seconds)
     times = sensor.frame_times(frame_dt_s, len(log_frames) - 1)
     return _counts(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32), times,
                    law, smooth=float(smooth))

@@ -24,7 +24,7 @@ from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.simulator import circuits, noise, sensor
 from evflow.simulator.active import BLOCK
-from evflow.simulator.arguments import check_arguments
+from evflow.simulator.arguments import check_arguments, check_interval
 from evflow.simulator.bins import Schedule
 from evflow.simulator.constants import Constants
 from evflow.simulator.grids import Touched, as_log, put, scan, scan_brownian
@@ -121,7 +121,7 @@ def simulate_voxels(
     Raises:
         EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
             range, or more noise than an interval holds), EV015 (frames and camera of different
-            size), EV020 (bins, frame_dt_s).
+            size), EV020 (no key, camera or model; bins, frame_dt_s).
 
     Example:
         >>> log_frames = to_log(frames)  # of evflow.light.log_maps
@@ -135,12 +135,9 @@ def simulate_voxels(
     if log_frames.ndim < 3 or log_frames.shape[-3] < 2:
         raise EvflowDataError("EV002", f"log_frames has shape {log_frames.shape}.",
                               "Expected (..., T, H, W) with at least two frames.")
-    timed = not isinstance(frame_dt_s, jax.core.Tracer)
     if not isinstance(bins, int | np.integer) or bins < 2:
         raise EvflowDataError("EV020", f"bins={bins!r}.", "It is a whole number, >= 2.")
-    if np.ndim(frame_dt_s) or (timed and not 0 < float(frame_dt_s) < math.inf):
-        raise EvflowDataError("EV020", f"frame_dt_s={frame_dt_s}.", "It is one number of seconds, "
-                              "> 0, for all videos; jax.vmap takes one for each.")
+    seconds = check_interval(frame_dt_s)
     if log_frames.dtype != jnp.uint8:
         check_log("log_frames", log_frames)
     if camera.shape[-2:] != log_frames.shape[-2:]:
@@ -152,11 +149,11 @@ def simulate_voxels(
             "EV015", f"the camera's leading axes are {camera.shape[:-2]}, the frames' {lead}.",
             "Give one camera (H, W) or one for each video.")
     camera = jax.tree.map(lambda m: jnp.asarray(m, jnp.float32), sensor.simulable(camera))
-    if timed and _by_blocks(key, law, log_frames, camera):
-        return _in_blocks(key, np.asarray(log_frames), camera, float(frame_dt_s), law, bins)
+    if seconds is not None and _by_blocks(key, law, log_frames, camera):
+        return _in_blocks(key, np.asarray(log_frames), camera, seconds, law, bins)
     nominal = noise.nominal_thresholds(law, camera) if noise.is_noisy(law, camera) else None
-    if nominal is not None and timed:
-        noise.check_rate(noise.most_rate(law, camera, nominal), float(frame_dt_s))
+    if nominal is not None and seconds is not None:
+        noise.check_rate(noise.most_rate(law, camera, nominal), seconds)
     times = sensor.frame_times(frame_dt_s, log_frames.shape[-3] - 1)
     return _voxels(key, log_frames, camera, nominal, jnp.asarray(frame_dt_s, jnp.float32), times,
                    law, bins=bins, lead=lead)

@@ -129,6 +129,19 @@ def test_what_is_no_rate_is_refused(value: Any) -> None:
         SensorModel(leak_hz=value)
 
 
+@pytest.mark.parametrize(("name", "value"), [
+    ("voltmeter", 3), ("voltmeter", None), ("photoreceptor", True), ("eta_is_all", "no"),
+    ("cutoff_by_light", 2), ("eta_intensity", None), ("noise_resets_memory", np.ones(2, bool))])
+def test_fields_of_another_type_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(EvflowDataError, match=rf"EV020.*SensorModel\({name}="):
+        SensorModel(**{name: value})
+
+
+def test_switches_may_be_of_numpy() -> None:
+    assert SensorModel(eta_is_all=np.bool_(True), cutoff_by_light=0) == SensorModel(
+        eta_is_all=True, cutoff_by_light=False)
+
+
 @pytest.mark.parametrize("options", [
     {"kind": "dvs"}, {"kind": "esim", "leak_hz": 0.1}, {"kind": "esim", "timestamps": "v2e"},
     {"kind": "paper", "shot_hz": 1.0}, {"kind": "paper", "noise_resets_memory": True},

@@ -183,7 +183,10 @@ def test_bytes_pass_through_the_log_map() -> None:
     ({"log_frames": jnp.full((3, *SHAPE), jnp.nan)}, "EV007"),
     ({"log_frames": jnp.full((3, *SHAPE), 128.0)}, "EV003"),
     ({"frame_dt_s": -1e-3}, "EV020"), ({"frame_dt_s": np.nan}, "EV020"),
+    ({"frame_dt_s": np.full(3, 1e-3)}, "EV020"), ({"frame_dt_s": "1e-3"}, "EV020"),
+    ({"smooth": "1"}, "EV020"), ({"smooth": None}, "EV020"), ({"smooth": np.nan}, "EV020"),
+    ({"key": 0}, "EV020"), ({"model": "v2e"}, "EV020"), ({"camera": {"theta_on": 0.2}}, "EV020"),
     ({"camera": dataclasses.replace(QUIET, eta_on=QUIET.eta_on + 1e7)}, "EV014")])
 def test_bad_input_is_refused(change: dict[str, Any], code: str) -> None:
-    given = {"log_frames": LOG, "camera": QUIET, "frame_dt_s": 1e-3} | change
-    assert code_of(lambda: simulate_counts(KEY, **given)) == code
+    given = {"key": KEY, "log_frames": LOG, "camera": QUIET, "frame_dt_s": 1e-3} | change
+    assert code_of(lambda: simulate_counts(**given)) == code

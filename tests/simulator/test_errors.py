@@ -81,6 +81,8 @@ TIMES = np.array([0, 1000, 2000])
     ({"key": None}, "EV020", "key is None"),
     ({"key": np.random.default_rng(0)}, "EV020", "jax.random.key(0)"),
     ({"key": jax.random.split(KEY)}, "EV020", "keys of shape (2,)"),
+    ({"key": jax.random.split(jax.random.PRNGKey(0))}, "EV020", "keys of shape (2, 2)"),
+    ({"key": np.zeros(3, np.uint32)}, "EV020", "key is array([0, 0, 0]"),
 ])
 def test_bad_input_says_what_was_seen(changed: dict[str, Any], code: str, seen: str) -> None:
     given = {"key": KEY, "frames": frames(), "times_us": TIMES, "camera": CAMERA} | changed
@@ -121,6 +123,7 @@ def test_the_same_input_unharmed_is_accepted() -> None:
     for dtype in (np.uint8, np.uint16, np.float32, np.float64, np.float16):
         assert len(simulate(KEY, frames(dtype=dtype), TIMES, CAMERA)) == 0
     assert len(simulate(KEY, with_value(255.0), TIMES.astype(np.uint32), CAMERA)) > 0
+    assert len(simulate(jax.random.PRNGKey(0), with_value(255.0), TIMES, CAMERA)) > 0
 
 
 @pytest.mark.parametrize(("blocks", "times", "code", "seen"), [
@@ -154,6 +157,8 @@ LOG = jnp.full((3, *SHAPE), 4.0)
     ({"frame_dt_s": float("nan")}, "EV020"),
     ({"frame_dt_s": float("inf")}, "EV020"),
     ({"frame_dt_s": np.array([1e-3, 2e-3])}, "EV020"),
+    ({"frame_dt_s": None}, "EV020"),
+    ({"frame_dt_s": "1e-3"}, "EV020"),
     ({"bins": 1}, "EV020"),
     ({"bins": 5.0}, "EV020"),
     ({"camera": Camera.constant((6, 4))}, "EV015"),
