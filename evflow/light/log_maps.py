@@ -29,6 +29,8 @@ LOG_EPS_DN = 255.0 * LOG_EPS
 MOST_LOG = 6.0  # above the logarithm of 255 DN
 MOST_OF_ONE = 12.0  # for a single pixel: a thousand times as bright as white
 SAMPLED = 61  # stride of the values that are compared with it
+BELOW_BLACK = -1e-3  # lin-log begins at 0, but for rounding
+MOST_EPS = 0.1  # mean of `log_eps`, which ends at .001: above, the average would outshine white
 
 
 def lin_log(dn: ArrayLike) -> Array:
@@ -96,9 +98,9 @@ def to_log(frames: ArrayLike, log_map: str = "linlog") -> Array:
     return LOG_MAPS[log_map][0](frames.astype(jnp.float32))
 
 
-def check_log(name: str, values: Any) -> None:
+def check_log(name: str, values: Any, log_map: str | None = None) -> None:
     """Raise EV007 unless all values are finite (fast path: a finite sum implies it), EV003 if they
-    cannot be logarithms of DN. Traced values pass."""
+    cannot be logarithms of DN, in this map if one is given. Traced values pass."""
     if isinstance(values, jax.core.Tracer):
         return
     values = np.asarray(values)
@@ -109,6 +111,11 @@ def check_log(name: str, values: Any) -> None:
             raise EvflowDataError(
                 "EV007", f"{name} holds NaN or infinite values.",
                 "A logarithm of 0, or of a missing pixel? Use evflow.light.log_maps.to_log.")
+    if log_map == "log_eps" and mean > MOST_EPS:
+        raise EvflowDataError(
+            "EV003", f"{name} has a mean of {mean:.3g}, but the model's log_map is 'log_eps', in "
+            "which white is 0.",
+            "Convert frames in DN: evflow.light.log_maps.to_log(frames, 'log_eps').")
     if 0 < mean < 1:
         _check_no_fractions(name, values)
     some = float(values.reshape(-1)[::SAMPLED].max(initial=0))
@@ -117,6 +124,12 @@ def check_log(name: str, values: Any) -> None:
             "EV003", f"{name} has a mean of {mean:.3g} and reaches {max(some, mean):.3g}, but the "
             "logarithm of white (255 DN) is 5.54.",
             "Is it DN? Convert: evflow.light.log_maps.to_log(frames).")
+    if log_map == "linlog" and values.size and (low := float(values.min())) < BELOW_BLACK:
+        raise EvflowDataError(
+            "EV003", f"{name} reaches down to {low:.3g}, but the model's log_map is 'linlog', in "
+            "which black is 0.",
+            "Convert frames in DN: evflow.light.log_maps.to_log(frames). If it is log(I / 255 + "
+            ".001), as ESIM's: SensorModel(log_map='log_eps').")
 
 
 def _check_no_fractions(name: str, values: np.ndarray) -> None:

@@ -54,9 +54,10 @@ def simulate_counts(
         pixels whose parameters are impossible (theta <= 0, eta < 0), which else raise EV014.
 
     Raises:
-        EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
-            range, or more noise than an interval holds), EV015 (frames and camera of different
-            size), EV020 (no key, camera or model; options; a model that has no such counts).
+        EvflowDataError: EV002 (shape), EV003 (no logarithms, or those of another map), EV007 (NaN),
+            EV014 (camera out of range, or more noise than an interval holds), EV015 (frames and
+            camera of different size), EV020 (no key, camera or model; options; a
+            model that has no such counts).
     """
     check_arguments(key, camera, model)
     model = model or SensorModel()
@@ -80,7 +81,7 @@ def simulate_counts(
             "Add up simulate_voxels over bins." if law.kind == "voltmeter" else
             "Its dead time, jitter and second order have no gradient: dataclasses.replace(model, "
             "refractory_s=0, leak_jitter=0, photoreceptor=None).")
-    check_log("log_frames", log_frames)
+    check_log("log_frames", log_frames, law.log_map)
     seconds = check_interval(frame_dt_s)
     camera = jax.tree.map(lambda m: jnp.asarray(m, log_frames.dtype), sensor.simulable(camera))
     nominal = noise.nominal_thresholds(law, camera) if noise.is_noisy(law, camera) else None

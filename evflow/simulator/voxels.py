@@ -119,9 +119,9 @@ def simulate_voxels(
         pixels whose parameters are impossible (theta <= 0, eta < 0), which else raise EV014.
 
     Raises:
-        EvflowDataError: EV002 (shape), EV003 (no logarithms), EV007 (NaN), EV014 (camera out of
-            range, or more noise than an interval holds), EV015 (frames and camera of different
-            size), EV020 (no key, camera or model; bins, frame_dt_s).
+        EvflowDataError: EV002 (shape), EV003 (no logarithms, or those of another map), EV007 (NaN),
+            EV014 (camera out of range, or more noise than an interval holds), EV015 (frames and
+            camera of different size), EV020 (no key, camera or model; bins, frame_dt_s).
 
     Example:
         >>> log_frames = to_log(frames)  # of evflow.light.log_maps
@@ -139,7 +139,7 @@ def simulate_voxels(
         raise EvflowDataError("EV020", f"bins={bins!r}.", "It is a whole number, >= 2.")
     seconds = check_interval(frame_dt_s)
     if log_frames.dtype != jnp.uint8:
-        check_log("log_frames", log_frames)
+        check_log("log_frames", log_frames, law.log_map)
     if camera.shape[-2:] != log_frames.shape[-2:]:
         raise EvflowDataError(
             "EV015", f"the camera is {camera.shape[-2:]}, the frames {log_frames.shape[-2:]}.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,7 +15,8 @@ from helpers.videos import code_of
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
-from evflow.simulator import simulate, simulate_stream, simulate_voxels
+from evflow.light.log_maps import to_log
+from evflow.simulator import simulate, simulate_counts, simulate_stream, simulate_voxels
 from evflow.simulator.pack import Keys
 
 SHAPE = (4, 6)
@@ -178,6 +180,24 @@ def test_nan_log_frames_are_refused() -> None:
     frames[1, 2, 3] = np.nan
     with pytest.raises(EvflowDataError, match="EV007"):
         simulate_voxels(jax.random.key(0), frames, Camera.constant((4, 5)), frame_dt_s=1e-3)
+
+
+@pytest.mark.parametrize("simulated", [simulate_voxels, simulate_counts])
+def test_logarithms_of_another_map_are_refused(simulated: Callable[..., jax.Array]) -> None:
+    """Each map's own pass, from black to white; within jit values are not known."""
+    dn = np.linspace(0, 255, 3 * SHAPE[0] * SHAPE[1]).reshape(3, *SHAPE)
+
+    def of(log_map: str, model: SensorModel | None) -> jax.Array:
+        return simulated(KEY, to_log(dn, log_map), CAMERA, frame_dt_s=1e-3, model=model)
+
+    assert float(of("linlog", None).sum()) > 0
+    assert float(of("log_eps", SensorModel(kind="esim")).sum()) > 0
+    assert float(of("log_eps", SensorModel(log_map="log_eps")).sum()) > 0
+    with pytest.raises(EvflowDataError, match=r"EV003.*down to -6\.9.*log_map='log_eps'"):
+        of("log_eps", None)
+    with pytest.raises(EvflowDataError, match=r"EV003.*log_map is 'log_eps'.*, 'log_eps'\)"):
+        of("linlog", SensorModel(kind="esim"))
+    jax.jit(lambda log: simulated(KEY, log, CAMERA, frame_dt_s=1e-3))(to_log(dn, "log_eps"))
 
 
 def test_brightness_in_place_of_logarithms_is_refused() -> None:
