@@ -56,15 +56,15 @@ def simulate(
 
     Args:
         key: of jax.random; determines noise, leak pattern and the crossings of a Brownian pixel.
-        frames: (T, H, W), T >= 2: uint8, float DN on 0..255, or uint16 on 0..65535 (convert 10-
-            and 12-bit data with `evflow.light.log_maps.to_dn`). Between frames log intensity is
-            interpolated linearly.
+        frames: (T, H, W), T >= 2: uint8, float DN on 0..255, or uint16 on 0..65535 (10- and 12-bit
+            data need `full_scale`). Between frames log intensity is interpolated linearly.
         times_us: (T,) integer microseconds, strictly increasing; the first may be anything.
         camera: maps (H, W).
         model: the pixel circuit; None is `SensorModel()`.
         labels: also return which events are noise.
-        full_scale: value of white in float frames. None is 255; float frames of which none exceeds
-            8 are then refused, as they mostly are fractions, logarithms or radiance.
+        full_scale: value of white in float and uint16 frames (1023 for 10 bits); that of uint8 is
+            always 255. None is 65535 for uint16 and 255 for floats; float frames of which none
+            exceeds 8 are then refused, as they mostly are fractions, logarithms or radiance.
 
     Returns:
         Sorted `Events`, integer microseconds in (times_us[0], times_us[-1]]. With `labels`, also
@@ -75,7 +75,7 @@ def simulate(
         EvflowDataError: EV001 (fewer than two frames), EV002 (shapes), EV003 (dtype or range),
             EV004 (times do not increase), EV007 (NaN), EV014 (camera out of range, or more events
             or noise than an interval holds), EV015 (frames and camera of different size), EV020
-            (called within jit, vmap or grad; no key, camera or model).
+            (called within jit, vmap or grad; no key, camera or model; full_scale).
 
     Example:
         >>> camera = ef.Camera.sample(jax.random.key(0), frames.shape[1:])
@@ -138,8 +138,8 @@ def simulate_stream(
         With `labels`, pairs of them and bool (N,) as in `simulate`.
 
     Raises:
-        EvflowDataError: EV001, EV002, EV003, EV004, EV007, EV014, EV015 as in `simulate`, while
-            the iterator is read.
+        EvflowDataError: EV020 (no key, camera or model); EV001, EV002, EV003, EV004, EV007, EV014,
+            EV015, EV020 (full_scale) as in `simulate`, while the iterator is read.
 
     Example:
         >>> with ef.open_writer("out.h5", size) as out:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
+from evflow.light.log_maps import to_dn
 from evflow.light.ranges import DARKEST_DN, meaning
 
 
@@ -25,14 +26,14 @@ def blocks(
         shape: (H, W).
         length: frames of a block.
         copy: copy frames on arrival, for sources that reuse one buffer.
-        full_scale: value of white in float frames; None is 255, and frames that never exceed
-            DARKEST_DN are then refused.
+        full_scale: value of white in float and uint16 frames. None is 255 for floats, of which
+            some must then exceed DARKEST_DN, and 65535 for uint16.
 
     Raises:
         EvflowDataError: EV001 for less than two frames; EV002, EV003, EV004, EV007 and EV015 for
             bad ones.
     """
-    pairs = ((_flat(frame, copy), t)
+    pairs = ((_flat(frame, copy, full_scale), t)
              for frame, t in _single_frames(frames_iter, times_iter, shape, full_scale))
     taken = list(itertools.islice(pairs, 1))
     if not taken:
@@ -47,9 +48,9 @@ def blocks(
                               "Events need a change: give at least two frames.")
 
 
-def _flat(frame: np.ndarray, copy: bool) -> np.ndarray:
+def _flat(frame: np.ndarray, copy: bool, full_scale: float | None) -> np.ndarray:
     if frame.dtype == np.uint16:
-        frame = frame.astype(np.float32) * np.float32(255.0 / 65535.0)
+        frame = to_dn(frame, full_scale or 65535.0)
     dtype = np.uint8 if frame.dtype == np.uint8 else np.float32
     return frame.astype(dtype, copy=copy).ravel()
 
@@ -73,6 +74,8 @@ def _single_frames(
         if full_scale not in (None, 255) and block.dtype.kind == "f":
             block = block * block.dtype.type(255 / full_scale)
         _check_block(block, times, shape, dtype, index)
+        if full_scale is not None:
+            _check_white(block, full_scale, index)
         if block.dtype.kind == "f" and not bright:
             doubt, bright = doubt or meaning(block), float(block.max(initial=0)) > DARKEST_DN
         dtype = block.dtype
@@ -87,6 +90,21 @@ def _single_frames(
         raise EvflowDataError(
             "EV003", f"no value of the float frames is above {DARKEST_DN:g} where white is 255: "
             f"{doubt.what}?", doubt.fix)
+
+
+def _check_white(block: np.ndarray, full_scale: float, index: int) -> None:
+    """Raise EV003 for integers beyond white, EV020 for bytes with another white than 255; floats
+    have been scaled by it."""
+    if block.dtype == np.uint8 and full_scale != 255:
+        raise EvflowDataError(
+            "EV020", f"full_scale={full_scale} with uint8 frames, whose white is 255.", "Leave it "
+            "out; or scale them to floats: evflow.light.log_maps.to_dn(frames, full_scale).")
+    if block.dtype == np.uint16 and (high := int(block.max(initial=0))) > full_scale:
+        over = int(block.reshape(len(block), -1).max(1).argmax())
+        raise EvflowDataError(
+            "EV003", f"frame {index + over} reaches {high}, beyond white at full_scale="
+            f"{full_scale:g}.", "Pass the value of white, 1023 for 10 bits, 4095 for 12, 65535 for "
+            "16; what is brighter than white: np.minimum(frames, full_scale).")
 
 
 def _check_block(

@@ -9,6 +9,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from helpers.recordings import equal
 from helpers.sources import message, read
 from helpers.videos import SHAPE, code_of, drifting, milliseconds
 
@@ -24,6 +25,7 @@ from evflow import (
 from evflow.errors import EvflowDataError
 from evflow.io.source import open_frames
 from evflow.light.colour import luma, mosaic
+from evflow.light.log_maps import to_dn
 
 LIGHT = drifting(3, (24, 32))  # DN, linear
 KEY, CAMERA = jax.random.key(0), Camera.constant(SHAPE, 0.2, 0.2)
@@ -167,6 +169,13 @@ def test_what_the_messages_tell_to_do_gives_the_light(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         simulate(KEY, np.float32(0.25) * bright, milliseconds(4), CAMERA, full_scale=63.75).t,
         simulate(KEY, bright, milliseconds(4), CAMERA).t)
+    deep = np.rint(light * 16).astype(np.uint16)  # twelve bits
+    for white in (4095, 65535):
+        events, same = (simulate(KEY, frames, milliseconds(4), CAMERA, full_scale=full)
+                        for frames, full in ((deep, white), (to_dn(deep, white), 255)))
+        equal(events, same)
+    equal(events, simulate(KEY, deep, milliseconds(4), CAMERA))
+    simulate(KEY, light.astype(np.uint8), milliseconds(4), CAMERA, full_scale=255)
     black = np.zeros((4, *SHAPE), np.float32)  # and nothing is wrong with the night
     assert len(simulate(KEY, black, milliseconds(4), CAMERA)) == 0
     late = np.concatenate([dark[:2], light[2:]])  # nor with a video that begins in the dark
