@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -113,7 +114,9 @@ class Camera:
         nominal = sample_nominal(k_nominal, shape[:-2], prior)
         return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)
 
-    def drawn(self, key: Array, std: Camera) -> Camera:
+    def drawn(
+        self, key: Array, std: Camera, shared: Mapping[str, float] | None = None
+    ) -> Camera:
         """A camera drawn from an estimate: each pixel from N(estimate, std^2), kept in range.
 
         Estimated maps alone are too uniform: pixels with few events have the camera's median.
@@ -121,6 +124,10 @@ class Camera:
         Args:
             key: of jax.random.
             std: standard deviations (..., H, W) of this camera's maps, as `CameraEstimate.std`.
+            shared: the part of std that all pixels share, relative to the values, by name of the
+                map (`CameraEstimate.shared_error`). It is drawn once per map and multiplied in,
+                log-normal; None draws all of std pixel by pixel, which makes a camera whose median
+                is uncertain too uneven.
 
         Returns:
             A camera of the same shape, thresholds >= .01, noise rates >= 0.
@@ -131,13 +138,19 @@ class Camera:
         if std.shape != self.shape:
             raise EvflowDataError("EV015", f"standard deviations of shape {std.shape} for maps of "
                                   f"shape {self.shape}.", "Give those of this camera.")
-        draws = jax.random.normal(
-            key, (len(PARAMETERS), *self.shape), jnp.result_type(self.theta_on))
-        least = {"theta_on": THETA_MIN, "theta_off": THETA_MIN}
-        return Camera(**{
-            name: jnp.maximum(getattr(self, name) + getattr(std, name) * draw,
-                              least.get(name, 0.0))
-            for name, draw in zip(PARAMETERS, draws, strict=True)})
+        kind, count = jnp.result_type(self.theta_on), len(PARAMETERS)
+        draws = jax.random.normal(key, (count, *self.shape), kind)
+        once = jax.random.normal(
+            jax.random.fold_in(key, count), (count, *self.shape[:-2], 1, 1), kind)
+        least, maps = {"theta_on": THETA_MIN, "theta_off": THETA_MIN}, {}
+        for name, draw, common in zip(PARAMETERS, draws, once, strict=True):
+            value, error, part = getattr(self, name), getattr(std, name), (shared or {}).get(name)
+            if part:
+                error = jnp.sqrt(jnp.maximum(error**2 - (part * value) ** 2, 0.0))
+            pixels = value + error * draw
+            pixels = pixels * jnp.exp(part * common) if part else pixels
+            maps[name] = jnp.maximum(pixels, least.get(name, 0.0))
+        return Camera(**maps)
 
     def validate(self) -> Camera:
         """Refuse an impossible camera (on the host; traced arrays pass unchecked).

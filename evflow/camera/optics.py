@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import Summary
 from evflow.camera.sensors import LogMap, SensorModel
 from evflow.errors import EvflowDataError
@@ -73,6 +74,20 @@ def read_summary(path: str | os.PathLike) -> tuple[dict[str, float], dict[str, f
         raise EvflowDataError("EV009", f"{path}: a value of its summary is not a finite number.",
                               "Make the file again: evflow estimate.")
     return {n: float(v) for n, v in of.items()}, {n: float(v) for n, v in std.items()}
+
+
+def read_shared(path: str | os.PathLike) -> dict[str, float]:
+    """What `shared_error` gives of the summary in a camera.npz; empty if it has none. Raises EV009,
+    EV016."""
+    found = read_summary(path)
+    return {} if found is None else shared_error(*found)
+
+
+def shared_error(summary: Mapping[str, float], std: Mapping[str, float]) -> dict[str, float]:
+    """The error that all pixels of a camera share, relative to the values, by name of the map: that
+    of its summary, by name. Without maps whose value is 0 or whose error is unknown."""
+    return {name: std[name] / summary[name] for name in PARAMETERS
+            if summary[name] > 0 and np.isfinite(std[name])}
 
 
 def read_known(path: str | os.PathLike) -> dict[str, tuple[float, float]]:

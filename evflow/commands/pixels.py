@@ -37,7 +37,8 @@ class Pixels:
     sensor's own."""
     draw: bool = False
     """Draw the camera's pixels from their estimates and errors, which makes them as uneven as the
-    real ones; the most likely values are too uniform."""
+    real ones; the most likely values are too uniform. The error that all pixels share is drawn once
+    for each map: with another --seed, the whole camera differs by as much."""
     sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
     """Pixel circuit. clean, noisy: v2e's presets; v2e: its defaults; esim; dvs346, dvs240:
     DVS-Voltmeter's; paper: the paper's. The options below change parts of it."""
@@ -160,7 +161,7 @@ class Pixels:
         import jax
 
         from evflow.camera import Camera
-        from evflow.camera.optics import read_undetermined
+        from evflow.camera.optics import read_shared, read_undetermined
 
         refuse(self, THRESHOLDS, "--camera has its own")
         if self.sensor != "clean":
@@ -172,7 +173,7 @@ class Pixels:
             if std is None:
                 raise EvflowDataError("EV020", f"{path} holds no standard deviations.",
                                       "--draw needs the camera.npz of evflow estimate.")
-            camera = camera.drawn(jax.random.key(self.seed), std)
+            camera = camera.drawn(jax.random.key(self.seed), std, read_shared(path))
         return camera
 
     def _drawn(self, shape: tuple[int, int]) -> Camera:

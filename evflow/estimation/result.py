@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from evflow.camera import PARAMETERS, Camera, Summary
-from evflow.camera.optics import Optics, as_arrays, summary_arrays
+from evflow.camera.optics import Optics, as_arrays, shared_error, summary_arrays
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.bench.levels import Bench
 from evflow.estimation.drift import Third
@@ -80,6 +80,13 @@ class CameraEstimate:
                          f"{float(getattr(self.summary_std, name)):.2g}"
                          for name in (*determined, "eta_on", "eta_off"))
         return f"CameraEstimate({width}x{height}{values}, {len(self.notes)} notes)"
+
+    @property
+    def shared_error(self) -> dict[str, float]:
+        """The part of std that all pixels share, relative to the values, by name of the map: what
+        `Camera.drawn` takes."""
+        return shared_error(*({k: float(v) for k, v in dataclasses.asdict(s).items()}
+                              for s in (self.summary, self.summary_std)))
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write camera.npz: theta_on ..., theta_on_std ... (if known), valid, n_events, hot, dead,

@@ -313,6 +313,27 @@ def test_a_drawn_camera_is_as_uneven_as_estimates_and_errors_together() -> None:
     assert float(wide.eta_on.min()) == 0.0
 
 
+def test_an_error_that_all_pixels_share_moves_the_camera_as_a_whole() -> None:
+    """A median of thresholds known to a factor alone, with errors of .02 of each pixel's own."""
+    shape, shared = (2, 50, 60), {"theta_on": 1.0, "theta_off": 0.5, "eta_on": 0.3}
+    mean = Camera.constant(shape, 0.2, 0.2, 0.1, 0.1)
+    std = Camera.constant(shape, np.hypot(0.2, 0.02), np.hypot(0.1, 0.02), 0.03, 0.02)
+    cameras = [mean.drawn(jax.random.key(i), std, shared) for i in range(40)]
+    for name, own in (("theta_on", 0.1), ("theta_off", 0.1), ("eta_on", 0.0)):
+        maps = np.array([getattr(camera, name) for camera in cameras])
+        middle = np.median(maps, (-2, -1))  # (40, 2)
+        np.testing.assert_allclose(maps.std((-2, -1)) / middle, own, rtol=0.06, atol=1e-3)
+        logs = np.log(middle / float(getattr(mean, name)[0, 0, 0]))
+        assert logs.std() == pytest.approx(shared[name], rel=4 / np.sqrt(2 * 80))
+        assert abs(logs.mean()) < 4 * shared[name] / np.sqrt(80)
+        assert abs(np.corrcoef(logs.T)[0, 1]) < 4 / np.sqrt(40)
+    alone = mean.drawn(jax.random.key(0), std)
+    np.testing.assert_array_equal(cameras[0].eta_off, alone.eta_off)
+    draws = jax.random.normal(jax.random.key(0), (4, *shape))
+    np.testing.assert_array_equal(
+        alone.theta_on, jnp.maximum(mean.theta_on + std.theta_on * draws[0], THETA_MIN))
+
+
 def test_standard_deviations_come_with_an_estimate(tmp_path: Path) -> None:
     camera = Camera.constant((4, 5), 0.2, 0.3)
     plain, estimate, broken = (tmp_path / f"{n}.npz" for n in ("plain", "estimate", "broken"))

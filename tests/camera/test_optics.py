@@ -8,13 +8,15 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from evflow.camera import Camera
+from evflow.camera import Camera, Summary
 from evflow.camera.optics import (
     Optics,
     as_arrays,
     read_sensor,
+    read_shared,
     read_summary,
     read_undetermined,
+    summary_arrays,
 )
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
@@ -38,6 +40,16 @@ def test_a_camera_without_any_has_an_ideal_pixel(tmp_path: Path) -> None:
     Camera.constant((4, 5)).save(tmp_path / "camera.npz")
     sensor, optics = read_sensor(tmp_path / "camera.npz")
     assert sensor.cutoff_hz == sensor.refractory_s == optics.offset_dn == optics.delay_s == 0
+
+
+def test_what_pixels_share_is_the_relative_error_of_the_summary(tmp_path: Path) -> None:
+    path = tmp_path / "camera.npz"
+    Camera.constant((4, 5)).save(path)
+    assert read_shared(path) == {}
+    values, std = (Summary(*map(np.float32, row)) for row in (
+        (0.25, 0.5, 2, 0, 0.03, 0.03), (0.125, np.nan, 1, 0.1, 0.01, 0.01)))
+    Camera.constant((4, 5)).save(path, overwrite=True, **summary_arrays(values, std))
+    assert read_shared(path) == {"theta_on": 0.5, "eta_on": 0.5}
 
 
 @pytest.mark.parametrize("value", [np.nan, np.zeros(2), "fast"])

@@ -16,6 +16,8 @@ import pytest
 from helpers.videos import drifting
 
 from evflow import Camera, read_events, read_recording, simulate
+from evflow.camera import Summary
+from evflow.camera.optics import summary_arrays
 from evflow.camera.sensors import SENSORS, SecondOrder
 from evflow.cli import main
 from evflow.commands.pixels import Pixels
@@ -122,6 +124,24 @@ def test_thresholds_are_drawn_apart_from_leak_and_noise(mismatch: float | None) 
     for theta in (camera.theta_on, camera.theta_off):
         for drawn in (pattern, whole.words.astype(jnp.float32)):
             assert abs(np.corrcoef(drawn, np.ravel(theta))[0, 1]) < 0.057
+
+
+def test_a_drawn_camera_is_no_more_uneven_for_a_median_that_is_not_known(tmp_path: Path) -> None:
+    path, shape = tmp_path / "camera.npz", (50, 60)
+    values, errors = (Summary(*jnp.float32([theta, theta, eta, 0, sigma, sigma]))
+                      for theta, eta, sigma in ((0.187, 0.1, 0.025), (0.187, 0.05, 0.02)))
+    std = {"theta_on": np.hypot(0.187, 0.02), "theta_off": np.hypot(0.187, 0.02),
+           "eta_on": 0.05, "eta_off": 0.0}
+    Camera.constant(shape, 0.187, 0.187, 0.1).save(
+        path, **summary_arrays(values, errors),
+        **{f"{name}_std": np.full(shape, value, np.float32) for name, value in std.items()})
+    drawn = [Pixels(camera=path, draw=True, seed=i).pixels((60, 50)) for i in range(4)]
+    for camera in drawn:
+        for theta in (camera.theta_on, camera.theta_off):
+            assert float(theta.std() / theta.mean()) == pytest.approx(0.107, rel=0.1)
+        assert float(camera.eta_on.std()) == pytest.approx(0, abs=1e-4)
+    medians = np.array([np.median(camera.theta_on) for camera in drawn])
+    assert np.ptp(np.log(medians)) > 0.2
 
 
 def test_a_sensor_s_size_and_slow_motion(

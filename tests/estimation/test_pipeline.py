@@ -23,6 +23,7 @@ from evflow import (
     simulate,
 )
 from evflow.camera import PARAMETERS
+from evflow.camera.optics import read_shared
 from evflow.errors import EvflowDataError
 
 
@@ -111,6 +112,11 @@ def test_saved_and_loaded(measured: Found, tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.theta_off, found.camera.theta_off)
     with np.load(path) as data:
         assert {"theta_on_std", "eta_off_std", "valid", "n_events"} <= set(data)
+    assert read_shared(path) == pytest.approx(found.shared_error)
+    assert found.shared_error.keys() == set(PARAMETERS)
+    for name, share in found.shared_error.items():  # a part of every pixel's own error
+        relative = getattr(found.std, name) / getattr(found.camera, name)
+        assert 0 < share < float(np.median(relative))
     with pytest.raises(EvflowDataError, match="EV013"):
         found.save(path)
 

@@ -88,7 +88,7 @@ class Settings:
     ) -> Settings:
         """From maps (H, W), their standard deviations and the circuit. Medians and spreads are
         robust to hot and dead pixels; a spread combines that of the estimates with their own
-        errors.
+        errors, in which the error that all pixels share cannot be told apart without a summary.
         summary: an estimate's summary, which is used instead of medians of the maps."""
         middle = {name: float(np.median(values)) for name, values in maps.items()}
         sigma = {}
