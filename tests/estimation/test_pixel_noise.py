@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evflow.camera import Summary
-from evflow.estimation.maps import with_unquiet_error
+from evflow.camera import Camera, Summary
+from evflow.estimation.maps import with_rates, with_unquiet_error
 from evflow.estimation.pixel_noise import (
     _shapes,
     pixel_rates,
@@ -135,6 +135,30 @@ def test_rates_of_their_own_do_not_follow_the_thresholds() -> None:
     theta = np.maximum(np.random.default_rng(3).normal(0.3, 0.12, (2, *SHAPE)), 0.03)
     for rates in (0.2 * np.ones((2, *SHAPE)), np.zeros((2, *SHAPE))):
         assert threshold_law(quiet_counts(rates, 2.0), theta, NONE_HOT) is None
+
+
+@pytest.mark.parametrize("uneven", [True, False])
+def test_the_summary_has_the_rates_of_the_maps_where_noise_follows_the_thresholds(
+    uneven: bool
+) -> None:
+    """Else it keeps its own, which is better known than the few events of quiet pixels tell."""
+    theta = np.maximum(np.random.default_rng(3).normal(0.3, 0.12, (2, *SHAPE)), 0.03)
+    rates = 0.4 * (0.3 / theta if uneven else np.ones(theta.shape))
+    quiet = quiet_counts(rates, 20.0)
+    camera = Camera(*map(jnp.asarray, (*theta, *np.ones_like(theta))))
+    low = Summary(*(jnp.float32(v) for v in (0.2, 0.2, 0.4, 0.4, 0.08, 0.08)))
+    std = Summary(*(jnp.float32(v) for v in (0.01, 0.01, 0.04, 0.04, 0.01, 0.01)))
+    _, _, summary, error = with_rates(camera, camera, quiet, NONE_HOT, low, std)
+    if uneven:
+        law = threshold_law(quiet, theta, NONE_HOT)
+        assert law is not None
+        rate, relative = uneven_rate(*quiet[0], 0.4, 0.1, NONE_HOT, law[0])
+        assert 0.4 < rate < float(rates[0].mean()) * 1.05
+        assert float(summary.eta_on) == pytest.approx(rate)
+        assert float(error.eta_on) == pytest.approx(rate * relative)
+        assert summary.theta_on == low.theta_on
+    else:
+        assert (summary, error) == (low, std)
 
 
 def test_the_rate_of_uneven_pixels_is_what_they_sent_where_they_sent_enough() -> None:

@@ -153,6 +153,11 @@ def test_what_the_estimate_has_made_of_the_first_half_is_shared(
     made = pipeline.measure(recording)
     assert made.first is not None
     assert made.first.rest == (5, 10)
+    assert made.first.rest_of(recording) == (5, 10)
+    twice = dataclasses.replace(  # as it was before every second frame was left out
+        recording, frames=np.repeat(recording.frames, 2, 0)[:-1], frame_times=np.arange(
+            recording.frame_times[0], recording.frame_times[-1] + 1, 20_000))
+    assert made.first.rest_of(twice) == (10, 20)
     monkeypatch.setattr(resimulate, "estimate_camera", None)  # nothing is estimated again
     numbers = evflow.write_report(
         tmp_path / "shared.html", made.found, recording, first=made.first)

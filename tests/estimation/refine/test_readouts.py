@@ -51,7 +51,8 @@ def test_a_readout_begins_another_group(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(receptor_data, "LEAST", 0)
     t = [35_000, 38_000, 40_200, 45_000, 60_000, 75_000, 79_800, 90_000]
     parts = [(np.full((13, 1, 2), 100.0), np.full(12, 0.01),
-              *without_readouts(seen(t, [0] * 8), TIMES, found)) for found in (None, READOUT)]
+              *without_readouts(seen(t, [0] * 8), TIMES, found), np.zeros(2, bool))
+             for found in (None, READOUT)]
     groups, counts = [], []
     for part in parts:
         data = receptor_data.sample([part])
