@@ -63,8 +63,8 @@ class Third:
 def part(span_us: tuple[int, int], evidence: PixelEvidence) -> Part:
     """The thresholds from a single stretch's evidence."""
     aa, ab, bb, _, _, yy, events = evidence.equations
-    odd = unlike_the_path(aa + 2 * ab + bb, yy, events)
-    aa, ab, bb, ay, by, yy, events = (evidence.equations * ~odd).sum((1, 2))
+    evidence = evidence.without(unlike_the_path(aa + 2 * ab + bb, yy, events))
+    aa, ab, bb, ay, by, yy, events = evidence.equations.sum((1, 2))
     middle, scale = sum(span_us) // 2, np.array([[aa, ab], [ab, bb]])
     if events < LEAST_EVENTS or np.linalg.det(scale) <= 1e-6 * aa * bb or yy <= 0:
         return Part(middle, np.full(2, np.nan))
