@@ -62,9 +62,11 @@ class Third:
 
 def part(span_us: tuple[int, int], evidence: PixelEvidence) -> Part:
     """The thresholds from a single stretch's evidence."""
-    aa, ab, bb, _, _, yy, events = evidence.equations
-    evidence = evidence.without(unlike_the_path(aa + 2 * ab + bb, yy, events))
-    aa, ab, bb, ay, by, yy, events = evidence.equations.sum((1, 2))
+    equations = evidence.equations
+    aa, ab, bb, _, _, yy, events = equations
+    if (odd := unlike_the_path(aa + 2 * ab + bb, yy, events)).any():
+        equations = equations * ~odd
+    aa, ab, bb, ay, by, yy, events = equations.sum((1, 2))
     middle, scale = sum(span_us) // 2, np.array([[aa, ab], [ab, bb]])
     if events < LEAST_EVENTS or np.linalg.det(scale) <= 1e-6 * aa * bb or yy <= 0:
         return Part(middle, np.full(2, np.nan))
