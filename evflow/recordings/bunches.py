@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evflow.recordings.region import only
 from evflow.types import Events, Recording, release
 
 BIN_US = 250
@@ -41,8 +42,7 @@ def beside(events: Events, frame_times: np.ndarray, found: Bunch) -> Events:
     ends = np.searchsorted(events.t, [frame_times + found.begin_us, frame_times + found.end_us])
     for first, last in ends.T:
         kept[first:last] = False
-    return Events.unchecked(events.x[kept], events.y[kept], events.t[kept], events.p[kept],
-                            events.size)
+    return only(events, kept)
 
 
 def bunch(recording: Recording) -> Bunch | None:

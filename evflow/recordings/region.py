@@ -32,9 +32,11 @@ def inside(events: Events, rows: slice, columns: slice) -> Events:
 
 def outside(events: Events, pixels: np.ndarray) -> Events:
     """The events of other pixels than these, (H, W) bool."""
-    if not pixels.any():
-        return events
-    kept = ~pixels[events.y, events.x]
+    return only(events, ~pixels[events.y, events.x]) if pixels.any() else events
+
+
+def only(events: Events, kept: np.ndarray) -> Events:
+    """Some of the events; kept: (N,) bool."""
     return Events.unchecked(events.x[kept], events.y[kept], events.t[kept], events.p[kept],
                             events.size)
 
