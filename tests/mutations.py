@@ -45,7 +45,7 @@ MUTATIONS = (
              "return lp + 0.95 * eps * (log_i - lp)", f"{SIMULATE}test_simulate.py -k low_pass"),
     Mutation("refractory ignored", PIXEL, "    spikes = delayed(spikes, ready, dead)\n", "",
              f"{SIMULATE}test_simulate.py -k refractory"),
-    Mutation("leak's sign", PIXEL, "state.base - leaked", "state.base + leaked",
+    Mutation("leak's sign", PIXEL, "left = base - due", "left = base + due",
              f"{SIMULATE}test_noise.py -k leak"),
     Mutation("eta", NOISE, "on, off = camera.eta_on, camera.eta_off\n",
              "on, off = 1.03 * camera.eta_on, 1.03 * camera.eta_off\n",

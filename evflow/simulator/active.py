@@ -94,7 +94,8 @@ def look(
         carry: tuple[PixelState, Array], inputs: tuple[Array, Array, Array]
     ) -> tuple[tuple[PixelState, Array], None]:
         (own, active), (frame, dt, salt) = carry, inputs
-        log_i, base, inner = to_log(frame, model.log_map), own.base, own.inner
+        log_i, inner = to_log(frame, model.log_map), own.inner
+        base, owed = own.base, own.owed
         if model.corner is not None:
             log_i = pixel.low_pass(model, own.lp, log_i, _i01(frame), dt)
         elif inner is not None:
@@ -102,9 +103,10 @@ def look(
             log_i, inner = second_order.rest(model, own.lp, inner, log_i, middle, dt)
         if whole.leaking is not None:
             drawn = noise.draw(whole.words, salt)
-            base = base - noise.leak(model, whole.leaking, whole.words, drawn, dt)
+            leaked = noise.leak(model, whole.leaking, whole.words, drawn, dt)
+            base, owed = pixel.lowered(base, owed, leaked)
         compared = log_i if inner is None else inner.amplified
-        own = PixelState(log_i, base, own.last, inner)
+        own = PixelState(log_i, base, own.last, inner, owed)
         return (own, active | _beyond(whole.camera, compared - base)), None
 
     active = jnp.zeros(pixels.lp.shape, bool)
@@ -187,10 +189,10 @@ def _gathered(maps: T, at: Array) -> T:
 
 
 def _put_back(model: Constants, pixels: PixelState, own: PixelState, at: Array) -> PixelState:
-    kept = ("base", "last") if model.refractory_s is not None else ("base",)
+    changes = {"base": True, "last": model.refractory_s is not None, "owed": model.carries_leak}
     put: dict[str, Any] = {name: getattr(pixels, name).at[at].set(
         getattr(own, name), mode="drop", unique_indices=True, indices_are_sorted=True)
-        for name in kept}
+        for name, changed in changes.items() if changed}
     if pixels.inner is not None and own.inner is not None:
         amplified = pixels.inner.amplified.at[at].set(
             own.inner.amplified, mode="drop", unique_indices=True, indices_are_sorted=True)

@@ -75,6 +75,11 @@ class Constants:
         return self.refractory_s is not None and self.timestamps == "crossing"
 
     @property
+    def carries_leak(self) -> bool:
+        """Whether leak too small for float32 is carried on; v2e loses it."""
+        return self.leak_hz is not None and self.timestamps == "crossing"
+
+    @property
     def waits(self) -> bool:
         """Whether an event within the refractory period of another is delayed, not lost."""
         return self.is_dead_between and self.kind == "v2e" and self.photoreceptor is None

@@ -170,22 +170,22 @@ def _scan_smooth(
     ) -> tuple[tuple[PixelState, Array, Array], None]:
         pixels, on, off = carry
         i01 = sensor.i01_of(model, log_i)
-        lp, base = log_i, pixels.base
+        lp, base, owed = log_i, pixels.base, pixels.owed
         if model.corner is not None:
             lp = pixel.low_pass(model, pixels.lp, log_i, i01, dt)
         if whole.leaking is not None:
-            base = base - whole.leaking * dt
+            base, owed = pixel.lowered(base, owed, whole.leaking * dt)
         contrast = lp - base
         up, down = (jnp.maximum(soft_floor(sign * contrast / theta, smooth), 0.0)
                     for sign, theta in ((1.0, camera.theta_on), (-1.0, camera.theta_off)))
-        base = base + up * camera.theta_on - down * camera.theta_off
+        base, owed = pixel.lowered(base, owed, down * camera.theta_off - up * camera.theta_on)
         if whole.rates is not None:
             rates = whole.rates.at(i01)
             if model.noise_resets_memory:
                 some = noise.some(dt * (rates[0] + rates[1]))
                 base = base + some * (lp - base)
             up, down = up + dt * rates[0], down + dt * rates[1]
-        return (dataclasses.replace(pixels, lp=lp, base=base), on + up, off + down), None
+        return (dataclasses.replace(pixels, lp=lp, base=base, owed=owed), on + up, off + down), None
 
     zero = jnp.zeros_like(frames[0])
     (_, on, off), _ = jax.lax.scan(body, (state.pixels, zero, zero), frames)

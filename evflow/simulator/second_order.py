@@ -163,7 +163,7 @@ def first_time(
 @dataclasses.dataclass(frozen=True)
 class Fired:
     """Result of an interval: memory, y, seconds since the last event; events as signed count, time
-    of the first and their distance, in intervals."""
+    of the first and their distance, in intervals; leak too small for base, see `pixel.lowered`."""
 
     base: Array
     amplified: Array
@@ -171,6 +171,7 @@ class Fired:
     count: Array
     first: Array
     spacing: Array
+    owed: Array
 
 
 def fire(
@@ -201,8 +202,10 @@ def fire(
     at = first + (count - 1.0) * spacing
     reset = jnp.minimum(at + dead, 1.0)
     anew = start + rise * reset
+    silent = base - leak * left
     return Fired(
-        jnp.where(fires, anew - leak * (1.0 - reset), base - leak * left),
+        jnp.where(fires, anew - leak * (1.0 - reset), silent),
         jnp.where(fires, amplified(anew, anew, rise, delay, 1.0 - reset),
                   amplified(y, begin, rise, delay, left)),
-        jnp.where(fires, (1.0 - at) * dt, last + dt), sign * count, first, spacing)
+        jnp.where(fires, (1.0 - at) * dt, last + dt), sign * count, first, spacing,
+        jnp.where(fires | (waits > 0), 0.0, leak - (base - silent)))

@@ -154,7 +154,8 @@ def start(
     )
     last = jnp.full_like(log_i, pixel.never_fired(model))
     inner = None if model.photoreceptor is None else second_order.at_rest(log_i)
-    pixels = PixelState(log_i, base, last, inner)
+    owed = jnp.zeros_like(log_i) if model.carries_leak else None
+    pixels = PixelState(log_i, base, last, inner, owed)
     return sensor, SimState(
         pixels, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32), k_intervals)
 

@@ -16,8 +16,8 @@ from helpers.videos import by_pixel
 
 from evflow.camera import Camera, CameraPrior
 from evflow.camera.leak import without_leak
-from evflow.camera.sensors import SensorModel
-from evflow.simulator import simulate
+from evflow.camera.sensors import SecondOrder, SensorModel
+from evflow.simulator import simulate, simulate_counts
 from evflow.simulator.constants import Constants
 from evflow.simulator.noise import (
     cosine,
@@ -153,6 +153,22 @@ def test_leak_is_on_events_at_its_rate_whatever_the_threshold() -> None:
     pixel, t, _ = by_pixel(events)
     gaps = np.diff(t)[np.diff(pixel) == 0]
     np.testing.assert_allclose(gaps, 20_000, atol=20)
+
+
+@pytest.mark.parametrize("photoreceptor", [None, SecondOrder().at(200.0)])
+def test_leak_too_small_for_float32_is_carried_on(photoreceptor: SecondOrder | None) -> None:
+    """2e-7 an interval, where a memory of 5.3 holds steps of 4.8e-7."""
+    frames, times = np.full((25_001, 1, 1), 200, np.uint8), 100 * np.arange(25_001)
+    camera = Camera.constant((1, 1), 0.002, 0.002)
+    model = SensorModel(leak_hz=1.0, photoreceptor=photoreceptor)
+    events = simulate(jax.random.key(0), frames, times, camera, model=model)
+    np.testing.assert_allclose(events.t, [1_000_000, 2_000_000], rtol=1e-3)
+    counts = simulate_counts(jax.random.key(0), frames, camera, frame_dt_s=1e-4, model=model)
+    np.testing.assert_array_equal(counts.ravel(), [2.0, 0.0])
+    if photoreceptor is None:  # contrast stays where the ramp of width .2 begins, at .9
+        smooth = simulate_counts(jax.random.key(0), frames, camera, frame_dt_s=1e-4, model=model,
+                                 smooth=0.2)
+        np.testing.assert_allclose(smooth.ravel(), [2.5 - 0.9, 0.0], atol=0.01)
 
 
 def test_leak_is_a_part_of_eta_that_is_all_noise() -> None:
