@@ -99,7 +99,8 @@ def estimate(
     front_end, n_events = state.front_end, state.n_events.astype(np.uint32)
     refined = refine(state)
     hot, dead, summary, std = refined.hot, refined.dead, refined.summary, refined.std
-    stats = without_those(state.stats, state.sent[:, hot].sum(1))
+    pooled_hot = hot if front_end.faulty is None else hot & ~front_end.faulty
+    stats = without_those(state.stats, state.sent[:, pooled_hot].sum(1))
     alone: tuple[str, ...] = ()
     if lacking := undetermined(stats, summary):
         summary, std, alone = with_prior(lacking, list(refined.chunks), summary, std)

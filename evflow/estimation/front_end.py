@@ -14,7 +14,7 @@ from evflow.estimation.dead_time import DeadTime, dead_time, first_events
 from evflow.estimation.refine import Found, Stretch, find_photoreceptor, frame_noise
 from evflow.estimation.refine.path import Films
 from evflow.estimation.refine.photoreceptor import STRETCHES
-from evflow.recordings.faulty_pixels import silent_lines
+from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 
 
@@ -22,7 +22,7 @@ from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 class FrontEnd:
     """seen_by: how the pixels see what the frames show; noise_dn, blur_s: the frames' noise in DN
     and their exposure, 0 if it is unknown; found: the search for the photoreceptor, None if there
-    was none; dead: the dead time; silent: (H, W) bool, columns and rows that never fire, None if
+    was none; dead: the dead time; faulty: (H, W) bool, pixels that fire alone or never, None if
     there are none; films: of stretches that are still to be read."""
 
     seen_by: Photoreceptor = IDEAL
@@ -30,7 +30,7 @@ class FrontEnd:
     blur_s: float = 0.0
     found: Found | None = None
     dead: DeadTime = dataclasses.field(default_factory=DeadTime)
-    silent: np.ndarray | None = None
+    faulty: np.ndarray | None = None
     films: Films = dataclasses.field(default_factory=dict)
 
 
@@ -38,16 +38,16 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
     """Measure the front end on some stretches of a recording. measured: False assumes ideal
     pixels."""
     dead = dead_time(first_events(max((s.recording.events for s in stretches), key=len)))
-    silent = _silent(stretches)
+    faulty = _faulty(stretches)
     runs = [(s.recording, s.run) for s in stretches if s.run]
     if not runs:
-        return FrontEnd(dead=dead, silent=silent)
+        return FrontEnd(dead=dead, faulty=faulty)
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
     films: Films = {}
     found = find_photoreceptor(runs, noise_dn, films) if measured else None
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
-    return FrontEnd(seen_by, noise_dn, blur_s, found, dead, silent, films)
+    return FrontEnd(seen_by, noise_dn, blur_s, found, dead, faulty, films)
 
 
 def agree(before: FrontEnd, now: FrontEnd) -> bool:
@@ -61,10 +61,10 @@ def agree(before: FrontEnd, now: FrontEnd) -> bool:
         (np.abs(away) <= 2.0 * now.found.std).all())
 
 
-def _silent(stretches: Sequence[Stretch]) -> np.ndarray | None:
-    """`silent_lines` of a few stretches; None if there are none."""
+def _faulty(stretches: Sequence[Stretch]) -> np.ndarray | None:
+    """Hot and dead pixels of a few stretches; None if there are none."""
     few = [stretches[i] for i in np.unique(np.linspace(0, len(stretches) - 1, STRETCHES).round())
            .astype(int)]
     counts = sum(s.recording.events.slice(*s.span_us).count_map().sum(0) for s in few)
-    silent = silent_lines(np.asarray(counts))
-    return silent if silent.any() else None
+    faulty = hot_among_neighbours(np.asarray(counts)) | dead_pixels(np.asarray(counts))
+    return faulty if faulty.any() else None

@@ -93,25 +93,25 @@ def window_counts(window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 def window_stats(
     params: api.Params, window: Window, seen_by: Photoreceptor = IDEAL,
-    silent: np.ndarray | None = None,
+    faulty: np.ndarray | None = None,
 ) -> api.Stats:
-    """Stats of the pixels that a window's frames show, or of all if they show none, without silent
+    """Stats of the pixels that a window's frames show, or of all if they show none, without faulty
     ones (H, W). Large sensors go band by band, whose sums add."""
     shape = window.frame0.shape
-    silent = np.zeros(shape, bool) if silent is None else silent
+    faulty = np.zeros(shape, bool) if faulty is None else faulty
     if shape[0] * shape[1] <= LARGE:
-        return _stats(params, window, seen_by, silent)
+        return _stats(params, window, seen_by, faulty)
     return functools.reduce(operator.add, (
-        _stats(params, rows_of(window, rows), seen_by, silent[rows])
+        _stats(params, rows_of(window, rows), seen_by, faulty[rows])
         for rows in bands(shape, BAND)))
 
 
 def _stats(
-    params: api.Params, window: Window, seen_by: Photoreceptor, silent: np.ndarray
+    params: api.Params, window: Window, seen_by: Photoreceptor, faulty: np.ndarray
 ) -> api.Stats:
     """Quiet pixels of the same brightness go through the network once, with their number."""
     shown = exposed(window.frame0, window.frame1).ravel()
-    counted = (shown if shown.any() else ~shown) & ~silent.ravel()
+    counted = (shown if shown.any() else ~shown) & ~faulty.ravel()
     frames = np.stack([_light(f, seen_by).ravel() for f in (window.frame0, window.frame1)], 1)
     pixels, voxels = fired_voxels(window.events, window.t0_us, window.t1_us - window.t0_us)
     quiet = counted.copy()

@@ -91,7 +91,7 @@ def read_stretch(
     for number, window in enumerate(windows_of([stretch])):
         if number % every == 0:
             front_end = state.front_end
-            more = window_stats(state.params, window, front_end.seen_by, front_end.silent)
+            more = window_stats(state.params, window, front_end.seen_by, front_end.faulty)
             stats = more if stats is None else stats + more
         counts, shown = window_counts(window)
         sent, n_shown = sent + counts, n_shown + shown

@@ -190,6 +190,20 @@ def test_a_dead_pixel_is_listed(watched: tuple[Recording, Camera]) -> None:
     assert "pixels.dead" in [note.code for note in found.notes]
 
 
+def test_dead_pixels_here_and_there_are_no_sign_of_high_thresholds(
+    watched: tuple[Recording, Camera]
+) -> None:
+    """A tenth of them made the network's OFF threshold .37. Where little moves they stay unseen."""
+    recording, camera = watched
+    events = recording.events
+    dead = np.random.default_rng(0).random(SHAPE) < 0.1
+    kept = ~dead[events.y, events.x]
+    rest = Events(*(getattr(events, name)[kept] for name in "xytp"), events.size)
+    found = estimate_camera(dataclasses.replace(recording, events=rest), refine="off").summary
+    assert float(found.theta_off) == pytest.approx(float(jnp.median(camera.theta_off)), rel=0.05)
+    assert float(found.theta_on) == pytest.approx(float(jnp.median(camera.theta_on)), rel=0.15)
+
+
 def test_what_a_region_of_interest_leaves_out_changes_nothing(
     watched: tuple[Recording, Camera], measured: Found
 ) -> None:
