@@ -19,15 +19,11 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before JAX reads it; inherited by the cases
+
 import jax
 import tyro
 from rich.console import Console
-
-from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
-from evflow.files.folders import need_writable
-
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 from benchmarks import (
     bench_estimate,
@@ -41,6 +37,9 @@ from benchmarks import (
 from benchmarks.harness import Case, Record, Setting, compare, facts, measure
 from benchmarks.tables import table
 from benchmarks.turns import by_task, in_turn
+from evflow.errors import EvflowDataError
+from evflow.files.atomic import atomic_write
+from evflow.files.folders import need_writable
 
 SUBJECTS: dict[str, tuple[Case, ...]] = {
     "limits": limits.CASES,
@@ -140,7 +139,6 @@ def select(only: tuple[str, ...]) -> list[Case]:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")  # inherited by the cases' processes
     try:
         sys.exit(main(tyro.cli(Options, prog="python -m benchmarks")))
     except EvflowDataError as e:

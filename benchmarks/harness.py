@@ -27,6 +27,8 @@ import jax
 import evflow
 
 PACKAGES = ("jax", "jaxlib", "numpy", "numba", "torch")
+# Variables that change how fast the same code is.
+TUNING = ("GLIBC_TUNABLES", "LD_PRELOAD", "NPROC", "OMP_NUM_THREADS", "XLA_FLAGS")
 Clocks = tuple[float, float, float | None]
 TURN_S = 0.5  # at least
 
@@ -109,8 +111,9 @@ def absent(case: Case) -> Record | None:
     """The record of a case whose package is not installed."""
     if not case.needs or importlib.util.find_spec(case.needs) is not None:
         return None
+    extra = "bench" if case.needs in ("numba", "torch") else "io"
     return Record(*case.name, skipped=f"skipped: {case.needs} is not installed "
-                                      "(pip install 'evflow-jax[bench]')")
+                                      f"(pip install 'evflow-jax[{extra}]')")
 
 
 class Runner:
@@ -225,7 +228,7 @@ def _others(turns: Sequence[tuple[Clocks, Clocks]]) -> float | None:
 
 
 def facts() -> dict[str, Any]:
-    """Machine, versions and load of a run, saved on every line."""
+    """Machine, versions, load and tuning of a run, saved on every line."""
     versions = {"evflow": evflow.__version__, "commit": _commit()}
     for name in PACKAGES:
         try:
@@ -239,6 +242,7 @@ def facts() -> dict[str, Any]:
         "cpu": _cpu_model(), "cpus": cores(),
         "memory_gb": round(memory, 1), "load_before": round(os.getloadavg()[0], 2),
         "versions": versions,
+        "environment": {name: os.environ[name] for name in TUNING if name in os.environ},
     }
 
 

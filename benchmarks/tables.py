@@ -11,8 +11,9 @@ from benchmarks.harness import Record
 
 def table(records: list[Record], run: dict[str, Any]) -> Table:
     """One row per record; a line between subjects."""
-    title = f"{run['cpu']}, {run['cpus']} cores, load {run['load_before']} before; " + ", ".join(
-        f"{name} {version}" for name, version in run["versions"].items())
+    machine = [run[name] for name in ("device", "cpu") if name in run] + [f"{run['cpus']} cores"]
+    versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
+    title = f"{', '.join(machine)}, load {run['load_before']} before; {versions}"
     shown = Table(title=title, caption="x first: time against the first case of the same task, "
                   "turn by turn, above 1 = slower. % of sgemm, copy: of the best measured in this "
                   "run. others: cores busy with other processes meanwhile.")

@@ -20,7 +20,8 @@ pytest.importorskip("tyro")
 
 from benchmarks import bench_estimate, bench_simulator, bench_voxels
 from benchmarks.__main__ import SUBJECTS, Options, main, select
-from benchmarks.harness import Case, Record, Setting, Workload, compare, measure
+from benchmarks.harness import Case, Record, Setting, Workload, absent, compare, facts, measure
+from benchmarks.tables import table
 from benchmarks.turns import by_task, in_turn
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
@@ -104,8 +105,26 @@ def _whole(_: Setting) -> Workload:
 
 
 def test_absent_package_skips_and_error_fails() -> None:
-    absent = Case("voxels", "task", "peer", _broken, needs="no_such_package")
-    assert "no_such_package is not installed" in measure(absent, QUICK).skipped
+    missing = Case("voxels", "task", "peer", _broken, needs="no_such_package")
+    assert "no_such_package is not installed" in measure(missing, QUICK).skipped
+
+
+@pytest.mark.parametrize(("package", "extra"), [("torch", "bench"), ("h5py", "io")])
+def test_an_absent_package_is_installed_by_its_extra(
+    package: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    record = absent(Case("io", "task", "peer", _broken, needs=package))
+    assert record is not None
+    assert f"evflow-jax[{extra}]" in record.skipped
+
+
+def test_a_run_names_its_device_and_what_tunes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NPROC", "1")
+    run = facts()
+    assert run["environment"]["NPROC"] == "1"
+    shown = table([Record("io", "task", "peer")], run | {"device": "a GPU"})
+    assert str(shown.title).startswith(f"a GPU, {run['cpu']}, ")
 
 
 def test_cases_of_a_task_take_turns_and_a_broken_one_costs_no_other() -> None:

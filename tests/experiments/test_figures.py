@@ -286,6 +286,20 @@ def flow() -> dict[str, Figures]:
                     for at in ((2, 0), (3, 0), (3, 1))] for label, name in names.items()}
 
 
+def other_flow() -> dict[str, Figures]:
+    names = {"default parameters": "default", "thresholds uniform": "wide", "estimate": "evflow",
+             "truth": "oracle", "LGAN": "lgan"}
+
+    def of(name: str, target: str) -> Figures:
+        row, source = rf"AEE \[px\]\|{name} \(3\)", "see_better_flow_cameras"
+        mean = values(source, row, "mean", 0, target)[0]
+        return [mean, *([0.0] if name == "default" else (
+            values(source, row, "to default", k, target)[0] for k in range(2)))]
+
+    return {label: [*of(name, "middle noisy"), *of(name, "low noisy")]
+            for label, name in names.items()}
+
+
 def recorded_flow() -> dict[str, Figures]:
     names = {"default parameters": "default", "thresholds log-uniform": "wide-log",
              "estimate, with": r"evflow\+circuit"}
@@ -352,6 +366,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "### Longer trainings"): longer,
     (ACCURACY, "### Video of real recordings"): recorded_video,
     (ACCURACY, "### Flow of real recordings"): recorded_flow,
+    (ACCURACY, "### Flow of two other cameras"): other_flow,
     (ACCURACY, "### Flow"): flow,
     (ACCURACY, "### Losses and flow steps"): losses,
     (ACCURACY, "A Newton's cradle, thresholds from"): cradle,
