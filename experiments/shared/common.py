@@ -53,6 +53,12 @@ def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> 
     atomic_text(path, json.dumps(record, indent=2, default=str) + "\n", overwrite=True)
 
 
+def config_of_result(path: Path) -> dict[str, Any]:
+    """The configuration of a result that `write_result` saved."""
+    config: dict[str, Any] = json.loads(path.read_text())["config"]
+    return config
+
+
 def plain(value: Any) -> Any:
     """A result with lists in place of arrays."""
     if isinstance(value, dict):

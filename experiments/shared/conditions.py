@@ -33,6 +33,7 @@ from evflow.network.api import Params, config_of, estimate_y, finish
 from evflow.network.coordinates import squash
 from evflow.network.weights import weights_path
 from evflow.recordings import iter_windows
+from experiments.shared.common import config_of_result, write_result
 from experiments.shared.scored_on import Recorded
 from experiments.shared.targets import Target
 
@@ -59,7 +60,7 @@ class Condition:
     """One condition. label: its name in the tables; name: of the run, one per training; targets:
     to test on; make: maps of K cameras (K, H, W), or None where events do not come from a simulated
     camera; circuit: of their pixels, and the optics of their frames, None for the training's;
-    source: digest of the file that it is made from; generator: weights of EventGAN."""
+    source: digest of the files that it is made from; generator: weights of EventGAN."""
 
     label: str
     name: str
@@ -156,26 +157,34 @@ class Workshop:
         """That of `estimated`."""
         return read_sensor(self._estimate(target))
 
-    def mapped(self, target: AnyTarget, name: str, params: Params) -> Camera:
+    def mapped(self, target: AnyTarget, name: str, params: Params, source: str) -> Camera:
         """Maps of the target's recording by a network alone."""
-        return self.stored(self.kept(target, name, lambda r: network_maps(r, params)))
+        return self.stored(self.kept(target, name, lambda r: network_maps(r, params), source))
 
     def compared(self, target: AnyTarget, name: str) -> Camera:
         """Estimate of the target's recording by a compared system."""
-        return self.stored(self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera))
+        return self.stored(self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera,
+                                     target.source))
 
     def _estimate(self, target: AnyTarget) -> Path:
-        return self.kept(target, OURS, lambda r: estimate_camera(r, self.params))
+        return self.kept(target, OURS, lambda r: estimate_camera(r, self.params), target.source)
 
     def kept(
-        self, target: AnyTarget, name: str, measure: Callable[[Recording], Camera | CameraEstimate]
+        self, target: AnyTarget, name: str,
+        measure: Callable[[Recording], Camera | CameraEstimate], source: str,
     ) -> Path:
-        """The file of a measurement of the target's recording, made on first use."""
+        """The file of a measurement of the target's recording, made on first use. source: digest of
+        the files that it is made from, kept beside it; EV013 where it was made from others."""
         path = self.folder / f"{target.name} {name}.npz"
+        beside = path.with_suffix(".json")
         if not path.is_file():
             measured = measure(self.record(target))
-            path.parent.mkdir(parents=True, exist_ok=True)
+            write_result(beside, {}, {"made_from": source})
             measured.save(path)
+        elif beside.is_file() and config_of_result(beside)["made_from"] != source:
+            raise EvflowDataError(
+                "EV013", f"{path} was measured from another {target.name} or by another {name}.",
+                "Give it another name, or choose another --out.")
         return path
 
 
@@ -205,9 +214,10 @@ def conditions(
     found = [condition for name in names for condition in _named(shop, targets, name)]
     for name, path in files.estimators.items():
         params = load_weights(path)
-        found += [Condition(name, f"{t.name} {name}", (t,),
-                            _bound(shop.mapped, t, name, params), digest(weights_path(path)))
-                  for t in targets]
+        for t in targets:
+            source = " ".join(filter(None, (digest(weights_path(path)), t.source)))
+            found.append(Condition(name, f"{t.name} {name}", (t,),
+                                   _bound(shop.mapped, t, name, params, source), source))
     found += [Condition(name, name, tuple(targets), lambda: None, digest(path), path)
               for name, path in files.generators.items()]
     return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path),
@@ -231,8 +241,7 @@ def _named(shop: Workshop, targets: Sequence[AnyTarget], name: str) -> list[Cond
         raise EvflowDataError("EV020", f"condition {name!r}.", f"Choose of {list(CHOICES)}.")
     circuit = shop.circuit if name == OURS_WHOLE else None
     return [Condition(name, f"{t.name} {name}", (t,), _bound(own[name], t),
-                      t.source if isinstance(t, Recorded) else "",
-                      circuit=circuit and _bound(circuit, t)) for t in targets]
+                      t.source, circuit=circuit and _bound(circuit, t)) for t in targets]
 
 
 def _of_known(shop: Workshop, known: Sequence[Target], name: str) -> list[Condition]:

@@ -1,4 +1,4 @@
-"""Runs that continue in a folder: of the same setting, and with nothing left out."""
+"""Runs that continue in a folder: of the same setting and files, and with nothing left out."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
-from evflow.network.weights import weights_path
+from evflow.network.weights import model_card, weights_path
 from evflow.training.config import as_dict
-from experiments.shared.common import write_result
+from experiments.shared.common import config_of_result, slug, write_result
 from experiments.shared.conditions import Condition, digest
 from experiments.shared.see_better_settings import Setting
 
@@ -30,6 +30,25 @@ def same_setting(out: Path, task: str, weights: str, setting: Setting) -> None:
                                   "Choose another --out.")
         return
     write_result(path, {}, wanted)
+
+
+def same_files(condition: Condition, folder: Path) -> None:
+    """EV013 where the run in `folder` was trained for other files than the condition's, or scored
+    on another recording. Scores that do not say what they rest on are taken for the same."""
+    seen: dict[str, list[bool]] = {
+        condition.label: [], **{t.name: [] for t in condition.targets}}
+    weights = folder / "weights.safetensors"
+    if weights.is_file():
+        seen[condition.label].append(model_card(weights).get("made_from") == condition.source)
+    for target in condition.targets:
+        path = folder / f"{slug(target.name)}.json"
+        config = config_of_result(path) if path.is_file() else {}
+        for name, key, source in ((condition.label, "made_from", condition.source),
+                                  (target.name, "scored_on", target.source)):
+            seen[name].append(config.get(key, source) == source)
+    if other := [name for name, same in seen.items() if not all(same)]:
+        raise EvflowDataError("EV013", f"{folder} rests on another {other[0]}.",
+                              "Give it another name, or choose another --out.")
 
 
 def nothing_lost(out: Path, conditions: Iterable[Condition], seeds: int) -> None:

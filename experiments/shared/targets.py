@@ -49,13 +49,15 @@ FRAME_STEPS, FRAME_NOISE_DN = 25, 0.5  # of the recording that is estimated from
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Target:
-    """A camera (H, W) and its circuit; nominal: the camera-wide values of its maps."""
+    """A camera (H, W) and its circuit; nominal: the camera-wide values of its maps; source: of no
+    file."""
 
     name: str
     camera_name: str
     camera: Camera
     nominal: Summary
     circuit: SensorModel
+    source: str = ""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -42,6 +42,7 @@ from experiments.shared.conditions import (
     camera_medians,
     conditions,
 )
+from experiments.shared.same_runs import same_files
 from experiments.shared.scored_on import OfClips, Recorded, ScoredOn
 from experiments.shared.see_better_settings import Setting
 
@@ -52,7 +53,7 @@ TEXTURE_SEED = 11
 
 
 def run_card(condition: Condition, camera: Camera | None, **figures: float) -> dict[str, Any]:
-    """The model card of a training; made_from: digest of the file that its camera comes from."""
+    """The model card of a training; made_from: digest of the files that its camera comes from."""
     return {**provenance(), **figures, "condition": condition.name, "made_from": condition.source,
             "cameras": {} if camera is None else camera_medians(camera)}
 
@@ -147,7 +148,11 @@ class Trainings:
 
     def complete_all(self, wanted: list[Condition], until: float) -> int:
         """Complete the seeds of each condition, beginning none after `until` (time.monotonic());
-        returns how many trainings are missing."""
+        returns how many trainings are missing. Raises EV013, before any training, where a run rests
+        on other files."""
+        for condition in wanted:
+            for seed in range(self.setting.seeds):
+                same_files(condition, self.folder(condition, seed))
         missing = 0
         for seed in range(self.setting.seeds):
             for condition in wanted:
@@ -158,23 +163,21 @@ class Trainings:
         return missing
 
     def complete(self, condition: Condition, seed: int) -> None:
-        """Train and test what is missing. Raises EV013 where a run rests on another file."""
+        """Train and test what is missing."""
         if self.done(condition, seed):
             return
         path = self.folder(condition, seed) / "weights.safetensors"
         if not path.is_file():
             self.train(condition, seed, path)
-        if model_card(path).get("made_from") != condition.source:
-            raise EvflowDataError(
-                "EV013", f"{path.parent} was trained for another {condition.label}.",
-                "Give it another name, or choose another --out.")
         params = load_weights(path)
         for target in condition.targets:
             began = time.monotonic()
             scores = self.score(self.network(condition), params, target)
             write_result(self.scored(condition, seed, target), {
                 "scores": {k: v.tolist() for k, v in scores.items()},
-                "seconds": time.monotonic() - began}, {"label": condition.label, "seed": seed})
+                "seconds": time.monotonic() - began}, {
+                    "label": condition.label, "seed": seed, "made_from": condition.source,
+                    "scored_on": target.source})
             means = ", ".join(f"{k} {np.nanmean(v):.4f}" for k, v in scores.items())
             print(f"{condition.label}, seed {seed}, {target.name}: {means}", flush=True)
 
