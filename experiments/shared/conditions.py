@@ -33,7 +33,7 @@ from evflow.network.api import Params, config_of, estimate_y, finish
 from evflow.network.coordinates import squash
 from evflow.network.weights import weights_path
 from evflow.recordings import iter_windows
-from experiments.shared.common import config_of_result, write_result
+from experiments.shared.common import config_of_result, slug, write_result
 from experiments.shared.scored_on import Recorded
 from experiments.shared.targets import Target
 
@@ -206,11 +206,14 @@ def network_maps(recording: Recording, params: Params) -> Camera:
 def conditions(
     shop: Workshop, targets: Sequence[AnyTarget], names: Sequence[str], files: Files = NONE
 ) -> list[Condition]:
-    """Of the names (`CHOICES`) and of files; raises EV020 for an unknown name, one used twice, or
-    one that no target can have."""
-    counts = Counter((*names, *files.estimators, *files.generators, *files.cameras))
-    if twice := [name for name, count in counts.items() if count > 1]:
-        raise EvflowDataError("EV020", f"two conditions are called {twice}.", "Rename one.")
+    """Of the names (`CHOICES`) and of files; raises EV020 for an unknown name, two that have one
+    file name (`slug`), one of `CHOICES` for a file, or one that no target can have."""
+    of_files = (*files.estimators, *files.generators, *files.cameras)
+    _distinct("conditions", (*names, *of_files))
+    _distinct("targets", [t.name for t in targets])
+    if taken := {slug(name) for name in of_files} & {slug(name) for name in CHOICES}:
+        raise EvflowDataError("EV020", f"a file is called {sorted(taken)}, as a condition without.",
+                              "Give it another name.")
     found = [condition for name in names for condition in _named(shop, targets, name)]
     for name, path in files.estimators.items():
         params = load_weights(path)
@@ -220,9 +223,18 @@ def conditions(
                                    _bound(shop.mapped, t, name, params, source), source))
     found += [Condition(name, name, tuple(targets), lambda: None, digest(path), path)
               for name, path in files.generators.items()]
-    return found + [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path),
-                              circuit=_bound(read_sensor, path))
-                    for name, path in files.cameras.items()]
+    found += [Condition(name, name, tuple(targets), _bound(shop.stored, path), digest(path),
+                        circuit=_bound(read_sensor, path))
+              for name, path in files.cameras.items()]
+    _distinct("runs", [condition.name for condition in found])
+    return found
+
+
+def _distinct(what: str, names: Sequence[str]) -> None:
+    """EV020 where two of the names are one as a file's name."""
+    counts = Counter(map(slug, names))
+    if twice := list(dict.fromkeys(name for name in names if counts[slug(name)] > 1)):
+        raise EvflowDataError("EV020", f"two {what} are called {twice}.", "Rename one.")
 
 
 def _named(shop: Workshop, targets: Sequence[AnyTarget], name: str) -> list[Condition]:

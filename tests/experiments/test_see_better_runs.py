@@ -62,6 +62,25 @@ def test_finished_runs_of_other_files_are_refused(runs: Trainings, tmp_path: Pat
         go_on(files["y"])
 
 
+@pytest.mark.parametrize(("names", "given", "seen"), [
+    ((), ("my cam", "my_cam"), r"two conditions are called \['my cam', 'my_cam'\]"),
+    ((), ("raw",), r"a file is called \['raw'\]"),
+    ((), ("ecc_median",), r"a file is called \['ecc_median'\]"),
+    (("evflow",), ("high noisy evflow",), "two runs are called")])
+def test_names_that_would_share_a_folder_are_refused(
+    names: tuple[str, ...], given: tuple[str, ...], seen: str, tmp_path: Path
+) -> None:
+    path, target = cameras(tmp_path)["x"], targets.target("high", "noisy", SHAPE)
+    with pytest.raises(EvflowDataError, match=f"EV020.*{seen}"):
+        conditions(workshop(tmp_path), [target], names, Files(cameras=dict.fromkeys(given, path)))
+
+
+def test_targets_that_would_share_a_file_are_refused(tmp_path: Path) -> None:
+    both = [Recorded(name, "", recordings.make()) for name in ("a b", "a_b")]
+    with pytest.raises(EvflowDataError, match=r"EV020.*two targets"):
+        conditions(workshop(tmp_path), both, ("default",))
+
+
 def test_a_measurement_is_that_of_its_recording(tmp_path: Path) -> None:
     one, other = (Recorded("real", source, recordings.make()) for source in ("one", "other"))
 
