@@ -232,7 +232,9 @@ def picture(result: dict[str, Result], path: Path) -> None:
 
 
 def examples(images: dict[str, np.ndarray], path: Path) -> None:
-    """Images (N, H, W) by condition, a row each, of the first clips."""
+    """Images (N, H, W) by condition, a row each, of the first clips; of nothing no file."""
+    if not images:
+        return
     columns = min(SHOWN, len(next(iter(images.values()))))
     figure = plots.new_figure(1.4 * columns + 0.5, 1.4 * len(images))
     axes = figure.subplots(len(images), columns, squeeze=False)

@@ -55,6 +55,7 @@ def test_less_error_is_better_and_nothing_is_claimed_of_a_single_seed() -> None:
 
 def test_of_nothing_there_is_no_picture(tmp_path: Path) -> None:
     gains.picture({"high noisy": {}}, tmp_path / "none.png")
+    gains.examples({}, tmp_path / "none.png")
     assert list(tmp_path.iterdir()) == []
 
 
