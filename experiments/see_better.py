@@ -94,7 +94,7 @@ def main(options: Options) -> dict[str, Any]:
     runs = Trainings(setting, options.out, options.weights, named_files(options.recordings))
     conditions = runs.conditions(
         Files(*map(named_files, (options.estimators, options.eventgan, options.cameras))))
-    same_setting(options.out, options.task, options.weights, setting)
+    same_setting(options.out, options.task, options.weights, setting, runs.lpips is not None)
     nothing_lost(options.out, conditions, setting.seeds)
     left = runs.complete_all(conditions, began + options.max_seconds)
     result = {k: gains.compared(scores) for k, scores in runs.scores(conditions).items()}

@@ -54,7 +54,8 @@ ABLATIONS = {
 
 def compared(rows: Rows) -> Result:
     """Every condition's means, its paired differences to default and wide, and its share of the
-    oracle's gain over default where that gain is significant."""
+    oracle's gain over default where that gain is significant. Compared are the measures that both
+    have: LPIPS may have been installed between two trainings."""
     result: Result = {}
     for label, measures in rows.items():
         result[label] = {}
@@ -63,7 +64,7 @@ def compared(rows: Rows) -> Result:
             entry: dict[str, Any] = {
                 "mean": float(means.mean()), "seeds": list(seeds), "values": means.tolist()}
             for other in REFERENCES:
-                if other != label and other in rows and name not in CONSTANT:
+                if other != label and name in rows.get(other, {}) and name not in CONSTANT:
                     entry[f"to {other}"] = difference(seeds, rows[other][name])
             result[label][name] = entry
     for name, label in ((n, k) for k, v in result.items() for n in v):
@@ -215,7 +216,7 @@ def picture(result: dict[str, Result], path: Path) -> None:
         labels = [k for k in rows if k != DEFAULT][::-1]
         for axis, name in zip(line, measures, strict=True):
             for y, label in enumerate(labels):
-                change = rows[label][name].get(f"to {DEFAULT}")
+                change = rows[label].get(name, {}).get(f"to {DEFAULT}")
                 if change:
                     axis.errorbar(change["mean"], y, xerr=change["ci"] or 0.0, fmt="o",
                                   color=plots.ON_COLOUR if label == OURS else plots.OFF_COLOUR)

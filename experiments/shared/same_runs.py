@@ -13,17 +13,21 @@ from experiments.shared.common import config_of_result, slug, write_result
 from experiments.shared.conditions import Condition, digest
 from experiments.shared.see_better_settings import Setting
 
+LPIPS_LOSS = "lpips_in_loss"
 
-def same_setting(out: Path, task: str, weights: str, setting: Setting) -> None:
-    """Record the setting of the runs in `out`; EV013 where they were made by another."""
+
+def same_setting(out: Path, task: str, weights: str, setting: Setting, lpips: bool) -> None:
+    """Record the setting of the runs in `out`; EV013 where they were made by another. lpips:
+    whether it is installed, which changes what video is trained by in some settings."""
     # What may grow from one command to the next: everything is trained and scored by itself.
     free = ("names", "cameras", "circuits", "seeds")
-    shared = {"task": task, "weights": weights, "estimator": digest(weights_path(weights))}
+    shared = {"task": task, "weights": weights, "estimator": digest(weights_path(weights)),
+              LPIPS_LOSS: lpips and setting.perceptual and task == "video"}
     wanted = shared | {k: v for k, v in as_dict(setting).items() if k not in free}
     wanted = json.loads(json.dumps(wanted))
     path = out / "setting.json"
     if path.is_file():
-        before = json.loads(path.read_text())["config"]
+        before = {LPIPS_LOSS: wanted[LPIPS_LOSS]} | config_of_result(path)  # older ones: unsaid
         if before != wanted:
             differ = [k for k in wanted if before.get(k) != wanted[k]]
             raise EvflowDataError("EV013", f"{out} holds runs of another setting ({differ}).",

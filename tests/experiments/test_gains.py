@@ -59,6 +59,18 @@ def test_of_nothing_there_is_no_picture(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_measures_that_one_lacks_are_not_compared(tmp_path: Path) -> None:
+    """As after LPIPS was installed: older trainings have no such scores."""
+    old, new = ({"ssim": scores([0.3, value])} for value in (0.4, 0.5))
+    for rows in ({"default": old, "evflow": new | {"lpips": scores([0.2, 0.3])}},
+                 {"default": new | {"lpips": scores([0.2, 0.3])}, "evflow": old, "wide": old}):
+        found = gains.compared(rows)
+        assert found["evflow"]["ssim"]["to default"]["seeds"] == 2
+        assert "to default" not in found["evflow"].get("lpips", {})
+        gains.picture({"high noisy": found}, tmp_path / "gains.png")
+        assert "LPIPS" in gains.report({"high noisy": found}, "video", {}, 0)
+
+
 def test_seeds_without_a_partner_are_left_out() -> None:
     some = {k: v for k, v in scores([0.2, 0.4, 0.9]).items() if k != 1}
     change = gains.difference(some, scores([0.1, 5.0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.network.weights import save_weights
 from experiments.shared import targets
 from experiments.shared.conditions import Condition, Files, Workshop, conditions
+from experiments.shared.same_runs import same_setting
 from experiments.shared.scored_on import Recorded
 from experiments.shared.see_better_settings import preset_of
 from experiments.shared.trainings import Trainings, run_card
@@ -79,6 +81,20 @@ def test_targets_that_would_share_a_file_are_refused(tmp_path: Path) -> None:
     both = [Recorded(name, "", recordings.make()) for name in ("a b", "a_b")]
     with pytest.raises(EvflowDataError, match=r"EV020.*two targets"):
         conditions(workshop(tmp_path), both, ("default",))
+
+
+def test_what_video_is_trained_by_is_part_of_the_setting(tmp_path: Path) -> None:
+    small, full = (preset_of("video", preset) for preset in ("debug", "full"))
+    for name, setting in (("small", small), ("full", full)):
+        same_setting(tmp_path / name, "video", "default", setting, lpips=False)
+    same_setting(tmp_path / "small", "video", "default", small, lpips=True)  # scored by it alone
+    with pytest.raises(EvflowDataError, match=r"EV013.*lpips_in_loss"):
+        same_setting(tmp_path / "full", "video", "default", full, lpips=True)
+    path = tmp_path / "full" / "setting.json"
+    older = json.loads(path.read_text())
+    del older["config"]["lpips_in_loss"]
+    path.write_text(json.dumps(older))
+    same_setting(tmp_path / "full", "video", "default", full, lpips=True)
 
 
 def test_a_measurement_is_that_of_its_recording(tmp_path: Path) -> None:
