@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import time
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -73,19 +75,23 @@ def windows(
 def estimated_maps(
     params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
 ) -> dict[str, Maps]:
-    """Maps by ESTIMATORS.
+    """Maps by ESTIMATORS; arguments and names as of `estimators`."""
+    return {name: make() for name, make in estimators(
+        params, recording, found, min_window_us).items()}
 
-    Args:
-        params: weights; the paper's are used too, with windows as short as in its training.
-        recording: to estimate from.
-        found: its whole estimate.
-        min_window_us: of the windows.
 
-    Returns:
-        Maps by name; empty for a scene at rest, whose thresholds are undetermined.
-    """
+def estimators(
+    params: Any, recording: Recording, found: CameraEstimate, min_window_us: int
+) -> dict[str, Callable[[], Maps]]:
+    """What makes the maps of each of ESTIMATORS; empty for a scene at rest, whose thresholds are
+    undetermined. params: weights; the paper's are used too, with windows as short as in its
+    training. found: the recording's whole estimate; min_window_us: of the windows."""
     if not found.windows:
         return {}
+
+    @functools.cache
+    def known() -> Summary:
+        return finish(params, pool_recording(params, recording, min_window_us)[0])[0]
 
     def flow(weights: Any) -> np.ndarray:
         return stacked(estimate_camera(recording, weights, refine="off",
@@ -93,28 +99,34 @@ def estimated_maps(
 
     paper = paper_weights() if pools(params) else params
     short = min(min_window_us, WINDOW_US)
-    by_paper = {PAPER_WINDOW: windows(paper, recording, short, None), PAPER_FLOW: [flow(paper)]}
+    by_paper: dict[str, Callable[[], Maps]] = {
+        PAPER_WINDOW: lambda: windows(paper, recording, short, None),
+        PAPER_FLOW: lambda: [flow(paper)]}
     if not pools(params):
         return by_paper
     shape = recording.events.size[::-1]
-    known, _ = finish(params, pool_recording(params, recording, min_window_us)[0])
     return by_paper | {
-        WINDOW: windows(params, recording, min_window_us, known), FLOW: [flow(params)],
-        NETWORK: [everywhere(known, shape)], SUMMARY: [everywhere(found.summary, shape)],
-        WHOLE: [stacked(found.camera)]}
+        WINDOW: lambda: windows(params, recording, min_window_us, known()),
+        FLOW: lambda: [flow(params)], NETWORK: lambda: [everywhere(known(), shape)],
+        SUMMARY: lambda: [everywhere(found.summary, shape)],
+        WHOLE: lambda: [stacked(found.camera)]}
 
 
 def fitted(
-    params: Any, recording: Recording, found: CameraEstimate, min_window_us: int = 40_000
+    params: Any, recording: Recording, found: CameraEstimate, seconds: float,
+    min_window_us: int = 40_000,
 ) -> dict[str, Fitted]:
-    """The estimators of `estimated_maps` with one map (without the whole estimate) as compared
-    systems; their thresholds are the medians of the maps."""
+    """The estimators with one map (without the whole estimate) as compared systems; their
+    thresholds are the medians of the maps. seconds: what the whole estimate took, and with it its
+    summary."""
     rows = {}
-    for name, maps in estimated_maps(params, recording, found, min_window_us).items():
-        if name in (PAPER_FLOW, FLOW, NETWORK, SUMMARY):
-            camera = Camera(*(jnp.asarray(m, jnp.float32) for m in maps[0]))
-            rows[name] = Fitted(camera, np.stack([found.valid] * 2),
-                                np.median(maps[0][:2], (1, 2)), 0.0)
+    made = estimators(params, recording, found, min_window_us)
+    for name in (name for name in made if name in (PAPER_FLOW, FLOW, NETWORK, SUMMARY)):
+        start = time.perf_counter()
+        maps = made[name]()[0]
+        took = seconds if name == SUMMARY else time.perf_counter() - start
+        rows[name] = Fitted(Camera(*(jnp.asarray(m, jnp.float32) for m in maps)),
+                            np.stack([found.valid] * 2), np.median(maps[:2], (1, 2)), took)
     return rows
 
 

@@ -35,7 +35,7 @@ def ours(params: Any, recording: Recording) -> dict[str, Fitted]:
     found = estimate_camera(recording, params, min_window_us=span)
     seconds = time.perf_counter() - start
     theta = np.array([float(found.summary.theta_on), float(found.summary.theta_off)])
-    return alone.fitted(params, recording, found, span) | {
+    return alone.fitted(params, recording, found, seconds, span) | {
         OURS: Fitted(found.camera, np.stack([found.valid] * 2), theta, seconds)}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -59,11 +60,11 @@ def calibrated_and_scored(case: Case, held_out: bool) -> tuple[Recording, Case, 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Thresholds:
     """A camera to integrate with (None: no events at all), its log map's offset, and for how many
-    seconds it was sought."""
+    seconds it was sought (None: it was not)."""
 
     camera: Camera | None
     offset_dn: float = 0.0
-    seconds: float = 0.0
+    seconds: float | None = None
 
 
 def thresholds(
@@ -76,11 +77,14 @@ def thresholds(
         fitted = SYSTEMS[name].fit(part)
         found[name] = Thresholds(fitted.camera, getattr(SYSTEMS[name], "offset_dn", 0.0),
                                  fitted.seconds)
+    start = time.perf_counter()
     ours = estimate_camera(part, params)
-    found |= {name: Thresholds(fitted.camera)
-              for name, fitted in alone.fitted(params, part, ours).items() if name != alone.SUMMARY}
-    found["ours, summary"] = Thresholds(constant(shape, ours.summary))
-    found["ours, maps"] = Thresholds(ours.camera)
+    seconds = time.perf_counter() - start
+    found |= {name: Thresholds(fitted.camera, seconds=fitted.seconds)
+              for name, fitted in alone.fitted(params, part, ours, seconds).items()
+              if name != alone.SUMMARY}
+    found["ours, summary"] = Thresholds(constant(shape, ours.summary), seconds=seconds)
+    found["ours, maps"] = Thresholds(ours.camera, seconds=seconds)
     if case.truth is not None and case.nominal is not None:
         found["true, nominal"] = Thresholds(constant(shape, case.nominal))
         found["true, maps"] = Thresholds(case.truth)
@@ -139,9 +143,11 @@ def example(case: Case, by: dict[str, Thresholds], names: Sequence[str]) -> Exam
 
 
 def averages(collected: Found) -> dict[str, dict[str, dict[str, Any]]]:
-    """Means over the recordings of a group: scores with their intervals, images, seconds."""
+    """Means over the recordings of a group: scores with their intervals, images, seconds (None
+    where nothing was sought)."""
     return {group: {horizon: {name: {
         **{s: mean_ci(np.array(found)[:, i]) for i, s in enumerate(SCORES)},
-        "images": sum(r[-2] for r in found), "seconds": float(np.mean([r[-1] for r in found]))}
+        "images": sum(r[-2] for r in found),
+        "seconds": None if found[0][-1] is None else float(np.mean([r[-1] for r in found]))}
         for name, found in row.items()} for horizon, row in horizons.items()}
         for group, horizons in collected.items()}

@@ -33,7 +33,8 @@ def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
                 values = [f"{row[s][0]:.3f}" + (f" ± {row[s][1]:.3f}" if row[s][1] else "")
                           for s in SCORES]
                 paper = ", ".join(map(str, PAPER.get(kind, {}).get(name, ())))
-                lines.append(f"| {name} | {' | '.join(values)} | {row['seconds']:.1f} | {paper} |")
+                took = "" if row["seconds"] is None else f"{row['seconds']:.1f}"
+                lines.append(f"| {name} | {' | '.join(values)} | {took} | {paper} |")
     return "\n".join(lines)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from typing import Any
 
 import cv2
@@ -57,7 +58,9 @@ def held_out(
     n, d = changes(second)
     used = np.abs(d) > CHANGED
     design = np.stack([n[:, 0][used], -n[:, 1][used]], -1).astype(np.float64)
+    start = time.perf_counter()
     best, *_ = np.linalg.lstsq(design, d[used].astype(np.float64), rcond=None)
+    seconds = time.perf_counter() - start
     size = float(np.sqrt(np.mean(d[used] ** 2)))
 
     def left(on: np.ndarray, off: np.ndarray) -> float:
@@ -65,7 +68,7 @@ def held_out(
         return float(np.sqrt(np.mean(rest[used] ** 2)) / size)
 
     result = {"frame regression": {"theta": best.tolist(), "left": left(*(np.full(
-        d.shape[1:], t, np.float32) for t in best)), "seconds": 0.0, "notes": [
+        d.shape[1:], t, np.float32) for t in best)), "seconds": seconds, "notes": [
             f"{used.sum()} changes of {len(usable(second))} frame intervals"]}}
     for name, fit in all_fits(params, first, systems).items():
         maps = (np.asarray(getattr(fit.camera, f"theta_{p}")) for p in POLARITIES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,7 +35,21 @@ def test_errors_by_hand() -> None:
 
 def test_a_scene_at_rest_has_no_rows() -> None:
     found: Any = SimpleNamespace(windows=0)
-    assert alone.fitted({}, None, found) == {}  # type: ignore[arg-type]
+    assert alone.fitted({}, None, found, 1.0) == {}  # type: ignore[arg-type]
+
+
+def test_each_estimator_was_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(*_: Any) -> list[np.ndarray]:
+        time.sleep(0.01)
+        return [np.full((4, *SHAPE), 0.2)]
+
+    names = (alone.PAPER_FLOW, alone.NETWORK, alone.SUMMARY, alone.WINDOW)
+    monkeypatch.setattr(alone, "estimators", lambda *_: dict.fromkeys(names, slow))
+    found: Any = SimpleNamespace(valid=np.ones(SHAPE, bool))
+    made = alone.fitted({}, None, found, 7.0)  # type: ignore[arg-type]
+    assert made.keys() == set(names) - {alone.WINDOW}
+    assert 7 > made[alone.PAPER_FLOW].seconds >= 0.01 <= made[alone.NETWORK].seconds
+    assert made[alone.SUMMARY].seconds == 7
 
 
 def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:

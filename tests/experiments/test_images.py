@@ -50,6 +50,14 @@ def test_scores_are_those_of_bytes() -> None:
     assert 0.9 < whole < 1
 
 
+def test_what_was_not_sought_took_no_time() -> None:
+    averages = integrated.averages({"ramp": {"1 frame": {
+        name: [[1.0, 2.0, 3.0, 4.0, 5, took]] for name, took in (("held", None), ("ours", 2.0))}}})
+    table = integrated_pages.table(averages)
+    assert "4.000 |  |  |" in table  # nothing was sought
+    assert "4.000 | 2.0 |  |" in table
+
+
 def test_images_of_the_right_thresholds_are_the_frames() -> None:
     recording = sweep()
     right, wrong = (integrated.Thresholds(Camera.constant(SHAPE, t, t)) for t in (0.05, 0.07))
