@@ -21,9 +21,8 @@ from evflow.camera import CameraPrior
 from evflow.estimation.pooled import pool_recording
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
-from experiments.shared.curves_pages import draw, table
+from experiments.shared.curves_pages import draw, point, table
 from experiments.shared.many import Setup, study
-from experiments.shared.protocols import ENOUGH
 
 BASE = Protocol(prior=CameraPrior(mismatch=(0.03, 0.03)))
 # 200 ms at other frame rates, other durations at 25 ms, other speeds; (frame_ms, intervals).
@@ -63,15 +62,12 @@ def score(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndar
     return row
 
 
-def point(rows: list[dict[str, np.ndarray]], key: str, low: float = ENOUGH,
-          high: float = np.inf) -> dict[str, float]:
-    """Mean error of theta and of eta over polarities with low <= signal events < high."""
-    rows = [r for r in rows if key in r]
-    errors, signal = (np.array([r[k] for r in rows]).reshape(-1, 4) for k in (key, "signal"))
-    used = (np.maximum(signal, 0.0) >= low) & (signal < high)
-    return {"recordings": len(rows), **{
-        name: float(errors[:, part][used[:, part]].mean()) if used[:, part].any() else np.nan
-        for name, part in (("theta", slice(0, 2)), ("eta", slice(2, 4)))}}
+def alike(found: dict[Protocol, list[dict[str, np.ndarray]]]) -> list[dict[str, np.ndarray]]:
+    """Rows that tell lengths of windows apart: of recordings whose frames divide each length, and
+    that are long enough for all."""
+    return [row for protocol, rows in found.items()
+            if not any(us % (1000 * protocol.frame_ms) for us in WINDOWS_US) for row in rows
+            if all(f"network {us // 1000}" in row for us in WINDOWS_US)]
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -88,20 +84,22 @@ def main(options: Options) -> dict[str, Any]:
     if options.preset == "debug":
         settings = {name: dict(list(points.items())[-2:]) for name, points in settings.items()}
     result: dict[str, Any] = {}
-    base: list[dict[str, np.ndarray]] = []
+    found: dict[Protocol, list[dict[str, np.ndarray]]] = {}  # two settings have one in common
     for name, points in settings.items():
         result[name] = {}
         for value, protocol in points.items():
-            rows = study(score, Setup(options.weights, options.seed), [protocol] * count,
-                         options.workers, f"{name} {value}")
+            if protocol not in found:
+                found[protocol] = study(score, Setup(options.weights, options.seed),
+                                        [protocol] * count, options.workers, f"{name} {value}")
+            rows = found[protocol]
             result[name][value] = {"refined": point(rows, "refined"),
                                    "network": point(rows, "network 50")}
-            base += rows
+    base = [row for rows in found.values() for row in rows]
     result["signal events"] = {
         high: {k: point(base, f, low, high) for k, f in (("refined", "refined"),
                                                          ("network", "network 50"))}
         for low, high in itertools.pairwise(EVENTS)}
-    result["window [ms]"] = {us // 1000: {"network": point(base, f"network {us // 1000}")}
+    result["window [ms]"] = {us // 1000: {"network": point(alike(found), f"network {us // 1000}")}
                              for us in WINDOWS_US}
     conclude(options, "curves", result, table(result))
     draw(result, options.out / "curves.png")

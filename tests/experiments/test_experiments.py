@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ from experiments import (
     quickstart,
     true_video,
 )
-from experiments.shared import hidden_scene
+from experiments.shared import curves_pages, hidden_scene
+from experiments.shared.cameras import Protocol
 from experiments.shared.generated_pages import auroc
 
 
@@ -121,6 +123,39 @@ def test_one_polarity_alone_is_scored_and_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_curves_compare_like_with_like_and_count_what_they_use() -> None:
+    def row(signal: float, *lengths: int) -> dict[str, np.ndarray]:
+        return {"signal": np.full(4, signal), "refined": np.full(4, 0.1),
+                **{f"network {ms}": np.full(4, 0.2) for ms in lengths}}
+
+    rows = [row(300, 25, 50, 100), row(5000, 25, 50), row(10, 25, 50, 100)]
+    assert curves_pages.point(rows, "network 100") == {
+        "recordings": 1, "theta": pytest.approx(0.2), "eta": pytest.approx(0.2)}
+    assert curves_pages.point(rows, "refined", 0, 1000)["recordings"] == 2
+    slow = dataclasses.replace(curves.BASE, frame_ms=20)
+    assert curves.alike({curves.BASE: rows, slow: rows}) == [rows[0], rows[2]]
+    counted = {kind: curves_pages.point(rows, key)
+               for kind, key in (("refined", "refined"), ("network", "network 100"))}
+    text = curves_pages.table({"duration [ms]": {50: counted}})
+    assert "| 50 | 2 / 1 |" in text
+
+
+def test_a_protocol_of_two_settings_is_simulated_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Protocol] = []
+
+    def study(_score: object, _setup: object, protocols: list[Protocol], *_: object
+              ) -> list[dict[str, np.ndarray]]:
+        seen.append(protocols[0])
+        return [{"signal": np.full(4, 300.0), "refined": np.ones(4), "network 50": np.ones(4)}]
+
+    monkeypatch.setattr(curves, "study", study)
+    curves.main(curves.Options(out=tmp_path, preset="full", recordings=1))
+    assert len(set(seen)) == len(seen) == len(
+        [*curves.RATES, *curves.DURATIONS, *curves.SPEEDS]) - 1
+
+
 def test_curves_are_drawn(tmp_path: Path) -> None:
     result = curves.main(curves.Options(out=tmp_path, recordings=1))
     assert {"frame interval [ms]", "duration [ms]", "signal events"} < set(result)
