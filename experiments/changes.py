@@ -34,7 +34,7 @@ from experiments.shared.change_windows import window_errors
 from experiments.shared.changes_pages import MEASURES, picture, table
 from experiments.shared.common import begin, conclude, run_script
 from experiments.shared.images import mean_ci
-from experiments.shared.recordings import real_recordings
+from experiments.shared.recordings import distinct, real_recordings
 
 FRAME_MS = 32  # of simulated recordings: 16 parts of 2 frames of the 1 kHz video
 
@@ -81,6 +81,7 @@ def recordings(options: Options) -> Iterator[tuple[str, Recording, np.ndarray | 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "changes")
     plots.require()
+    distinct(options.recording)
     params = load_weights(options.weights)
     batches = options.batches or {"debug": 2, "full": 40}[options.preset]
     result = window_errors(params, options.seed, batches)

@@ -25,7 +25,7 @@ from evflow.report.plots import event_image, new_figure, save_figure
 from evflow.report.resimulate import INSTANT_US, Trial, busiest, held_out, resimulate, usable_runs
 from evflow.types import Recording
 from experiments.shared.common import begin, conclude, markdown, run_script, slug
-from experiments.shared.recordings import held_recordings
+from experiments.shared.recordings import distinct, held_recordings
 
 Pixel = Literal["measured", "ideal", "maps alone"]
 PIXELS: tuple[Pixel, ...] = ("measured", "ideal", "maps alone")
@@ -96,10 +96,10 @@ def draw(trials: dict[str, Trial], path: Path) -> None:
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "real_recordings")
+    paths = distinct(options.recordings) or held_recordings()
     params = load_weights(options.weights)
     rows: list[list[str]] = []
     result: dict[str, Any] = {}
-    paths = options.recordings or held_recordings()
     for path in paths[:1] if options.preset == "debug" else paths:
         recording = read_recording(path)
         trials: dict[str, Trial] = {}

@@ -15,7 +15,7 @@ from experiments.shared.recorded import (
     read_rotation,
     sequence_name,
 )
-from experiments.shared.recordings import held_folder, held_recordings
+from experiments.shared.recordings import distinct, held_folder, held_recordings
 
 ROTATIONS = ("ijrr_boxes_rotation", "ijrr_dynamic_rotation")
 
@@ -29,10 +29,7 @@ def parts(
     where two have one name, and the last one's error where none can be read."""
     paths = list(data) or held_recordings()[::-1]
     cut = not whole and bool(data)  # the held ones are slices, shorter than their cuts
-    names = [sequence_name(path) for path in paths]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise EvflowDataError("EV020", f"more than one recording is called {sorted(twice)}.",
-                              "Rename a file: it is by its name that a sequence is known.")
+    distinct(paths, sequence_name)
     found: list[Part] = []
     for path in paths:
         start, stop = cut_of(path) if cut else (0.0, math.inf)

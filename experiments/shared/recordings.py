@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from evflow import Recording, read_recording
+from evflow.errors import EvflowDataError
+from experiments.shared.common import slug
 
 HELD = ("ijrr_slider_depth", "newton_cradle_davis346.aedat4")
 
@@ -23,11 +25,22 @@ def held_folder() -> Path:
     return Path(os.environ.get("EVFLOW_DATA") or "absent") / "data/recordings"
 
 
+def distinct(paths: Sequence[Path], name: Callable[[Path], str] = lambda path: slug(path.stem)
+             ) -> Sequence[Path]:
+    """The paths; EV020 where two recordings have one name."""
+    names = [name(path) for path in paths]
+    if twice := {n for n in names if names.count(n) > 1}:
+        raise EvflowDataError("EV020", f"more than one recording is called {sorted(twice)}.",
+                              "Rename a file: it is by its name that a recording is known.")
+    return paths
+
+
 def real_recordings(
     paths: Sequence[Path], span_s: tuple[float, float] | None, most: int | None
 ) -> Iterator[tuple[str, Recording]]:
-    """(name, recording) of these paths, or of at most so many `held_recordings` without any."""
-    for path in paths or held_recordings()[:most]:
+    """(name, recording) of these paths, or of at most so many `held_recordings` without any. Raises
+    as `distinct`."""
+    for path in distinct(paths) or held_recordings()[:most]:
         yield path.stem, cut(read_recording(path), span_s)
 
 

@@ -34,6 +34,7 @@ from experiments import (
     one_polarity,
     quickstart,
     real_pixels,
+    real_recordings,
     see_better,
     tell_apart,
     template,
@@ -81,6 +82,16 @@ def test_conditions_and_rows_that_are_not_there(
 ) -> None:
     with pytest.raises(EvflowDataError, match=seen):
         real_pixels.main(real_pixels.Options(out=tmp_path, **given))
+
+
+@pytest.mark.parametrize("name", ["a.aedat4", "a.bag"])
+@pytest.mark.parametrize(("script", "option"), [
+    (changes, "recording"), (integrate, "recording"), (real_recordings, "recordings")],
+    ids=lambda x: x if isinstance(x, str) else x.__name__)
+def test_recordings_of_one_name(script: Any, option: str, name: str, tmp_path: Path) -> None:
+    both = (tmp_path / "one/a.aedat4", tmp_path / "other" / name)
+    with pytest.raises(EvflowDataError, match=r"EV020.*more than one recording is called \['a'\]"):
+        script.main(script.Options(out=tmp_path, **{option: both}))
 
 
 def test_weights_that_workers_cannot_load_are_named_by_the_parent(tmp_path: Path) -> None:
