@@ -85,7 +85,7 @@ def fused_summary(params: Any, start: Begun) -> tuple[Summary, Summary]:
 
 def main(options: Options) -> dict[str, float]:
     at_least(1, recordings=options.recordings, workers=options.workers)
-    name, net = begin_fit(options, "summary")
+    name, net = begin_fit(options, "summary", "fusion")
     setup = Setup(str(options.weights), options.seed, photos=True)
     protocols = draw_protocols(options.seed, options.recordings)
     made = study(row, setup, protocols, options.workers, "recordings")

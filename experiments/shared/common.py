@@ -134,7 +134,11 @@ def estimator(weights: str | Path, *parts: str) -> tuple[str, dict[str, Any]]:
     params = load_weights(weights)
     config_of(params)
     (name, net), = params.items()
-    if missing := [part for part in parts if part not in net]:
+    missing = [part for part in parts if part not in net]
+    if missing == ["fusion"]:
+        raise EvflowDataError("EV018", f"{weights} has no part fusion.",
+                              "Fit it first: python -m experiments.fuse.")
+    if missing:
         raise EvflowDataError(
             "EV018", f"{weights} has no part {' and '.join(missing)}: its network ({name}) sees "
             "every pixel alone, and estimates no errors.", "Take weights of the default network.")

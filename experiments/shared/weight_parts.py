@@ -21,12 +21,12 @@ class FitOptions(Protocol):
     def overwrite(self) -> bool: ...
 
 
-def begin_fit(options: FitOptions, part: str) -> tuple[str, dict[str, Any]]:
+def begin_fit(options: FitOptions, *parts: str) -> tuple[str, dict[str, Any]]:
     """The architecture's name and the network in `options.weights`. Raises EV020 or EV013 where
-    `options.out` cannot be written, EV018 where the weights lack the part."""
+    `options.out` cannot be written, EV018 where the weights lack one of the parts."""
     need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
-    return estimator(options.weights, part)
+    return estimator(options.weights, *parts)
 
 
 def save_part(

@@ -15,7 +15,7 @@ from helpers.networks import random_params
 from benchmarks import __main__ as benchmarks
 from evflow.errors import EvflowDataError
 from evflow.network.config import MODELS
-from evflow.network.weights import save_weights
+from evflow.network.weights import load_weights, save_weights
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.run import started_from
 from experiments import (
@@ -72,6 +72,14 @@ def test_weights_without_a_summary_or_errors(script: Any, tmp_path: Path) -> Non
     given = {"weights": str(path), "out": tmp_path / ("a.safetensors" if script in FITS else "out")}
     with pytest.raises(EvflowDataError, match=r"EV018.*no part .*sees every pixel alone"):
         script.main(script.Options(**given))
+
+
+def test_noise_is_told_apart_after_the_fusion(tmp_path: Path) -> None:
+    (name, net), = load_weights("default").items()
+    path = save_weights(tmp_path / "unfused.safetensors",
+                        {name: {k: v for k, v in net.items() if k != "fusion"}}, {})
+    with pytest.raises(EvflowDataError, match=r"EV018.*no part fusion.*experiments\.fuse"):
+        tell_apart.main(tell_apart.Options(path, out=tmp_path / "made.safetensors"))
 
 
 @pytest.mark.parametrize(("given", "seen"), [
