@@ -23,7 +23,7 @@ from evflow.camera import PARAMETERS
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
 from experiments.shared.coverage_pages import LEVELS, curves, deviations, draw, strata
-from experiments.shared.many import Setup, study
+from experiments.shared.many import Setup, enough, study
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,7 +87,7 @@ def main(options: Options) -> dict[str, Any]:
     count = options.count(options.recordings, debug=12, full=1000)
     protocols = [drawn(np.random.default_rng((options.seed, i)), options) for i in range(count)]
     setup = Setup(options.weights, options.seed, options.photos)
-    rows = study(score, setup, protocols, options.workers, "cameras")
+    rows = enough(study(score, setup, protocols, options.workers, "cameras"))
     found = curves(rows)
     result = {"levels": LEVELS.tolist(), "cameras": len(rows), "curves": found,
               "strata": strata(rows)}

@@ -26,7 +26,7 @@ from evflow.network.weights import weights_hash
 from evflow.training.config import PRESETS
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import at_least, run_script
-from experiments.shared.fusion_fit import cross_validated, figures_of, fit
+from experiments.shared.fusion_fit import FOLDS, cross_validated, figures_of, fit
 from experiments.shared.many import Setup
 from experiments.shared.real_cameras import draw_exposed, draw_other, draw_real
 from experiments.shared.refinement import COVERED, begun
@@ -81,12 +81,14 @@ def row(params: Any, hidden: Hidden, _protocol: Protocol) -> dict[str, np.ndarra
 
 
 def main(options: Options) -> dict[str, Any]:
-    at_least(1, recordings=options.recordings, workers=options.workers)
+    at_least(1, steps=options.steps, workers=options.workers)
+    at_least(FOLDS, recordings=options.recordings)
     name, net = begin_fit(options, "summary")
     protocols = [drawn(options.seed, i) for i in range(options.recordings)]
     setup = Setup(str(options.weights), options.seed, photos=True)
     origin = f"{options.seed} {weights_hash(options.weights)}"
-    rows = collected(row, setup, protocols, options.workers, options.rows, origin)
+    rows = collected(row, setup, protocols, options.workers, options.rows, origin,
+                     least=FOLDS)
     y, std = cross_validated(rows, options.steps, options.seed)
     widen = np.quantile(np.abs(y - rows["true"]) / std, COVERED, axis=0)
     figures = figures_of(rows, y, std * widen)

@@ -27,12 +27,13 @@ from evflow.estimation.refine.signal import joined
 from evflow.network.coordinates import squash_summary, summary_std, unsquash_summary
 from experiments.shared.cameras import Hidden, Protocol, draw_protocols
 from experiments.shared.common import at_least, run_script
-from experiments.shared.many import Setup, study
+from experiments.shared.many import Setup, enough, study
 from experiments.shared.refinement import Begun, begun
 from experiments.shared.signal_fit import Row, judged, train
 from experiments.shared.weight_parts import begin_fit, save_part
 
 HELD_OUT = 5  # every n-th recording
+LEAST = 2  # one to fit to, and one that is held out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +85,12 @@ def fused_summary(params: Any, start: Begun) -> tuple[Summary, Summary]:
 
 
 def main(options: Options) -> dict[str, float]:
-    at_least(1, recordings=options.recordings, workers=options.workers)
+    at_least(1, steps=options.steps, workers=options.workers)
+    at_least(LEAST, recordings=options.recordings)
     name, net = begin_fit(options, "summary", "fusion")
     setup = Setup(str(options.weights), options.seed, photos=True)
     protocols = draw_protocols(options.seed, options.recordings)
-    made = study(row, setup, protocols, options.workers, "recordings")
+    made = enough(study(row, setup, protocols, options.workers, "recordings"), LEAST)
     part = partial(_some, made)
     fit = partial(train, steps=options.steps, seed=options.seed)
     widen, figures = judged(part(True), fit(part(False)))

@@ -18,7 +18,7 @@ import numpy as np
 from evflow import estimate_camera
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, markdown, run_script
-from experiments.shared.many import Setup, study
+from experiments.shared.many import Setup, enough, study
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ def main(options: Options) -> dict[str, float]:
     begin(options, "template")
     count = options.count(options.recordings, debug=3, full=100)
     setup = Setup(options.weights, options.seed)
-    rows = study(score, setup, [Protocol()] * count, options.workers, "recordings")
+    rows = enough(study(score, setup, [Protocol()] * count, options.workers, "recordings"))
     result = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     conclude(options, "template", result, markdown(
         ("parameter", "mean error"), ((name, f"{v:.4f}") for name, v in result.items())))

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import jax
 
 from evflow import load_weights
+from evflow.errors import EvflowDataError
 from evflow.process.terminal import bar
 from evflow.process.workers import worker_pool
 from evflow.scenes import make_bank, own_bank
@@ -70,6 +71,15 @@ def study(
     (insufficient recordings)."""
     rows = scores(score, setup, list(enumerate(protocols)), workers, title)
     return [row for row in rows if row is not None]
+
+
+def enough(rows: list[Result], least: int = 1) -> list[Result]:
+    """The rows of a study; EV017 where there are fewer than so many."""
+    if len(rows) < least:
+        raise EvflowDataError(
+            "EV017", f"{len(rows)} of the recordings had enough events; it takes {least}.",
+            "Take more --recordings, or another --seed.")
+    return rows
 
 
 def made(

@@ -12,7 +12,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
 from experiments.shared.cameras import Hidden, Protocol
-from experiments.shared.many import Setup, scores
+from experiments.shared.many import Setup, enough, scores
 
 Row = dict[str, np.ndarray]
 Rows = dict[str, np.ndarray]  # the same, stacked
@@ -22,10 +22,11 @@ OFTEN = 50  # recordings from one saving to the next
 
 def collected(
     row: Callable[[Any, Hidden, Protocol], Row | None], setup: Setup,
-    protocols: Sequence[Protocol], workers: int, path: Path | None, origin: str,
+    protocols: Sequence[Protocol], workers: int, path: Path | None, origin: str, least: int = 1,
 ) -> Rows:
     """Rows of one recording of each protocol, stacked, without those that are None. path: file to
-    save them in, and to resume from if it holds rows of the same origin (weights, seed)."""
+    save them in, and to resume from if it holds rows of the same origin (weights, seed). Raises as
+    `saved_rows`, and EV017 with fewer rows than `least`."""
     found: list[Row] = []
     begin = 0
     if path and path.exists():
@@ -37,7 +38,7 @@ def collected(
         if path and (i % OFTEN == 0 or i == len(protocols)):
             with atomic_write(path, overwrite=True) as t, open(t, "wb") as f:
                 np.savez(f, allow_pickle=False, next=i, origin=origin, **stack(found))
-    return stack(found)
+    return stack(enough(found, least))
 
 
 def saved_rows(path: Path, origin: str, most: int) -> tuple[int, list[Row]]:
@@ -60,4 +61,4 @@ def saved_rows(path: Path, origin: str, most: int) -> tuple[int, list[Row]]:
 
 
 def stack(rows: Sequence[Row]) -> Rows:
-    return {k: np.stack([r[k] for r in rows]) for k in rows[0]}
+    return {k: np.stack([r[k] for r in rows]) for k in (rows[0] if rows else ())}

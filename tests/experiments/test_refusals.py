@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,8 +41,10 @@ from experiments import (
     template,
     true_video,
 )
+from experiments.shared import many, rows
 from experiments.shared.common import begin, estimator, write_result
 from experiments.shared.rows import saved_rows
+from experiments.shared.video_strata import strata
 
 FITS: list[Any] = [calibrate, fuse, tell_apart]
 
@@ -60,6 +63,36 @@ def test_counts_below_one(script: Any, option: str, count: int, tmp_path: Path) 
     with pytest.raises(EvflowDataError, match=rf"EV020.*--{option} {count}"):
         script.main(script.Options(**given))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("script", "given"), [
+    (fuse, {"steps": 0}), (fuse, {"recordings": 4}),
+    (tell_apart, {"steps": 0}), (tell_apart, {"recordings": 1})],
+    ids=lambda x: str(x) if isinstance(x, dict) else x.__name__)
+def test_fits_of_too_little(script: Any, given: dict[str, int], tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=rf"EV020.*--{next(iter(given))}"):
+        script.main(script.Options("default", out=tmp_path / "made.safetensors", **given))
+
+
+@pytest.mark.parametrize("script", [fuse, tell_apart, template, coverage],
+                         ids=lambda s: s.__name__)
+def test_recordings_without_events_give_no_figures(
+    script: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nothing(_one: object, _setup: object, jobs: list[object], *_: object) -> Iterator[None]:
+        yield from (None for _ in jobs)
+
+    for module in (many, rows):
+        monkeypatch.setattr(module, "scores", nothing)
+    given: dict[str, Any] = {"out": tmp_path / "out", "recordings": 6}
+    if script in FITS:
+        given |= {"weights": "default", "out": tmp_path / "made.safetensors"}
+    if script is fuse:
+        given["rows"] = tmp_path / "rows.npz"
+    for _ in range(2):  # rows that are kept are read again
+        with pytest.raises(EvflowDataError, match=r"EV017.*0 of the recordings had enough"):
+            script.main(script.Options(**given))
+    assert strata([]) == {}
 
 
 @pytest.mark.parametrize("script", [*FITS, coverage, curves, one_polarity, true_video],
