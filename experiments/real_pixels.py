@@ -81,7 +81,8 @@ def halves(path: Path) -> list[str] | None:
     """A real recording's cells; None where its halves determine nothing."""
     recording = read_recording(path)
     runs = plan_runs(recording, plan_windows(recording).pairs)
-    cuts = [run[k:k + max(2, len(run) // 2)] for run in runs for k in (0, len(run) // 2)]
+    if not (cuts := scores.in_two(runs)):
+        return None
     noise = frame_noise([(recording, i) for run in runs for i in run])
     first, second = (receptor_sample(
         [(recording, cut) for cut in cuts[k::2]], noise) for k in (0, 1))
@@ -101,8 +102,8 @@ def main(options: Options) -> dict[str, Any]:
     estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=1, full=40)
     names = known(options.conditions) or (FEW if options.preset == "debug" else tuple(CHANGES))
-    rows = measured(options, names, count)
     real = [line for path in options.recordings_at if (line := halves(path))]
+    rows = measured(options, names, count)
     text = "\n\n".join((
         markdown(scores.HEADS, (scores.cells(n, r) for n, r in rows.items())),
         markdown(scores.OTHER_HEADS,

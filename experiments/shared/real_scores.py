@@ -24,10 +24,18 @@ OTHER_HEADS = ("what else", "condition", "true", "found in", "median error", "68
 
 
 def need_rows(path: Path | None) -> Path:
-    """The file of the rows; EV020 where none was named."""
+    """The file of the rows; EV020 where none was named, EV016 where there is none."""
     if path is None:
         raise EvflowDataError("EV020", "--as-it-is without --rows.", "Name the file of the rows.")
+    if not path.is_file():
+        raise EvflowDataError("EV016", f"no rows at {path}.", "Name the file of the rows.")
     return path
+
+
+def in_two(runs: Sequence[list[int]]) -> list[list[int]]:
+    """First and second half of each run of frame intervals, in turn. Runs of fewer than 4 are left
+    out: a half is of two intervals at least, and both would hold the same one."""
+    return [run[k:k + len(run) // 2] for run in runs if len(run) >= 4 for k in (0, len(run) // 2)]
 
 
 def thresholds(found: CameraEstimate, truth: np.ndarray) -> Row:
