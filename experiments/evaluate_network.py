@@ -6,11 +6,11 @@
     python -m experiments.evaluate_network --weights runs/flow/evflownet.safetensors
 
 Weights: released names, .safetensors files, published checkpoints. --data takes recordings of any
-format: IJRR, MVSEC, HQF, EVIMO2v2 (flow alone: its event cameras have no frames), EVREAL. The cuts
-are those of `CUTS` (shared/recorded.py), by the sequence's name; files called NAME_cut have
-theirs already. Without --data: synthetic cameras behind three circuits that no training simulates
-(shared/targets.py), and, where the environment variable EVFLOW_DATA names a folder with them,
-two real recordings and two slices of rotations, whose flow follows from the gyroscope.
+format: IJRR, MVSEC, HQF, EVIMO2v2 (flow alone: no frames), EVREAL. The cuts are those of `CUTS`
+(shared/recorded.py), by the sequence's name; files called NAME_cut have theirs already. Without
+--data: synthetic cameras behind three circuits that no training simulates (shared/targets.py), and,
+where the environment variable EVFLOW_DATA names a folder with them, two real recordings and two
+slices of rotations, whose flow follows from the gyroscope.
 
 Images are scored linear and in the log domain, log(1 + 255 I) / log 256; flow of real recordings by
 FWL. Writes evaluate_network.json, .md and .png.
@@ -30,9 +30,8 @@ from evflow.downstream.released import load_network
 from evflow.errors import EvflowDataError
 from evflow.metrics import PROTOCOLS
 from evflow.report import plots
-from evflow.training.config import as_dict
 from experiments.shared import held_out
-from experiments.shared.common import at_least, begin, run_script, write_result, write_text
+from experiments.shared.common import at_least, begin, conclude, run_script
 from experiments.shared.network_outputs import Synthetic, real_flow, real_video
 from experiments.shared.network_scores import picture, report
 from experiments.shared.recorded_parts import parts, rotations
@@ -76,6 +75,8 @@ def main(options: Options) -> dict[str, Any]:
     begin(options, "evaluate_network")
     plots.require()
     check_finite(options)
+    if options.size is not None and not options.data:
+        raise EvflowDataError("EV020", "--size without --data.", "Name the recordings.")
     at_least(0, warmup_s=options.warmup_s)
     at_least(LEAST_MS, window_ms=options.window_ms)
     at_least(LEAST_SIDE, side=options.side)
@@ -84,7 +85,7 @@ def main(options: Options) -> dict[str, Any]:
     networks = {name: load_network(name) for name in options.weights}
     lpips = held_out.installed_lpips(say=print)
     found = parts(options.data, options.warmup_s, options.window_ms, whole=options.whole,
-                  size=parse_size(options.size) if options.data else None)
+                  size=parse_size(options.size))
     slices = {} if options.data else rotations()
     synthetic = None if options.data else Synthetic(options.side, options.scenes)
     result: dict[str, Any] = {}
@@ -106,12 +107,10 @@ def main(options: Options) -> dict[str, Any]:
         result, f"SSIM preset {options.protocol}, mean over {protocol.aggregate}, warm-up of up to "
         f"{options.warmup_s:g} s where recordings are as long, histeq {options.histeq}.")
     conventions = {task: held_out.scored_by(task, lpips is not None) for task in ("video", "flow")}
-    write_result(options.out / "evaluate_network.json",
-                 result | ({"synthetic": conventions} if synthetic else {}), as_dict(options))
-    write_text(options.out / "evaluate_network.md", text)
+    conclude(options, "evaluate_network",
+             result | ({"synthetic": conventions} if synthetic else {}), text)
     if shown:
         picture(shown, options.out / "evaluate_network.png")
-    print(text)
     return result
 
 

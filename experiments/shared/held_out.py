@@ -37,7 +37,8 @@ FLOW = ("aee", "outlier_percent", "fwl", "fwl_truth")
 CONVENTION = FwlConvention(splat="round")
 ENDPOINTS = {"aee": "pixels with events", "outlier_px": OUTLIER_PX}
 RISING = ("ssim", "psnr", "fwl")  # better where larger
-PROTOCOL = PROTOCOLS["evreal"]  # of images; log_mse is the mse of `log_map` of both
+PRESET = "evreal"
+PROTOCOL = PROTOCOLS[PRESET]  # of images; log_mse is the mse of `log_map` of both
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 
 from evflow.report import plots
 from experiments.shared import gains
+from experiments.shared.held_out import PRESET
 
 SHOWN = 4  # frames of a sequence in the picture
 # E2VID+ by others, conventions of `etnet`: MSE, SSIM, LPIPS; to check a run of its weights by.
@@ -19,6 +20,9 @@ E2VID_PLUS = {
     "poster_6dof": (.0698, .4624, .2233)}
 FWL_SAID = ("FWL of bilinear votes at the last event of each window; of rotations at the first, as "
             "the gyroscope's flow is; of synthetic cameras rounded to the nearest pixel.")
+
+SYNTHETIC_SAID = (f"Synthetic cameras, whatever --protocol and its like say: SSIM preset {PRESET}, "
+                  "means over clips, no histogram equalised or stretched.")
 
 
 def report(result: dict[str, Any], how: str) -> str:
@@ -42,6 +46,8 @@ def report(result: dict[str, Any], how: str) -> str:
                   _row(*["---"] * 5)]
         lines += [_row(name, where, _cell(r["fwl"]), _cell(r.get("fwl_truth")),
                        _cell(r["events_per_window"], 0)) for name, where, r in flow]
+    if any(row["synthetic"] for row in result.values()):
+        lines += ["", SYNTHETIC_SAID]
     for name, row in result.items():
         if row["synthetic"]:
             kinds = list(next(iter(row["synthetic"].values())))

@@ -23,7 +23,7 @@ from evflow.metrics import PROTOCOLS, FwlConvention, fwl
 from evflow.types import Events
 from experiments import evaluate_network
 from experiments.evaluate_network import Options
-from experiments.shared import network_outputs, recorded, recorded_parts, targets
+from experiments.shared import network_outputs, network_scores, recorded, recorded_parts, targets
 
 SIZE = (32, 24)
 
@@ -193,6 +193,16 @@ def test_recordings_that_give_nothing_are_an_error(
     assert not options.out.exists()
     with pytest.raises(EvflowDataError, match=r"EV020.*WxH"):
         evaluate_network.main(dataclasses.replace(options, size="32"))
+    with pytest.raises(EvflowDataError, match=r"EV020.*--size without --data"):
+        evaluate_network.main(dataclasses.replace(options, data=()))
+
+
+def test_tables_of_synthetic_cameras_say_how_they_are_scored() -> None:
+    row = {"synthetic": {"high noisy": {"ssim": 0.5}}}
+    text = network_scores.report({"a": row, "b": row}, "SSIM preset etnet.")
+    assert text.count(network_scores.SYNTHETIC_SAID) == 1
+    assert text.index("SSIM preset evreal") < text.index("high noisy")
+    assert "evreal" not in network_scores.report({"a": {"synthetic": {}}}, "SSIM preset etnet.")
 
 
 @pytest.mark.slow
