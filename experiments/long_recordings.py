@@ -3,9 +3,9 @@
     python -m experiments.long_recordings --images photographs/ --seconds 30 --keep /tmp/long
 
 Photographs side by side pan before the camera at 1000 frames per second; 25 of them a second are
-kept, as a DAVIS346 records them. Printed are the CPU seconds and the memory of
-`estimate_camera`, the errors of the summary and of the pixels, and how often the 95 % interval
-holds the truth.
+kept, as a DAVIS346 records them. Printed are the CPU seconds of `estimate_camera`, the largest
+memory of the process (which has simulated the recording, unless it was kept), the errors of the
+summary and of the pixels, and how often the 95 % interval holds the truth.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class Options:
     seconds: float = 30.0
     size: tuple[int, int] = (346, 260)
     frames_hz: int = 25
+    """A divisor of 1000."""
     mismatch: float = 0.03
     effort: Literal["quick", "normal", "full"] = "normal"
     weights: str = "default"
@@ -66,7 +67,7 @@ def main(options: Options) -> dict[str, Any]:
     before, wall = time.process_time(), time.monotonic()
     found = estimate_camera(path, load_weights(options.weights), effort=options.effort)
     result = {"cpu_s": time.process_time() - before, "wall_s": time.monotonic() - wall,
-              "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+              "process_peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
               "events": int(found.n_events.sum()), "read_s": found.extent.read_s,
               **score(found, camera)}
     conclude(options, "long_recordings", result, markdown(

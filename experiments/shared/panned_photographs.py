@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -68,9 +69,14 @@ def film(pan: Pan) -> Iterator[np.ndarray]:
 
 
 def recorded(pan: Pan, folder: Path) -> tuple[Path, Camera]:
-    """The recording's file, written now or kept in the folder before, and its camera."""
+    """The recording's file, written now or kept in the folder before, and its camera. EV020 where
+    frames are not whole milliseconds apart."""
+    if 1000 % pan.frames_hz:
+        raise EvflowDataError("EV020", f"--frames-hz {pan.frames_hz}.", "Give a divisor of 1000.")
     width, height = pan.size
-    path = folder / (f"{slug(pan.images.resolve().name)}_{width}x{height}_{pan.seconds:g}s_"
+    images = pan.images.resolve()
+    place = hashlib.sha256(str(images).encode()).hexdigest()[:8]  # two folders may share a name
+    path = folder / (f"{slug(images.name)}_{place}_{width}x{height}_{pan.seconds:g}s_"
                      f"{pan.frames_hz}hz_{pan.mismatch:g}_{pan.seed}.h5")
     k_camera, k_events = jax.random.split(jax.random.key(pan.seed))
     prior = CameraPrior(theta=(0.2, 0.3), mismatch=(pan.mismatch, pan.mismatch))
