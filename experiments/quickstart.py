@@ -1,8 +1,8 @@
 """The whole path in one picture: a camera is estimated from a recording, and the recording's own
 frames are simulated again as that camera would have seen them.
 
-    python -m experiments.quickstart                      # a hidden camera watches a rendered scene
-    python -m experiments.quickstart flight.aedat4        # your recording
+    python -m experiments.quickstart              # a hidden camera watches a rendered scene
+    python -m experiments.quickstart flight.aedat4 --out out/flight        # your recording
 
 Writes out/quickstart/quickstart.png, camera.npz and result.json.
 """
@@ -18,11 +18,12 @@ import tyro
 
 from evflow import CameraEstimate, Events, estimate_camera, read_recording
 from evflow.camera import Summary
+from evflow.errors import EvflowDataError
 from evflow.process.terminal import bar
 from evflow.report import plots
 from evflow.report.page import spread
 from evflow.report.text import LABELS, describe
-from experiments.shared.common import at_least, run_script, write_result
+from experiments.shared.common import at_least, begin, run_script, write_result
 from experiments.shared.hidden_scene import FRAME_EVERY, hidden_camera, simulate_again
 
 
@@ -58,6 +59,7 @@ def truth_table(truth: Summary, found: CameraEstimate) -> str:
 
 
 def main(options: Options) -> dict[str, Any]:
+    begin(options, "result")
     at_least(16, width=options.width, height=options.height)
     at_least(2 * FRAME_EVERY, milliseconds=options.milliseconds)
     plots.require()
@@ -67,6 +69,9 @@ def main(options: Options) -> dict[str, Any]:
             options.seed, options.width, options.height, options.milliseconds)
     else:
         recording = read_recording(options.recording)
+        if not recording.has_frames:
+            raise EvflowDataError("EV011", f"{options.recording} has no frames.",
+                                  "Give a recording with frames.")
     print(recording)
     with bar("estimating") as progress:
         found = estimate_camera(recording, progress=progress)

@@ -26,7 +26,7 @@ from evflow.process.provenance import provenance
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
 
 STARTED = time.monotonic()
-HOW = ("out", "workers", "max_seconds")  # options that change nothing in a result
+HOW = ("out", "workers", "max_seconds", "rows")  # options that change nothing in a result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,10 +53,16 @@ def write_result(path: Path, result: dict[str, Any], config: dict[str, Any]) -> 
     atomic_text(path, json.dumps(record, indent=2, default=str) + "\n", overwrite=True)
 
 
-def config_of_result(path: Path) -> dict[str, Any]:
-    """The configuration of a result that `write_result` saved."""
-    config: dict[str, Any] = json.loads(path.read_text())["config"]
-    return config
+def saved(path: Path, part: Literal["result", "config"]) -> dict[str, Any]:
+    """A part of what `write_result` saved; EV009 where the file holds none."""
+    try:
+        held = json.loads(path.read_text())[part]
+        if not isinstance(held, dict):
+            raise TypeError(f"{part} is no object")
+    except (ValueError, KeyError, TypeError, OSError) as e:
+        raise EvflowDataError("EV009", f"{path} holds no result of these scripts ({e}).",
+                              "Remove it, or choose another --out.") from e
+    return held
 
 
 def plain(value: Any) -> Any:
@@ -108,8 +114,8 @@ def slug(name: str) -> str:
 
 def begin(options: Any, name: str) -> None:
     """Before the work of a script that will write NAME.json into options.out: EV020 where a count
-    among its options is less than 1, EV013 where that file is the result of other options, EV019
-    where it cannot be written."""
+    among its options is less than 1, EV013 where that file is the result of other options, EV009
+    where it is no result, EV019 where it cannot be written."""
     at_least(1, **{field.name: value for field in dataclasses.fields(options)
                    if type(value := getattr(options, field.name)) is int and field.name != "seed"})
     path = options.out / f"{name}.json"
@@ -120,7 +126,7 @@ def begin(options: Any, name: str) -> None:
             options.out.rmdir()
     if not path.is_file():
         return
-    before = json.loads(path.read_text())["config"]
+    before = saved(path, "config")
     wanted = json.loads(json.dumps(dataclasses.asdict(options), default=str))
     differ = [k for k, v in wanted.items() if k not in HOW and before.get(k) != v]
     if differ:

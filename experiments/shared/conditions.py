@@ -33,7 +33,7 @@ from evflow.network.api import Params, config_of, estimate_y, finish
 from evflow.network.coordinates import squash
 from evflow.network.weights import weights_path
 from evflow.recordings import iter_windows
-from experiments.shared.common import config_of_result, slug, write_result
+from experiments.shared.common import saved, slug, write_result
 from experiments.shared.scored_on import Recorded
 from experiments.shared.targets import Target
 
@@ -181,7 +181,7 @@ class Workshop:
             measured = measure(self.record(target))
             write_result(beside, {}, {"made_from": source})
             measured.save(path)
-        elif beside.is_file() and config_of_result(beside)["made_from"] != source:
+        elif beside.is_file() and saved(beside, "config")["made_from"] != source:
             raise EvflowDataError(
                 "EV013", f"{path} was measured from another {target.name} or by another {name}.",
                 "Give it another name, or choose another --out.")

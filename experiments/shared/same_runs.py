@@ -9,7 +9,7 @@ from pathlib import Path
 from evflow.errors import EvflowDataError
 from evflow.network.weights import model_card, weights_path
 from evflow.training.config import as_dict
-from experiments.shared.common import config_of_result, slug, write_result
+from experiments.shared.common import saved, slug, write_result
 from experiments.shared.conditions import Condition, digest
 from experiments.shared.see_better_settings import Setting
 
@@ -27,7 +27,7 @@ def same_setting(out: Path, task: str, weights: str, setting: Setting, lpips: bo
     wanted = json.loads(json.dumps(wanted))
     path = out / "setting.json"
     if path.is_file():
-        before = {LPIPS_LOSS: wanted[LPIPS_LOSS]} | config_of_result(path)  # older ones: unsaid
+        before = {LPIPS_LOSS: wanted[LPIPS_LOSS]} | saved(path, "config")  # older ones: unsaid
         if before != wanted:
             differ = [k for k in wanted if before.get(k) != wanted[k]]
             raise EvflowDataError("EV013", f"{out} holds runs of another setting ({differ}).",
@@ -46,7 +46,7 @@ def same_files(condition: Condition, folder: Path) -> None:
         seen[condition.label].append(model_card(weights).get("made_from") == condition.source)
     for target in condition.targets:
         path = folder / f"{slug(target.name)}.json"
-        config = config_of_result(path) if path.is_file() else {}
+        config = saved(path, "config") if path.is_file() else {}
         for name, key, source in ((condition.label, "made_from", condition.source),
                                   (target.name, "scored_on", target.source)):
             seen[name].append(config.get(key, source) == source)
@@ -62,7 +62,7 @@ def nothing_lost(out: Path, conditions: Iterable[Condition], seeds: int) -> None
         return
     made = {(t.name, c.label) for c in conditions for t in c.targets}
     targets, lost = {target for target, _ in made}, set()
-    for target, rows in json.loads(path.read_text())["result"]["targets"].items():
+    for target, rows in saved(path, "result").get("targets", {}).items():
         if target not in targets:
             lost.add(target)
             continue

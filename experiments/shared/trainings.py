@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import math
 import time
 from pathlib import Path
@@ -31,7 +30,7 @@ from evflow.process.provenance import provenance
 from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
 from experiments.shared import eventgan_sequences, gains, held_out, targets
-from experiments.shared.common import slug, write_result
+from experiments.shared.common import saved, slug, write_result
 from experiments.shared.conditions import (
     NONE,
     RAW,
@@ -260,7 +259,7 @@ class Trainings:
                     path = self.scored(condition, seed, target)
                     if path.is_file():
                         row = found[target.name].setdefault(condition.label, {})
-                        scores = json.loads(path.read_text())["result"]["scores"]
+                        scores = saved(path, "result")["scores"]
                         for name, values in scores.items():
                             row.setdefault(name, {})[seed] = np.array(values, np.float64)
         return found

@@ -14,11 +14,14 @@ import pytest
 from helpers.networks import random_params
 
 from benchmarks import __main__ as benchmarks
+from evflow import Recording
 from evflow.errors import EvflowDataError
+from evflow.io import write_recording
 from evflow.network.config import MODELS
 from evflow.network.weights import load_weights, save_weights
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.run import started_from
+from evflow.types import Events
 from experiments import (
     ablate,
     calibrate,
@@ -44,6 +47,8 @@ from experiments import (
 from experiments.shared import many, rows
 from experiments.shared.common import begin, estimator, write_result
 from experiments.shared.rows import saved_rows
+from experiments.shared.same_runs import nothing_lost, same_setting
+from experiments.shared.see_better_settings import preset_of
 from experiments.shared.video_strata import strata
 
 FITS: list[Any] = [calibrate, fuse, tell_apart]
@@ -167,6 +172,40 @@ def test_a_result_of_other_options_is_not_replaced(tmp_path: Path) -> None:
     workers = evaluate.Options(out=tmp_path, workers=2)
     write_result(tmp_path / "evaluate.json", {}, dataclasses.asdict(workers))
     begin(dataclasses.replace(workers, workers=1), "evaluate")
+    kept = real_pixels.Options(out=tmp_path)
+    write_result(tmp_path / "real_pixels.json", {}, dataclasses.asdict(kept))
+    begin(dataclasses.replace(kept, rows=tmp_path / "rows.json"), "real_pixels")
+
+
+def test_quickstart_replaces_no_other_recording(tmp_path: Path) -> None:
+    options = quickstart.Options(out=tmp_path)
+    write_result(tmp_path / "result.json", {}, dataclasses.asdict(options))
+    begin(options, "result")  # repeated
+    with pytest.raises(EvflowDataError, match=r"EV013.*other options \(recording\)"):
+        quickstart.main(dataclasses.replace(options, recording=tmp_path / "flight.aedat4"))
+
+
+def test_quickstart_needs_frames(tmp_path: Path) -> None:
+    events = Events([1, 2], [3, 4], [0, 1000], [True, False], (32, 24))
+    path = tmp_path / "bare.h5"
+    write_recording(path, Recording.of_events(events))
+    with pytest.raises(EvflowDataError, match=r"EV011.*bare\.h5 has no frames"):
+        quickstart.main(quickstart.Options(path, out=tmp_path / "out"))
+
+
+@pytest.mark.parametrize("text", ['{"result": {', "[1]", '{"result": {}}', '{"config": 3}'])
+def test_a_file_that_is_no_result_is_named(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "evaluate.json"
+    path.write_text(text)
+    with pytest.raises(EvflowDataError, match=r"EV009.*evaluate\.json holds no result"):
+        begin(evaluate.Options(out=tmp_path), "evaluate")
+    for name in ("setting.json", "see_better.json"):
+        (tmp_path / name).write_text('{"config')
+    setting = preset_of("video", "debug")
+    with pytest.raises(EvflowDataError, match=r"EV009.*setting\.json"):
+        same_setting(tmp_path, "video", "default", setting, lpips=False)
+    with pytest.raises(EvflowDataError, match=r"EV009.*see_better\.json"):
+        nothing_lost(tmp_path, [], 1)
 
 
 def test_results_that_cannot_be_written_are_refused_before_the_work(tmp_path: Path) -> None:
