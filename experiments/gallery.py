@@ -10,6 +10,7 @@ import dataclasses
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
+from evflow.files.folders import need_writable
 from experiments.shared.common import run_script
 from experiments.shared.gallery_pictures import PICTURES
 from experiments.shared.gallery_scenes import Scenes
@@ -29,7 +30,7 @@ def main(options: Options) -> None:
     if unknown := set(options.only) - set(PICTURES):
         raise EvflowDataError("EV020", f"no pictures {sorted(unknown)}.",
                               f"Choose from {', '.join(PICTURES)}.")
-    options.out.mkdir(parents=True, exist_ok=True)
+    need_writable(options.out)
     scenes = Scenes(options.seed)
     for name, draw in PICTURES.items():
         if not options.only or name in options.only:

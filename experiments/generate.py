@@ -31,13 +31,14 @@ from evflow.camera import CameraPrior
 from evflow.network.api import Params
 from evflow.process.terminal import bar
 from evflow.scenes import TextureBank, make_bank
-from experiments.shared.common import begin, conclude, run_script
+from experiments.shared.common import at_least, begin, conclude, run_script
 from experiments.shared.generated import Row, Windows, compare, figures, scene_of, simulated
 from experiments.shared.generated_cameras import CHANGED, variants
 from experiments.shared.generated_pages import separation, table
 
 Array = jax.Array
 
+LEAST_S, LEAST_SIDE = 1e-3, 16  # of a window
 REFERENCES = 4  # simulations whose mean log_prob is taken as typical
 
 
@@ -89,6 +90,8 @@ def compared(
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "generate")
+    at_least(LEAST_S, window_s=options.window_s)
+    at_least(LEAST_SIDE, shape=min(options.shape))
     params = load_weights(options.weights)
     scenes = options.scenes or {"debug": 4, "full": 100}[options.preset]
     k_bank, k_data = jax.random.split(jax.random.key(options.seed))

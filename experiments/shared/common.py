@@ -114,10 +114,11 @@ def slug(name: str) -> str:
 
 def begin(options: Any, name: str) -> None:
     """Before the work of a script that will write NAME.json into options.out: EV020 where a count
-    among its options is less than 1, EV013 where that file is the result of other options, EV009
-    where it is no result, EV019 where it cannot be written."""
+    among its options is less than 1, or its seed less than 0, EV013 where that file is the result
+    of other options, EV009 where it is no result, EV019 where it cannot be written."""
     at_least(1, **{field.name: value for field in dataclasses.fields(options)
                    if type(value := getattr(options, field.name)) is int and field.name != "seed"})
+    at_least(0, seed=getattr(options, "seed", None))
     path = options.out / f"{name}.json"
     new = not options.out.exists()
     need_writable(options.out)

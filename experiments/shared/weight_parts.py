@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from evflow.commands.writing import need_absent, need_suffix
 from evflow.network.weights import model_card, save_weights
-from experiments.shared.common import estimator
+from experiments.shared.common import at_least, estimator
 
 
 class FitOptions(Protocol):
@@ -19,11 +19,15 @@ class FitOptions(Protocol):
     def out(self) -> Path: ...
     @property
     def overwrite(self) -> bool: ...
+    @property
+    def seed(self) -> int: ...
 
 
 def begin_fit(options: FitOptions, *parts: str) -> tuple[str, dict[str, Any]]:
-    """The architecture's name and the network in `options.weights`. Raises EV020 or EV013 where
-    `options.out` cannot be written, EV018 where the weights lack one of the parts."""
+    """The architecture's name and the network in `options.weights`. Raises EV020 for a
+    negative seed, EV020 or EV013 where `options.out` cannot be written, EV018 where the weights
+    lack one of the parts."""
+    at_least(0, seed=options.seed)
     need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
     return estimator(options.weights, *parts)

@@ -32,6 +32,7 @@ from experiments import (
     curves,
     evaluate,
     fuse,
+    gallery,
     generate,
     integrate,
     noise_rates,
@@ -68,6 +69,21 @@ def test_counts_below_one(script: Any, option: str, count: int, tmp_path: Path) 
     with pytest.raises(EvflowDataError, match=rf"EV020.*--{option} {count}"):
         script.main(script.Options(**given))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("script", [coverage, one_polarity, fuse, tell_apart],
+                         ids=lambda x: x.__name__)
+def test_negative_seeds(script: Any, tmp_path: Path) -> None:
+    given: dict[str, Any] = {"weights": "default", "seed": -1}
+    given["out"] = tmp_path / ("made.safetensors" if script in FITS else "out")
+    with pytest.raises(EvflowDataError, match=r"EV020.*--seed -1"):
+        script.main(script.Options(**given))
+
+
+@pytest.mark.parametrize("given", [{"window_s": 0.0}, {"shape": (0, 64)}], ids=str)
+def test_windows_without_anything_in_them(given: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=rf"EV020.*--{next(iter(given)).replace('_', '-')} 0"):
+        generate.main(generate.Options(out=tmp_path, **given))
 
 
 @pytest.mark.parametrize(("script", "given"), [
@@ -213,6 +229,8 @@ def test_results_that_cannot_be_written_are_refused_before_the_work(tmp_path: Pa
     for out in (tmp_path / "file", tmp_path / "file/results"):
         with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
             template.main(template.Options(out=out))
+    with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
+        gallery.main(gallery.Options(out=tmp_path / "file"))
     with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
         benchmarks.main(benchmarks.Options(out=tmp_path / "file/times.jsonl"))
     assert (tmp_path / "file").read_text() == "kept"
