@@ -57,7 +57,8 @@ def main(options: Options) -> dict[str, Any]:
     card = {"preset": options.preset, "steps": int(state.step), "seed": config.seed,
             "figures": result, "config": as_dict(config), **provenance()}
     save_weights(options.out / "generator.safetensors", params, card, overwrite=True)
-    write_result(options.out / "eventgan.json", result, as_dict(config))
+    write_result(options.out / "eventgan.json", result,
+                 as_dict(config) | {"scenes": options.scenes})
     picture(list(itertools.islice(held_out(params, config), SHOWN)), options.out / "eventgan.png")
     text = table(result)
     print(text)

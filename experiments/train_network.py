@@ -87,7 +87,8 @@ def main(options: Options) -> dict[str, Any]:
             **provenance()}
     save_network(options.out / f"{options.network}.safetensors", network, state.params, card,
                  normalised=learning.normalised, overwrite=True)
-    write_result(options.out / f"{options.network}.json", result, as_dict(config))
+    write_result(options.out / f"{options.network}.json", result,
+                 as_dict(config) | {"batches": options.batches})
     print(table(result))
     return result
 

@@ -53,4 +53,5 @@ def table(result: dict[str, Any]) -> str:
                 cells = [f"{row[m][0]:.4f}" + (f" ± {row[m][1]:.4f}" if row[m][1] else "")
                          for m in MEASURES]
                 lines.append(f"| {system} | {' | '.join(cells)} |")
+    lines.append("\n± is the 95 % interval over recordings.")
     return "\n".join(lines)

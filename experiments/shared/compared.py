@@ -23,13 +23,17 @@ def averages(found: list[dict[str, Any]]) -> dict[str, Any]:
     for name in (n for n in found[0] if n != "signal"):
         mine = [r[name] for r in found if name in r]
         one = {k: float(np.mean([r[k] for r in mine])) for k in mine[0] if "/" in k}
-        one |= {f"error/{p}": float(np.std([r[f"median/{p}"] for r in mine])
-                                    / np.sqrt(len(mine))) for p in POLARITIES}
+        one |= {f"error/{p}": standard_error([r[f"median/{p}"] for r in mine]) for p in POLARITIES}
         # A median: the first recording compiles.
         one["seconds"] = float(np.median([r["seconds"] for r in mine]))
         one["determined"] = float(np.mean([r["determined"] for r in mine]))
         result[name] = one | {"recordings": len(mine)}
     return result
+
+
+def standard_error(values: list[float]) -> float:
+    """Of their mean; 0 of a single value."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
 def table(result: dict[str, Any]) -> str:
@@ -46,6 +50,7 @@ def table(result: dict[str, Any]) -> str:
             cells += [f"{r['determined']:.0%}", f"{r['seconds']:.2f}"]
             cells += [f"{x:.3f}" for x in paper] if paper else ["", ""]
             lines.append(f"| {protocol} ({r['recordings']}) | {name} | {' | '.join(cells)} |")
+    lines += ["", "± is the standard error over recordings."]
     for recording, systems in result["real"].items():
         lines += ["", f"| {recording} | θ ON | θ OFF | change left over | s |", "|" + "---|" * 5]
         lines += [f"| {name} | {r['theta'][0]:.3f} | {r['theta'][1]:.3f} | {r['left']:.1%} | "

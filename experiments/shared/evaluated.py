@@ -8,6 +8,7 @@ import numpy as np
 
 from experiments.shared import alone
 from experiments.shared.common import markdown
+from experiments.shared.images import mean_ci
 from experiments.shared.protocols import ENOUGH
 
 PAPER = {"theta_on": 0.023, "theta_off": 0.022, "eta_on": 0.045, "eta_off": 0.027}
@@ -43,8 +44,8 @@ def averages(rows: list[dict[str, float]]) -> dict[str, Any]:
         result[parameter] |= {
             "sequences": int(used.sum()), "median": float(np.median(column("summary")[used]))}
         for name in ("summary", "map_gain"):
-            result[parameter][f"{name}_ci95"] = float(
-                1.96 * column(name)[used].std() / np.sqrt(used.sum()))
+            known = column(name)[used]
+            result[parameter][f"{name}_ci95"] = mean_ci(known)[1] if known.size else np.nan
     return result
 
 
@@ -55,8 +56,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
              cell(r["constant"]), f"{PAPER[name]:.3f}")
             for preset, found in results.items() for name, r in found.items()
             for who in alone.ESTIMATORS if f"{who}: mae_pixel" in r)
-    return "\n".join((whole(results), "", "## Each estimator by itself", "", alone.SAID, "",
-                      markdown(heads, rows)))
+    return "\n".join((whole(results), "", "± is the 95 % interval over recordings.", "",
+                      "## Each estimator by itself", "", alone.SAID, "", markdown(heads, rows)))
 
 
 def cell(value: float) -> str:

@@ -35,6 +35,7 @@ def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
                 paper = ", ".join(map(str, PAPER.get(kind, {}).get(name, ())))
                 took = "" if row["seconds"] is None else f"{row['seconds']:.1f}"
                 lines.append(f"| {name} | {' | '.join(values)} | {took} | {paper} |")
+    lines += ["", "± is the 95 % interval over recordings."]
     return "\n".join(lines)
 
 

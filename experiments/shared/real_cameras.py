@@ -75,12 +75,6 @@ def shot_rates(hidden: Hidden, protocol: Protocol) -> np.ndarray:
         for eta, theta in ((camera.eta_on, camera.theta_on), (camera.eta_off, camera.theta_off))])
 
 
-def ideal(protocol: Protocol) -> bool:
-    """Whether pixels have no low-pass, and frames measure the light that they see."""
-    return not (protocol.model.cutoff_hz or protocol.model.refractory_s or protocol.exposure_ms
-                or protocol.dark_dn or protocol.black_dn or protocol.frame_noise_dn > 0.5)
-
-
 def draw_real(rng: np.random.Generator) -> Protocol:
     """A camera of the mixture: a quarter are ideal, the others have random imperfections."""
     mismatch = float(np.exp(rng.uniform(np.log(0.02), np.log(0.15))))

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from experiments.shared import alone, evaluated
+from experiments.shared import alone, compared, evaluated
 
 SHAPE = (4, 6)
 
@@ -65,6 +66,18 @@ def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:
     first = text.splitlines()[2].split(" | ")
     assert first[3] == "–"  # no network pools
     assert first[-1].startswith("–")  # no interval was given
+
+
+def test_intervals_of_few_recordings_are_wide() -> None:
+    values = [0.01, 0.02, 0.06]
+    rows = [{f"{k}/theta_on": value if k == "summary" else 1e3 for k in (
+        "true", "summary", "signal", "map_gain")} | {
+        f"true/{name}": 0.0 for name in list(evaluated.PAPER)[1:]} for value in values]
+    found = evaluated.averages(rows)["theta_on"]
+    assert found["summary_ci95"] == pytest.approx(4.3027 * np.std(values, ddof=1) / np.sqrt(3),
+                                                  rel=1e-4)
+    assert compared.standard_error(values) == pytest.approx(stats.sem(values))
+    assert compared.standard_error(values[:1]) == 0
 
 
 @pytest.mark.parametrize(("error", "width", "within"), [(0.1, 0.2, 1.0), (-0.3, 0.2, 0.0)])

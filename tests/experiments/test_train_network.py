@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -110,6 +112,26 @@ def test_a_measured_camera_brings_its_circuit(tmp_path: Path) -> None:
     assert run.learning.data.model == measured
     assert run.learning.data.offset_dn == 7.0
     assert command.configuration(command.Options(out=Path())).learning.data.model != measured
+
+
+def test_results_say_on_how_much_they_were_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = SimpleNamespace(completed=lambda: SimpleNamespace(step=3, params={"generator": {}}))
+    for script in (command, train_eventgan):
+        for name, result in (("train", ended), ("measure", {"a": 1.0}), ("table", "")):
+            monkeypatch.setattr(script, name, lambda *_, result=result: result)
+    for script, names in ((train_eventgan, ("make_bank", "picture", "save_weights")),
+                          (command, ("init_state", "save_network"))):
+        for name in names:
+            monkeypatch.setattr(script, name, lambda *_, **__: None)
+    monkeypatch.setattr(train_eventgan, "held_out", lambda *_: [])
+    monkeypatch.setattr(command, "source", lambda *_: (None, None))
+    train_eventgan.main(train_eventgan.Options(out=tmp_path, preset="debug", scenes=7))
+    command.main(command.Options(out=tmp_path, preset="debug", batches=9))
+    configs = [json.loads((tmp_path / f"{name}.json").read_text())["config"]
+               for name in ("eventgan", "e2vid")]
+    assert (configs[0]["scenes"], configs[1]["batches"]) == (7, 9)
 
 
 @pytest.mark.slow
