@@ -102,7 +102,10 @@ def compared(name: str, config: TrainConfig, banks: Any, seeds: list[int], optio
         return variants.error_of(row)
 
     rate = 1.0 if options.preset == "debug" else variants.best_rate(tuned)
-    return {"rate": rate, "seeds": rows([(seed, rate) for seed in seeds], HELD)}
+    found = rows([(seed, rate) for seed in seeds], HELD)
+    if not (weights := options.out / f"{slug(name)}.safetensors").exists():
+        print(f"{weights} is not written: its scores are those kept in {options.rows}")
+    return {"rate": rate, "seeds": found}
 
 
 if __name__ == "__main__":

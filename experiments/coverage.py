@@ -20,6 +20,7 @@ import numpy as np
 
 from evflow import estimate_camera
 from evflow.camera import PARAMETERS
+from evflow.errors import EvflowDataError
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
 from experiments.shared.coverage_pages import LEVELS, curves, deviations, draw, strata
@@ -83,6 +84,8 @@ def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, Any] | N
 
 def main(options: Options) -> dict[str, Any]:
     begin(options, "coverage")
+    if options.intervals is not None and options.seconds is not None:
+        raise EvflowDataError("EV020", "--intervals with --seconds.", "Give one of them.")
     estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=12, full=1000)
     protocols = [drawn(np.random.default_rng((options.seed, i)), options) for i in range(count)]

@@ -61,7 +61,7 @@ def main(options: Options) -> dict[str, Any]:
             progress(i + 1, options.cameras)
     for path in options.recordings:
         rows.append({"camera": path.stem, **compared(read_recording(path), trained, None)})
-    result = {"cameras": rows, **figures([r for r in rows if r["camera"].startswith("hidden")])}
+    result = {"cameras": rows, **figures(rows[:options.cameras])}
     conclude(options, "guessed_frames", result, table(result))
     return result
 

@@ -28,7 +28,7 @@ from experiments.shared.common import begin, plain, run_script, write_result, wr
 from experiments.shared.measured_noise import measured, measured_page, ours
 from experiments.shared.noise_pages import page, table
 from experiments.shared.noise_scenes import MODELS, SCENES, counting, law, record
-from experiments.shared.noise_systems import BENCH, DN, SYSTEMS, THETA, closed_forms, scored
+from experiments.shared.noise_systems import BENCH, DN, SYSTEMS, THETA, closed_forms, inside, scored
 from experiments.shared.table_two import LUX, SCP
 
 
@@ -76,8 +76,7 @@ def table_of(params: Any, sensor: str, scene: str, options: Options) -> dict[str
     rates = {name: np.array([f[name] for f in found]).reshape(shape) for name in found[0]}
     return {"scp": [SCP[r] for r in rows], "theta": THETA[rows], "lux": LUX[columns],
             "rates": rates, "errors": {name: scored(rates, name) for name in SYSTEMS},
-            "inside": [float((np.abs(rates["ours"] - rates["truth"]) <= k * rates["std"]).mean())
-                       for k in (1, 2)]}
+            "inside": inside(rates)}
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def table(result: dict[str, Any]) -> str:
     for sensor, scenes in result["simulated"].items():
         for scene, one in scenes.items():
             truth, found = (one["rates"][k].mean(0) for k in ("truth", "ours"))
-            inside = ", ".join(f"{share:.0%}" for share in one["inside"])
+            inside = ", ".join(f"{share:.0%}" for share in one["inside"] if np.isfinite(share))
             for i, scp in enumerate(one["scp"]):
                 at = {lux: " / ".join(f"{1e3 * (a - b):+.1f} ({1e3 * b:.0f})" for a, b in zip(
                     found[i, j], truth[i, j], strict=True)) for j, lux in enumerate(one["lux"])}

@@ -33,6 +33,13 @@ def closed_forms(theta: np.ndarray, dn: float, bench: np.ndarray) -> Rates:
             "evolt, θ": np.array([float(r) for r in voltmeter_noise(dn, *theta)])}
 
 
+def inside(rates: Rates) -> list[float]:
+    """Shares of our answers within 1 and 2 std of the truth; NaN without an answer."""
+    away = np.abs(rates["ours"] - rates["truth"]) / rates["std"]
+    answered = away[np.isfinite(rates["ours"])]
+    return [float((answered <= k).mean()) if answered.size else float("nan") for k in (1, 2)]
+
+
 def scored(rates: Rates, name: str) -> dict[str, Any]:
     """Mean |η - truth| over the cells, ON and OFF, with its 95 % interval over seeds; "answered" is
     the share of cells with an answer (only these are scored)."""

@@ -79,6 +79,19 @@ def test_the_table_says_what_so_many_seeds_show(tmp_path: Path) -> None:
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
+def test_weights_that_are_not_made_again_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("Trainer", "make_errors"):
+        monkeypatch.setattr(variants, name, lambda *_: None)
+    monkeypatch.setattr(ablate, "resumed", lambda *_: [row(0.1)])
+    options = ablate.Options("losses", out=tmp_path, rows=tmp_path / "rows.json")
+    for _ in range(2):
+        ablate.compared("L_P", BASE, (None, None), [0], options)
+        (tmp_path / "L_P.safetensors").touch()
+    assert capsys.readouterr().out.count("L_P.safetensors is not written") == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("study", STUDIES)
 def test_ablations_train_and_score(study: ablated.Study, tmp_path: Path) -> None:

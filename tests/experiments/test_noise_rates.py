@@ -16,7 +16,7 @@ from experiments.noise_rates import Options
 from experiments.shared import alone, measured_noise, noise_scenes, noise_systems
 from experiments.shared.common import plain
 from experiments.shared.noise_scenes import MODELS, SCENES
-from experiments.shared.noise_systems import BENCH, DN, SYSTEMS, THETA
+from experiments.shared.noise_systems import BENCH, DN, SYSTEMS, THETA, inside
 
 KEY = jax.random.key(5)
 
@@ -48,6 +48,14 @@ def test_rest_with_a_texture_has_the_noise_of_its_light() -> None:
         counts += np.stack([recording.events.count_map().sum((1, 2)), truth * 64**2 * seconds])
     assert (np.abs(counts[0] - counts[1]) < 4 * np.sqrt(counts[1])).all()
     np.testing.assert_allclose(truth, noise_scenes.law("eq12", THETA[0], 100.0), rtol=1e-3)
+
+
+def test_refused_estimates_are_neither_inside_nor_outside() -> None:
+    rates = {"truth": np.ones((2, 1, 1, 2)), "ours": np.full((2, 1, 1, 2), np.nan),
+             "std": np.full((2, 1, 1, 2), 0.1)}
+    assert np.isnan(inside(rates)).all()
+    rates["ours"][0] = [1.05, 1.15]
+    assert inside(rates) == [0.5, 1.0]
 
 
 def test_a_moving_disc_leaves_quiet_parts() -> None:

@@ -86,6 +86,11 @@ def test_windows_without_anything_in_them(given: dict[str, Any], tmp_path: Path)
         generate.main(generate.Options(out=tmp_path, **given))
 
 
+def test_two_lengths_of_a_recording(tmp_path: Path) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*--intervals with --seconds"):
+        coverage.main(coverage.Options(out=tmp_path, intervals=8, seconds=1.0))
+
+
 @pytest.mark.parametrize(("script", "given"), [
     (fuse, {"steps": 0}), (fuse, {"recordings": 4}),
     (tell_apart, {"steps": 0}), (tell_apart, {"recordings": 1})],
