@@ -28,7 +28,7 @@ from experiments.shared import alone
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, run_script
 from experiments.shared.evaluated import PAPER, averages, inside, table
-from experiments.shared.many import Setup, study
+from experiments.shared.many import Setup, enough, study
 from experiments.shared.protocols import ENOUGH, other_protocols, protocols
 
 CONSTANT = {"theta_on": 0.3, "theta_off": 0.3, "eta_on": 0.114, "eta_off": 0.114}
@@ -99,8 +99,8 @@ def main(options: Options) -> dict[str, dict[str, Any]]:
     setup = Setup(options.weights, options.seed, images=options.images)
     rows = protocols() if options.cameras == "known" else other_protocols()
     count = options.count(options.sequences, debug=6, full=320)
-    results = {name: averages(study(
-        score, setup, [protocol] * count, options.workers, f"mismatch {name}"))
+    results = {name: averages(enough(study(
+        score, setup, [protocol] * count, options.workers, f"mismatch {name}")))
         for name, protocol in rows.items()}
     conclude(options, "evaluate", results, table(results))
     return results

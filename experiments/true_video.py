@@ -28,7 +28,7 @@ from evflow.recordings.windows import plan_windows
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.common import StudyOptions, begin, conclude, estimator, markdown, run_script
 from experiments.shared.known_video import noise_on_video, paths_between, refined
-from experiments.shared.many import Setup, study
+from experiments.shared.many import Setup, enough, study
 from experiments.shared.protocols import ENOUGH, protocols
 from experiments.shared.video_strata import mean, strata
 
@@ -96,8 +96,8 @@ def main(options: Options) -> dict[str, Any]:
     setup = Setup(options.weights, options.seed)
     result: dict[str, Any] = {}
     for name, protocol in protocols().items():
-        result[name] = strata(study(
-            score, setup, [protocol] * sequences, options.workers, name))
+        result[name] = strata(enough(study(
+            score, setup, [protocol] * sequences, options.workers, name)))
     conclude(options, "true_video", result, markdown(HEADS, (
         (name, k, f"{v['recordings']}", f"{v['ours']:.4f}", f"{v['known']:.4f}",
          f"{v['ratio']:.2f}", *(f"{v[p]:.4f}" if p in v else "" for p in PATHS))

@@ -35,9 +35,9 @@ def closed_forms(theta: np.ndarray, dn: float, bench: np.ndarray) -> Rates:
 
 def inside(rates: Rates) -> list[float]:
     """Shares of our answers within 1 and 2 std of the truth; NaN without an answer."""
-    away = np.abs(rates["ours"] - rates["truth"]) / rates["std"]
-    answered = away[np.isfinite(rates["ours"])]
-    return [float((answered <= k).mean()) if answered.size else float("nan") for k in (1, 2)]
+    answered = np.isfinite(rates["ours"])
+    away, std = (x[answered] for x in (np.abs(rates["ours"] - rates["truth"]), rates["std"]))
+    return [float((away <= k * std).mean()) if away.size else float("nan") for k in (1, 2)]
 
 
 def scored(rates: Rates, name: str) -> dict[str, Any]:

@@ -19,10 +19,9 @@ def mean(values: Any) -> float:
 
 def strata(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     """Mean errors per figure of whatever a row has them for ("ours", "known", ...), and the ratio
-    of ours to the true video's; all recordings with enough events, then by stratum. Nothing of no
-    rows."""
+    of ours to the true video's; all recordings with enough events, then by stratum."""
     found: dict[str, dict[str, float]] = {}
-    for figure in [k.split("/")[1] for k in (rows[0] if rows else ()) if k.startswith("ours/")]:
+    for figure in [k.split("/")[1] for k in rows[0] if k.startswith("ours/")]:
         polarity = "off" if "off" in figure else "on"
         signal = np.array([r[f"signal/theta_{polarity}"] for r in rows])
         speed = np.array([r["speed"] for r in rows])

@@ -56,6 +56,8 @@ def test_refused_estimates_are_neither_inside_nor_outside() -> None:
     assert np.isnan(inside(rates)).all()
     rates["ours"][0] = [1.05, 1.15]
     assert inside(rates) == [0.5, 1.0]
+    rates["ours"][0], rates["std"][0, ..., 0] = [1.0, 1.15], 0.0  # none, and known to be none
+    assert inside(rates) == [0.5, 1.0]
 
 
 def test_a_moving_disc_leaves_quiet_parts() -> None:
