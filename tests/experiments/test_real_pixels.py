@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from helpers import recordings
 
+from evflow.errors import EvflowDataError
 from experiments import real_pixels
 from experiments.shared import real_scores
 
@@ -21,3 +22,12 @@ def test_a_recording_of_short_runs_determines_nothing(monkeypatch: pytest.Monkey
     monkeypatch.setattr(real_pixels, "read_recording", lambda _: recordings.make(count=3))
     monkeypatch.setattr(real_pixels, "plan_runs", lambda *_: [[0, 1]])
     assert real_pixels.halves(Path("short.aedat4")) is None
+
+
+def test_recordings_are_read_before_cameras_are_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(real_pixels, "measured", lambda *_: pytest.fail("measured"))
+    absent = tmp_path / "absent.aedat4"
+    with pytest.raises(EvflowDataError, match=r"EV016.*absent\.aedat4"):
+        real_pixels.main(real_pixels.Options(out=tmp_path / "out", recordings_at=(absent,)))

@@ -143,8 +143,7 @@ def test_noise_is_told_apart_after_the_fusion(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("given", "seen"), [
     ({"conditions": ("wet",)}, "EV020.*no condition wet"),
     ({"as_it_is": True}, "EV020.*--as-it-is without --rows"),
-    ({"as_it_is": True, "rows": Path("absent.json")}, "EV016.*no rows at absent.json"),
-    ({"recordings_at": (Path("absent.aedat4"),)}, "EV016.*absent.aedat4")])
+    ({"as_it_is": True, "rows": Path("absent.json")}, "EV016.*no rows at absent.json")])
 def test_conditions_and_rows_that_are_not_there(
     given: dict[str, Any], seen: str, tmp_path: Path
 ) -> None:
