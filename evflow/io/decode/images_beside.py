@@ -25,7 +25,14 @@ from evflow.io.decode.stream import Gathered
 from evflow.io.decode.tables import Images, Loaded, with_frames
 from evflow.io.decode.units import UNITS_US, shared_unit, written_unit
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import Stamps, mid_exposure, names_exposure, stated, stated_by
+from evflow.io.images.exposures import (
+    Stamps,
+    beside_times,
+    mid_exposure,
+    names_exposure,
+    stated,
+    stated_by,
+)
 from evflow.io.images.streams import WORD, ImageStream
 from evflow.io.images.times import to_us
 from evflow.notes import Note
@@ -84,13 +91,17 @@ def stamps_of(
     images: str, times: str, arrays: Mapping[str, Any], whole: Callable[[str], np.ndarray],
     path: Path,
 ) -> Stamps:
-    """The stamps of `images`, whose times are the array `times`. EV008 (two columns that are not
-    begin and end)."""
+    """The stamps of `images`, whose times are the array `times`, unless begin and end of the
+    exposures stand beside it. EV008 (two columns that are not begin and end)."""
     count = arrays[images].shape[0]
+    ends = [name for name, array in arrays.items() if array.shape == (count,) and (
+        name.rpartition("/")[0] == times.rpartition("/")[0] and "expos" in name.lower())]
     beside = _near(images, arrays, lambda name, shape: shape in (
         (), (1,), (count,), (count, 1), (1, count)) and names_exposure(name) and (
         written_unit(name) != "auto"))
-    return mid_exposure(whole(times), f"{times} in {path}")._replace(
+    clock = whole(times)
+    pair = beside_times(times, clock, ends, whole) or mid_exposure(clock, f"{times} in {path}")
+    return pair._replace(
         stated_us=stated([beside], whole) or stated_by(arrays[images], arrays[times]))
 
 
@@ -143,7 +154,8 @@ def _loading(
         if unit == "auto" and (len(stamps.times) < 2 or np.isfinite(stamps.times).all()):
             unit = shared_unit(stamps.times, events.t, ["us", *UNITS_US]) or "auto"
         us, _, exposure_us, _ = to_us(stamps, f"{times} of {path}", unit)
-        return Stamps(us, stated_us=exposure_us), lambda part: map(_seen, pixels(name, part))
+        return Stamps(us, stated_us=exposure_us, notes=stamps.notes), lambda part: map(
+            _seen, pixels(name, part))
 
     return load
 

@@ -20,10 +20,10 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode.hdf5 import DAMAGE, MAGIC, MAX_RATIO, load_h5py, need_filters, plausible
 from evflow.io.decode.stream import Chunk, Gathered
 from evflow.io.hints import Hints
+from evflow.io.images.event_clock import beside_events
 from evflow.io.images.exposures import Stamps, stated_by
 from evflow.io.images.recorded import FrameStack, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
-from evflow.io.images.times import beside_events
 from evflow.notes import Note
 from evflow.types import Recording
 

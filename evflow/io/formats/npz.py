@@ -31,10 +31,10 @@ from evflow.io.decode.images_beside import beside, stamps_of, times_of
 from evflow.io.decode.stream import Gathered, gather
 from evflow.io.decode.units import written_unit
 from evflow.io.hints import Hints
+from evflow.io.images.event_clock import beside_events
 from evflow.io.images.exposures import KEY, exposed_note
 from evflow.io.images.recorded import cut, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
-from evflow.io.images.times import beside_events
 from evflow.io.writer import EventWriter
 from evflow.notes import Note
 from evflow.types import Events, Recording

@@ -17,10 +17,10 @@ import numpy as np
 from evflow.checks import Size
 from evflow.io.decode.stream import Chunk, Damage, gather
 from evflow.io.hints import Hints
+from evflow.io.images.event_clock import beside_events
 from evflow.io.images.exposures import Stamps
 from evflow.io.images.recorded import FrameStack, cut
 from evflow.io.images.streams import events_alone
-from evflow.io.images.times import beside_events
 from evflow.notes import Note
 from evflow.types import Recording
 

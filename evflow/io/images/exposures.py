@@ -8,7 +8,7 @@ and NaN say nothing, and what is longer than the interval between frames is not 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,8 @@ from evflow.notes import Note
 KEY = "exposure_us"  # name under which it is written
 LONGEST = 1.05  # an exposure lasts at most the interval between frames; times are rounded
 NAMES = re.compile(r"(?:^|_)exposures?(?:_?times?|_?durations?)?$")  # without the unit
+ENDS = re.compile(r"start|begin"), re.compile(r"end|stop")  # of an exposure, in a name
+NEAR = 0.1  # of an exposure: times that differ by less are the same, rounded
 NOTED = "frames.exposure"
 FOREVER_US = 2.0**62
 
@@ -30,11 +32,13 @@ class Stamps(NamedTuple):
 
     times: (T,) in the file's unit, mid-exposure if it holds begin and end; length: of the exposure
     in that unit; stated_us: of the exposure, under a name with a unit. 0 if they are unknown.
+    notes: what was assumed.
     """
 
     times: np.ndarray
     length: float = 0.0
     stated_us: int = 0
+    notes: tuple[Note, ...] = ()
 
     def exposure_us(self, unit: str) -> int:
         """The exposure, with times in this unit; 0 if it is unknown."""
@@ -61,6 +65,36 @@ def middle(begin: np.ndarray, end: np.ndarray) -> Stamps | None:
     times = (begin + lengths // 2 if begin.dtype == end.dtype == np.int64 else
              begin + 0.5 * lengths)
     return Stamps(times, float(np.median(lengths)) if len(lengths) else 0.0)
+
+
+def ends_of(names: Collection[str]) -> list[str]:
+    """The names of the begin and the end of exposures; none if there is not one of each."""
+    found = [name for word in ENDS for name in names if word.search(name.lower())]
+    return found if len(set(found)) == len(found) == 2 else []
+
+
+def beside_times(
+    clock: str, times: np.ndarray, names: Collection[str], get: Callable[[str], Any]
+) -> Stamps | None:
+    """The stamps of exposures whose begin and end stand beside times (T,), which are either of
+    them, their middle, or another clock's, with a note.
+
+    clock: what the times are called; get(name): the array or column of a name. None if there are no
+    begin and end: they are named exposures, or the times lie at or between them.
+    """
+    if not (pair := ends_of(names)):
+        return None
+    begin, end = (np.asarray(get(name)) for name in pair)
+    numbers = all(a.dtype.kind in "iuf" and a.shape == times.shape and a.ndim == 1
+                  for a in (times, begin, end))
+    found = middle(begin, end) if numbers else None
+    if found is None or not found.length > 0:
+        return None
+    if any((np.abs(times - at) <= NEAR * found.length).all() for at in (begin, found.times, end)):
+        return found
+    return found._replace(notes=(Note(
+        "frames.clock", f"frames are at the middle of {' and '.join(pair)}; {clock} differs from "
+        "all three and was not used"),)) if all("expos" in name.lower() for name in pair) else None
 
 
 def names_exposure(name: str) -> bool:

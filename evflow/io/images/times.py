@@ -26,21 +26,24 @@ from evflow.io.decode.columns import meaning
 from evflow.io.decode.text import is_float
 from evflow.io.decode.units import (
     UNITS_US,
-    other_unit,
-    shared_unit,
     usual_step,
-    usual_unit,
     video_unit,
     written_unit,
 )
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import Stamps, believed, mid_exposure, middle, stated
+from evflow.io.images.exposures import (
+    Stamps,
+    believed,
+    beside_times,
+    ends_of,
+    mid_exposure,
+    middle,
+    stated,
+)
 from evflow.io.images.frames import existing
 from evflow.notes import Note
-from evflow.types import Events
 
 MAX_BYTES = 1 << 28  # 256 MiB of text: some ten million frames
-ENDS = re.compile(r"start|begin"), re.compile(r"end|stop")  # of an exposure, in an array's name
 TELL = "pass --timestamps-unit with --frames (simulate: --time-unit)"
 
 Notes = tuple[Note, ...]
@@ -75,13 +78,27 @@ def read_times(path: Path, unit: str = "auto", names: Collection[str] = ()) -> F
     rows, header, written = _rows(path)
     named = [i for i, field in enumerate(header) if meaning(field) == "t"]
     if len(header) == len(rows[0] if rows else ()) and len(named) == 1:
-        exposure_us = stated(header, lambda name: _values(rows, header.index(name)))
-        stamps = Stamps(_numbers(path, rows, named[0]), stated_us=exposure_us)
-        labels, written = _labels(rows, names), written_unit(header[named[0]])
+        stamps, written = _named(path, rows, header, named[0])
+        labels = _labels(rows, names)
     else:
         stamps, labels = _columns(path, rows, names)
     found = to_us(stamps, path, unit if unit != "auto" else written)
     return found._replace(names=tuple(labels)).believed()
+
+
+def _named(
+    path: Path, rows: list[list[str]], header: list[str], time: int
+) -> tuple[Stamps, str]:
+    """The stamps of columns that a header names, `time` the one of the times, and their unit."""
+    def column(name: str) -> np.ndarray:
+        place = header.index(name)
+        return _numbers(path, [row for row in rows if is_float(row[place])], place)
+
+    times = _numbers(path, rows, time)
+    pair = beside_times(header[time], times, header, column)
+    units = map(written_unit, (*(ends_of(header) if pair else ()), header[time]))
+    return (pair or Stamps(times))._replace(stated_us=stated(header, column)), next(
+        (unit for unit in units if unit != "auto"), "auto")
 
 
 def _stored(path: Path) -> Stamps:
@@ -101,10 +118,12 @@ def _archived(path: Path) -> Stamps:
     arrays = {name: array for name, array in held.items() if array.ndim}
     for named in (arrays, [name for name in arrays if meaning(name) == "t"]):
         if len(named) == 1:
-            return mid_exposure(arrays[next(iter(named))], path)._replace(
+            times = arrays[clock := next(iter(named))]
+            pair = beside_times(clock, times, arrays, arrays.__getitem__)
+            return (pair or mid_exposure(times, path))._replace(
                 stated_us=stated(held, held.__getitem__))
-    ends = [array for word in ENDS for name, array in arrays.items() if word.search(name)]
-    if len(ends) == 2 and ends[0].shape == ends[1].shape == (len(ends[0]),):
+    ends = [arrays[name] for name in ends_of(arrays)]
+    if ends and ends[0].shape == ends[1].shape == (len(ends[0]),):
         return mid_exposure(np.stack(ends, 1), path)
     raise EvflowDataError(
         "EV008", f"{path} holds {', '.join(arrays) or 'no array'}; which are the frames' times?",
@@ -145,37 +164,7 @@ def to_us(stamps: Stamps, where: object, unit: str = "auto") -> FrameTimes:
     us = Hints(time_unit=unit).microseconds(times, unit)
     with naming(where):
         us = check_times(us, f"times read in {unit}", strict=True)
-    return FrameTimes(us, notes, stamps.exposure_us(unit))
-
-
-def beside_events(
-    stamps: Stamps, where: object, native: str, hints: Hints, events: Events
-) -> FrameTimes:
-    """Times of the frames stored with a recording's events in us, and a note if their unit was
-    inferred.
-
-    native: their unit in the format; if in it they fall beside the events, that in which they fall
-    among them. The unit in `hints` is that of the events; frames share it, unless another unit
-    makes their span agree with the events'. Fractions in a unit of integers indicate the unit that
-    allows them. Raises as `to_us`.
-    """
-    times, asked = stamps.times, hints.time_unit
-    odd = times.dtype.kind == "f" and native != "s"
-    usual = asked == "auto" and not odd
-    numbers = times.ndim == 1 and times.dtype.kind in "iuf" and bool(np.isfinite(times).all())
-    other = other_unit(times, events.t, native) if usual and numbers else None
-    if not numbers or (usual and other is None):
-        unit = native if asked == "auto" else asked
-        return FrameTimes(hints.microseconds(times, native), (), stamps.exposure_us(unit))
-    units = [other] if other else [native, *UNITS_US] if asked == "auto" else [asked, native]
-    shared = shared_unit(times, events.t, units)
-    if shared is None and asked == "auto":
-        return to_us(stamps, where)
-    unit = shared or usual_unit(times, units)
-    notes = () if unit == asked else (
-        Note("frames.unit", f"frame times of {where} were read in {unit}."),)
-    return FrameTimes(
-        Hints(time_unit=unit).microseconds(times, unit), notes, stamps.exposure_us(unit))
+    return FrameTimes(us, (*stamps.notes, *notes), stamps.exposure_us(unit))
 
 
 def _video_unit(times: np.ndarray, where: object) -> tuple[str, Notes]:
@@ -276,11 +265,6 @@ def _numbers(path: Path, rows: list[list[str]], column: int) -> np.ndarray:
         return np.array([int(f) for f in fields], np.int64)
     except (ValueError, OverflowError):
         return np.array([float(f) for f in fields])
-
-
-def _values(rows: list[list[str]], column: int) -> np.ndarray:
-    """A column as float64, without the fields that are no numbers."""
-    return np.array([float(row[column]) for row in rows if is_float(row[column])])
 
 
 def _counts(column: tuple[str, ...]) -> bool:

@@ -60,6 +60,12 @@ FILES: dict[str, tuple[str, Any]] = {
         f"{1000 * t},{ODD / 1e3},1.5\n" for t in MIDDLE)),
     "pairs": ("t.npy", PAIRS),
     "pairs of ns": ("t.npy", 1000 * PAIRS),
+    "begin and end beside their begin": ("t.csv", "t,exposure_start,exposure_end\n" + "".join(
+        f"{b},{b},{e}\n" for b, e in PAIRS.tolist())),
+    "begin and end in ns by name": ("t.csv", "i,t,exposure_end_ns,exposure_start_ns\n" + "".join(
+        f"{i},{e},{1000 * e},{1000 * b}\n" for i, (b, e) in enumerate(PAIRS.tolist()))),
+    "start and end beside the middle": ("t.npz", {
+        "t": np.array(MIDDLE), "start": PAIRS[:, 0], "end": PAIRS[:, 1]}),
     "begin and end": ("t.npz", {"exposure_begin": PAIRS[:, 0], "exposure_end": PAIRS[:, 1]}),
     "a number beside": ("t.npz", {"t": np.array(MIDDLE), "exposure_time_ns": 1000 * ODD})}
 
@@ -81,6 +87,22 @@ def test_files_of_times_tell_the_exposure(tmp_path: Path, kind: str) -> None:
     found = read_times(write(tmp_path, kind))
     halves = "ns" in kind
     assert (found.us.tolist(), found.exposure_us) == ([t + halves for t in MIDDLE], ODD)
+
+
+def test_begin_and_end_stand_above_another_time(tmp_path: Path) -> None:
+    """With a note; what is not called an exposure must lie at the time to be one."""
+    ends = dict(zip(("exposure_start", "exposure_end"), PAIRS.T, strict=True))
+    np.savez(tmp_path / "t.npz", t=BEGIN - 5_000, **ends)
+    found = read_times(tmp_path / "t.npz", "us")
+    assert (found.us.tolist(), found.exposure_us) == (MIDDLE, ODD)
+    assert [(n.code, "t differs from all three" in n.text) for n in found.notes] == [
+        ("frames.clock", True)]
+    rows = np.arange(5)
+    for others in ({"start": BEGIN, "end": BEGIN + ODD}, {"row_start": rows, "row_end": rows + 1},
+                   {"exposure_start": BEGIN, "exposure_end": BEGIN}):
+        np.savez(tmp_path / "t.npz", t=BEGIN - 5_000, **others)
+        found = read_times(tmp_path / "t.npz", "us")
+        assert (found.us.tolist(), found.exposure_us) == ((BEGIN - 5_000).tolist(), 0)
 
 
 def test_seconds_and_milliseconds(tmp_path: Path) -> None:
@@ -112,6 +134,7 @@ def test_every_source_has_the_exposure_of_its_times_and_one_note(tmp_path: Path,
 @pytest.mark.parametrize("arrays", [
     {"frame_times": PAIRS}, {"exposure_ts": 1000 * PAIRS - 500},
     {"t": np.array(MIDDLE), "exposure_us": np.full(5, ODD)},
+    {"t": BEGIN, "exposure_begin": BEGIN, "exposure_end": BEGIN + ODD},
     {"timestamps": np.array(MIDDLE), "exposure_times_ms": np.array([ODD / 1e3])}])
 def test_stacks_in_npz(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
     path = tmp_path / "a.npz"

@@ -30,11 +30,12 @@ from evflow.io.formats.ros.messages import (
 from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded, triggers
 from evflow.io.hints import Hints
 from evflow.io.images import encodings
+from evflow.io.images.event_clock import beside_events
 from evflow.io.images.exposures import Stamps
 from evflow.io.images.pictures import claimed_size
 from evflow.io.images.recorded import FrameStack
 from evflow.io.images.streams import ImageStream, choose, events_alone
-from evflow.io.images.times import FrameTimes, beside_events
+from evflow.io.images.times import FrameTimes
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
