@@ -14,8 +14,7 @@ import numpy as np
 
 from evflow.checks import Size, beyond, check_polarity, check_size
 from evflow.errors import EvflowDataError
-from evflow.io.decode.columns import whole
-from evflow.io.decode.units import UNITS_US, since_1970
+from evflow.io.decode.units import UNITS_US, check_whole, since_1970
 from evflow.light.colour import COLOURS
 from evflow.notes import Note
 
@@ -175,11 +174,8 @@ class Hints:
         if t.dtype.kind in "mM" and not np.isnat(t).any():  # they know their unit
             t, unit = t.astype(f"{t.dtype.kind}8[us]").astype(np.int64), "us"
         if t.dtype.kind == "f":
-            if self.time_unit == "auto" and native != "s":
-                unit = native if whole(t) else "s"  # no camera counts whole seconds
-                raise EvflowDataError(
-                    "EV003", f"times are {t.dtype} (first {t[0]}), but {native} must be integers.",
-                    f"Are they {unit}? Pass time_unit={unit!r} (--time-unit {unit}).")
+            if self.time_unit == "auto":
+                check_whole(t, native)
             if not np.isfinite(t).all():
                 raise EvflowDataError("EV007", f"{(~np.isfinite(t)).sum():,} times are not finite.")
             with np.errstate(over="ignore"):  # an overflow is refused below

@@ -99,11 +99,11 @@ def _stored(data: Any) -> int:
 def in_unit(
     path: Path, chunks: Iterator[Chunk], unit: str, hints: Hints
 ) -> tuple[Iterator[Chunk], str]:
-    """The chunks and the unit of their times; EV003 if fractions follow integer times."""
-    if hints.time_unit != "auto":
-        return chunks, hints.time_unit
+    """The chunks and the unit of their times, which one in `hints` overrides; EV003 if fractions
+    follow integer times."""
+    given = hints.time_unit != "auto"
     if unit != "auto":
-        return in_us(chunks, unit), "us"
+        return (chunks, unit) if given else (in_us(chunks, unit), "us")
     first = list(itertools.islice(chunks, 1))
     chunks = itertools.chain(first, chunks)
     if not first or first[0].t.dtype.kind != "f":
@@ -111,7 +111,7 @@ def in_unit(
     t = first[0].t
     if not columns.whole(t) or (len(t) and since_1970(float(t[0])) == ["s"]):
         return chunks, "s"
-    return in_us(all_whole(path, chunks), "us"), "us"
+    return chunks if given else in_us(all_whole(path, chunks), "us"), "us"
 
 
 def all_whole(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -128,5 +128,5 @@ def in_us(chunks: Iterable[Chunk], unit: str) -> Iterator[Chunk]:
     """Convert chunks whose times are in that unit, integer or not, to us."""
     as_given = Hints(time_unit=unit)
     for chunk in chunks:
-        written.seen(chunk.t, unit)
+        written.seen(chunk.t, unit, unit)
         yield chunk._replace(t=as_given.microseconds(chunk.t, unit))

@@ -19,6 +19,11 @@ class Chunk(NamedTuple):
     where: Callable[[int], int]
     unit: str = "byte"
 
+    def area(self) -> float:
+        """The pixels of the area that its events reach."""
+        width, height = (max(float(np.nanmax(a, initial=0.0)), 0.0) + 1 for a in (self.x, self.y))
+        return width * height
+
     def only(self, kept: np.ndarray) -> Chunk:
         """The events at these indices."""
         return Chunk(self.x[kept], self.y[kept], self.t[kept], self.p[kept],

@@ -6,6 +6,7 @@ values. Only the requested range is checked.
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from evflow.files.spool import Spool
 from evflow.io.decode import late, written
 from evflow.io.decode.causes import why_no_polarity, why_outside
 from evflow.io.decode.chunk import Chunk
-from evflow.io.decode.units import UNITS_US
+from evflow.io.decode.units import UNITS_US, check_whole
 from evflow.io.hints import Hints, dropped, within
 from evflow.notes import Note
 from evflow.types import Events
@@ -64,7 +65,10 @@ class Gathering:
         if chunk.t.dtype.kind == "f" and not (fits := np.abs(chunk.t) < 2.0**63).all():
             raise self._odd(chunk, "t", int(np.argmin(fits)))
         unit = self.native if self.hints.time_unit == "auto" else self.hints.time_unit
-        written.seen(chunk.t, unit)
+        if self.hints.time_unit == "auto":
+            check_whole(
+                chunk.t, self.native, math.prod(self.size) if self.size else chunk.area())
+        written.seen(chunk.t, unit, self.native)
         t = self.hints.microseconds(chunk.t, self.native, self.offset)
         t = self.joint(t) if self.joint else t
         if not self.seen:

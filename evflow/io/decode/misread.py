@@ -78,10 +78,13 @@ def doubt(
 
 
 def with_doubts(recording: Recording, format: str, parsed: Hints, written: Written) -> Recording:
-    """The recording, with a note if its times are doubtful; EV023 if the user must decide."""
+    """The recording, with a note if its times are doubtful; EV023 if the user must decide. A unit
+    that the user gave is doubted where it is not the format's own."""
     coarseness = coarse(recording.events.t, written)
-    found = doubt(recording.events, recording.frame_times, format, written.unit) if (
-        parsed.time_unit == "auto") else None
+    given = parsed.time_unit != "auto"
+    found = (None if given and parsed.time_unit == written.native else
+             misread(recording.events, recording.frame_times, written.unit) if given else
+             doubt(recording.events, recording.frame_times, format, written.unit))
     if found is not None:
         note = Note("events.unit", f"{found.seen} If so, pass --time-unit {found.unit}")
     elif coarseness:

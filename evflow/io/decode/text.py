@@ -51,8 +51,7 @@ def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
     seen = False
     for chunk in chunks:
         if not seen and len(chunk.t):
-            reach = [max(float(np.nanmax(a, initial=0.0)), 0.0) + 1 for a in (chunk.x, chunk.y)]
-            check_text_seconds(chunk.t, path, reach[0] * reach[1])
+            check_text_seconds(chunk.t, path, chunk.area())
         seen = seen or len(chunk.t) > 0
         yield chunk
 

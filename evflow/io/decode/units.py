@@ -145,6 +145,22 @@ def likeliest_unit(
                   f"{rates[other]:.3g}")
 
 
+def check_whole(t: np.ndarray, native: str, pixels: float = 0.0) -> None:
+    """Raise EV003 for times (N,) of a float dtype in a unit that is counted in integers, with the
+    unit in which they make the most usual recording. pixels: as in `check_text_seconds`; 0 if they
+    are unknown. Those that are not finite pass."""
+    if t.dtype.kind != "f" or native == "s" or not np.isfinite(t).all():
+        return
+    seen = f"times are {t.dtype} (first {t[0]}), but {native} must be integers"
+    units = ("ms", "us", "ns") if (t % 1 == 0).all() else ("s", "ms", "us")
+    if not pixels or len(t) < FEW_EVENTS:
+        raise EvflowDataError("EV003", f"{seen}.", f"Are they {', '.join(units)}? Pass time_unit "
+                              "(--time-unit).")
+    unit, why = likeliest_unit(len(t), float(np.ptp(t)), pixels, float(t[0]), units)
+    raise EvflowDataError(
+        "EV003", f"{seen}; {why}.", f"Pass time_unit={unit!r} (--time-unit {unit}).")
+
+
 def check_text_seconds(t: np.ndarray, where: object, pixels: float) -> None:
     """Raise EV003 if the first times (N,) of a text, as written, are integers, which seconds are
     not, or later than any date since 1970. pixels: of the sensor, or of the area that events

@@ -23,10 +23,12 @@ STEPS_US = (100_000, 10_000, 1_000)  # of times written with few digits
 
 @dataclasses.dataclass
 class Written:
-    """unit: of the event times in the file, None if it has none; apart_us: spacing of their dtype
+    """unit: of the event times in the file, None if it has none; native: that of its format;
+    apart_us: spacing of their dtype
     `kind` at such values, 0 if exact."""
 
     unit: str | None = None
+    native: str | None = None
     apart_us: float = 0.0
     kind: str = ""
 
@@ -45,12 +47,13 @@ def watched() -> Iterator[Written]:
         _WATCHED.reset(token)
 
 
-def seen(t: np.ndarray, unit: str) -> None:
-    """Record times (N,) of a file, of any dtype, in that unit; the first unit is the file's."""
+def seen(t: np.ndarray, unit: str, native: str) -> None:
+    """Record times (N,) of a file, of any dtype, in that unit; the first unit is the file's.
+    native: what it is by the format, if none is given."""
     found = _WATCHED.get()
     if found is None:
         return
-    found.unit = found.unit or unit
+    found.unit, found.native = found.unit or unit, found.native or native
     if t.dtype.kind == "f" and t.size:
         apart = float(np.spacing(np.abs(t).max())) * UNITS_US[unit]
         if apart > found.apart_us:

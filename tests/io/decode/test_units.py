@@ -156,6 +156,26 @@ def test_dates_beyond_this_century_are_asked_about(tmp_path: Path) -> None:
     assert read_recording(path, time_unit="ns").events.t[0] // 10**6 == 1_700_000_000
 
 
+@pytest.mark.parametrize(("unit", "wrong"), [("ms", "s"), ("us", "s")])
+def test_fractions_of_a_counted_unit_and_a_given_one_are_judged_by_the_rate(
+    tmp_path: Path, unit: str, wrong: str
+) -> None:
+    path = noisy(tmp_path, "a.npz", "us", 2.0)
+    held = dict(np.load(path))
+    np.savez(path, **{**held, "t": held["t"] / UNITS_US[unit] + (unit == "us") * 0.25})
+    error = refused(path)
+    assert (error.code, error.fix) == ("EV003", f"Pass time_unit={unit!r} (--time-unit {unit}).")
+    assert not [n for n in read_recording(path, time_unit=unit).notes if n.code == "events.unit"]
+    (note,) = [n for n in read_recording(path, time_unit=wrong).notes if n.code == "events.unit"]
+    assert note.text.endswith(f"--time-unit {unit}")
+
+
+def test_a_given_unit_that_is_the_formats_own_is_not_doubted(tmp_path: Path) -> None:
+    for name in ("a.npz", "a.h5"):
+        path = noisy(tmp_path, name, "ns", 0.5)
+        assert not read_recording(path, time_unit="us").notes
+
+
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 @pytest.mark.parametrize("hz", [0.3, 10.0])
 def test_text_names_the_unit_that_its_numbers_speak_for(
