@@ -32,6 +32,7 @@ POSSIBLE_S = (2e-5, 2.0)  # 50,000 frames/s to one in two seconds
 USUAL_S = (2.5e-3, 0.125)  # 400 to 8 frames/s: only one of units 1000 apart can lie within
 MIDDLE_S = 0.02  # of two units, the one nearer to 50 frames/s
 LEAST_SHARED = 0.01  # of the whole span: in a wrong unit, times share a thousandth
+FAR_MORE = 10.0  # times as much is shared in the right unit
 
 DIGITS = "Export them again as integer microseconds, or as float64 seconds with six decimals."
 WORDS = re.compile(
@@ -91,15 +92,16 @@ def shared_unit(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | Non
 
 
 def other_unit(times: np.ndarray, t: np.ndarray, native: str) -> str | None:
-    """The unit in which times (T,) fall among events at t (N,) us if in the native one they do not;
-    None if they do, or in no unit."""
+    """The unit in which times (T,) of frames fall among events at t (N,) us if in the native one
+    they do not; None if they do, or in no unit."""
     factor = _factor(times, t, UNITS_US[native], [*UNITS_US.values()])
     return next((unit for unit, us in UNITS_US.items() if us == factor), None)
 
 
 def too_large(times: np.ndarray, t: np.ndarray) -> str:
-    """How many times times (T,) us are those of events at t (N,) us, in words ("1,000 times"), if
-    they only look apart because one of both was read in a wrong unit; "" if nothing says so."""
+    """How many times times (T,) us of frames are those of events at t (N,) us, in words ("1,000
+    times"), if they only look apart because one of both was read in a wrong unit; "" if nothing
+    says so."""
     factor = _factor(times, t, 1.0, [10.0**power for power in (-9, -6, -3, 3, 6, 9)])
     if not factor and len(times) and len(t) and since_1970(float(t[0])) == ["us"]:
         factor = next((UNITS_US[unit] for unit in since_1970(float(times[0])) if unit != "us"), 0.0)
@@ -109,10 +111,15 @@ def too_large(times: np.ndarray, t: np.ndarray) -> str:
 
 def _factor(times: np.ndarray, t: np.ndarray, native: float, factors: list[float]) -> float:
     """The factor at which times (T,) share most with events at t (N,), if at `native` they share
-    nothing; 0 if there is none."""
+    nothing, or far less and are no usual video, as they are at that factor; 0 if there is none.
+    Frames may last longer than events, or less: that alone tells nothing."""
     best = max(factors, key=lambda factor: _shared(times, t, factor))
-    apart = not _shared(times, t, native)
-    return best if apart and _shared(times, t, best) > LEAST_SHARED else 0.0
+    most, now = _shared(times, t, best), _shared(times, t, native)
+    if now == 0:
+        return best if most > LEAST_SHARED else 0.0
+    native_is, best_is = (USUAL_S[0] <= factor * usual_step(times) / S_US <= USUAL_S[1]
+                          for factor in (native, best))
+    return best if best_is and not native_is and most > FAR_MORE * now else 0.0
 
 
 def _shared(times: np.ndarray, t: np.ndarray, factor: float) -> float:

@@ -57,13 +57,34 @@ def test_frames_tell_their_unit_by_rate_date_and_events(unit: str) -> None:
 
 def test_a_clock_that_is_off_is_no_other_unit() -> None:
     t, us = events().t, FRAMES_US.astype(np.int64)
-    assert other_unit(1000 * us + 500_000, t, "us") is None  # they overlap as they are
     assert other_unit(1000 * (us + 2_000_000), t + 2_000_000, "us") == "ns"
     for away in (10**7, 10**9, 10**9 + 400_000, 1_700_000_000_000_000):
         assert other_unit(us + away, t, "us") is None
         assert too_large(us + away, t) == ""
     assert other_unit(us[:0], t, "us") is None
     assert too_large(us, t[:0]) == ""
+
+
+@pytest.mark.parametrize("first", [0, 500_000])
+@pytest.mark.parametrize(("native", "unit"), [
+    ("us", "ns"), ("us", "ms"), ("s", "us"), ("s", "ns"), ("ns", "ms")])
+def test_frames_that_begin_with_the_events_tell_their_unit_by_their_rate(
+    native: str, unit: str, first: int
+) -> None:
+    t = events().t
+    frames = ((FRAMES_US + first) / UNITS_US[unit]).astype(np.int64)
+    assert other_unit(frames, t, native) == unit
+    assert other_unit(frames, t[t < 100_000] + first, native) == unit  # a part of the events
+    if native == "us":
+        assert too_large(frames, t) == ("1,000 times" if unit == "ns" else "1/1,000 of")
+
+
+@pytest.mark.parametrize("step_us", [500, 5_000, 40_000, 1_000_000])
+@pytest.mark.parametrize("count", [2, 100, 10_000])
+def test_frames_may_last_longer_than_the_events_or_less(step_us: int, count: int) -> None:
+    us = step_us * np.arange(count)
+    assert other_unit(us, events().t, "us") is None
+    assert too_large(us, events().t) == ""
 
 
 def test_times_that_tell_no_unit() -> None:
