@@ -119,7 +119,7 @@ class Simulate(Pixels, Footage, Compiling):
                     if self.labels:
                         later(writer.append_labels, noise)
                     count += len(events)
-        source.notes.extend(_coarse(sensor, seen))
+        source.notes.extend((*_coarse(sensor, seen), *_none(count)))
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)
         facts = {"out": str(self.out), "format": writer.NAME, "events": count, "frames": frames,
@@ -215,6 +215,13 @@ def _coarse(sensor: SensorModel, seen: list[int]) -> list[Note]:
         "frames.coarse", f"frames are {1e3 * apart_s:.3g} ms apart on average, but the low-pass of "
         f"{sensor.cutoff_hz:g} Hz takes {1e3 * slow_s:.3g} ms at white: bright pixels follow a "
         "frame at once. A higher frame rate would show it.")] if apart_s > slow_s else []
+
+
+def _none(count: int) -> list[Note]:
+    """A note if there are no events."""
+    return [] if count else [Note(
+        "events.none", "no pixel sent an event: nothing in the frames changes by a threshold. If "
+        "it should, is white what is white in them (--full-scale)?")]
 
 
 def _kept(video: Frames, colour: str, came: deque[Pair]) -> Frames:

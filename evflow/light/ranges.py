@@ -1,7 +1,8 @@
-"""What float frames probably hold, judged by their values: DN, or what is often mistaken for DN.
+"""What frames probably hold, judged by their values: DN, or what is often mistaken for DN.
 
 Frames in DN 0..255 nearly always exceed `DARKEST_DN` somewhere. Values that stay below it are
-fractions of white, logarithms or radiance; simulated as DN they would be a black video.
+fractions of white, logarithms or radiance; simulated as DN they would be a black video. So would
+integers of a few bits stored in 16.
 """
 
 from __future__ import annotations
@@ -10,7 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evflow.errors import EvflowDataError
+
 DARKEST_DN = 8.0  # if no frame exceeds it, they are not DN
+DIM_DN = 64.0  # if no frame exceeds it, white may lie elsewhere
+FEW_BITS = 4095  # uint16 that no frame exceeds are 12 bits or fewer
 MOST_LOG = 6.0  # the logarithm of 255 DN is 5.54
 LOG_MEDIAN = 1.0  # logarithms of DN are mostly above it, radiance mostly below
 AS_THEY_ARE = "if they are really that dark: --full-scale 255 (full_scale=255)"
@@ -40,6 +45,35 @@ def meaning(frame: np.ndarray) -> Meaning | None:
     return Meaning("radiance", f"Pass the value of white, e.g. --full-scale {high:.3g} "
                    "(full_scale=), or in Python evflow.light.log_maps.to_dn(frames, white); "
                    f"{AS_THEY_ARE}.")
+
+
+def meaning_of_logs(frame: np.ndarray) -> Meaning | None:
+    """What a frame (or several) of logarithms is probably relative to, if not to DN 0..255; None
+    for others."""
+    high = float(np.exp(min(float(frame.max()), MOST_LOG)))
+    if high > DARKEST_DN:
+        return None
+    fractions = high <= 1.01
+    return Meaning(
+        f"logarithms of {'fractions of white' if fractions else 'radiance'}",
+        f"Pass the value of white: --full-scale {1 if fractions else high:.3g} (full_scale=); "
+        f"{AS_THEY_ARE}.")
+
+
+def likely_white(high: float) -> float:
+    """The smallest usual white of integers that is not below `high`."""
+    usual = [float(2**bits - 1) for bits in (8, 10, 12, 14, 16)]
+    return next((white for white in usual if high <= white), high)
+
+
+def check_bits(peak: int) -> None:
+    """Raise EV003 if uint16 frames whose largest value is `peak` hold fewer bits than 16; entirely
+    black ones pass."""
+    if 0 < peak <= FEW_BITS:
+        raise EvflowDataError(
+            "EV003", f"no value of the 16-bit frames is above {peak}, where white is 65535.",
+            f"Pass the value of white: --full-scale {likely_white(peak):g} (full_scale=); if they "
+            "are really that dark: --full-scale 65535.")
 
 
 def _negative(frame: np.ndarray, low: float, high: float) -> Meaning:

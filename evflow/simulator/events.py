@@ -64,7 +64,8 @@ def simulate(
         labels: also return which events are noise.
         full_scale: value of white in float and uint16 frames (1023 for 10 bits); that of uint8 is
             always 255. None is 65535 for uint16 and 255 for floats; float frames of which none
-            exceeds 8 are then refused, as they mostly are fractions, logarithms or radiance.
+            exceeds 8 are then refused, as they mostly are fractions, logarithms or radiance, and
+            uint16 of which none exceeds 4095, as they mostly are 12 bits or fewer.
 
     Returns:
         Sorted `Events`, integer microseconds in (times_us[0], times_us[-1]]. With `labels`, also

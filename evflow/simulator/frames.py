@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import to_dn
-from evflow.light.ranges import DARKEST_DN, meaning
+from evflow.light.ranges import DARKEST_DN, check_bits, meaning
 
 
 def blocks(
@@ -27,7 +27,8 @@ def blocks(
         length: frames of a block.
         copy: copy frames on arrival, for sources that reuse one buffer.
         full_scale: value of white in float and uint16 frames. None is 255 for floats, of which
-            some must then exceed DARKEST_DN, and 65535 for uint16.
+            some must then exceed DARKEST_DN, and 65535 for uint16, of which some must exceed
+            FEW_BITS.
 
     Raises:
         EvflowDataError: EV001 for less than two frames; EV002, EV003, EV004, EV007 and EV015 for
@@ -63,6 +64,7 @@ def _single_frames(
     if full_scale is not None and not 0 < full_scale < np.inf:
         raise EvflowDataError("EV020", f"full_scale={full_scale}.", "Give the value of white.")
     dtype, last, index, doubt, bright = None, None, 0, None, full_scale is not None
+    peak = 0  # of uint16 frames
     for block, times in itertools.zip_longest(frames_iter, times_iter):
         if block is None or times is None:
             raise EvflowDataError(
@@ -78,6 +80,7 @@ def _single_frames(
             _check_white(block, full_scale, index)
         if block.dtype.kind == "f" and not bright:
             doubt, bright = doubt or meaning(block), float(block.max(initial=0)) > DARKEST_DN
+        peak = max(peak, int(block.max(initial=0))) if block.dtype == np.uint16 else peak
         dtype = block.dtype
         for frame, t in zip(block, times.tolist(), strict=True):
             if last is not None and t <= last:
@@ -90,6 +93,8 @@ def _single_frames(
         raise EvflowDataError(
             "EV003", f"no value of the float frames is above {DARKEST_DN:g} where white is 255: "
             f"{doubt.what}?", doubt.fix)
+    if full_scale is None:
+        check_bits(peak)
 
 
 def _check_white(block: np.ndarray, full_scale: float, index: int) -> None:

@@ -240,7 +240,9 @@ def test_without_events_there_is_no_film(
     np.save(still, np.full((6, 20, 30), 90, np.uint8))
     assert main(["simulate", str(still), "-o", str(tmp_path / "out.h5"), *BASE, "--preview",
                  str(film)]) == 0
-    assert f"no events, so {film} is not made" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"no events, so {film} is not made" in said
+    assert "no pixel sent an event" in said
     assert not film.exists()
 
 

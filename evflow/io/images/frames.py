@@ -28,7 +28,7 @@ from evflow.light.colour import (
     parse_pattern,
     seen_note,
 )
-from evflow.light.ranges import DARKEST_DN, meaning
+from evflow.light.ranges import DARKEST_DN, DIM_DN, check_bits, meaning, meaning_of_logs
 from evflow.notes import Note
 
 Frames = Iterator[tuple[np.ndarray, int]]
@@ -179,29 +179,32 @@ def converted(images: Iterable[Image], hints: FrameHints, notes: list[Note]) -> 
         last = image.time_us
         yield frame, last
     doubt.settle()
-    if hints.full_scale is None and 0 < peak <= DARKEST_DN * 257:
-        raise EvflowDataError(
-            "EV003", f"no value of the 16-bit frames is above {peak}, where white is 65535.",
-            f"Pass the value of white: --full-scale {values.likely_white(peak):g} (full_scale=).")
+    notes += [note for note in doubt.notes() if note not in notes]
+    if hints.full_scale is None:
+        check_bits(peak)
 
 
 class _Doubt:
     """Whether float frames are in DN: refused where none exceeds DARKEST_DN in all, or in the first
-    DOUBTED, for a video that fades in from black."""
+    DOUBTED, for a video that fades in from black; noted where none exceeds DIM_DN."""
 
     def __init__(self, hints: FrameHints) -> None:
-        self.open = hints.full_scale is None and hints.response != "log"
+        self.dim = hints.full_scale is None  # while no frame exceeds DIM_DN
+        self.logs = hints.response == "log"
         self.error: EvflowDataError | None = None
-        self.seen = 0
+        self.seen, self.peak = 0, 0.0  # DN
 
     def look(self, image: Image) -> None:
         """Take one more frame into account; EV003."""
-        if not self.open:
-            return
         pixels = image.pixels
-        self.open = pixels.dtype.kind == "f" and not pixels.max(initial=0) > DARKEST_DN
-        meant = meaning(pixels) if self.open and self.error is None else None
-        if meant:
+        if not (self.dim and pixels.dtype.kind == "f" and pixels.size):
+            self.dim = False
+            return
+        high = float(pixels.max())
+        self.peak = max(self.peak, float(np.exp(min(high, DIM_DN))) if self.logs else high)
+        self.dim = self.peak <= DIM_DN
+        if self.peak <= DARKEST_DN and self.error is None and (
+                meant := (meaning_of_logs if self.logs else meaning)(pixels)):
             self.error = values.misread(meant, image.where, pixels, 255)
         self.seen += 1
         if self.seen == DOUBTED:
@@ -209,8 +212,13 @@ class _Doubt:
 
     def settle(self) -> None:
         """Raise EV003 if no frame was bright."""
-        if self.open and self.error is not None:
+        if self.error is not None and self.peak <= DARKEST_DN:
             raise self.error
+
+    def notes(self) -> list[Note]:
+        """That all frames are dim, if so."""
+        return [Note("frames.depth", f"the frames reach {self.peak:.3g} where white is 255: "
+                     f"--full-scale {self.peak:.3g}?")] if self.dim and self.peak > 0 else []
 
 
 def _seen(image: Image, hints: FrameHints, notes: list[Note]) -> Array:

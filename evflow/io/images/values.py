@@ -12,7 +12,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.light.colour import luma
-from evflow.light.ranges import Meaning, meaning
+from evflow.light.ranges import Meaning, likely_white, meaning
 from evflow.light.response import linear_light
 from evflow.notes import Note
 
@@ -130,9 +130,3 @@ def _check_finite(pixels: np.ndarray, where: str) -> None:
         raise EvflowDataError(
             "EV007", f"{where} holds {(~finite).sum():,} NaN or infinite values.",
             "A log of dark pixels? Use linear intensity.", where=where)
-
-
-def likely_white(high: float) -> float:
-    """The smallest usual white of integers that is not below `high`."""
-    usual = [float(2**bits - 1) for bits in (8, 10, 12, 14, 16)]
-    return next((white for white in usual if high <= white), high)

@@ -161,7 +161,6 @@ def test_what_the_messages_tell_to_do_gives_the_light(tmp_path: Path) -> None:
         np.testing.assert_allclose(seen, light, rtol=1e-4)
     dark = (light / 50).astype(np.float32)  # insisted on
     np.testing.assert_allclose(read(stack(tmp_path / "s", dark), fps=1, full_scale=255)[0], dark)
-    assert len(simulate(KEY, np.rint(dark * 257).astype(np.uint16), milliseconds(4), CAMERA)) >= 0
     assert len(simulate(KEY, dark, milliseconds(4), CAMERA, full_scale=255)) >= 0
     with pytest.raises(EvflowDataError, match="EV020"):
         simulate(KEY, dark, milliseconds(4), CAMERA, full_scale=0)
@@ -174,7 +173,8 @@ def test_what_the_messages_tell_to_do_gives_the_light(tmp_path: Path) -> None:
         events, same = (simulate(KEY, frames, milliseconds(4), CAMERA, full_scale=full)
                         for frames, full in ((deep, white), (to_dn(deep, white), 255)))
         equal(events, same)
-    equal(events, simulate(KEY, deep, milliseconds(4), CAMERA))
+    equal(simulate(KEY, 16 * deep, milliseconds(4), CAMERA),
+          simulate(KEY, 16 * deep, milliseconds(4), CAMERA, full_scale=65535))
     simulate(KEY, light.astype(np.uint8), milliseconds(4), CAMERA, full_scale=255)
     black = np.zeros((4, *SHAPE), np.float32)  # and nothing is wrong with the night
     assert len(simulate(KEY, black, milliseconds(4), CAMERA)) == 0
@@ -189,6 +189,23 @@ def test_what_the_messages_tell_to_do_gives_the_light(tmp_path: Path) -> None:
     assert code_of(lambda: open_frames(tmp_path / "s.npy", fps=1, response="log2")) == "EV020"
 
 
+@pytest.mark.parametrize(("white", "told"), [(1, "1 "), (7, "7 "), (30, "30?"), (100, "")])
+@pytest.mark.parametrize("logs", [False, True])
+def test_light_whose_white_lies_elsewhere_is_told(
+    tmp_path: Path, white: float, told: str, logs: bool
+) -> None:
+    light = np.repeat(white / drifting(1).max() * drifting(1) + 1e-6, 2, 0)
+    path = stack(tmp_path / "s", (np.log(light) if logs else light).astype(np.float32))
+    hints: dict = {"fps": 1, "response": "log" if logs else "linear"}
+
+    def noted(**more: Any) -> str:
+        return "".join(n.text for n in read(path, **hints, **more)[2] if n.code == "frames.depth")
+
+    said = message(noted) if white < 8 else noted()
+    assert f"--full-scale {told}" in said if told else said == ""
+    assert noted(full_scale=255) == ""
+
+
 @pytest.mark.parametrize(("values", "code"), [
     (drifting(4) / 255, "EV003"), (drifting(4), "EV003"), (drifting(4) / 16, "EV003"),
     (drifting(4) * np.nan, "EV007"), (np.log(drifting(4)), "")])
@@ -197,7 +214,7 @@ def test_voxels_of_what_are_no_logarithms(values: np.ndarray, code: str) -> None
         KEY, values.astype(np.float32), CAMERA, frame_dt_s=1e-3)) == code
 
 
-@pytest.mark.parametrize(("bits", "white"), [(8, 255), (10, 1023)])
+@pytest.mark.parametrize(("bits", "white"), [(8, 255), (10, 1023), (12, 4095)])
 def test_integers_of_few_bits_in_sixteen_need_their_white(
     tmp_path: Path, bits: int, white: int
 ) -> None:
@@ -205,7 +222,11 @@ def test_integers_of_few_bits_in_sixteen_need_their_white(
     np.save(tmp_path / "a.npy", frames)
     with pytest.raises(EvflowDataError, match=f"EV003.*--full-scale {white} "):
         list(open_frames(tmp_path / "a.npy", fps=30).open())
+    with pytest.raises(EvflowDataError, match=f"EV003.*--full-scale {white} "):
+        simulate(KEY, frames, milliseconds(3), Camera.constant((9, 16)))
+    simulate(KEY, frames, milliseconds(3), Camera.constant((9, 16)), full_scale=65535)
     seen = [frame for frame, _ in open_frames(tmp_path / "a.npy", fps=30, full_scale=white).open()]
     np.testing.assert_allclose(seen, frames * (255 / white), rtol=1e-6)
-    np.save(tmp_path / "a.npy", np.concatenate([frames, 64 * frames]))  # begins in the dark
+    late = np.concatenate([frames, 65535 // frames.max() * frames])  # begins in the dark
+    np.save(tmp_path / "a.npy", late)
     assert len(list(open_frames(tmp_path / "a.npy", fps=30).open())) == 6
