@@ -117,7 +117,7 @@ def measure(
     recording = thinned(without_repeats(recording))
     if not recording.has_frames or stands_still(recording):
         stage("counting noise")
-        return Measured(estimate_noise(recording))
+        return Measured(estimate_noise(recording, alone=False))
     params = load_weights() if params is None else params
     pools = config_of(params).pool
     min_window_us = min_window_us if pools else min(min_window_us, WINDOW_US)

@@ -21,28 +21,30 @@ from evflow.estimation.pixel_noise import pixel_rates
 from evflow.estimation.remarks import dead_notes, noise_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.estimation.shot import Shot, by_light, measured_noise, measured_shot, scatter
-from evflow.notes import Note
+from evflow.notes import Note, why_no_frames
 from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
 from evflow.recordings.stillness import unlike_noise
 from evflow.training.config import PRESETS
 from evflow.types import Recording
 
 
-def estimate_noise(recording: Recording, *, lux: float | None = None) -> CameraEstimate:
+def estimate_noise(
+    recording: Recording, *, lux: float | None = None, alone: bool = True
+) -> CameraEstimate:
     """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
 
     A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
     over pixels that are neither hot nor dead. Thresholds are those of the network's training prior,
     with its width; `valid` is False everywhere. lux: the illuminance, for `.bench`, which
     `noise_over_light` joins. Leak is identified by its intervals, shot noise if frames show the
-    light. Raises EV011 (EV017 with frames) if the scene moves, or the recording is too short to
-    decide.
+    light. alone: noise is what was asked for, not what is left without frames. Raises EV017 (EV011
+    unless `alone`) if the scene moves, or the recording is too short to decide.
     """
     events = recording.events
     counts = events.count_map()
     total = counts.sum(0, dtype=np.uint32)
     hot, dead = hot_at_rest(total), dead_pixels(total)
-    _require_static(recording, hot)
+    _require_static(recording, hot, alone)
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(
         *(_rates(n, hot, dead, seconds) for n in counts), strict=True)
@@ -101,16 +103,21 @@ def uniform(bounds: tuple[float, float]) -> tuple[float, float]:
     return 0.5 * sum(bounds), (bounds[1] - bounds[0]) / float(np.sqrt(12.0))
 
 
-def _require_static(recording: Recording, hot: np.ndarray) -> None:
+def _require_static(recording: Recording, hot: np.ndarray, alone: bool) -> None:
     reason = unlike_noise(recording.events, hot)
-    if reason:
+    if reason and alone:
         raise EvflowDataError(
-            "EV017" if recording.has_frames else "EV011",
-            f"without using frames only the noise of a static scene can be measured, and {reason}",
-            ("It has frames: measure its thresholds too (--protocol motion). " if
-             recording.has_frames else "Thresholds are measured against intensity: provide frames, "
-             "--frames DIR --timestamps FILE. ") +
-            "To measure only noise, record some seconds of a static scene.")
+            "EV017", f"noise is measured in a static scene, and {reason}",
+            "Record some seconds in which nothing moves and the light is steady" + (
+                ", or measure the thresholds of this recording too: --protocol motion."
+                if recording.has_frames else "; the thresholds of a moving scene need frames."))
+    if reason:
+        why = why_no_frames(recording.notes)
+        raise EvflowDataError(
+            "EV011", f"the recording has no frames{why}; without them only the noise of a static "
+            f"scene can be measured, and {reason}", "Thresholds are measured against intensity: "
+            f"{'mend what left the frames out, or ' if why else ''}provide frames, --frames DIR "
+            "--timestamps FILE. To measure only noise, record some seconds of a static scene.")
 
 
 def _rates(

@@ -70,7 +70,7 @@ def test_twelve_bits_in_sixteen(tmp_path: Path) -> None:
     frames = folder(tmp_path, 3) .astype(np.uint16) * 16
     for i, frame in enumerate(frames):
         cv2.imwrite(str(tmp_path / f"img{i + 1}.png"), frame)
-    assert "--full-scale" in read(tmp_path, fps=10)[2][0].text
+    assert "--full-scale 4095" in message(lambda: read(tmp_path, fps=10))
     np.testing.assert_allclose(read(tmp_path, fps=10, full_scale=4080)[0], frames / 16, rtol=1e-6)
     assert "EV003" in message(lambda: read(tmp_path, fps=10, full_scale=1023))
 

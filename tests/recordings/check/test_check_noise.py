@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from helpers.networks import hidden
 
 from evflow import Events, Recording, check, estimate_camera, read_recording
 from evflow.errors import EvflowDataError
+from evflow.estimation.static import estimate_noise
+from evflow.notes import Note
 from evflow.recordings.stillness import clustered, coincidence_excess, stands_still
 
 SIZE = (64, 48)
@@ -100,8 +103,13 @@ def test_what_moves_in_frames_or_events_does_not_stand_still() -> None:
 
 def test_a_moving_scene_is_refused() -> None:
     recording = Recording.of_events(hidden(14, 600)[0].events)
-    with pytest.raises(EvflowDataError, match=r"EV011.*the scene moves.*--frames DIR"):
+    with pytest.raises(EvflowDataError, match=r"EV011.*scene moves.*: provide frames, --frames"):
         estimate_camera(recording)
+    lost = dataclasses.replace(recording, notes=(Note("frames.unused", "frames are 60x40"),))
+    with pytest.raises(EvflowDataError, match=r"EV011.*no frames: frames are 60x40; .*mend what"):
+        estimate_camera(lost)
+    with pytest.raises(EvflowDataError, match=r"EV017.*the scene moves.*Record some seconds in "):
+        estimate_noise(recording)
 
 
 def test_company_is_what_independent_noise_lacks() -> None:
