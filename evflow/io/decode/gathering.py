@@ -174,11 +174,11 @@ class Gathering:
         spot, before = self._place(chunk, i), int(t[i - 1]) if i else self.last
         if t[i] < before and not self.lateness:
             if ahead:
-                self.last = int(t[i - ahead - 1])
+                self.last = int(t[i - ahead - 1]) if i > ahead else self.first
+            fix = late.advice(t, i, before, self._turns(chunk), self.joint is not None)
             return EvflowDataError(
                 "EV004", f"{self.path}: time goes back from {before:,} to {t[i]:,} us at {spot}"
-                f"{self.so_far()}", late.advice(t, i, before, self._turns(chunk))
-                + self.sound_part(), where=self.path)
+                f"{self.so_far()}", fix + self.sound_part(), where=self.path)
         width, height = self.size or (1 << 16, 1 << 16)
         return EvflowDataError(
             "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "

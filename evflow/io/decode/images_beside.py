@@ -65,6 +65,10 @@ def beside(
                 "frames.stream", f"frames are from {name}, at the times in {times}"),))
             streams.append(Images(stream, _loading(
                 name, times, arrays, whole, pixels, path, found.events)))
+        elif array.dtype.kind == "b" and _shaped(array.shape) and _words(name) & ENCODED:
+            streams.append(Images(ImageStream(
+                name, _size(array.shape), "bool, black and white only: save brightness, as uint8 "
+                "0 to 255"), lambda: (Stamps(np.zeros(0)), lambda part: ())))
         elif array.dtype.hasobject and _words(name) & ENCODED:
             streams.append(Images(ImageStream(
                 name, None, "of variable length, as encoded images are: save them as arrays, or as "
@@ -123,10 +127,14 @@ def _near(
 
 def are_images(array: Any) -> bool:
     """Whether an array may be images."""
-    shape = array.shape
+    return array.dtype.kind in "iuf" and _shaped(array.shape)
+
+
+def _shaped(shape: tuple[int, ...]) -> bool:
+    """Whether a shape may be that of images."""
     last = len(shape) in (3, 4) and min(shape[1:3]) >= LEAST_SIDE and (
         len(shape) == 3 or shape[3] in CHANNELS)
-    return bool((last or channels_first(shape)) and shape[0] and array.dtype.kind in "iuf")
+    return bool((last or channels_first(shape)) and shape[0])
 
 
 def channels_first(shape: tuple[int, ...]) -> bool:

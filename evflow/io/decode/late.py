@@ -38,12 +38,15 @@ def ahead_of(t: np.ndarray, i: int) -> int:
     ones; 0 if event i itself is late."""
     ahead = i - int(np.searchsorted(t[:i], t[i], "right"))
     behind = int(np.count_nonzero(t[i : i + LOOK] < t[i - 1])) if i else 0
-    return ahead if ahead <= min(FEW, i - 1) and ahead < behind else 0
+    return ahead if ahead <= FEW and ahead < behind else 0
 
 
-def advice(t: np.ndarray, i: int, before: int, turns: tuple[int, ...] = ()) -> str:
+def advice(
+    t: np.ndarray, i: int, before: int, turns: tuple[int, ...] = (), join: bool = False
+) -> str:
     """What it means that t[i] is smaller than `before`, its predecessor, and what to do. turns:
-    after how many us the stored numbers begin anew, beside `WRAPS`."""
+    after how many us the stored numbers begin anew, beside `WRAPS`; join: whether clocks are
+    joined, of which this is none."""
     step = before - int(t[i])
     if step <= RESET_US and _turn(step, turns):
         return ("The stored integers begin anew, as they have too few bits: write them as 64-bit "
@@ -60,6 +63,11 @@ def advice(t: np.ndarray, i: int, before: int, turns: tuple[int, ...] = ()) -> s
                     "them, without frames: --late join (late='join')")
         return ("A camera reset, or two recordings joined? Read one after the other: --late join "
                 "(late='join')")
+    if join:
+        return (f"--late join takes a step back of more than {RESET_US / 1e6:g} s for another "
+                f"clock, and this is one of {step / 1e6:.3g} s. Short recordings that were joined? "
+                "Write each to a file of its own. Packets that were overtaken? --late drop, or "
+                "--late sort")
     return ("Packets that were overtaken? Leave late events out: --late drop (late='drop'), or "
             "sort them in: --late sort")
 

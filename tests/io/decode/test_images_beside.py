@@ -178,6 +178,8 @@ def test_encoded_images_are_told(tmp_path: Path) -> None:
     with h5py.File(path, "a") as f:
         f.create_dataset("images", 6, h5py.vlen_dtype(np.uint8))
     assert "images (of variable length" in read_recording(path).notes[0].text
+    path = npz(tmp_path, {"frames": FRAMES > 100, "frame_times": TIMES})
+    assert "frames (bool, " in read_recording(path).notes[0].text
 
 
 def test_a_stream_that_is_named_is_read_or_refused(tmp_path: Path) -> None:

@@ -147,6 +147,22 @@ def test_the_message_fits_the_cause_and_its_advice_works(
         assert len(advised(path)) >= 3
 
 
+def test_a_first_event_far_ahead_is_no_other_clock(tmp_path: Path) -> None:
+    for kind in ("npz", "text"):
+        path = FILES[kind](tmp_path, table(changed(_0=10**15)))
+        error = refused(path)
+        assert "The 1 events before it are ahead" in error.fix
+        assert "join" not in error.fix
+        assert len(read_events(path, late="drop")) == 1999
+
+
+def test_a_step_back_that_is_not_joined_is_said_to_be_none(tmp_path: Path) -> None:
+    path = npz(tmp_path, table(np.concatenate([T[:600], T[:600]])))
+    assert "overtaken? Leave" in refused(path).fix
+    assert "more than 1 s for another clock, and this is one of 0.599 s" in refused(
+        path, late="join").fix
+
+
 @each
 def test_clocks_are_put_one_behind_the_other(tmp_path: Path, kind: str) -> None:
     columns = table(np.concatenate([T + 5_000_000, T + 40]))
