@@ -53,6 +53,7 @@ def write_video(
     with atomic_write(path, overwrite=overwrite) as temporary, contextlib.ExitStack() as stack:
         made = aside(path, f"part{kind}")  # OpenCV tells the kind of film by the ending
         stack.callback(remove, made)
+        made.touch()  # says why where nothing can be written, which OpenCV does not
         if kind == ".gif":
             how = _write_gif(made, pictures, count, fps)
         else:

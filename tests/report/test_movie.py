@@ -168,6 +168,9 @@ def test_what_is_refused(tmp_path: Path) -> None:
             write_film(tmp_path / name, of, film)
         assert raised.value.code == code
     assert (tmp_path / "there.mp4").read_bytes() == b"mine"
+    for name in ("a.mp4", "a.gif"):
+        with pytest.raises(EvflowDataError, match=r"EV019.*not written .no such folder"):
+            write_film(Path("/proc") / name, recording, Film())
     for name, value in (("fps", 0.0), ("window_us", 0), ("slow", -1.0), ("scale", 99)):
         with pytest.raises(EvflowDataError, match="EV020"):
             Film(**{name: value})
