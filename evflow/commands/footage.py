@@ -8,7 +8,7 @@ import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from evflow.commands.options import check_finite, value
+from evflow.commands.options import check_finite, refuse, value
 from evflow.light.colour import Colour
 
 if TYPE_CHECKING:
@@ -82,13 +82,17 @@ class Footage:
         from evflow.io.source import open_frames
 
         check_finite(self)
+        sweeps = self.saccades is not None
+        if sweeps:
+            refuse(self, ("fps", "timestamps", "time_unit"), "saccades have their own times")
         options = {name: getattr(self, name) for name in (
-            "fps", "timestamps", "colour", "time_unit", "full_scale", "partial", "bayer",
-            "response", "background", "frames_topic", "repeated")}
-        source = open_frames(path, **options, flip=self.flip_frames, start_s=self.start,
-                             stop_s=self.stop, picture=self.saccades is not None)
+            "timestamps", "colour", "time_unit", "full_scale", "partial", "bayer", "response",
+            "background", "frames_topic", "repeated")}
+        part = {"start_s": self.start, "stop_s": self.stop}
+        source = open_frames(path, **options, **({} if sweeps else part), flip=self.flip_frames,
+                             fps=1.0 if sweeps else self.fps, picture=sweeps)
         if self.saccades is not None:
-            source = swept(source, self.saccades, crop=self.crop, resize=self.resize,
+            source = swept(source, self.saccades, **part, crop=self.crop, resize=self.resize,
                            sensor_size=self.sensor_size)
         else:
             source = cropped(source, crop=self.crop, resize=self.resize,

@@ -115,7 +115,7 @@ def _video(path: Path, asked: FrameHints) -> FrameSource:
 
 
 def _recording(path: Path, asked: FrameHints) -> FrameSource:
-    if asked.fps is not None or asked.timestamps is not None:
+    if (asked.fps is not None and not asked.picture) or asked.timestamps is not None:
         raise EvflowDataError(
             "EV020", f"{path} is a recording, whose frames have their own times.",
             "Leave out --fps and --timestamps, or pass only its images.", where=path)

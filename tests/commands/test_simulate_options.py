@@ -200,6 +200,14 @@ def test_a_picture_by_saccades(tmp_path: Path, capsys: pytest.CaptureFixture[str
     rates = np.histogram(events.t, 30, (0, 300_000))[0].reshape(3, 10)
     assert (rates.sum(1) > 100).all()
     assert (rates[:, [0, 9]].max(1) < 0.2 * rates.max(1)).all()
+    part = run(tmp_path / "cat.png", "--saccades", "4", "--start", "0.1", "--stop", "0.2",
+               capsys=capsys)[0].t
+    assert 100_000 < part[0] < part[-1] < 200_000
+    for option in (["--fps", "100"], ["--time-unit", "ms"], ["--start", "0.4"]):
+        assert main(["simulate", str(tmp_path / "cat.png"), "-o", str(tmp_path / "a.h5"),
+                     "--saccades", "4", *option])
+        said = capsys.readouterr().err
+        assert "EV020" in said if option[0] != "--start" else "They last 0.3 s" in said
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".npz"])

@@ -64,7 +64,7 @@ class FrameHints:
         from its first event.
     frames_topic: which image stream of a recording to use (see `Hints`).
     repeated: "keep" or "drop" frames that repeat the one before (`repeats`). picture: the source
-        may be a single picture.
+        may be a single picture, whose time is not asked for.
     clip: treat values above full_scale as white and negative ones as black, for radiance, which has
         no upper limit, instead of refusing them.
     """

@@ -29,18 +29,21 @@ CORNERS = ((0.0, 0.0), (0.5, math.sqrt(3) / 2), (1.0, 0.0), (0.0, 0.0))  # of a 
 
 
 def swept(
-    source: FrameSource, side_px: float, *, crop: str | None = None, resize: str | None = None,
+    source: FrameSource, side_px: float, *, start_s: float | None = None,
+    stop_s: float | None = None, crop: str | None = None, resize: str | None = None,
     sensor_size: str | None = None,
 ) -> FrameSource:
-    """The video for a source with one frame; other arguments as in `cropping.cropped`. Raises EV020
-    (several frames, a side out of range, or a raw mosaic)."""
+    """The video for a source with one frame, from start_s to stop_s of the sweep; other arguments
+    as in `cropping.cropped`. Raises EV001 (nothing lies between them), EV020 (several frames, a
+    side out of range, or a raw mosaic)."""
     if not STEP_PX <= side_px <= LONGEST_PX:
         raise EvflowDataError("EV020", f"--saccades {side_px:g}.",
                               f"Give a side from {STEP_PX:g} to {LONGEST_PX:g} pixels.")
     if source.count != 1:
         raise EvflowDataError("EV020", f"--saccades over {source.count or 'several'} frames.",
                               "It needs a single picture: a video has its own motion.")
-    cropping, path = cropping_of(source.size, crop, resize, sensor_size), saccades(side_px)
+    cropping = cropping_of(source.size, crop, resize, sensor_size)
+    path = saccades(side_px).part(start_s, stop_s)
 
     def frames() -> Frames:
         (picture, _), = source.open()
@@ -67,6 +70,15 @@ class Path:
 
     at_px: Array
     times_us: Array
+
+    def part(self, start_s: float | None, stop_s: float | None) -> Path:
+        """What lies between, in seconds; None for its ends. EV001 if nothing does."""
+        seconds = 1e-6 * self.times_us
+        kept = (seconds >= (start_s or 0.0)) & (seconds < (np.inf if stop_s is None else stop_s))
+        if not kept.any():
+            raise EvflowDataError("EV001", "no part of the saccades is left.", "They last "
+                                  f"{seconds[-1]:g} s: --start and --stop within them.")
+        return Path(self.at_px[kept], self.times_us[kept])
 
 
 def saccades(side_px: float) -> Path:
