@@ -76,8 +76,9 @@ def check_size(size: Any) -> Size:
 
 def check_exposure(exposure_us: float) -> int:
     """Microseconds >= 0 as an int; raises EV020."""
-    if not 0 <= exposure_us < 2**62:
-        raise EvflowDataError("EV020", f"exposure_us={exposure_us}.",
+    one = isinstance(exposure_us, int | float | np.number)
+    if not (one and 0 <= exposure_us < 2**62):
+        raise EvflowDataError("EV020", f"exposure_us={exposure_us!r}.",
                               "Give microseconds, >= 0; 0 if it is unknown.")
     return int(exposure_us)
 

@@ -182,6 +182,7 @@ def test_concatenate_refuses_other_order_and_sizes() -> None:
     ({"frames": np.full((2, 4, 6), np.nan, np.float32)}, "EV007", "frame 0 has 24 NaN"),
     ({"frames": np.zeros((2, 6, 4), np.uint8)}, "EV015", "Swap width and height"),
     ({"frames": np.zeros((2, 5, 5), np.uint8)}, "EV015", "frames are 5x5"),
+    ({"exposure_us": "a"}, "EV020", "exposure_us='a'"),
 ])
 def test_bad_recordings_say_what_where_and_the_fix(changed: dict, code: str, seen: str) -> None:
     given_ = {"events": events(), "frames": frames(), "frame_times": [5, 11]} | changed

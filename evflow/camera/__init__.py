@@ -5,6 +5,7 @@
     file.py      its maps as an .npz
     sensors.py   SensorModel, the pixel circuit, and sensors by name
     leak.py      the part of its noise that is leak
+    arguments.py keys, shapes and numbers at the border
     optics.py    what is measured beside the maps: summary, circuit, how frames relate to light
     perturb.py   hot and dead pixels, measured noise
     exports/     a camera as settings of other simulators

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evflow.camera import file
+from evflow.camera.arguments import check_key, parameter, shape_of_maps
 from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import CameraPrior, Summary, sample_nominal
-from evflow.checks import plain
+from evflow.checks import need, plain
 from evflow.errors import EvflowDataError, naming
 
 Array = jax.Array
@@ -68,11 +69,8 @@ class Camera:
 
     @staticmethod
     def constant(
-        shape: tuple[int, ...],
-        theta_on: float = 0.2,
-        theta_off: float = 0.2,
-        eta_on: float = 0.0,
-        eta_off: float = 0.0,
+        shape: tuple[int, ...], theta_on: float = 0.2, theta_off: float = 0.2,
+        eta_on: float = 0.0, eta_off: float = 0.0,
     ) -> Camera:
         """The same parameters at every pixel.
 
@@ -87,10 +85,11 @@ class Camera:
             A camera of float32 maps.
 
         Raises:
-            EvflowDataError: EV002 (fewer than two axes), EV014 (a value out of range).
+            EvflowDataError: EV002 (no shape of maps), EV014 (a value out of range, or no number).
         """
-        values = (theta_on, theta_off, eta_on, eta_off)
-        return Camera(*(jnp.full(shape, v, jnp.float32) for v in values)).validate()
+        shape, values = shape_of_maps(shape), (theta_on, theta_off, eta_on, eta_off)
+        return Camera(*(jnp.full(shape, parameter(name, v), jnp.float32)
+                        for name, v in zip(PARAMETERS, values, strict=True))).validate()
 
     @staticmethod
     def sample(key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None) -> Camera:
@@ -105,11 +104,11 @@ class Camera:
             The cameras, maps of that shape, thresholds clamped at .01 as in v2e.
 
         Raises:
-            EvflowDataError: EV002 (fewer than two axes).
+            EvflowDataError: EV002 (no shape of maps), EV020 (no key, or no prior).
         """
-        if len(shape) < 2:
-            raise EvflowDataError("EV002", f"shape is {shape}.", "Expected (..., H, W).")
-        prior = prior or CameraPrior()
+        check_key(key)
+        shape, prior = shape_of_maps(shape), CameraPrior() if prior is None else prior
+        need(prior, CameraPrior, "prior", "For example CameraPrior(theta=(0.1, 0.4)).")
         k_nominal, k_pixels = jax.random.split(key)
         nominal = sample_nominal(k_nominal, shape[:-2], prior)
         return sample_pixels(k_pixels, nominal, (shape[-2], shape[-1]), prior.eta_spread)

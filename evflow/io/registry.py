@@ -254,6 +254,7 @@ def open_writer(
 def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventWriter]:
     """The writer of a format, or of an output's extension; EV020 if there is none, or if the
     extension stands for another format."""
+    need(path, str | os.PathLike, "path", "It comes first: write_events(path, events).")
     if format is not None and format not in WRITERS:
         raise EvflowDataError("EV020", f"format={format!r}.", f"Choose from {sorted(WRITERS)}.")
     suffix = Path(path).suffix.lower()

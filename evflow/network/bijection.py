@@ -18,8 +18,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
+from evflow.camera.arguments import check_key
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.network import architecture, coordinates, encoder, flow, pooling
 from evflow.network.architecture import Params, config_of
@@ -61,6 +63,10 @@ class Code:
 def parts(params: Params) -> tuple[ModelConfig, Params]:
     """The static structure, and the parts of the network."""
     return config_of(params), next(iter(params.values()))
+
+
+def _check_code(code: Code) -> None:
+    need(code, Code, "code", "Give that of code_from_video(params, dL, camera), or of encode.")
 
 
 def pixel_context(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
@@ -162,9 +168,10 @@ def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array
 
     Raises:
         EvflowDataError: EV002 (voxels and code of different pixels), EV003 (not real numbers),
-            EV007 (NaN), EV018 (not weights).
+            EV007 (NaN), EV018 (not weights), EV020 (not a code).
     """
     config, net = parts(params)
+    _check_code(code)
     check_shape("voxels", voxels, (*code.context.shape[:-1], 2 * config.bins))
     voxels = real(voxels)
     return _forward(net, voxels, same_precision(voxels, code), config=config)
@@ -192,9 +199,10 @@ def inverse(params: Params, y: ArrayLike, z: ArrayLike, code: Code) -> Array:
         Voxels (..., H, W, 32).
 
     Raises:
-        EvflowDataError: EV002, EV003, EV007, EV018 as in `forward`.
+        EvflowDataError: EV002, EV003, EV007, EV018, EV020 as in `forward`.
     """
     config, net = parts(params)
+    _check_code(code)
     pixels = code.context.shape[:-1]
     for name, values, channels in (("y", y, 4), ("z", z, 2 * config.bins - 4)):
         check_shape(name, values, (*pixels, channels))
@@ -237,9 +245,12 @@ def generate(
     Raises:
         EvflowDataError: EV002, EV014 (no valid camera), EV015 (camera of another size), EV018 (not
             weights, or a sensor with the paper's network), EV020 (a sensor whose low-pass depends
-            on an intensity that the code does not have).
+            on an intensity that the code does not have; no key, camera or code).
     """
     config, _ = parts(params)
+    check_key(key)
+    need(camera, Camera, "camera", "For example that of estimate_camera: found.camera.")
+    _check_code(code)
     if config.code == "feature" and not photoreceptor(sensor, optics).ideal:
         raise EvflowDataError(
             "EV018", "the paper's condition contains the events, not the light that a low-pass "

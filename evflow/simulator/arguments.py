@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from evflow.camera.arguments import check_key, number
 from evflow.camera.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.checks import need
@@ -21,16 +22,7 @@ def check_arguments(key: Any, camera: Any, model: Any) -> None:
          "Camera.constant((height, width), theta_on=0.2, theta_off=0.2).")
     if model is not None:
         need(model, SensorModel, "model", "For example SensorModel(cutoff_hz=100.0).")
-    dtype, shape = str(getattr(key, "dtype", None)), getattr(key, "shape", ())
-    one: tuple[int, ...] = ()
-    if dtype == "uint32":  # the older kind of key: an array of words
-        one = jax.eval_shape(jax.random.PRNGKey, 0).shape
-    if not (dtype.startswith("key<") or one) or shape[len(shape) - len(one):] != one:
-        raise EvflowDataError("EV020", f"key is {key!r:.60}.",
-                              "Give a key of jax.random: jax.random.key(0).")
-    if shape != one:
-        raise EvflowDataError("EV020", f"key holds keys of shape {shape}.",
-                              "Give one of them: keys[0].")
+    check_key(key)
 
 
 def check_interval(frame_dt_s: Any) -> float | None:
@@ -43,11 +35,3 @@ def check_interval(frame_dt_s: Any) -> float | None:
             "EV020", f"frame_dt_s={frame_dt_s!r:.60}.", "It is one number of seconds, > 0, for all "
             "frames; jax.vmap takes one for each video.")
     return seconds
-
-
-def number(value: Any) -> float:
-    """An argument that is one number, as a float; NaN if it is something else, as text is."""
-    try:
-        return math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
-    except (TypeError, ValueError):
-        return math.nan

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera
+from evflow.camera.arguments import number
 from evflow.camera.sensors import SensorModel
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
 from evflow.simulator import noise, pixel, sensor
-from evflow.simulator.arguments import check_arguments, check_interval, number
+from evflow.simulator.arguments import check_arguments, check_interval
 from evflow.simulator.constants import Constants
 from evflow.simulator.grids import as_log
 from evflow.simulator.pixel import PixelState

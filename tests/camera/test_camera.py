@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,29 @@ def test_constant_cameras() -> None:
         assert array.dtype == jnp.float32
         np.testing.assert_allclose(array, value, rtol=1e-6)
     assert float(Camera.constant(SHAPE).eta_on.max()) == 0.0
+
+
+@pytest.mark.parametrize(("made", "code", "said"), [
+    (lambda: Camera.constant((4.5, 3)), "EV002", "shape is (4.5, 3)"),
+    (lambda: Camera.constant((-1, 3)), "EV002", "whole numbers"),
+    (lambda: Camera.constant(5), "EV002", "shape is 5"),
+    (lambda: Camera.constant((4, 5), theta_off="a"), "EV014", "theta_off='a'"),
+    (lambda: Camera.constant((4, 5), eta_on=None), "EV014", "eta_on=None"),
+    (lambda: Camera.sample(0, (4, 5)), "EV020", "key is 0"),
+    (lambda: Camera.sample(jax.random.key(0), (4,)), "EV002", "shape is (4,)"),
+    (lambda: Camera.sample(jax.random.key(0), (4, 5), "x"), "EV020", "expected CameraPrior"),
+    (lambda: Camera.sample(jax.random.split(jax.random.key(0)), (4, 5)), "EV020", "keys[0]")])
+def test_what_is_no_argument_is_named(made: Any, code: str, said: str) -> None:
+    with pytest.raises(EvflowDataError, match=f"{code}.*{re.escape(said)}"):
+        made()
+
+
+def test_keys_and_thresholds_may_be_traced() -> None:
+    for key in (jax.random.key(0), jax.random.PRNGKey(0)):
+        assert jax.jit(lambda k: Camera.sample(k, (4, 5)))(key).shape == (4, 5)
+    keys = jax.random.split(jax.random.key(0), 3)
+    assert jax.vmap(lambda k: Camera.sample(k, (4, 5)))(keys).theta_on.shape == (3, 4, 5)
+    assert jax.jit(lambda t: Camera.constant((np.int64(4), 5), t))(0.3).shape == (4, 5)
 
 
 @pytest.mark.parametrize("name", PARAMETERS)

@@ -342,3 +342,5 @@ def test_the_extension_tells_the_format(tmp_path: Path) -> None:
         assert all(name in str(raised.value) for name in WRITERS)
     with pytest.raises(EvflowDataError, match="EV020"):
         open_writer(tmp_path / "a.h5", (0, 5))
+    with pytest.raises(EvflowDataError, match=r"EV020.*path is of type NoneType"):
+        write_events(None, events)

@@ -281,6 +281,11 @@ def without_summary(params: Any) -> Any:
         p, v[..., :4] * np.nan, v[..., :28], api.encode(p, v, d))),
     ("EV014", lambda p, v, d: api.generate(
         p, jax.random.key(0), Camera(*[d * 0 - 0.1] * 4), api.encode(p, v, d))),
+    ("EV020", lambda p, v, d: api.generate(p, 0, Camera.constant(d.shape), api.encode(p, v, d))),
+    ("EV020", lambda p, v, d: api.generate(p, jax.random.key(0), None, api.encode(p, v, d))),
+    ("EV020", lambda p, v, d: api.generate(p, jax.random.key(0), Camera.constant(d.shape), None)),
+    ("EV020", lambda p, v, d: api.forward(p, v, None)),
+    ("EV020", lambda p, v, d: api.inverse(p, v[..., :4], v[..., :28], None)),
     ("EV014", lambda p, v, d: unsquash(Camera(*[d * 0 - 0.1] * 4))),
     ("EV002", lambda p, v, d: squash(v[..., :3])),
     ("EV007", lambda p, v, d: squash(v[..., :4] * np.nan)),

@@ -1,0 +1,54 @@
+"""Keys, shapes of maps and single numbers, checked at the border; traced ones pass."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any
+
+import jax
+import numpy as np
+
+from evflow.errors import EvflowDataError
+
+
+def check_key(key: Any) -> None:
+    """Raise EV020 unless it is one key of jax.random."""
+    dtype, shape = str(getattr(key, "dtype", None)), getattr(key, "shape", ())
+    one: tuple[int, ...] = ()
+    if dtype == "uint32":  # the older kind of key: an array of words
+        one = jax.eval_shape(jax.random.PRNGKey, 0).shape
+    if not (dtype.startswith("key<") or one) or shape[len(shape) - len(one):] != one:
+        raise EvflowDataError("EV020", f"key is {key!r:.60}.",
+                              "Give a key of jax.random: jax.random.key(0).")
+    if shape != one:
+        raise EvflowDataError("EV020", f"key holds keys of shape {shape}.",
+                              "Give one of them: keys[0].")
+
+
+def shape_of_maps(shape: Any) -> tuple[int, ...]:
+    """The shape (..., H, W) as ints; raises EV002."""
+    try:
+        sides = tuple(operator.index(side) for side in shape)
+    except TypeError:
+        sides = ()
+    if len(sides) < 2 or min(sides) < 0:
+        raise EvflowDataError("EV002", f"shape is {shape!r:.60}.",
+                              "Expected (..., H, W), whole numbers.")
+    return sides
+
+
+def parameter(name: str, value: Any) -> Any:
+    """A value of maps, a number or an array; raises EV014 for anything else."""
+    if isinstance(value, np.ndarray | jax.Array) or not math.isnan(number(value)) or (
+            isinstance(value, float)):
+        return value
+    raise EvflowDataError("EV014", f"{name}={value!r:.60}.", "Give a number.")
+
+
+def number(value: Any) -> float:
+    """An argument that is one number, as a float; NaN if it is something else, as text is."""
+    try:
+        return math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
