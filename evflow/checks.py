@@ -40,10 +40,10 @@ def plain(name: str, value: Any) -> Any:
             "EV003", f"{name} is a {type(value).__name__}, which cannot be made an array ({e}).",
             "For a PyTorch tensor: tensor.detach().cpu().numpy().") from e
     if array.dtype.kind in "mM":
+        kind = {"m": "timedelta", "M": "datetime"}[array.dtype.kind]
         raise EvflowDataError(
             "EV003", f"{name} has dtype {array.dtype}, a type with its own time unit.",
-            f"Times are integer us: {'t' if array.dtype.kind == 'm' else '(t - t[0])'}"
-            ".astype('timedelta64[us]').astype(np.int64).")
+            f"Times are integer us: t.astype('{kind}64[us]').astype(np.int64).")
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 

@@ -47,6 +47,7 @@ TIMES = np.array([0, 1000, 2000])
     ({"frames": np.ma.masked_equal(frames(), frames()[1, 1, 1])}, "EV003", "masked"),
     ({"times_us": np.ma.masked_equal(TIMES, TIMES[1])}, "EV003", "times_us has 1 masked"),
     ({"times_us": TIMES.astype("m8[us]")}, "EV003", "astype('timedelta64[us]').astype(np.int64)"),
+    ({"times_us": TIMES.astype("M8[us]")}, "EV003", ": t.astype('datetime64[us]').astype(np.int64"),
     ({"frames": with_value(np.nan)}, "EV007", "1 values of the frames are not finite, first in "
                                               "frame 1 at y=2, x=3"),
     ({"frames": with_value(-np.inf)}, "EV007", "frame 1"),
