@@ -57,15 +57,21 @@ def in_seconds(path: Path, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
 
 
 def plain(block: bytes, byte: int) -> bytes:
-    """Lines of the same length in bytes, with blanks between numbers: without commas and byte order
-    mark, and with polarity words (True, OFF, pos ... in any case) replaced by 1 and 0."""
+    """Lines of the same length in bytes, with blanks between numbers: without commas, byte order
+    mark and polarity words."""
     if byte == 0 and block.startswith(codecs.BOM_UTF8):
         block = b"   " + block[len(codecs.BOM_UTF8):]
+    return without_words(block).translate(BLANKS)
+
+
+def without_words(block: bytes) -> bytes:
+    """Lines of the same length in bytes, with polarity words (True, OFF, pos ... in any case)
+    replaced by 1 and 0."""
     if WORD.search(block, 0, MAX_LINE):  # if one line has a word, all have
         for word in set(WORD.findall(block)):
             digit = b"1" if word.lower() in ON else b"0"
             block = re.sub(rb"\b%b\b" % word, digit.ljust(len(word)), block)
-    return block.translate(BLANKS)
+    return block
 
 
 def _blocks(f: IO[bytes], byte: int) -> Iterator[tuple[int, bytes]]:

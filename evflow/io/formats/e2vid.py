@@ -57,7 +57,8 @@ def read(path: Path, hints: Hints) -> Recording:
 
 def _is_text(head: bytes) -> bool:
     first = FIRST.match(head)
-    return first is not None and EVENT.match(head, first.end()) is not None
+    return first is not None and EVENT.match(
+        text.without_words(head), first.end()) is not None
 
 
 @contextlib.contextmanager

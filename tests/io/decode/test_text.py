@@ -55,6 +55,9 @@ def test_e2vid_text_and_zips(tmp_path: Path) -> None:
         text = archive.read("dynamic_6dof.txt")
     (tmp_path / "plain.txt").write_bytes(text)
     equal(read_events(tmp_path / "plain.txt"), want("e2vid").events)
+    words = re.sub(rb"(?m) ([01])$", lambda p: b" True" if p[1] == b"1" else b" False", text)
+    (tmp_path / "words.txt").write_bytes(words)
+    equal(read_events(tmp_path / "words.txt"), want("e2vid").events)
     (tmp_path / "numbers.txt").write_text("3 4\n5 6\n")
     assert "text of 2 columns of numbers" in str(refused(tmp_path / "numbers.txt"))
     with zipfile.ZipFile(path, "a") as archive:
