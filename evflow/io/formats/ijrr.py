@@ -34,7 +34,7 @@ from evflow.types import Recording
 NAME = "ijrr"
 EXTENSIONS: tuple[str, ...] = (".zip", ".txt", "")
 
-EVENTS, IMAGES = "events.txt", "images.txt"
+EVENTS, IMAGES, FOLDER = "events.txt", "images.txt", "images"
 CLOCK = Note("frames.clock", "frame times are those of images.txt")
 ROW = re.compile(rb"\d+\.\d+[ \t]+\d+[ \t]+\d+[ \t]+-?[01][ \t]*\r?")
 
@@ -176,8 +176,10 @@ def _image(root: Root, name: str) -> np.ndarray:
     if parts.is_absolute() or ".." in parts.parts:
         raise EvflowDataError("EV008", f"images.txt names {name}, which is outside of it.")
     file = root.joinpath(*parts.parts)
+    if not file.is_file():  # some name images without their folder
+        file = root.joinpath(FOLDER, *parts.parts)
     if not file.is_file():
         raise EvflowDataError(
-            "EV016", f"images.txt names {name}, which is not in {root}.",
+            "EV016", f"images.txt names {name}, which is not in {root} or its {FOLDER}.",
             "Restore the image, or remove its line.", where=root)
     return decode(file)

@@ -89,7 +89,7 @@ def test_ijrr_with_bad_images(tmp_path: Path, index: str, code: str) -> None:
     lambda text: text.replace("/", "\\"), lambda text: "\ufeff" + text,
     lambda text: text.replace(" ", ","), lambda text: text.replace(" ", ";\t"),
     lambda text: "timestamp, filename\n" + text, lambda text: text.replace("\n", "\r\n"),
-    lambda text: re.sub(r"(images.*png)", r'"\1"', text)])
+    lambda text: re.sub(r"(images.*png)", r'"\1"', text), lambda text: text.replace("images/", "")])
 def test_ijrr_index_as_other_tools_write_it(
     tmp_path: Path, change: Callable[[str], str]
 ) -> None:
