@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -51,17 +52,20 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     """The images of a folder, or of its only subfolder with images, and their times.
 
     Times come from `hints.timestamps`, from `hints.fps`, or from a file in `TIMES` beside them.
-    Raises EV008 (no images), EV002 (counts differ), EV016 (an image is missing), EV020 (no
-    times), and what `read_times` raises.
+    Raises EV008 (no images, or one in two formats), EV002 (counts differ), EV016 (an image is
+    missing), EV020 (no times), and what `read_times` raises.
     """
     folder, files = _find(root)
     made = _made(folder)
     if hints.fps is not None:
+        _check_once(files)
         times = np.array([hints.at_rate(i) for i in range(len(files))], np.int64)
         return ImageFolder(tuple(files), times, made + _gaps(files))
     source = _times_file(root, folder, hints)
     by_name = {file.name: file for file in files}
     us, notes, exposure_us, names = read_times(source, hints.time_unit, by_name)
+    if not names:
+        _check_once(files)
     missing = [name for name in names if name not in by_name]
     if missing:
         raise EvflowDataError(
@@ -76,6 +80,17 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
             where=folder)
     files = [by_name[name] for name in names] if names else files
     return ImageFolder(tuple(files), us, notes + made, exposure_us)
+
+
+def _check_once(files: list[Path]) -> None:
+    """Raise EV008 for files whose names differ in their ending alone."""
+    seen: dict[str, Path] = {}
+    for file in files:
+        if (other := seen.setdefault(file.stem, file)) is not file:
+            raise EvflowDataError(
+                "EV008", f"{file.parent} holds {other.name} and {file.name}: one image in two "
+                "formats?", "Keep one of them, or name each image in the file of times.",
+                where=file.parent)
 
 
 def _gaps(files: list[Path]) -> tuple[Note, ...]:
@@ -114,7 +129,8 @@ def unread_images(root: Path) -> tuple[Note, ...]:
             times = next((p for place in dict.fromkeys((folder, root)) for name in TIMES
                           if is_there(p := place / name)), "FILE")
             return (Note("frames.unused", f"{len(files):,} images in {folder} were not read, as no "
-                         f"images.txt names their times: --frames {folder} --timestamps {times}"),)
+                         "images.txt names their times: --frames "
+                         f"{quote(str(folder))} --timestamps {quote(str(times))}"),)
     return ()
 
 

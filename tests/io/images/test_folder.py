@@ -66,6 +66,16 @@ def test_sixteen_bits_stay(tmp_path: Path, suffix: str) -> None:
     assert notes == []
 
 
+def test_one_image_in_two_formats_is_asked_about(tmp_path: Path) -> None:
+    frames = folder(tmp_path, 3, "f{}.png")
+    cv2.imwrite(str(tmp_path / "f1.bmp"), frames[0])
+    assert "f1.bmp and f1.png: one image" in message(lambda: read(tmp_path, fps=10))
+    (tmp_path / "timestamps.txt").write_text("0\n1\n2\n3\n")
+    assert "EV008" in message(lambda: read(tmp_path, time_unit="s"))
+    (tmp_path / "timestamps.txt").write_text("0 f1.png\n1 f2.png\n2 f3.png\n3 f1.bmp\n")
+    assert len(read(tmp_path, time_unit="s")[0]) == 4
+
+
 def test_twelve_bits_in_sixteen(tmp_path: Path) -> None:
     frames = folder(tmp_path, 3) .astype(np.uint16) * 16
     for i, frame in enumerate(frames):
