@@ -6,6 +6,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
+from shlex import quote
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -56,7 +57,8 @@ def read_maps(path: Path) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
         raise EvflowDataError(
             "EV008", f"{path} holds {', '.join(sorted(data)[:12])} but not "
             f"{', '.join(missing)}.{recording}", EXPECTED if not recording else
-            f"Estimate its camera, evflow estimate {path} -o cam/, and pass cam/camera.npz.")
+            f"Estimate its camera, evflow estimate {quote(str(path))} -o cam/, and pass "
+            "cam/camera.npz.")
     with naming(path):
         for name in {*PARAMETERS, *ERRORS} & set(data):
             if data[name].dtype.kind not in "fiu":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -145,8 +146,9 @@ class Simulate(Pixels, Footage, Compiling):
                 rate, slow=slow, window_us=max(1, round(rate.window_us / slow))),
                 overwrite=self.overwrite)
         except BaseException:  # and Ctrl-C: the events are whole, and need not be made again
-            print(f"note: {self.out} is complete. The film alone: evflow render {self.out} "
-                  f"-o {film} --slow {slow:.3g}", file=sys.stderr)
+            again = shlex.join(
+                ["evflow", "render", str(self.out), "-o", str(film), "--slow", f"{slow:.3g}"])
+            print(f"note: {self.out} is complete. The film alone: {again}", file=sys.stderr)
             raise
         return f"{described}, {slow:.3g} times slower than life" if slow > 1 else described
 

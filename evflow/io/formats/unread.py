@@ -7,6 +7,7 @@ import io
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from shlex import quote
 
 from evflow.errors import EvflowDataError
 from evflow.files.archives import DAMAGE, npy_header
@@ -103,8 +104,9 @@ def folder(path: Path, is_recording: Callable[[Path], bool]) -> Known:
     if images := [p for p in sorted(path.iterdir()) if p.is_dir() and list_images(p)]:
         times = _times_of(len(list_images(images[0])), [*files, *sorted(images[0].iterdir())])
         events = next((r for r in recordings if r != times), recordings[0])
-        return Known(what, f"Pass {events} with its frames: --frames {images[0]} --timestamps "
-                     f"{times or 'FILE, the file of their times'}.")
+        return Known(what, f"Pass {events} with its frames: --frames {quote(str(images[0]))} "
+                     "--timestamps " + (f"{quote(str(times))}." if times else
+                                        "FILE, the file of their times."))
     others = " and others one by one" if len(recordings) > 1 else ""
     return Known(what, f"Pass {recordings[0]}{others}.")
 
@@ -119,9 +121,9 @@ def _times_of(n_images: int, files: list[Path]) -> Path | None:
 
 
 def _of(path: Path, found: Known) -> Known:
-    """Fill in the names of the file and of one beside it."""
-    return found._replace(fix=found.fix.replace(" IN ", f" {path} ").replace(
-        "OUT", str(path.with_suffix(""))))
+    """Fill in the names of the file and of one beside it, as a shell takes them."""
+    return found._replace(fix=found.fix.replace(" IN ", f" {quote(str(path))} ").replace(
+        "OUT", quote(str(path.with_suffix("")))))
 
 
 def _array(head: bytes) -> Known | None:

@@ -7,6 +7,7 @@ colour boxes of MP4 and MOV and the colour elements of Matroska are read.
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import IO
 
 import cv2
@@ -25,9 +26,9 @@ def hdr_note(path: Path) -> tuple[Note, ...]:
     return () if curve is None else (Note(
         "frames.hdr", f"{path} is HDR ({curve}), which OpenCV {cv2.__version__} decodes to 8 bits "
         + ("and tone-maps" if int(cv2.__version__.split(".")[0]) > 4 else
-           "without undoing its curve") + f": light is approximate. Exactly: ffmpeg -i {path.name} "
-        "-vf zscale=transfer=linear:npl=1000,format=gbrpf32le,format=gray16le frames/%06d.png, and "
-        "the folder with --fps."),)
+           "without undoing its curve") + f": light is approximate. Exactly: ffmpeg -i "
+        f"{quote(path.name)} -vf zscale=transfer=linear:npl=1000,format=gbrpf32le,format=gray16le "
+        "frames/%06d.png, and the folder with --fps."),)
 
 
 def hdr_curve(path: Path) -> str | None:

@@ -12,6 +12,7 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 from typing import IO, Any
 
 import cv2
@@ -166,8 +167,8 @@ def open_video(path: str | os.PathLike, hints: FrameHints | None = None) -> Vide
             raise EvflowDataError(
                 "EV009", f"no frame of {path} can be decoded; its codec is "
                 f"{codec.decode('ascii', 'replace')}, which OpenCV may not know here.",
-                f"Convert it: ffmpeg -i {path.name} -c:v libx264 -crf 12 new.mp4; or, if it is "
-                "damaged, copy it again.", where=path)
+                f"Convert it: ffmpeg -i {quote(path.name)} -c:v libx264 -crf 12 new.mp4; or, if it "
+                "is damaged, copy it again.", where=path)
         _check_converted(path, capture, claimed, first)
         if not hints.partial and claimed > 1:
             _check_end(path, capture, claimed)
@@ -197,13 +198,13 @@ def _check_converted(path: Path, capture: Any, claimed: int, first: np.ndarray) 
     raise EvflowDataError(
         "EV009", f"all frames of {path} are decoded to the same black picture: interlaced video "
         "that OpenCV does not convert here?",
-        f"Deinterlace it: ffmpeg -i {path.name} -vf bwdif new.mp4.", where=path)
+        f"Deinterlace it: ffmpeg -i {quote(path.name)} -vf bwdif new.mp4.", where=path)
 
 
 def _still(path: Path, count: int) -> Note:
     return Note("frames.still", f"all {count:,} frames of {path} are identical: nothing moves, or "
                 "it is interlaced, which some versions of OpenCV do not convert: deinterlace it "
-                f"(ffmpeg -i {path.name} -vf bwdif new.mp4).")
+                f"(ffmpeg -i {quote(path.name)} -vf bwdif new.mp4).")
 
 
 def _check_end(path: Path, capture: Any, claimed: int) -> None:

@@ -46,6 +46,7 @@ FILES = {  # name: bytes, and what the message says
     "a.raw": (bytes(range(99)), "begin with lines `% evt 3.0`"),
     "old.dat": (b"\0\1\0\2\0\3" * 9, "AEDAT 1"),
     "utf16.csv": ("t,x,y,p\n0.1,3,4,1\n".encode("utf-16"), "iconv -f UTF-16 -t UTF-8"),
+    "with a blank.csv": ("t,x,y,p\n0.1,3,4,1\n".encode("utf-16"), "with a blank.csv' > '"),
     "mac.csv": (b"t,x,y,p\r0.1,3,4,1\r0.2,3,4,1\r", "tr '\\r' '\\n' <"),
     "lfs.h5": (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "git lfs pull"),
     "page.npz": (b"<!DOCTYPE html><html>", "The download failed"),
