@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import gc
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +31,7 @@ from evflow.commands.train import Train, with_configuration
 from evflow.commands.version import Version
 from evflow.commands.voxel import Voxel
 from evflow.errors import EvflowDataError
+from evflow.files.atomic import REASONS
 from evflow.process import early
 from evflow.process.compilation import remember
 from evflow.process.terminal import INTERRUPTED, leave, print_anything, stoppable, unread
@@ -58,12 +60,19 @@ def command_type(arguments: Sequence[str] = ()) -> Any:
 
 
 def in_parsing_order(arguments: list[str]) -> list[str]:
-    """The arguments in the order the parser expects; raises EV020 for an unknown command."""
+    """The arguments in the order the parser expects; raises EV020 for an unknown command, or
+    options before it."""
     first = arguments[0] if arguments else ""
     if first == "--version":
         return ["version", *arguments[1:]]
     if first == "help":
         return [*arguments[1:2], "--help"]
+    verb = next((word for word in arguments if word in COMMANDS), "")
+    if first.startswith("--") and first != "--help" and verb:
+        rest = list(arguments)
+        rest.remove(verb)
+        raise EvflowDataError("EV020", f"{first} stands before the command.", "Options follow it: "
+                              f"{shlex.join(['evflow', verb, *rest])}.")
     if first and not first.startswith("-") and first not in COMMANDS:
         near = difflib.get_close_matches(first, COMMANDS, n=1)
         fix = f"Did you mean: evflow {near[0]}?" if near else (
@@ -99,8 +108,10 @@ def main(argv: list[str] | None = None) -> int:
         unread()
         return 0
     except OSError as e:
-        print(f"the output cannot be written: {e}", file=sys.stderr)
-        return 3
+        name, why = e.filename or "the output", REASONS.get(e.errno or 0, e.strerror or str(e))
+        print(EvflowDataError("EV019", f"{name} cannot be used ({why}).",
+                              "Choose another output."), file=sys.stderr)
+        return EXITS["EV019"]
     except KeyboardInterrupt as e:
         print(str(e) or "interrupted; no half-written file is left.", file=sys.stderr)
         return INTERRUPTED

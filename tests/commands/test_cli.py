@@ -100,6 +100,20 @@ def test_data_errors_are_one_line_and_exit_1(
     assert not Path(out + ".h5").exists()
 
 
+def test_a_name_that_is_too_long_exits_3(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["convert", str(flight), str(tmp_path / f"{'a' * 300}.npz")]) == 3
+    error = capsys.readouterr().err
+    assert error.startswith("EV019")
+    assert "the name is too long" in error
+
+
+def test_options_follow_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--json", "info", "a b.npz"]) == 2
+    assert "Options follow it: evflow info --json 'a b.npz'." in capsys.readouterr().err
+
+
 def test_usage_errors_exit_2() -> None:
     with pytest.raises(SystemExit) as caught:
         main(["estimate"])

@@ -187,6 +187,8 @@ def save_npz(path: Path, **changed: Any) -> Path:
 def test_npz_reads_the_conventions_of_others(tmp_path: Path) -> None:
     want = make(100).events
     equal(read_events(save_npz(tmp_path / "a.npz", size=None, wh=np.array(SIZE))), want)
+    for size in (np.array([64.0, 48.0]), np.array("64x48"), np.array(["64", "48"])):
+        equal(read_events(save_npz(tmp_path / "a.npz", size=size)), want)
     signed = np.where(want.p, 1, -1).astype(np.int8)
     equal(read_events(save_npz(tmp_path / "b.npz", p=signed), polarity="pm1"), want)
     equal(read_events(save_npz(tmp_path / "c.npz", t=want.t * 1000 + 400), time_unit="ns"), want)
@@ -207,7 +209,9 @@ def test_npz_reads_the_conventions_of_others(tmp_path: Path) -> None:
     ({"x": np.arange(100) / 2}, "EV003", "undistorted"),
     ({"y": None}, "EV008", "['y']"),
     ({"size": None}, "EV015", "--size WxH"),
-    ({"size": np.array([1, 2, 3])}, "EV020", "(1, 2, 3)"),
+    ({"size": np.array([1, 2, 3])}, "EV015", "holds 1 2 3. "),
+    ({"size": np.array([64.5, 48])}, "EV015", "--size WxH"),
+    ({"size": np.array("large")}, "EV015", "holds large"),
     ({"frames": np.zeros((1, 48, 64), np.uint8)}, "EV008", "no frame_times"),
     ({"p": np.array([None] * 100)}, "EV008", "pickle"),
 ])

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from evflow.checks import COLUMNS, Size, check_columns
+from evflow.checks import COLUMNS, Size, check_columns, check_size
 from evflow.errors import EvflowDataError
 from evflow.files.archives import BLOCK, DAMAGE, Member, members
 from evflow.files.arrays import GrowingArray
@@ -75,7 +75,7 @@ def _recording(path: Path, found: dict[str, Member], hints: Hints) -> Recording:
     chosen = columns.by_name(plain) or columns.by_name(found)
     for name in chosen.values():
         found[name].need_numbers()
-    size = _size(plain)
+    size = _size(path, plain) if hints.size is None else hints.size
     if chosen:
         events = _events(path, {c: found[name] for c, name in chosen.items()}, hints, size,
                          written_unit(chosen["t"]) if chosen["t"] != "t" else "us")
@@ -99,11 +99,22 @@ def _own_frames(found: dict[str, Member]) -> bool:
         len(found["frame_times"].shape) == 1)
 
 
-def _size(found: dict[str, Member]) -> Any:
-    """Size of the sensor as stored: `size` is (width, height), even if that looks odd."""
+def _size(path: Path, found: dict[str, Member]) -> Any:
+    """Size of the sensor as stored: `size` is (width, height), even if that looks odd, or text
+    such as 64x48. EV015 if it is something else."""
     for name in ("size", "wh"):
         if name in found:
-            return tuple(found[name].whole().ravel().tolist())
+            stored = found[name].whole().ravel()
+            words = " ".join(map(str, stored.tolist()))
+            sides = columns.written_size(f"size {words}") if stored.dtype.kind in "US" else (
+                stored.tolist() if stored.dtype.kind in "iuf" else None)
+            try:
+                return check_size([int(v) if v == int(v) else v for v in sides or ()])
+            except (EvflowDataError, ValueError, OverflowError):
+                raise EvflowDataError(
+                    "EV015", f"{name} in {path} holds {words[:60] or 'nothing'}.",
+                    "It is (width, height) in pixels; where it is wrong, pass --size WxH.",
+                    where=path) from None
 
     def small(name: str) -> Any:
         member = found.get(name)
