@@ -43,14 +43,17 @@ class EventWriter(abc.ABC):
     ...         out.append(events)
 
     NAME: the format. DEPTHS: dtypes of frames it can hold, () for none. MAX_SIDE: largest side of a
-    sensor in pixels. TIMES_US: its first and last possible time. LABELS: whether it can label noise
-    events. exposure_us: of the frames, stored with them; 0 = unknown.
+    sensor in pixels. TIMES_US: its first and last possible time. BEYOND: what to do about others.
+    LABELS: whether it can label noise events. exposure_us: of the frames, stored with them; 0 =
+    unknown.
     """
 
     NAME: ClassVar[str]
     DEPTHS: ClassVar[tuple[str, ...]] = DEPTHS
     MAX_SIDE: ClassVar[int] = 65536
     TIMES_US: ClassVar[tuple[int, int]] = (-(2**63), 2**63 - 1)
+    BEYOND: ClassVar[str] = (
+        "Wrong time unit? Pass --time-unit when reading; or write dsec or npz.")
     LABELS: ClassVar[bool] = False
 
     def __init__(
@@ -206,8 +209,7 @@ class EventWriter(abc.ABC):
         if ends[0] < low or ends[-1] > high:
             raise EvflowDataError(
                 "EV003", f"{what} at {ends[0]:,}..{ends[-1]:,} us; {self.NAME} holds times from "
-                f"{low:,} to {high:,} us.",
-                "Wrong time unit? Pass --time-unit when reading; or write dsec or npz.")
+                f"{low:,} to {high:,} us.", self.BEYOND)
 
     def _flush(self) -> None:
         if self._waiting:

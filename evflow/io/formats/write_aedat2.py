@@ -30,6 +30,8 @@ class Aedat2Writer(EventWriter):
     NAME = NAME
     DEPTHS = ()
     TIMES_US = (0, 2**31 - 1)
+    BEYOND = ("That is 36 minutes from 0, however short the recording. Write aedat4, dsec or npz, "
+              "which keep such times, or in Python times from 0: t - t[0].")
 
     def __init__(self, path: str | os.PathLike, size: Size, **options: Any) -> None:
         super().__init__(path, size, **options)

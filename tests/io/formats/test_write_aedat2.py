@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.videos import code_of
+from helpers.sources import message
 
 from evflow import Events, read_events, write_events
 
@@ -44,5 +44,7 @@ def test_addresses_are_those_of_the_chip(tmp_path: Path, size: tuple[int, int]) 
 def test_what_jaer_cannot_hold_is_refused(tmp_path: Path) -> None:
     for events in (Events([1], [1], [0], [1], (64, 48)), Events([1], [1], [2**31], [1], (240, 180)),
                    Events([1], [1], [-1], [1], (240, 180))):
-        assert code_of(lambda e=events: write_events(tmp_path / "a.aedat", e, "aedat2")) == "EV003"
+        error = message(lambda e=events: write_events(tmp_path / "a.aedat", e, "aedat2"))
+        assert error.startswith("EV003")
+        assert ("36 minutes from 0" in error) == (events.size == (240, 180))
     assert list(tmp_path.iterdir()) == []
