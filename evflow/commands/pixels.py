@@ -79,7 +79,7 @@ class Pixels:
 
     def model(self) -> SensorModel:
         """The pixels' circuit; EV020 if it has no such part."""
-        from evflow.camera.sensors import known_sensor
+        from evflow.camera.sensors import WITHOUT, known_sensor
         from evflow.simulator.photoreceptor import as_measured
 
         model = (as_measured(*self._circuit())[1] if self._is_measured
@@ -92,6 +92,8 @@ class Pixels:
             given |= {name: getattr(self, name) for name in CHOICES}
         else:
             refuse(self, CHOICES, f"--sensor {self.sensor} has no such choice")
+        refuse(self, [name for name in WITHOUT[model.kind] if given.get(name)],
+               f"--sensor {self.sensor} has no such part; clean, noisy and v2e do")
         model = dataclasses.replace(model, **given)
         if not model.leak_hz:
             refuse(self, ("leak_jitter", "leak_fpn_decades"), "there is no leak without --leak-hz")

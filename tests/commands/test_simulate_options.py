@@ -301,6 +301,19 @@ def test_options_out_of_range(
     assert capsys.readouterr().err.startswith(code)
 
 
+def test_parts_that_a_sensor_lacks_are_options_in_the_message(
+    video: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["simulate", str(video), "-o", str(video.with_name("a.h5")), *BASE, "--sensor",
+               "dvs346", "--cutoff-hz"]
+    assert main([*command, "100"]) == 2
+    said = capsys.readouterr().err
+    assert "--cutoff-hz" in said
+    assert "--sensor dvs346 has no such part; clean, noisy and v2e do" in said
+    assert "SensorModel" not in said
+    assert main([*command, "0"]) == 0
+
+
 def test_the_law_of_a_cutoff_needs_one(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, law = video.with_name("out.npz"), "--no-cutoff-by-light"
     camera = Camera.constant((24, 32)).save(video.with_name("camera.npz"), sensor_cutoff_hz=40.0)
