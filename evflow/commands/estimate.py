@@ -27,13 +27,14 @@ from evflow.commands.options import (
 from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_folder
 from evflow.errors import EvflowDataError
-from evflow.notes import Note, as_dicts
+from evflow.notes import as_dicts
 
 if TYPE_CHECKING:
     from evflow.camera import Summary
     from evflow.estimation.halves import FirstPart
     from evflow.estimation.pipeline import Measured
     from evflow.estimation.result import CameraEstimate
+    from evflow.notes import Note
     from evflow.recordings.check import Report
     from evflow.types import Recording
 
@@ -119,22 +120,8 @@ class Estimate(Compiling, Reading):
         from evflow.report import plots
         from evflow.report.text import describe
 
-        check_finite(self)
+        self._check_options()
         moving = self.protocol == "motion"
-        need_folder(self.out)
-        if self.budget_s is not None and self.budget_s < 0:
-            raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.", "It must be >= 0.")
-        self._check_light()
-        if not moving:
-            refuse(self, ("weights", "window_ms", "reconstruct", *READ),
-                   "only useful with --protocol motion")
-        if not (moving and self.report):
-            refuse(self, ("simulators",), "only useful in the report of --protocol motion")
-        if not self.reconstruct:
-            refuse(self, ("reconstruct_weights",), "only useful with --reconstruct")
-        for name, protocol in (("thresholds", "static"), ("triggers", "step")):
-            if self.protocol != protocol:
-                refuse(self, (name,), f"only useful with --protocol {protocol}")
         need_packages(self.recording, *self.more, pictures=self.plots or self.report)
         early.settle()
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
@@ -161,6 +148,24 @@ class Estimate(Compiling, Reading):
         print(json.dumps(facts, indent=2) if self.json else "\n".join([words, *lines]))
         print(f"written to {self.out}/", file=sys.stderr)
 
+    def _check_options(self) -> None:
+        """Raise EV020 for options that are out of range or contradict each other."""
+        check_finite(self)
+        need_folder(self.out)
+        if self.budget_s is not None and self.budget_s < 0:
+            raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.", "It must be >= 0.")
+        self._check_light()
+        if self.protocol != "motion":
+            refuse(self, ("weights", "window_ms", "reconstruct", *READ),
+                   "only useful with --protocol motion")
+        if self.protocol != "motion" or not self.report:
+            refuse(self, ("simulators",), "only useful in the report of --protocol motion")
+        if not self.reconstruct:
+            refuse(self, ("reconstruct_weights",), "only useful with --reconstruct")
+        for name, protocol in (("thresholds", "static"), ("triggers", "step")):
+            if self.protocol != protocol:
+                refuse(self, (name,), f"only useful with --protocol {protocol}")
+
     def _check_light(self) -> None:
         """Raise EV020 if --lux or a second recording does not fit the protocol."""
         count = 1 + len(self.more)
@@ -181,6 +186,7 @@ class Estimate(Compiling, Reading):
 
     def _recorded(self, path: Path) -> tuple[Recording, Report, list[Note]]:
         """A recording, the findings of `evflow check`, and its doubts; raises its errors."""
+        from evflow.estimation.bench.rests import bench_note
         from evflow.files.spool import SOME, on_disk
         from evflow.process.terminal import bar
         from evflow.recordings.check import check
@@ -197,7 +203,7 @@ class Estimate(Compiling, Reading):
         spared = ("EV024",) if self.protocol == "step" else ()
         if self.checks and (failed := [e for e in report.errors if e.code not in spared]):
             raise failed[0].error()
-        stepping = self.protocol == "motion" and self._stepping(recording)
+        stepping = bench_note(recording) if self.protocol == "motion" else None
         beside = () if self.protocol == "motion" and not stepping else ("EV028",)
         doubts = [*([stepping] if stepping else []), *(
             finding.note() for finding in (*report.errors, *report.warnings)
@@ -208,15 +214,6 @@ class Estimate(Compiling, Reading):
         recording = self._reconstructed(recording) if self.reconstruct else recording
         recording = thinned(recording) if self.protocol == "motion" else recording
         return recording, report, doubts
-
-    def _stepping(self, recording: Recording) -> Note | None:
-        """A note that recommends --protocol step, if the recording looks like one of a bench."""
-        from evflow.estimation.bench.rests import steps_of_light
-
-        steps = steps_of_light(recording)
-        return Note("scene.steps", f"the light of the whole view changes in steps ({steps} in the "
-                    "first frames) and is constant in between: --protocol step measures such a "
-                    "recording better, without estimating motion.") if steps else None
 
     def _reconstructed(self, recording: Recording) -> Recording:
         """The recording with frames reconstructed from its events; EV020 if it has frames."""
@@ -233,12 +230,15 @@ class Estimate(Compiling, Reading):
     def _estimated(self, recording: Recording) -> tuple[Measured, dict[str, Any]]:
         from evflow.estimation.pipeline import measure
         from evflow.network.weights import load_weights, model_card, trained_steps, weights_hash
+        from evflow.process.signals import stop_requests
         from evflow.process.terminal import Stages, bar
         from evflow.report.text import thresholds
 
         params = load_weights(self.weights)
         began = time.monotonic()
-        with self._interrupted() as asked, bar("estimating", compiles=True) as progress:
+        no_requests = contextlib.nullcontext(list[int]())
+        interrupts = stop_requests() if self.on_interrupt == "save" else no_requests
+        with interrupts as asked, bar("estimating", compiles=True) as progress:
             stages = Stages(progress)
 
             def enough(summary: Summary, std: Summary) -> bool:
@@ -255,12 +255,6 @@ class Estimate(Compiling, Reading):
             made = dataclasses.replace(made, found=doubted(made.found))
         return made, {"weights": self.weights, "weights_sha256": weights_hash(self.weights),
                        "weights_steps": trained_steps(model_card(self.weights))}
-
-    def _interrupted(self) -> contextlib.AbstractContextManager[list[int]]:
-        """A list that becomes non-empty once the user asks for what is known so far."""
-        from evflow.process.signals import stop_requests
-
-        return stop_requests() if self.on_interrupt == "save" else contextlib.nullcontext([])
 
     def _on_the_bench(self, recording: Recording) -> tuple[Measured, dict[str, Any]]:
         from evflow.estimation.bench.calibration import calibrate_step

@@ -12,6 +12,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import lin_log
+from evflow.notes import Note
 from evflow.recordings.stillness import smooth
 from evflow.types import Events, Recording
 
@@ -49,6 +50,14 @@ def find_rests(recording: Recording) -> list[tuple[int, int]]:
     for first, last in found:
         _check_rest(recording, first, last)
     return found
+
+
+def bench_note(recording: Recording) -> Note | None:
+    """A note that recommends --protocol step, if the recording looks like one of a bench."""
+    steps = steps_of_light(recording)
+    return Note("scene.steps", f"the light of the whole view changes in steps ({steps} in the "
+                "first frames) and is constant in between: --protocol step measures such a "
+                "recording better, without estimating motion.") if steps else None
 
 
 def steps_of_light(recording: Recording) -> int:
