@@ -286,32 +286,27 @@ def flow() -> dict[str, Figures]:
                     for at in ((2, 0), (3, 0), (3, 1))] for label, name in names.items()}
 
 
+def flow_of(source: str, measure: str, names: dict[str, str], *targets: str) -> dict[str, Figures]:
+    """For each target the mean, and the difference from default parameters with its interval."""
+    def of(name: str, target: str) -> Figures:
+        row = rf"{measure}\|{name} \(3\)"
+        return [values(source, row, "mean", 0, target)[0], *([0.0] if name == "default" else (
+            values(source, row, "to default", k, target)[0] for k in range(2)))]
+
+    return {label: [figure for target in targets for figure in of(name, target)]
+            for label, name in names.items()}
+
+
 def other_flow() -> dict[str, Figures]:
     names = {"default parameters": "default", "thresholds uniform": "wide", "estimate": "evflow",
              "truth": "oracle", "LGAN": "lgan"}
-
-    def of(name: str, target: str) -> Figures:
-        row, source = rf"AEE \[px\]\|{name} \(3\)", "see_better_flow_cameras"
-        mean = values(source, row, "mean", 0, target)[0]
-        return [mean, *([0.0] if name == "default" else (
-            values(source, row, "to default", k, target)[0] for k in range(2)))]
-
-    return {label: [*of(name, "middle noisy"), *of(name, "low noisy")]
-            for label, name in names.items()}
+    return flow_of("see_better_flow_cameras", r"AEE \[px\]", names, "middle noisy", "low noisy")
 
 
 def recorded_flow() -> dict[str, Figures]:
     names = {"default parameters": "default", "thresholds log-uniform": "wide-log",
              "estimate, with": r"evflow\+circuit"}
-
-    def of(name: str, target: str) -> Figures:
-        row, source = rf"FWL\|{name} \(3\)", "see_better_flow_recordings"
-        mean = values(source, row, "mean", 0, target)[0]
-        return [mean, *([0.0] if name == "default" else (
-            values(source, row, "to default", k, target)[0] for k in range(2)))]
-
-    return {label: [*of(name, "slider_depth"), *of(name, "cradle")]
-            for label, name in names.items()}
+    return flow_of("see_better_flow_recordings", "FWL", names, "slider_depth", "cradle")
 
 
 def losses() -> dict[str, Figures]:
