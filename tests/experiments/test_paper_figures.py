@@ -59,7 +59,7 @@ def table_five() -> dict[str, Figures]:
     def of(label: str, name: str, source: str) -> Figures:
         theirs = cells("see_better_eventgan", rf".*\|{paper[label]}", "IJRR")[0].split("/") if (
             label in paper) else []
-        return [*map(float, theirs), *(values(source, rf"{measure}\|{name} \(5\)", "mean")[0]
+        return [*map(float, theirs), *(values(source, rf"{measure}\|{name} \([35]\)", "mean")[0]
                                        for measure in ("MSE", "SSIM", "LPIPS"))]
 
     return {label: of(label, *at) for label, at in rows.items()}
