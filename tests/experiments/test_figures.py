@@ -309,6 +309,19 @@ def recorded_flow() -> dict[str, Figures]:
     return flow_of("see_better_flow_recordings", "FWL", names, "slider_depth", "cradle")
 
 
+def eventgan() -> dict[str, Figures]:
+    def of(source: str, measure: str, column: str, without: str) -> Figures:
+        return [*(values(source, rf"{measure}\|{name} \(3\)", "mean")[0]
+                  for name in ("eventgan", "default", "oracle")),
+                values(source, without, column)[0]]
+
+    return {"SSIM": of("see_better_eventgan", "SSIM", "SSIM", "even grey"),
+            "LPIPS": of("see_better_eventgan", "LPIPS", "LPIPS", "even grey"),
+            "AEE": of("see_better_flow_eventgan", r"AEE \[px\]", "AEE", "no flow"),
+            "FWL": of("see_better_flow_eventgan", "FWL", "FWL", "no flow"),
+            "correlation": values("eventgan", "6000", "correlation")}
+
+
 def losses() -> dict[str, Figures]:
     rows = {"L_P |": ("L_P", 8), "+ L_F": (r"L_P \+ L_F \+ L_F'", 12),
             "+ L_E": (r"L_P \+ L_E", 16), "all |": (r"L_P \+ L_F \+ L_F' \+ L_E", 20),
@@ -363,6 +376,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     (ACCURACY, "### Flow of real recordings"): recorded_flow,
     (ACCURACY, "### Flow of two other cameras"): other_flow,
     (ACCURACY, "### Flow"): flow,
+    (ACCURACY, "### EventGAN"): eventgan,
     (ACCURACY, "### Losses and flow steps"): losses,
     (ACCURACY, "A Newton's cradle, thresholds from"): cradle,
     (ACCURACY, "Simulated cameras, five of each size"): sizes,
