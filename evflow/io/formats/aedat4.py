@@ -26,7 +26,7 @@ from evflow.files.compressed import most_bytes
 from evflow.files.limits import FREE, RATIO
 from evflow.io.decode import tables
 from evflow.io.decode.stream import Chunk, Damage
-from evflow.io.formats.aedat4_header import read_header, stream_names
+from evflow.io.formats.aedat4_header import elsewhere, read_header, stream_names
 from evflow.io.hints import Hints
 from evflow.io.images.aside import Aside
 from evflow.io.images.streams import ImageStream, choose
@@ -46,8 +46,9 @@ def read(path: Path, hints: Hints) -> Recording:
     """Events (N,) and frames (T, H, W) uint8; colour frames become their luma.
 
     With several event streams the first is read, or the one requested; with several frame streams
-    `streams.choose` picks one by the names of their outputs in DV. Raises EV008 (no event stream),
-    EV009 (damaged), EV010 (no `aedat`), and what `stream.gather` and `Recording` raise.
+    `streams.choose` picks one by their cameras and the names of their outputs in DV. Raises EV008
+    (no event stream), EV009 (damaged), EV010 (no `aedat`), and what `stream.gather` and
+    `Recording` raise.
     """
     header = read_header(path)
     streams = _decoder(path).id_to_stream()
@@ -63,8 +64,8 @@ def read(path: Path, hints: Hints) -> Recording:
     source = next(i for i in events if names[i] == camera)
     info = streams[source]
     size = hints.size or (info["width"], info["height"])
-    chosen = choose([ImageStream(names[i], (s["width"], s["height"])) for i, s in frames.items()],
-                    hints, size, camera)
+    chosen = choose([ImageStream(names[i], (s["width"], s["height"]), elsewhere=elsewhere(
+        header.outputs, i, source)) for i, s in frames.items()], hints, size, camera)
     taken = [i for i in frames if chosen.stream and chosen.stream.name == names[i]]
     starts, damage = _packets(path, header.packets, header.table)
     with _before(path, damage) as sound:

@@ -22,7 +22,8 @@ MAX_DEPTH = 64  # of the XML; DV writes 5
 
 class Header(NamedTuple):
     """packets: byte where packets begin; table: byte of their table, -1 for none; outputs: for each
-    stream {"originalModuleName": ..., "originalOutputName": ...}, as far as known."""
+    stream {"originalModuleName": ..., "originalOutputName": ..., "source": the camera's name}, as
+    far as known."""
 
     packets: int
     table: int
@@ -39,6 +40,12 @@ def stream_names(outputs: dict[str, dict[str, str]], streams: Iterable[int]) -> 
         name = "/".join(parts) or str(i)
         names[i] = f"{name}/{i}" if name in names.values() else name
     return names
+
+
+def elsewhere(outputs: dict[str, dict[str, str]], stream: int, events: int) -> bool:
+    """Whether the header says that a stream is of another camera than the stream of events."""
+    sources = {outputs.get(str(i), {}).get("source", "") for i in (stream, events)}
+    return len(sources) > 1 and all(sources)
 
 
 def read_header(path: Path) -> Header:
@@ -84,8 +91,8 @@ def _info_node(header: bytes) -> bytes:
 
 
 def _outputs(text: bytes) -> dict[str, dict[str, str]]:
-    """The attributes of each node directly below outInfo. ValueError or ExpatError unless it is
-    UTF-8 XML of bounded depth."""
+    """The attributes of each node directly below outInfo, and the source in the node `info` below
+    it. ValueError or ExpatError unless it is UTF-8 XML of bounded depth."""
     nodes: list[str] = []
     key = ""
     found: dict[str, dict[str, str]] = {}
@@ -103,8 +110,10 @@ def _outputs(text: bytes) -> dict[str, dict[str, str]]:
         key = ""
 
     def written(words: str) -> None:
-        if key and len(nodes) > 2 and nodes[-3] == "outInfo":
-            output = found.setdefault(nodes[-2], {})
+        inner = key == "source" and nodes[-2:-1] == ["info"]
+        below = nodes[:-2] if inner else nodes[:-1]
+        if key and len(below) > 1 and below[-2] == "outInfo":
+            output = found.setdefault(below[-1], {})
             output[key] = output.get(key, "") + words
 
     def refuse(*_: object) -> None:

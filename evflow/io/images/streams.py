@@ -26,19 +26,23 @@ MADE_LAST = re.compile("event|dvs")  # in the last part only: camera namespaces 
 OTHER = re.compile("depth|dispar|flow|normals?(map)?$|segment|semantic|mask|label|instance|"
                    "confidence|thermal|infrared|debug|overlay|heatmap|preview")  # no brightness
 CHANGED = re.compile("corrupt|blur|nois|denois|rect|undist|crop|resiz|downs|warp")
-SIDES = {"left": "", "right": ""}
+SIDES = ("left", "right")
+# Words that say what a stream holds, not of which camera: a number behind them may count anything.
+KINDS = re.compile("event|dvs|aps|image|img|frame|video|raw|mono|gr[ae]y|bit|colou?r|rgb|bgr")
 WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 
 @dataclasses.dataclass(frozen=True)
 class ImageStream:
     """Images of one source. name: as users refer to it; size: of its first image, None if unknown;
-    unusable: why they cannot be frames, "" if they can; notes: what to say if they are used."""
+    unusable: why they cannot be frames, "" if they can; notes: what to say if they are used;
+    elsewhere: whether the file says that they are of another camera than the events."""
 
     name: str
     size: Size | None = None
     unusable: str = ""
     notes: tuple[Note, ...] = ()
+    elsewhere: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,9 +71,9 @@ def choose(
     why = {stream.name: _against(stream, sensor, events) for stream in streams}
     fit = [stream for stream in streams if not why[stream.name]]
     fit = [stream for stream in fit if _kind(stream.name, events) != "changed"] or fit
-    far = min((_distance(stream.name, events) for stream in fit), default=(0, 0))
+    far = min((_distance(stream.name, events) for stream in fit), default=(0, 0, 0))
     nearest = [stream for stream in fit if _distance(stream.name, events) == far]
-    if len({_parts(stream.name)[:-1] for stream in nearest}) > 1:
+    if len({(_parts(s.name)[:-1], *_camera(s.name).items()) for s in nearest}) > 1:
         why |= {stream.name: "not the only one" for stream in nearest}
         nearest = []
     if not nearest:
@@ -132,7 +136,8 @@ def _against(stream: ImageStream, sensor: Size, events: str) -> str:
     if stream.size not in (None, sensor):
         swapped = ": width and height swapped?" if stream.size == sensor[::-1] else ""
         return f"{_size(stream.size)}, the sensor has {_size(sensor)}{swapped}"
-    return "of another camera" if _another_camera(stream.name, events) else ""
+    another = stream.elsewhere or _another_camera(stream.name, events)
+    return "of another camera" if another else ""
 
 
 def _left(
@@ -165,9 +170,11 @@ def _shared(name: str, events: str) -> int:
     return common
 
 
-def _distance(name: str, events: str) -> tuple[int, int]:
-    """A smaller value is nearer to the events: first by shared parts, then by further ones."""
-    return -_shared(name, events), len(_parts(name))
+def _distance(name: str, events: str) -> tuple[int, int, int]:
+    """A smaller value is nearer to the events: first by shared parts, then by numbers and sides
+    that only one of the names has, then by further parts."""
+    differ = len(_camera(name).items() ^ _camera(events).items())
+    return -_shared(name, events), differ, len(_parts(name))
 
 
 def _own(name: str, events: str) -> list[str]:
@@ -187,15 +194,33 @@ def _kind(name: str, events: str) -> str:
 
 
 def _another_camera(name: str, events: str) -> bool:
-    """Whether two names differ only by a number, or left and right: /cam0/events, /cam1/image."""
+    """Whether two names differ by left and right or by the number of a camera, anywhere
+    (/cam0_events, /cam1_image), or in a namespace only by such words (/cam/events, /cam1/image)."""
+    image, event = _camera(name), _camera(events)
+    if any(image[word] != event[word] for word in image.keys() & event.keys() if word):
+        return True
     one, other = _parts(name)[:-1], _parts(events)[:-1]
-    return one != other and [_numberless(part) for part in one] == [
-        _numberless(part) for part in other]
+    return one != other and [_plain(part) for part in one] == [_plain(part) for part in other]
 
 
-def _numberless(part: str) -> tuple[str, ...]:
-    words = (word.lower() for word in WORD.findall(part))
-    return tuple(SIDES.get(word, word) for word in words if not word.isdigit())
+def _camera(name: str) -> dict[str, str]:
+    """What a name tells of its camera: the number behind each word ("cam": "0"), behind "" if that
+    word says what the stream holds; and the side ("left, right": "left")."""
+    told, before = {}, ""
+    for word in map(str.lower, WORD.findall(name)):
+        if word in SIDES:
+            told[", ".join(SIDES)] = word
+        elif word.isdigit():
+            told[before] = word
+        else:
+            before = "" if KINDS.match(word) else word
+    return told
+
+
+def _plain(part: str) -> tuple[str, ...]:
+    """The words of a part of a name without numbers and sides."""
+    words = map(str.lower, WORD.findall(part))
+    return tuple(word for word in words if not word.isdigit() and word not in SIDES)
 
 
 def _size(size: Size | None) -> str:

@@ -37,11 +37,12 @@ def hdf5(folder: Path) -> Path:
     return folder / "cameras.h5"
 
 
-def aedat4(folder: Path) -> Path:
+def aedat4(folder: Path, told: str = "capture") -> Path:
+    """told: what of the streams' description differs between left and right."""
     pytest.importorskip("aedat")
     kinds = ("EVTS", "FRME", "EVTS", "FRME")
     xml = XML.format("".join(STREAM.format(i, kind).replace(
-        ">capture<", f">{'left' if i < 2 else 'right'}<") for i, kind in enumerate(kinds)))
+        f">{told}<", f">{'left' if i < 2 else 'right'}<") for i, kind in enumerate(kinds)))
     data = header(xml)
     for i, r in ((0, ONE), (2, OTHER)):
         data += packet(i, event_packet(r.events))
@@ -73,6 +74,18 @@ def test_either_camera_is_read_with_its_own_frames(tmp_path: Path, kind: str) ->
     assert (error.code, left in error.fix, right in error.fix) == ("EV020", True, True)
     alone = read_events(path, events_topic=right.strip("/"), no_frames=True)
     assert len(alone) == len(OTHER.events)
+
+
+def test_streams_of_aedat4_belong_together_by_their_source(tmp_path: Path) -> None:
+    """As dv-processing writes two cameras: modules and outputs have the same names."""
+    path = aedat4(tmp_path, "camera")
+    for asked, want in (("capture/EVTS", ONE), ("capture/EVTS/2", OTHER)):
+        got = read_recording(path, events_topic=asked)
+        equal(got.events, want.events)
+        np.testing.assert_array_equal(got.frames, want.frames)
+        assert any("(of another camera)" in n.text for n in got.notes)
+    named = read_recording(path, events_topic="capture/EVTS/2", frames_topic="capture/FRME")
+    np.testing.assert_array_equal(named.frames, ONE.frames)
 
 
 def test_the_right_camera_of_mvsec(tmp_path: Path) -> None:

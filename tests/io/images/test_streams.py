@@ -78,7 +78,16 @@ def test_of_several_streams_the_raw_one_near_the_events_is_taken(
     ("/renderer/image_raw", "/event_camera/events", None),
     ("/event_camera/image_raw", "/event_camera/events", "/event_camera/image_raw"),
     ("capture/frames accumulator/frames", "capture/events", "capture/frames"),
-    ("accumulator/frames", "capture/events", None), ("frames", "", "frames")])
+    ("accumulator/frames", "capture/events", None), ("frames", "", "frames"),
+    *((f"images/left images/right{more}", f"/events/{side}", f"images/{side}")
+      for side in ("left", "right") for more in ("", " images/raw")),
+    ("image_left image_right", "/events_right", "image_right"),
+    ("image_left", "/events_right", None), ("image_left image_right", "/events", None),
+    ("cam0_images cam1_images", "/cam1", "cam1_images"), ("/cam0_image", "/cam1_events", None),
+    ("/cam0_image /cam1_image", "/cam1_events", "/cam1_image"),
+    ("image_0 image_1", "/events_1", "image_1"), ("image_8bit", "/events_1", "image_8bit"),
+    ("w/frames w/frames_right", "w/events_right", "w/frames_right"),
+    ("w/frames w/frames_right", "w/events", "w/frames")])
 def test_names_of_drivers(names: str, events: str, best: str | None) -> None:
     assert taken(names, events) == best
 
