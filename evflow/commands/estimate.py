@@ -25,7 +25,7 @@ from evflow.commands.options import (
     write_json,
 )
 from evflow.commands.packages import need_packages
-from evflow.commands.writing import need_folder
+from evflow.commands.writing import need_apart, need_folder
 from evflow.errors import EvflowDataError
 from evflow.notes import as_dicts
 
@@ -152,6 +152,8 @@ class Estimate(Compiling, Reading):
         """Raise EV020 for options that are out of range or contradict each other."""
         check_finite(self)
         need_folder(self.out)
+        need_apart((self.out / name for name in FILES), self.recording, *self.more,
+                   self.thresholds, self.triggers, self.frames, self.timestamps)
         if self.budget_s is not None and self.budget_s < 0:
             raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.", "It must be >= 0.")
         self._check_light()

@@ -3,6 +3,7 @@ that do not match what is written."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -68,3 +69,13 @@ def need_absent(path: Path, overwrite: bool, *sources: Path | None) -> None:
         raise EvflowDataError(
             "EV013", f"{path} exists.", "Pass --overwrite if this command made that folder; "
             "choose another if not." if path.is_dir() else "Pass --overwrite.")
+
+
+def need_apart(files: Iterable[Path], *sources: Path | None) -> None:
+    """Raise EV020 if one of the files that a command writes into a folder is one of its sources:
+    with --overwrite it would be replaced, and may be the only copy."""
+    for path in files:
+        if path.exists() and any(source is not None and source.exists() and path.samefile(source)
+                                 for source in sources):
+            raise EvflowDataError("EV020", f"{path}, an output, is also an input.",
+                                  "Choose another folder: no command replaces its input.")

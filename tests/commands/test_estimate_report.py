@@ -131,6 +131,26 @@ def test_a_budget_below_nothing(flight: Path, tmp_path: Path) -> None:
     assert main([*command, "--protocol", "static", "--effort", "full"]) == 2
 
 
+@pytest.mark.parametrize("option", [None, "--thresholds", "--triggers", "--frames"])
+def test_no_input_is_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str | None
+) -> None:
+    """A recording called rec/camera.npz, or thresholds that lie where the camera is written."""
+    recording = tmp_path / "rec" / ("camera.npz" if option is None else "flight.npz")
+    recording.parent.mkdir()
+    write_events(recording, hidden(15, 440)[0], format="npz")
+    source = recording.with_name("camera.npz")
+    if option:
+        source.write_bytes(b"a source")
+    before = source.read_bytes()
+    protocol = "step" if option == "--triggers" else "static"
+    command = ["estimate", str(recording), "-o", str(tmp_path / "rec"), "--protocol", protocol]
+    assert main([*command, "--overwrite", *([option, str(source)] if option else [])]) == 2
+    assert "EV020" in (said := capsys.readouterr().err)
+    assert "is also an input" in said
+    assert source.read_bytes() == before
+
+
 def test_a_bench_is_told_to_say_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
