@@ -18,8 +18,7 @@ from evflow.io.images.frames import existing
 from evflow.types import Events
 
 MAX_BYTES = 1 << 26  # of text: some four million instants
-READERS = {"EVT2": evt2.triggers, "EVT2.1": evt21.triggers, "EVT3": evt3.triggers,
-           "aedat4": aedat4.triggers}
+READERS = {"EVT2": evt2.triggers, "EVT2.1": evt21.triggers, "EVT3": evt3.triggers}
 EXPECTED = ("Expected a text file with one time per line, on the clock of the events, or Prophesee "
             "RAW, AEDAT 4 or a ROS bag (evt3) with trigger events.")
 
@@ -28,8 +27,8 @@ def read_triggers(path: Path, events: Events, topic: str | None = None) -> np.nd
     """Times (N,) int64 us: edges of external signals in a recording, or the first number of each
     line of a text file, in the unit in which they lie within the events' span.
 
-    topic: whose events' triggers to read from a bag of several cameras. Raises EV001 (none), EV008
-    (neither), EV012 (outside the events in any unit), EV016.
+    topic: whose events' triggers to read from a bag or AEDAT 4 of several cameras. Raises EV001
+    (none), EV008 (neither), EV012 (outside the events in any unit), EV016.
     """
     found = _recorded(path, topic)
     if found is not None:
@@ -57,7 +56,9 @@ def _recorded(path: Path, topic: str | None) -> np.ndarray | None:
     for bag in (ros1, ros2):
         if bag.sniff(path, head):
             return bag.triggers(path, topic)
-    known = "aedat4" if aedat4.sniff(path, head) else prophesee.sniffed(path, head)
+    if aedat4.sniff(path, head):
+        return aedat4.triggers(path, topic)
+    known = prophesee.sniffed(path, head)
     if not known:
         return None
     return READERS[known](path) if known in READERS else np.zeros(0, np.int64)

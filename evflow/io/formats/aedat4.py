@@ -26,10 +26,10 @@ from evflow.files.compressed import most_bytes
 from evflow.files.limits import FREE, RATIO
 from evflow.io.decode import tables
 from evflow.io.decode.stream import Chunk, Damage
-from evflow.io.formats.aedat4_header import elsewhere, read_header, stream_names
+from evflow.io.formats.aedat4_header import Header, elsewhere, read_header, stream_names
 from evflow.io.hints import Hints
 from evflow.io.images.aside import Aside
-from evflow.io.images.streams import ImageStream, choose
+from evflow.io.images.streams import ImageStream, alike, another_camera, choose, nearest
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -74,17 +74,43 @@ def read(path: Path, hints: Hints) -> Recording:
             reading.chunks(), lambda: (*more, *chosen.notes, *reading.notes()))
 
 
-def triggers(path: Path) -> np.ndarray:
-    """Times (N,) int64 us of edges and pulses of external signals, up to any damage."""
+def triggers(path: Path, topic: str | None = None) -> np.ndarray:
+    """Times (N,) int64 us of edges and pulses of external signals, up to any damage.
+
+    topic: of whose events, by default the first. Raises EV001 (several streams of triggers, and
+    none is of that camera), EV020 (no such events).
+    """
     header = read_header(path)
+    streams = _triggers_of(path, header, topic)
     found = [np.zeros(0, np.int64)]
     with _before(path, _packets(path, header.packets, header.table)[1]) as sound:
         decoder = iter(_decoder(sound))
         while packet := _next(decoder):
             triggers = packet.get("triggers")
-            if triggers is not None:
+            if triggers is not None and packet["stream_id"] in streams:
                 found.append(triggers["t"][np.isin(triggers["source"], EXTERNAL)].astype(np.int64))
     return np.concatenate(found)
+
+
+def _triggers_of(path: Path, header: Header, topic: str | None) -> list[int]:
+    """The streams of triggers of the events' camera; the only one, whose ever it is: where cameras
+    are synchronised, the signal may be connected to one of them."""
+    kinds = {i: s["type"] for i, s in _decoder(path).id_to_stream().items()}
+    told, events = ([i for i in sorted(kinds) if kinds[i] == kind] for kind in (
+        "triggers", "events"))
+    if len(told) < 2 or not events:
+        return told
+    names = stream_names(header.outputs, {*told, *events})
+    camera, _ = Hints(events_topic=topic).camera([names[i] for i in events])
+    source = next(i for i in events if names[i] == camera)
+    near = nearest([names[i] for i in told if not elsewhere(header.outputs, i, source)
+                    and not another_camera(names[i], camera)], camera)
+    if not near or not alike(near):
+        raise EvflowDataError(
+            "EV001", f"{path} holds the triggers {', '.join(names[i] for i in told)}; which are "
+            f"those of {camera} is not clear.",
+            "Write their times into a text file, one per line, and pass that.", where=path)
+    return [i for i in told if names[i] in near]
 
 
 def _next(decoder: Iterator[dict[str, Any]]) -> dict[str, Any] | None:

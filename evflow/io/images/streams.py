@@ -71,16 +71,27 @@ def choose(
     why = {stream.name: _against(stream, sensor, events) for stream in streams}
     fit = [stream for stream in streams if not why[stream.name]]
     fit = [stream for stream in fit if _kind(stream.name, events) != "changed"] or fit
-    far = min((_distance(stream.name, events) for stream in fit), default=(0, 0, 0))
-    nearest = [stream for stream in fit if _distance(stream.name, events) == far]
-    if len({(_parts(s.name)[:-1], *_camera(s.name).items()) for s in nearest}) > 1:
-        why |= {stream.name: "not the only one" for stream in nearest}
-        nearest = []
-    if not nearest:
+    near = nearest([stream.name for stream in fit], events)
+    fit = [stream for stream in fit if stream.name in near]
+    if not alike(near):
+        why |= {name: "not the only one" for name in near}
+        fit = []
+    if not fit:
         return Chosen(None, _left(streams, why, None))
-    best = min(nearest, key=lambda s: ("raw" not in _own(s.name, events), s.name))
+    best = min(fit, key=lambda s: ("raw" not in _own(s.name, events), s.name))
     unused = _left(streams, why, best) if len(streams) > 1 else ()
     return Chosen(best, (*unused, *best.notes))
+
+
+def nearest(names: Sequence[str], events: str) -> list[str]:
+    """Those of the names of streams that are nearest to the name of the events."""
+    far = min((_distance(name, events) for name in names), default=None)
+    return [name for name in names if _distance(name, events) == far]
+
+
+def alike(names: Sequence[str]) -> bool:
+    """Whether streams are of one place and one camera, by their names."""
+    return len({(_parts(name)[:-1], *_camera(name).items()) for name in names}) <= 1
 
 
 @contextlib.contextmanager
@@ -136,7 +147,7 @@ def _against(stream: ImageStream, sensor: Size, events: str) -> str:
     if stream.size not in (None, sensor):
         swapped = ": width and height swapped?" if stream.size == sensor[::-1] else ""
         return f"{_size(stream.size)}, the sensor has {_size(sensor)}{swapped}"
-    another = stream.elsewhere or _another_camera(stream.name, events)
+    another = stream.elsewhere or another_camera(stream.name, events)
     return "of another camera" if another else ""
 
 
@@ -193,7 +204,7 @@ def _kind(name: str, events: str) -> str:
     return "changed" if any(map(CHANGED.match, words)) else "image"
 
 
-def _another_camera(name: str, events: str) -> bool:
+def another_camera(name: str, events: str) -> bool:
     """Whether two names differ by left and right or by the number of a camera, anywhere
     (/cam0_events, /cam1_image), or in a namespace only by such words (/cam/events, /cam1/image)."""
     image, event = _camera(name), _camera(events)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.fuzz_aedat4 import STREAM, XML, header
 
 from evflow import Events, EvflowDataError
 from evflow.estimation.bench.latency import measured_latency
@@ -90,25 +91,54 @@ def test_trigger_events_of_raw(tmp_path: Path, encoding: str) -> None:
     assert found.tolist() == [3 * 4096 + 70, 3 * 4096 + 4000]
 
 
+def told(stream: int, times: list[int], sources: list[int]) -> bytes:
+    """A packet of AEDAT 4 with triggers."""
+    count = len(times)
+    kind = np.dtype({"names": ["vtable", "source", "t"], "formats": ["<i4", "<i1", "<i8"],
+                     "offsets": [0, 4, 8], "itemsize": 16})
+    rows = np.zeros(count, kind)
+    begin = (4 * count + 7) // 8 * 8  # of the vtable, behind the offsets
+    rows["vtable"] = 16 + 16 * np.arange(count)
+    rows["t"], rows["source"] = times, sources
+    offsets = (begin + 16 + 12 * np.arange(count)).astype("<u4").tobytes().ljust(begin, b"\0")
+    vtable = struct.pack("<4H", 8, 16, 8, 4).ljust(16, b"\0")
+    packet = _buffer(b"TRIG", [], count, offsets + vtable + rows.tobytes())
+    return struct.pack("<2i", stream, len(packet)) + packet
+
+
 def test_trigger_events_of_aedat4(tmp_path: Path) -> None:
     """Edges of an external signal, not the clock's reset, nor the frames' own."""
     pytest.importorskip("aedat")
-    kind = np.dtype({"names": ["vtable", "source", "t"], "formats": ["<i4", "<i1", "<i8"],
-                     "offsets": [0, 4, 8], "itemsize": 16})
-    told = np.zeros(5, kind)
-    told["vtable"] = 16 + 16 * np.arange(5)
-    told["t"], told["source"] = [10, 340_000, 350_000, 360_000, 740_000], [0, 1, 2, 8, 3]
-    offsets = (24 + 16 + 12 * np.arange(5)).astype("<u4").tobytes().ljust(24, b"\0")
-    vtable = struct.pack("<4H", 8, 16, 8, 4).ljust(16, b"\0")
-    packet = _buffer(b"TRIG", [], 5, offsets + vtable + told.tobytes())
-    header = _header(SIZE, -1).replace(b"FRME", b"TRIG")
+    packet = told(1, [10, 340_000, 350_000, 360_000, 740_000], [0, 1, 2, 8, 3])
     path = tmp_path / "a.aedat4"
-    whole = VERSION + header + struct.pack("<2i", 1, len(packet)) + packet
+    whole = VERSION + _header(SIZE, -1).replace(b"FRME", b"TRIG") + packet
     path.write_bytes(whole)
     events = answers([10] * 4, 1)
     assert read_triggers(path, events).tolist() == [340_000, 350_000, 740_000]
-    path.write_bytes(whole + struct.pack("<2i", 1, len(packet)) + packet[:50])  # cut off
+    path.write_bytes(whole + packet[:58])  # cut off
     assert len(read_triggers(path, events)) == 3
+
+
+@pytest.mark.parametrize(("differs", "values", "camera"), [
+    ("camera", "left left right right", "capture/EVTS/2"),
+    ("capture", "left left right right", "right/EVTS"), ("capture", "a b c d", "c/EVTS")])
+def test_triggers_of_one_camera_of_aedat4(
+    tmp_path: Path, differs: str, values: str, camera: str
+) -> None:
+    """By the cameras' names in the header or the modules of DV; that neither tells is said."""
+    pytest.importorskip("aedat")
+    streams = enumerate(zip(("EVTS", "TRIG") * 2, values.split(), strict=True))
+    xml = "".join(STREAM.format(i, kind).replace(f">{differs}<", f">{value}<")
+                  for i, (kind, value) in streams)
+    path = tmp_path / "a.aedat4"
+    path.write_bytes(header(XML.format(xml)) + told(1, [340_000], [1]) + told(3, [740_000], [1]))
+    events = answers([10] * 4, 1)
+    if camera == "c/EVTS":
+        with pytest.raises(EvflowDataError, match=r"EV001.*b/TRIG, d/TRIG.*c/EVTS"):
+            read_triggers(path, events, camera)
+        return
+    assert read_triggers(path, events).tolist() == [340_000]
+    assert read_triggers(path, events, camera).tolist() == [740_000]
 
 
 @pytest.mark.parametrize(("text", "found"), [
