@@ -20,6 +20,7 @@ OTHER_SHARE = 0.02
 EXPOSURE = 0.08  # log units: change shared by most pixels
 ALIKE, ALIKE_SHARE = 0.05, 0.6  # log units, share of pixels
 SATURATED_DN, BLACK_DN = 252.0, 0.5  # a frame at either end hides what its pixel saw
+ALL_CHANGES = "the whole frame changes by"  # how the reasons for faulty steps begin
 LIT_SHARE = 0.3  # of the pixels: more ON than OFF or the reverse, if the light itself changed
 
 
@@ -32,8 +33,7 @@ def faulty_frames(
     glitches = dict.fromkeys(frames, "a frame that does not match the events (old, or "
                              "damaged?)")
     steps = dict.fromkeys((i for i in intervals if not _lit(recording, i)),
-                          "the whole frame changes by more than the events account for "
-                          "(auto-exposure?)")
+                          f"{ALL_CHANGES} more than the events account for (auto-exposure?)")
     shown: list[np.ndarray] = []
     for i in range(len(recording.frame_times)):
         if i % FRAMES == 0:
@@ -43,8 +43,8 @@ def faulty_frames(
         if len(shown) == 3 and _glitch(*shown) and not _lit(recording, i - 1):
             glitches[i - 1] = "a frame unlike the one before and the one after (a glitch?)"
         if len(shown) > 1 and (shift := _exposure(*shown[-2:])) and not _lit(recording, i - 1):
-            steps[i - 1] = (f"the whole frame changes by {np.expm1(shift):+.0%} without "
-                            "events (auto-exposure?)")
+            steps[i - 1] = (f"{ALL_CHANGES} {np.expm1(shift):+.0%} without events "
+                            "(auto-exposure?)")
     return glitches, steps
 
 

@@ -23,6 +23,7 @@ from evflow.recordings.check.steps import (
     Steps,
     displacement,
     frame_steps,
+    never_changes,
 )
 from evflow.recordings.stillness import MOVING, coincidence_excess
 from evflow.types import Recording
@@ -113,7 +114,7 @@ def _missing(steps: Steps) -> list[Finding]:
     events whose times are stretched."""
     change = np.abs(steps.changes[""])
     shown = float(change[change > STRONG * steps.cell**2].sum())
-    count = sum(len(steps.events.slice(int(t0), int(t1))) for t0, t1 in steps.bounds)
+    count = steps.most_events()
     if shown < LEAST_CHANGE or count > shown / MOST_THETA:
         return []
     wrong = too_few(count, shown)
@@ -127,10 +128,12 @@ def _frozen(recording: Recording, steps: Steps) -> list[Finding]:
     still = all(not np.nan_to_num(change).any() for change in steps.changes[""])
     if not still or np.isnan(steps.changes[""]).all() or len(events) < LEAST_EVENTS:
         return []
+    if not never_changes(recording.frames):  # but in frames that belong to no window
+        return []
     if coincidence_excess(events, np.zeros(events.size[::-1], bool)) <= MOVING:
         return []
     return [Finding(
-        "EV034", "error", f"all frames that were examined ({len(steps.bounds) + 1}) are alike, but "
+        "EV034", "error", f"all {len(recording.frames):,} frames are alike, but "
         f"the {len(events):,} events are those of a scene that moves.",
         "Did the frame camera stop, or was one frame written again and again? Nothing can be "
         "measured from such frames; --no-frames uses the events alone.")]

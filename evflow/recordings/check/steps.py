@@ -17,7 +17,8 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.spool import forget
-from evflow.recordings.windows import plan_windows
+from evflow.recordings.glitches import ALL_CHANGES
+from evflow.recordings.windows import WindowPlan, plan_windows
 from evflow.types import Events, Recording
 
 MIN_STEP_US = 20_000  # frames closer than that change too little
@@ -28,6 +29,8 @@ DARK_DN, BRIGHT_DN = 15.0, 250.0  # as in the refinement: outside, log changes a
 LEAST_EVENTS, LEAST_CELLS = 500, 200  # fewer are not enough to decide
 SURE_CELLS, SURE_EVENTS = 4_000, 20_000  # with this many, chance correlations are at most .03
 SWEEP_INTERVALS, SWEEP_US = 3, 200_000  # range of the sweep: frame intervals, at most us
+AT_REST = 0.2  # of the change of whole frames: below, frames change by nothing else but noise
+LIT = 0.5  # least r of steps of a light with events at another time; sound ones have .9
 SWEEP_STEP_US = 5_000
 LATENCY_US = 4_000  # of the events, in the mean
 LEAST_OVERLAP = 0.25  # of the events' power, of displaced frames
@@ -41,13 +44,15 @@ TURNED = " of the transpose"  # square sensors: the same of frames with rows and
 class Steps:
     """Frame steps to compare with events. changes: {flip: (K, cells)} change of log brightness, NaN
     in cells without a pixel that is well exposed in both frames; bounds: (K, 2) int64 us; cell:
-    side of a cell in pixels; interval_us: the median of all frame intervals."""
+    side of a cell in pixels; interval_us: the median of all frame intervals; silent: whether they
+    are steps of a light whose events come at another time."""
 
     events: Events
     changes: dict[str, np.ndarray]
     bounds: np.ndarray
     cell: int
     interval_us: float
+    silent: bool = False
 
     def correlations(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
         """Pearson's r with the frames' clock shifted by each offset; NaN if there are too few."""
@@ -82,8 +87,9 @@ class Steps:
         return np.where(enough, r, np.nan)
 
     def correlation(self, flip: str = "") -> float:
-        """Pearson's r of the recording as it is."""
-        return float(self.correlations(np.zeros(1, np.int64), flip)[0])
+        """Pearson's r of the recording as it is; 0 of silent steps with too few events."""
+        r = float(self.correlations(np.zeros(1, np.int64), flip)[0])
+        return 0.0 if self.silent and np.isnan(r) else r
 
     def enough(self) -> bool:
         """Whether there is enough data for a correlation near zero to mean that there is none."""
@@ -104,7 +110,8 @@ class Steps:
     @functools.cached_property
     def offsets_us(self) -> np.ndarray:
         """Offsets of the frames' clock that are tried, in us."""
-        count = int(min(SWEEP_INTERVALS * self.interval_us, SWEEP_US) // SWEEP_STEP_US)
+        reach = SWEEP_US if self.silent else SWEEP_INTERVALS * self.interval_us
+        count = int(min(reach, SWEEP_US) // SWEEP_STEP_US)
         return SWEEP_STEP_US * np.arange(-count, count + 1)
 
     @functools.cached_property
@@ -114,6 +121,10 @@ class Steps:
     def sweep(self, kept: slice = WHOLE) -> np.ndarray:
         """r of the kept steps at each of `offsets_us`."""
         return self._r(self._swept, kept=kept)
+
+    def most_events(self) -> int:
+        """Events within the steps at the one of `offsets_us` where they are most."""
+        return int(self._swept[:, 5].sum(0).max())
 
     def peak(self, r: np.ndarray) -> tuple[int, float]:
         """The offset in us of the largest r (interpolated by a parabola, without the events'
@@ -131,12 +142,22 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
     """The steps to examine, also for mirrored and, if they are square, transposed frames; None
     without frames, events or a common time."""
     try:
-        pairs = plan_windows(recording, MIN_STEP_US).pairs
+        plan = plan_windows(recording, MIN_STEP_US)
     except EvflowDataError:
         return None
-    if not pairs:
-        return None
-    pairs = _most_telling(recording, pairs)
+    pairs = _most_telling(recording, plan.pairs)
+    if silent := _without_events(recording, plan, pairs):
+        steps = _of(recording, silent, flips, silent=True)
+        if np.nan_to_num(np.abs(steps.sweep())).max() > LIT:
+            return steps
+    return _of(recording, pairs, flips) if pairs else None
+
+
+def _of(
+    recording: Recording, pairs: tuple[tuple[int, int], ...], flips: Mapping[str, tuple[int, ...]],
+    *, silent: bool = False,
+) -> Steps:
+    """The steps from the first to the last frame of each pair."""
     cell = max(1, round(max(recording.events.size) / CELLS))
     width, height = recording.events.size
     changes: dict[str, list[np.ndarray]] = collections.defaultdict(list)
@@ -149,7 +170,22 @@ def frame_steps(recording: Recording, flips: Mapping[str, tuple[int, ...]] = FLI
     bounds = recording.frame_times[np.array(pairs)]
     interval = float(np.median(np.diff(recording.frame_times)))
     return Steps(recording.events, {k: np.stack(v) for k, v in changes.items()}, bounds, cell,
-                 interval)
+                 interval, silent)
+
+
+def _without_events(
+    recording: Recording, plan: WindowPlan, pairs: tuple[tuple[int, int], ...]
+) -> tuple[tuple[int, int], ...]:
+    """Of each of MOST_STEPS parts the pair whose frames change most as a whole without events,
+    which is no window of the plan. None unless frames are at rest in `pairs`: then the light of a
+    bench may have stepped, and the frames be early or late by an interval or more."""
+    jumps = [(s.first, s.last) for s in plan.skipped if s.why.startswith(ALL_CHANGES)]
+    sizes = np.array([_seen_change(recording, *pair) for pair in jumps])
+    rest = max((_seen_change(recording, *pair) for pair in pairs), default=0.0)
+    if not jumps or rest > AT_REST * np.median(sizes):
+        return ()
+    parts = np.array_split(np.arange(len(jumps)), min(len(jumps), MOST_STEPS))
+    return tuple(jumps[part[np.argmax(sizes[part])]] for part in parts)
 
 
 def _most_telling(
@@ -169,6 +205,12 @@ def _most_telling(
         changes = [_seen_change(recording, *pairs[k]) for k in near]
         chosen.append(pairs[near[int(np.argmax(changes))]])
     return tuple(chosen)
+
+
+def never_changes(frames: np.ndarray) -> bool:
+    """Whether every few pixels of frames (T, H, W) are the same in all of them."""
+    some = np.s_[::STRIDE, ::STRIDE]
+    return all(np.array_equal(frame[some], frames[0][some]) for frame in frames)
 
 
 def _seen_change(recording: Recording, first: int, last: int) -> float:

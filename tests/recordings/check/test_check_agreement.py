@@ -154,9 +154,9 @@ def test_a_clock_of_few_digits_may_repeat_events(sound: Recording) -> None:
     assert "EV038" not in codes_of(coarse)
 
 
-@pytest.mark.parametrize("noise_dn", [0.0, 0.7])
-def test_a_light_that_rests_most_of_the_time_is_checked_at_its_steps(noise_dn: float) -> None:
-    """Evenly spread frame intervals may all lie within rests, where nothing but noise changes."""
+@pytest.fixture(scope="module")
+def rests() -> Recording:
+    """A light that steps every quarter of a second, filmed at 40 frames a second."""
     dn = screen([40.0, 100.0, 55.0, 220.0] * 6, rest=250, ramp=1)
     shown = np.flatnonzero(np.diff(dn, prepend=0.0, append=0.0)[:-1] != 0)
     shown = np.union1d(np.union1d(shown - 1, shown)[1:], np.arange(10, len(dn), 25))
@@ -164,7 +164,42 @@ def test_a_light_that_rests_most_of_the_time_is_checked_at_its_steps(noise_dn: f
     events = simulate(jax.random.key(0), video, 1000 * shown,
                       Camera.constant(SHAPE, 0.25, 0.25, 2.0, 2.0))
     kept = np.arange(10, len(dn), 25)
-    noise = np.random.default_rng(1).normal(0.0, noise_dn, (len(kept), *SHAPE))
-    frames = np.rint(dn[kept, None, None] + noise).clip(0, 255).astype(np.uint8)
-    found = check(Recording(events, frames, 1000 * kept))
+    frames = np.broadcast_to(dn[kept, None, None], (len(kept), *SHAPE))
+    return Recording(events, np.ascontiguousarray(frames, np.float32), 1000 * kept)
+
+
+def filmed(r: Recording, noise_dn: float) -> Recording:
+    """The recording with frames of 8 bits and that noise."""
+    noise = np.random.default_rng(1).normal(0.0, noise_dn, r.frames.shape)
+    return dataclasses.replace(r, frames=np.rint(r.frames + noise).clip(0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize("noise_dn", [0.0, 0.7])
+def test_a_light_that_rests_most_of_the_time_is_checked_at_its_steps(
+    rests: Recording, noise_dn: float
+) -> None:
+    """Evenly spread frame intervals may all lie within rests, where nothing but noise changes."""
+    found = check(filmed(rests, noise_dn))
     assert not {"EV024", "EV034"} & {f.code for f in found.findings}
+
+
+@pytest.mark.parametrize(("noise_dn", "offset_ms"), [(0.0, 50), (0.7, -100), (0.7, 150)])
+def test_frames_of_such_a_light_may_be_late_by_several_intervals(
+    rests: Recording, noise_dn: float, offset_ms: int
+) -> None:
+    """No events come between the frames of a step, which looks like a change of exposure."""
+    late = shifted(filmed(rests, noise_dn), 1000 * offset_ms)
+    (error,) = check(late).errors
+    assert error.code == "EV024"
+    assert frames_offset(late) == pytest.approx(-1000 * offset_ms, abs=10_000)
+
+
+def test_a_change_of_exposure_in_a_scene_at_rest_is_no_step_of_its_light(rests: Recording) -> None:
+    """The events are noise, at whatever time the frames are taken to be."""
+    n, rng = 20_000, np.random.default_rng(1)
+    t = np.sort(rng.integers(rests.events.t[0], rests.events.t[-1], n))
+    noise = Events(rng.integers(0, SHAPE[1], n), rng.integers(0, SHAPE[0], n), t,
+                   rng.random(n) < 0.5, SHAPE[::-1])
+    still = dataclasses.replace(filmed(rests, 0.7), events=noise)
+    assert not {"EV021", "EV024", "EV029"} & codes_of(still)
+    assert frames_offset(still) == 0
