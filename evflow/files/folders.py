@@ -55,7 +55,8 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     """Yield an empty folder; move what the block leaves there into `folder` once it succeeds.
 
     names: all files that the block may write. Those already in `folder` are removed, so that no
-    stale file lies beside the new ones; other files stay.
+    stale file lies beside the new ones; other files stay. Of several processes each moves its files
+    while the others wait.
     Raises EV013 if one of them exists and `overwrite` is false, EV019 if the folder cannot be
     written.
     """
@@ -70,7 +71,7 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
         clear_leftovers(folder / "stage")
         stage.mkdir()
         yield stage
-        with uninterrupted():
+        with _alone(folder), uninterrupted():
             _unstage(stage, folder, names, overwrite=overwrite)
     finally:
         with uninterrupted():
@@ -85,6 +86,20 @@ def need_writable(folder: Path) -> None:
     with atomic_write(folder / ".probe", overwrite=True) as probe:
         probe.touch()
     (folder / ".probe").unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder, which other processes wait for: files of two of them would mix.
+    Systems and file systems without such locks go on without."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            opened = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, opened)  # which frees the lock
+            fcntl.flock(opened, fcntl.LOCK_EX)
+        yield
 
 
 def _unstage(stage: Path, folder: Path, names: Sequence[str], *, overwrite: bool) -> None:

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -302,6 +303,30 @@ def test_a_staged_folder_is_new_as_a_whole(tmp_path: Path) -> None:
         (stage / "a.txt").write_text("two")
     assert sorted(p.name for p in folder.iterdir()) == ["a.txt", "mine.txt"]  # b.txt was stale
     assert (folder / "a.txt").read_text() == "two"
+
+
+def test_two_that_replace_one_folder_do_not_mix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, names, real = tmp_path / "out", ("a.txt", "b.txt"), os.replace
+    others: list[threading.Thread] = []
+
+    def put(words: str) -> None:
+        with staged(folder, names=names, overwrite=True) as stage:
+            for name in names:
+                (stage / name).write_text(words)
+
+    def slow(source: Path, target: Path) -> None:
+        real(source, target)
+        if not others and target.parent == folder and target.name in names:
+            others.append(threading.Thread(target=put, args=("other",)))
+            others[0].start()
+            others[0].join(0.3)  # it waits, or is done meanwhile
+
+    monkeypatch.setattr(os, "replace", slow)
+    put("one")
+    others[0].join()
+    assert {(folder / name).read_text() for name in names} == {"other"}
 
 
 def test_an_interrupt_leaves_no_half_removed_folder(
