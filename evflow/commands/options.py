@@ -72,8 +72,8 @@ class Reading:
     size: Annotated[str | None, value("WxH")] = None
     """Sensor size (346x260), if the file does not contain it or is wrong."""
     partial: bool = False
-    """Of a damaged or truncated file, use what lies before the damage (of HDF5 and npz only what
-    lies before a time that goes back)."""
+    """Of a damaged or truncated file, use what lies before the damage (of HDF5, npz and bags other
+    than MCAP only what lies before a time that goes back)."""
     drop_outside: bool = False
     """Leave out events outside the sensor instead of refusing them."""
     late: Literal["stop", "drop", "sort", "join"] = "stop"

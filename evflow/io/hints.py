@@ -68,8 +68,9 @@ class Hints:
     polarity: "auto" = {0, 1} or {-1, 1}, whichever fits; "01" and "pm1" require one; "invert"
         swaps ON and OFF.
     size: (width, height), overrides what the file says.
-    partial: of a damaged or truncated file, read what lies before the damage; of HDF5 and npz,
-        which are sound or not as a whole, only what lies before a time that goes back.
+    partial: of a damaged or truncated file, read what lies before the damage; of HDF5, npz and
+        bags other than MCAP, which are sound or not as a whole, only what lies before a time that
+        goes back.
     drop_outside: leave out events outside the sensor instead of refusing them.
     frames_topic: which of several image streams holds the frames (see `streams`).
     no_frames: read only the events.

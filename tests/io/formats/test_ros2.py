@@ -136,6 +136,44 @@ def test_messages_that_wait_in_a_log_beside_the_database(tmp_path: Path) -> None
     equal(read_events(cut.parent), want.events)
 
 
+@pytest.mark.parametrize("cut", ["the summary", "a second chunk"])
+def test_the_whole_chunks_of_a_cut_file_are_read_if_asked_for(tmp_path: Path, cut: str) -> None:
+    store, want = Store.new(), make()
+    folder = store.write(tmp_path / "bag", {
+        "/dvs/events": store.arrays(want.events), "/dvs/image_raw": store.images(want)}, "MCAP")
+    file, = folder.glob("*.mcap")
+    raw = file.read_bytes()
+    begin = at = 8  # behind the magic, records {u8 kind, u64 size, ...}
+    while raw[begin] != 6:
+        begin = at
+        at += 9 + int.from_bytes(raw[at + 1 : at + 9], "little")
+    rest = raw[at : at + 100] if cut == "the summary" else raw[begin : at - 99]
+    file.write_bytes(raw[:at] + rest)
+    for path in (folder, file):
+        error = refused(path)
+        assert (error.code, "--partial" in error.fix, "mcap recover" in error.fix) == (
+            "EV009", True, True)
+        got = read_recording(path, partial=True)
+        equal(got.events, want.events)
+        assert len(got.frames) == len(want.frames)
+        note, = (note for note in got.notes if note.code == "events.partial")
+        assert file.name in note.text
+    file.write_bytes(raw[:begin] + raw[begin : at - 99])  # nothing whole is left
+    assert refused(folder, partial=True).code == "EV009"
+
+
+def test_a_database_that_is_cut_off_names_what_copies_its_rows(tmp_path: Path) -> None:
+    store, want = Store.new(), make()
+    folder = store.write(tmp_path / "bag", {"/dvs/events": store.arrays(want.events)})
+    file, = folder.glob("*.db3")
+    file.write_bytes(file.read_bytes()[:-4096])
+    for partial in (False, True):
+        fix = refused(folder, partial=partial).fix
+        assert (".clone" in fix, "--partial" in fix, "reindex" in fix) == (True, False, False)
+    file.unlink()
+    assert "ros2 bag reindex" in refused(folder).fix
+
+
 @pytest.mark.parametrize("storage", SUFFIX)
 def test_damaged_copies_only_raise_data_errors(tmp_path: Path, storage: str) -> None:
     store, want = Store.new(), make(300, 2)

@@ -86,7 +86,7 @@ class Bag:
     """A bag, read message by message; whatever its reader raises becomes EV009.
 
     open_reader: returns an open reader like those of `rosbags`; aligned: messages are those of
-    ROS 2; mend: the command that repairs a bag."""
+    ROS 2; mend: how to read one whose recording was interrupted."""
 
     def __init__(
         self, path: Path, open_reader: Callable[[Path], Any], *, aligned: bool, mend: str
@@ -114,7 +114,7 @@ class Bag:
                                    'pip install "evflow-jax[ros]"', where=self.path)
         return EvflowDataError(
             "EV009", f"{self.path} is truncated or damaged ({e or type(e).__name__}).",
-            f"Copy it again; if its recording was interrupted, run `{self.mend}` on it.",
+            f"Copy it again; if its recording was interrupted, {self.mend}.",
             where=self.path)
 
     def all(self) -> list[str]:

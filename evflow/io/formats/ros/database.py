@@ -27,7 +27,10 @@ LARGEST_PAGE = 65536  # encoded specially, as it does not fit the header's two b
 
 
 class Database:
-    """An open database. counts: messages by (topic, type)."""
+    """An open database. counts: messages by (topic, type); damage: as of `Mcap`, but what is
+    damaged is refused."""
+
+    damage = ""
 
     def __init__(self, path: Path) -> None:
         _check_log(path)

@@ -2,7 +2,8 @@
 records or lie in chunks, compressed by LZ4 or zstd.
 
 What a record claims is checked against the file; indices are not used, as all records are scanned
-once. Any damage raises ValueError, struct.error or a decoder's error.
+once. Any damage raises ValueError, struct.error or a decoder's error; of a file that was cut off
+the whole records can be read alone.
 """
 
 from __future__ import annotations
@@ -42,9 +43,11 @@ class Chunk(NamedTuple):
 
 
 class Mcap:
-    """An open file. counts: messages by (topic, type)."""
+    """An open file. partial: read the records before the first that is not whole; counts: messages
+    by (topic, type); damage: what is wrong with that record, "" if nothing is."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, partial: bool = False) -> None:
+        self.damage = ""
         self._file = open(path, "rb")  # noqa: SIM115 (closed by `close`)
         self._total = os.path.getsize(path)
         self._schemas: dict[int, str] = {}
@@ -52,7 +55,7 @@ class Mcap:
         self._loose = tuple(array.array("Q") for _ in range(3))  # outside of chunks: time, place
         self._chunks: list[Chunk] = []
         try:
-            stated = self._scan()
+            stated = self._scan(partial)
             check_expansion(sum(chunk.size for chunk in self._chunks), self._total, path)
             counted = stated if stated is not None and self._described(stated) else self._counted()
         except BaseException:
@@ -110,31 +113,44 @@ class Mcap:
             yield kind, data[at : at + size]
             at += size
 
-    def _scan(self) -> Counter[int] | None:
+    def _scan(self, partial: bool) -> Counter[int] | None:
         """Index all records; returns the messages by channel if the file has statistics."""
-        if self._take(0, len(MAGIC)) != MAGIC or self._take(
-                self._total - len(MAGIC), len(MAGIC)) != MAGIC:
-            raise ValueError("it lacks MCAP's first or last bytes")
-        at, end, stated, chunks = len(MAGIC), self._total - len(MAGIC), None, 0
-        while at < end:
-            kind, size = struct.unpack("<BQ", self._take(at, 9))
-            at += 9
-            if size > end - at:
-                raise ValueError(f"a record claims {size:,} bytes, {end - at:,} are left")
-            if kind == MESSAGE:
-                _, _, time, _ = struct.unpack("<HIQQ", self._take(at, 22))
-                for column, value in zip(self._loose, (time, at, size), strict=True):
-                    column.append(value)
-            elif kind == CHUNK:
-                self._chunks.append(self._chunk(at, size))
-            elif kind == STATISTICS:
-                stated, chunks = _statistics(self._take(at, size))
-            elif kind in (HEADER, SCHEMA, CHANNEL):
-                self._describe(kind, self._take(at, size))
-            at += size
+        if self._take(0, len(MAGIC)) != MAGIC:
+            raise ValueError("it lacks MCAP's first bytes")
+        ended = self._take(self._total - len(MAGIC), len(MAGIC)) == MAGIC
+        at, end, stated, chunks = len(MAGIC), self._total - len(MAGIC) * ended, None, 0
+        try:
+            while at < end:
+                kind, at, size = self._index(at, end)
+                if kind == STATISTICS:
+                    stated, chunks = _statistics(self._take(at, size))
+                at += size
+            if not ended:
+                raise ValueError("it lacks MCAP's last bytes")
+        except (ValueError, struct.error) as e:
+            if not (partial and (self._chunks or self._loose[0])):
+                raise
+            self.damage = f"at byte {at:,}: {e}"
         if stated is not None and chunks != len(self._chunks):
             raise ValueError(f"it has {len(self._chunks)} of {chunks} chunks")
         return stated
+
+    def _index(self, at: int, end: int) -> tuple[int, int, int]:
+        """Kind, begin and size of the content of the record at a byte, which is indexed or
+        described."""
+        kind, size = struct.unpack("<BQ", self._take(at, 9))
+        at += 9
+        if size > end - at:
+            raise ValueError(f"a record claims {size:,} bytes, {end - at:,} are left")
+        if kind == MESSAGE:
+            _, _, time, _ = struct.unpack("<HIQQ", self._take(at, 22))
+            for column, value in zip(self._loose, (time, at, size), strict=True):
+                column.append(value)
+        elif kind == CHUNK:
+            self._chunks.append(self._chunk(at, size))
+        elif kind in (HEADER, SCHEMA, CHANNEL):
+            self._describe(kind, self._take(at, size))
+        return kind, at, size
 
     def _describe(self, kind: int, body: bytes) -> None:
         if kind == HEADER and _text(body, 0)[0] != "ros2":

@@ -39,7 +39,7 @@ def triggers(path: Path, topic: str | None) -> np.ndarray:
 
 
 def _bag(path: Path) -> Bag:
-    return Bag(path, _open, aligned=False, mend="rosbag reindex")
+    return Bag(path, _open, aligned=False, mend="run `rosbag reindex` on it")
 
 
 def _open(path: Path) -> Any:

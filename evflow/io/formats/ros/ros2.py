@@ -7,6 +7,7 @@ may be compressed as a whole, message by message or not at all, as their first b
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import tempfile
 from collections.abc import Collection, Iterator
@@ -24,11 +25,12 @@ from evflow.io.formats.ros.bag import Bag, read_bag, triggers_of
 from evflow.io.formats.ros.database import Database
 from evflow.io.formats.ros.mcap import Mcap
 from evflow.io.hints import Hints
+from evflow.notes import Note
 from evflow.types import Recording
 
 NAME = "rosbag2"
-DATABASE = ".db3"
-EXTENSIONS: tuple[str, ...] = (".mcap", DATABASE)
+DATABASE, MCAP = ".db3", ".mcap"
+EXTENSIONS: tuple[str, ...] = (MCAP, DATABASE)
 
 METADATA, LIST = "metadata.yaml", "relative_file_paths:"
 MOST_METADATA = 1 << 24  # bytes; a recording of a thousand files has 300 kB
@@ -46,18 +48,32 @@ def sniff(path: Path, head: bytes) -> bool:
 
 def read(path: Path, hints: Hints) -> Recording:
     """Raises EV010 (no `rosbags`, for compressed bags) and what `read_bag` raises."""
-    with _bag(path) as bag:
-        return read_bag(bag, hints)
+    with _bag(path, partial=hints.partial) as bag:
+        found = read_bag(bag, hints)
+        notes = tuple(Note("events.partial", "only the part before the damage was read "
+                           f"(--partial): {text}") for text in bag.reader.damage)
+        return dataclasses.replace(found, notes=(*notes, *found.notes)) if notes else found
 
 
 def triggers(path: Path, topic: str | None) -> np.ndarray:
     """Times (N,) int64 us of external signals beside the events of a topic; raises as `read`."""
-    with _bag(path) as bag:
+    with _bag(path, partial=True) as bag:
         return triggers_of(bag, topic)
 
 
-def _bag(path: Path) -> Bag:
-    return Bag(path, Reader, aligned=True, mend="ros2 bag reindex")
+def _bag(path: Path, *, partial: bool) -> Bag:
+    return Bag(path, lambda path: Reader(path, partial=partial), aligned=True,
+               mend=_mend(path, partial=partial))
+
+
+def _mend(path: Path, *, partial: bool) -> str:
+    """How to read what is left of a bag that was cut off: `ros2 bag reindex` writes the metadata
+    anew, but mends no file."""
+    files = path.iterdir() if path.is_dir() else [path]
+    if any(MCAP in file.suffixes for file in files):
+        recovered = f"read what `mcap recover FILE{MCAP} -o NEW{MCAP}` writes"
+        return recovered if partial else f"pass --partial, or {recovered}"
+    return f'read what `sqlite3 FILE{DATABASE} ".clone NEW{DATABASE}"` writes'
 
 
 class Connection(NamedTuple):
@@ -69,13 +85,16 @@ class Connection(NamedTuple):
 
 
 class Reader:
-    """All files of a bag in sequence."""
+    """All files of a bag in sequence. damage: what is wrong with those that were not read to their
+    end."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, partial: bool = False) -> None:
         with contextlib.ExitStack() as stack:
             files = _files(path) if path.is_dir() else [path]
-            self.storages = [_storage(file, stack) for file in files]
+            self.storages = [_storage(file, stack, partial=partial) for file in files]
             self._open = stack.pop_all()
+        self.damage = [f"{file.name}, {storage.damage}" for file, storage in zip(
+            files, self.storages, strict=True) if storage.damage]
         counts = sum((storage.counts for storage in self.storages[1:]),
                      self.storages[0].counts.copy())
         topics = {topic for storage in self.storages for topic in storage.counts}
@@ -97,8 +116,8 @@ class Reader:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files listed in the metadata, which rosbag2 writes one per line; ValueError if one is
-    missing or none is listed."""
+    """The files listed in the metadata, which rosbag2 writes one per line; EV009 if one is missing
+    or none is listed."""
     text = _begin(folder / METADATA, MOST_METADATA).decode("utf-8", "replace")
     listed = text.partition(LIST)[2]
     names, lines = list[str](), iter(listed.splitlines())
@@ -110,23 +129,26 @@ def _files(folder: Path) -> list[Path]:
             if not line.startswith("- "):
                 break
             names.append(line[2:].strip(" '\""))
-    if not names or not all(names):
-        raise ValueError(f"{METADATA} lists no files")
     files = [folder / PurePath(name).name for name in names]
-    if missing := [file.name for file in files if not is_there(file)]:
-        raise ValueError(f"{', '.join(missing[:5])} of its files are missing")
+    missing = [file.name for file in files if not is_there(file)]
+    if missing or not names or not all(names):
+        seen = f"what is missing: {', '.join(missing[:5])}" if missing else "no files"
+        raise EvflowDataError(
+            "EV009", f"{folder / METADATA} lists {seen}.", "Copy the bag again; or pass one of its "
+            "files alone, or run `ros2 bag reindex` on the folder, which lists those that are "
+            "there.", where=folder)
     return files
 
 
-def _storage(path: Path, stack: contextlib.ExitStack) -> Database | Mcap:
-    """The open file, first decompressed to a temporary one if necessary."""
+def _storage(path: Path, stack: contextlib.ExitStack, *, partial: bool) -> Database | Mcap:
+    """The open file, first decompressed to a temporary one if necessary. partial: as of `Mcap`."""
     head = _begin(path, 16)
     if head.startswith(ZSTD):
         path = _unpacked(path, stack)
         head = _begin(path, 16)
     if not head.startswith((mcap.MAGIC, database.MAGIC)):
         raise ValueError(f"{path.name} is neither an MCAP file nor a database")
-    storage = Mcap(path) if head.startswith(mcap.MAGIC) else Database(path)
+    storage = Mcap(path, partial=partial) if head.startswith(mcap.MAGIC) else Database(path)
     stack.callback(storage.close)
     return storage
 
