@@ -12,11 +12,12 @@ import array
 import contextlib
 import itertools
 import os
+import struct
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,14 +46,15 @@ def sniff(path: Path, head: bytes) -> bool:
 def read(path: Path, hints: Hints) -> Recording:
     """Events (N,) and frames (T, H, W) uint8; colour frames become their luma.
 
-    With several event streams the first is read, or the one requested; with several frame streams
-    `streams.choose` picks one by their cameras and the names of their outputs in DV. Raises EV008
-    (no event stream), EV009 (damaged), EV010 (no `aedat`), and what `stream.gather` and
-    `Recording` raise.
+    With several event streams the first that has packets is read, or the one requested; with
+    several frame streams `streams.choose` picks one by their cameras and the names of their outputs
+    in DV. Raises EV008 (no event stream), EV009 (damaged), EV010 (no `aedat`), and what
+    `stream.gather` and `Recording` raise.
     """
     header = read_header(path)
     streams = _decoder(path).id_to_stream()
-    events = [i for i, s in streams.items() if s["type"] == "events"]
+    packets = _packets(path, header.packets, header.table)
+    events = _of_events(streams, packets)
     if not events:
         kinds = ", ".join(f"{i}: {s['type']}" for i, s in sorted(streams.items()))
         raise EvflowDataError(
@@ -60,16 +62,16 @@ def read(path: Path, hints: Hints) -> Recording:
             "Record the events too, or pass the file that contains them.", where=path)
     frames = {i: s for i, s in streams.items() if s["type"] == "frame"}
     names = stream_names(header.outputs, {*frames, *events})
-    camera, more = hints.camera([names[i] for i in sorted(events)])
+    camera, more = hints.camera([names[i] for i in events])
     source = next(i for i in events if names[i] == camera)
     info = streams[source]
     size = hints.size or (info["width"], info["height"])
     chosen = choose([ImageStream(names[i], (s["width"], s["height"]), elsewhere=elsewhere(
         header.outputs, i, source)) for i, s in frames.items()], hints, size, camera)
     taken = [i for i in frames if chosen.stream and chosen.stream.name == names[i]]
-    starts, damage = _packets(path, header.packets, header.table)
-    with _before(path, damage) as sound:
-        reading = _Reading(sound, starts, damage, Aside(path, hints, size), source, taken)
+    with _before(path, packets.damage) as sound:
+        reading = _Reading(sound, packets.starts, packets.damage, Aside(path, hints, size), source,
+                           taken)
         return reading.aside.collect(
             reading.chunks(), lambda: (*more, *chosen.notes, *reading.notes()))
 
@@ -81,9 +83,10 @@ def triggers(path: Path, topic: str | None = None) -> np.ndarray:
     none is of that camera), EV020 (no such events).
     """
     header = read_header(path)
-    streams = _triggers_of(path, header, topic)
+    packets = _packets(path, header.packets, header.table)
+    streams = _triggers_of(path, header, packets, topic)
     found = [np.zeros(0, np.int64)]
-    with _before(path, _packets(path, header.packets, header.table)[1]) as sound:
+    with _before(path, packets.damage) as sound:
         decoder = iter(_decoder(sound))
         while packet := _next(decoder):
             triggers = packet.get("triggers")
@@ -92,12 +95,12 @@ def triggers(path: Path, topic: str | None = None) -> np.ndarray:
     return np.concatenate(found)
 
 
-def _triggers_of(path: Path, header: Header, topic: str | None) -> list[int]:
+def _triggers_of(path: Path, header: Header, packets: Packets, topic: str | None) -> list[int]:
     """The streams of triggers of the events' camera; the only one, whose ever it is: where cameras
     are synchronised, the signal may be connected to one of them."""
-    kinds = {i: s["type"] for i, s in _decoder(path).id_to_stream().items()}
-    told, events = ([i for i in sorted(kinds) if kinds[i] == kind] for kind in (
-        "triggers", "events"))
+    streams = _decoder(path).id_to_stream()
+    told = sorted(i for i, s in streams.items() if s["type"] == "triggers")
+    events = _of_events(streams, packets)
     if len(told) < 2 or not events:
         return told
     names = stream_names(header.outputs, {*told, *events})
@@ -111,6 +114,12 @@ def _triggers_of(path: Path, header: Header, topic: str | None) -> list[int]:
             f"those of {camera} is not clear.",
             "Write their times into a text file, one per line, and pass that.", where=path)
     return [i for i in told if names[i] in near]
+
+
+def _of_events(streams: dict[int, dict[str, Any]], packets: Packets) -> list[int]:
+    """The streams of events in order, those with packets first."""
+    events = (i for i, s in streams.items() if s["type"] == "events")
+    return sorted(events, key=lambda i: (i not in packets.streams, i))
 
 
 def _next(decoder: Iterator[dict[str, Any]]) -> dict[str, Any] | None:
@@ -204,24 +213,34 @@ def _before(path: Path, damage: Damage | None) -> Iterator[Path]:
         yield Path(copy.name)
 
 
-def _packets(path: Path, start: int, table: int) -> tuple[array.array[int], Damage | None]:
-    """Offsets of packets, each {i32 stream, i32 size, size bytes}, up to the table; and the Damage
-    at the first one that claims more bytes than are left, or expands too far: the decoder would
-    allocate that much."""
+class Packets(NamedTuple):
+    """Offsets of packets, the Damage at the first that is not sound, and the streams before it."""
+
+    starts: array.array[int]
+    damage: Damage | None
+    streams: set[int]
+
+
+def _packets(path: Path, start: int, table: int) -> Packets:
+    """The packets, each {i32 stream, i32 size, size bytes}, up to the table; and the Damage at the
+    first one that claims more bytes than are left, or expands too far: the decoder would allocate
+    that much."""
     total = os.path.getsize(path)
-    starts = array.array("q")
+    starts, streams = array.array("q"), set[int]()
     with open(path, "rb") as f:
         while start + 8 <= total and start != table:
-            f.seek(start + 4)
-            size = int.from_bytes(f.read(4), "little", signed=True)
+            f.seek(start)
+            stream, size = struct.unpack("<ii", f.read(8))
             if not 0 <= size <= total - start - 8:
-                return starts, Damage(start, f"a packet claims {size:,} bytes, "
-                                      f"{total - start - 8:,} are left")
+                return Packets(starts, Damage(start, f"a packet claims {size:,} bytes, "
+                               f"{total - start - 8:,} are left"), streams)
             if (most := most_bytes(f.read(size))) > FREE + RATIO * size:
-                return starts, Damage(start, f"a packet of {size:,} bytes expands to {most:,}")
+                return Packets(starts, Damage(start, f"a packet of {size:,} bytes expands to "
+                               f"{most:,}"), streams)
             starts.append(start)
+            streams.add(stream)
             start += 8 + size
-    return starts, None
+    return Packets(starts, None, streams)
 
 
 def _decoder(path: Path) -> Any:

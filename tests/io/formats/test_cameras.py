@@ -88,6 +88,14 @@ def test_streams_of_aedat4_belong_together_by_their_source(tmp_path: Path) -> No
     np.testing.assert_array_equal(named.frames, ONE.frames)
 
 
+def test_a_stream_of_aedat4_without_packets_is_not_the_first(tmp_path: Path) -> None:
+    pytest.importorskip("aedat")
+    xml = XML.format(STREAM.format(0, "EVTS") + STREAM.format(1, "EVTS"))
+    path = tmp_path / "a.aedat4"
+    path.write_bytes(header(xml) + packet(1, event_packet(ONE.events)))
+    equal(read_events(path), ONE.events)
+
+
 def test_the_right_camera_of_mvsec(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.hdf5", "w") as f:
         for side, r in (("left", ONE), ("right", OTHER)):

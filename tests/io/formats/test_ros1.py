@@ -123,6 +123,24 @@ def test_several_topics_and_none(tmp_path: Path) -> None:
 
 
 @needs_rosbags
+def test_topics_without_events_that_can_be_read_come_last(tmp_path: Path) -> None:
+    want = make()
+    array, mono = array_messages(want.events), packet_messages(want.events, "mono")
+    ns, four, seven = array[0][2], struct.pack("<I", 4), struct.pack("<I", 7)
+    first = [("/a/events", array[0][1], ns, header(ns) + struct.pack("<3I", 48, 64, 0)), *(
+        ("/b/trigger", PACKET, m[2], m[3].replace(four + b"mono", seven + b"trigger"))
+        for m in mono)]
+    path = write(tmp_path / "a.bag", first + array)
+    got = read_recording(path)
+    equal(got.events, want.events)
+    assert "not read: /a/events, /b/trigger" in got.notes[0].text
+    assert not len(read_recording(path, events_topic="/a/events").events)
+    error = refused(path, events_topic="/b/trigger")
+    assert error.code == "EV008"
+    assert "--events-topic NAME): /a/events, /dvs/events" in error.fix
+
+
+@needs_rosbags
 @pytest.mark.parametrize(("old", "new", "code", "seen"), [
     (struct.pack("<2I", 48, 64), struct.pack("<2I", 10, 64), "EV005", "outside 64x10"),
     (struct.pack("<2I", 48, 64), struct.pack("<2I", 0, 0), "EV015", "events reach"),

@@ -2,16 +2,16 @@
 
 sensor_msgs/Image and CompressedImage become frames at their header time (or at the time of
 recording, if no header has one), provided that the events are on ROS time; with several image
-topics `streams.choose` picks one. With several event topics the first one that has events is read,
-or the one requested, and a note names the others. If no event message contains the sensor's size,
-it is that of the only images that can be their frames.
+topics `streams.choose` picks one. With several event topics the first one whose first messages have
+events is read, or the one requested, and a note names the others. If no event message contains the
+sensor's size, it is that of the only images that can be their frames.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from evflow.io.formats.ros.messages import (
     Message,
     Packet,
 )
-from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded, triggers
+from evflow.io.formats.ros.packets import OTHER_CLOCK, decoded, readable, triggers
 from evflow.io.hints import Hints
 from evflow.io.images import encodings
 from evflow.io.images.event_clock import beside_events
@@ -45,16 +45,16 @@ LOOKED = 16  # messages examined for encoding and size
 def read_bag(bag: Bag, hints: Hints) -> Recording:
     """Raises EV008 (no events, unknown encoding), EV009 (damaged) and what `stream.gather` and
     `Recording` raise."""
-    topics = bag.topics(EVENT_TYPES)
+    topics = bag.event_topics(hints.events_topic)
     if not topics:
         raise EvflowDataError(
             "EV008", f"{bag.path} holds no topic of events, but {sorted(bag.all())[:8]}.",
             f"Known messages: {', '.join(EVENT_TYPES)}.", where=bag.path)
-    topic, notes = hints.camera([name for name, _ in topics])
-    kind = dict(topics)[topic]
+    topic, notes = hints.camera(list(topics))
+    kind = topics[topic]
     first, guessed = bag.sized(bag.first(topic, kind), topic, hints)
     notes += guessed
-    found = decoded(bag.path, first, bag.packets(topic, kind))
+    found = decoded(bag.path, first, bag.packets(topic, kind), [t for t in topics if t != topic])
     events, span, more = gather(bag.path, found.chunks, hints, first.size, found.native)
     notes += (*found.notes(), *more)
     with events_alone():
@@ -75,7 +75,7 @@ def read_bag(bag: Bag, hints: Hints) -> Recording:
 def triggers_of(bag: Bag, topic: str | None) -> np.ndarray:
     """Times (N,) int64 us of the trigger words beside the events of a topic, by default the first.
     Raises as `read_bag`."""
-    topics = dict(bag.topics(EVENT_TYPES))
+    topics = bag.event_topics(topic)
     if not topics:
         return np.zeros(0, np.int64)
     chosen = Hints(events_topic=topic).camera(list(topics))[0]
@@ -120,11 +120,23 @@ class Bag:
     def all(self) -> list[str]:
         return [f"{c.topic} ({c.msgtype})" for c in self.reader.connections]
 
-    def topics(self, kinds: Iterable[str]) -> list[tuple[str, str]]:
-        """(topic, message type) of these types, sorted by name, those with messages first."""
+    def event_topics(self, asked: str | None) -> dict[str, str]:
+        """{topic: message type} of events, by name; unless one is asked for, those first whose
+        first messages have events that can be read."""
         found = {(c.topic, c.msgtype): c.msgcount for c in self.reader.connections
-                 if c.msgtype in kinds}
-        return sorted(found, key=lambda pair: (found[pair] == 0, *pair))
+                 if c.msgtype in EVENT_TYPES}
+        order = sorted(found, key=lambda pair: (found[pair] == 0, *pair))
+        if asked is None and len(order) > 1:
+            order.sort(key=lambda pair: found[pair] == 0 or not self._has_events(*pair))
+        return dict(order)
+
+    def _has_events(self, topic: str, kind: str) -> bool:
+        """Whether the first messages of a topic have events that can be read, or are damaged."""
+        try:
+            some = list(itertools.islice(self.packets(topic, kind), LOOKED))
+        except (Damage, EvflowDataError):
+            return True  # reading it says what is wrong
+        return any(packet.data and readable(packet.encoding) for packet in some)
 
     def image_streams(self, hints: Hints) -> list[ImageStream]:
         """Image topics that have messages, by name; none if no frames are wanted."""

@@ -8,7 +8,7 @@ on time_base) and `libcaer_cmp` (see `libcaer_words`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,18 +35,29 @@ class Decoded(NamedTuple):
     notes: Callable[[], tuple[Note, ...]] = tuple
 
 
-def decoded(path: Path, first: Packet, packets: Iterable[Packet]) -> Decoded:
-    """Decode the packets, all in the encoding of the first."""
+def readable(encoding: str) -> bool:
+    """Whether events are read from packets of an encoding."""
+    return encoding == "evt3" or encoding in _decoders()
+
+
+def decoded(
+    path: Path, first: Packet, packets: Iterable[Packet], others: Sequence[str] = ()
+) -> Decoded:
+    """Decode the packets, all in the encoding of the first. others: further topics, for EV008."""
     if first.encoding == "evt3":
         evt = evt3.Decoder("payload byte")
         return Decoded(evt.chunks(_words(packets)), "us", evt.notes)
-    known = {"": _event_array, "mono": _mono, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp}
-    if first.encoding not in known:
+    if not readable(first.encoding):
+        also = f" Other topics (--events-topic NAME): {', '.join(others)}." if others else ""
         raise EvflowDataError(
             "EV008", f"{path}: events are encoded as {first.encoding[:20]!r}.",
-            f"Known encodings: evt3, {', '.join(filter(None, known))}; convert the bag with "
-            "event_camera_tools.", where=path)
-    return Decoded(_counted(known[first.encoding](packets)), "ns")
+            f"Known encodings: evt3, {', '.join(filter(None, _decoders()))}; convert the bag with "
+            f"event_camera_tools; 'trigger' holds no events.{also}", where=path)
+    return Decoded(_counted(_decoders()[first.encoding](packets)), "ns")
+
+
+def _decoders() -> dict[str, Callable[[Iterable[Packet]], Iterator[tuple[np.ndarray, ...]]]]:
+    return {"": _event_array, "mono": _mono, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp}
 
 
 def triggers(first: Packet, packets: Iterable[Packet]) -> np.ndarray:
