@@ -181,11 +181,12 @@ def _shared(name: str, events: str) -> int:
     return common
 
 
-def _distance(name: str, events: str) -> tuple[int, int, int]:
-    """A smaller value is nearer to the events: first by shared parts, then by numbers and sides
-    that only one of the names has, then by further parts."""
-    differ = len(_camera(name).items() ^ _camera(events).items())
-    return -_shared(name, events), differ, len(_parts(name))
+def _distance(name: str, events: str) -> tuple[int, int, int, int]:
+    """A smaller value is nearer to the events: first by shared parts, then by sides and numbers of
+    cameras that only one of the names has, by further parts, and by other numbers."""
+    differ = _camera(name).items() ^ _camera(events).items()
+    return (-_shared(name, events), sum(bool(word) for word, _ in differ), len(_parts(name)),
+            len(differ))
 
 
 def _own(name: str, events: str) -> list[str]:

@@ -87,7 +87,8 @@ def test_of_several_streams_the_raw_one_near_the_events_is_taken(
     ("/cam0_image /cam1_image", "/cam1_events", "/cam1_image"),
     ("image_0 image_1", "/events_1", "image_1"), ("image_8bit", "/events_1", "image_8bit"),
     ("w/frames w/frames_right", "w/events_right", "w/frames_right"),
-    ("w/frames w/frames_right", "w/events", "w/frames")])
+    ("w/frames w/frames_right", "w/events", "w/frames"), ("frames frames_2", "events", "frames"),
+    ("/cam0/image_mono8 /cam0/sub/image_raw", "/cam0/events", "/cam0/image_mono8")])
 def test_names_of_drivers(names: str, events: str, best: str | None) -> None:
     assert taken(names, events) == best
 
