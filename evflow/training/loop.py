@@ -18,6 +18,7 @@ from evflow.process.devices import Votes, agree, is_main
 from evflow.process.signals import stop_requests
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.config import as_dict
+from evflow.training.lock import locked
 from evflow.training.log import Headline, Log, Metrics
 from evflow.training.options import RunOptions
 
@@ -67,14 +68,16 @@ def train(
 
     Raises:
         EvflowDataError: EV007 where a metric is not finite (that state is not saved), EV013 where
-            the folder holds another run, EV016 where there is none to resume, EV020.
+            the folder holds another run, or another process trains in it, EV016 where there is
+            none to resume, EV020.
     """
     if options.save_every < 1:
         raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
     if options.resume == "must" and not options.out.is_dir():  # before a folder is made
         raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
                               "Check --out, or pass --resume auto.")
-    with stop_requests() as requests, Checkpoints(options.out) as checkpoints:
+    checkpoints = Checkpoints(options.out)
+    with stop_requests() as requests, locked(checkpoints.folder), checkpoints:
         identity = as_dict(config) | ({} if start is None else {"start": start})
         resumed = goes_on(checkpoints, identity, options)
         advance, state = begin()

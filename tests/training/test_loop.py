@@ -131,6 +131,18 @@ def test_nothing_is_begun_in_the_folder_of_another_run(tmp_path: Path) -> None:
             train(begin, plan, options)
 
 
+def test_only_one_process_trains_in_a_folder(tmp_path: Path) -> None:
+    """A second run would remove what the first is writing, and overwrite its configuration."""
+    def meanwhile(state: Walk) -> Stepped:
+        with pytest.raises(EvflowDataError, match=rf"EV013.*process {os.getpid()} on .*training"):
+            train(lambda: (advance, start()), Plan(seed=1), given(tmp_path))
+        return advance(state)
+
+    assert train(lambda: (meanwhile, start()), Plan(), given(tmp_path)).steps == 7
+    assert json.loads((tmp_path / "config.json").read_text())["seed"] == 0
+    assert train(lambda: (advance, start()), Plan(), given(tmp_path)).steps == 0  # it was released
+
+
 @pytest.mark.parametrize(("bad", "kept"), [
     (2, set()), (3, set()), (4, {"3"}), (5, {"3"}), (6, {"3"}), (7, {"3", "6"})])
 def test_what_diverges_is_not_saved(bad: int, kept: set[str], tmp_path: Path) -> None:
