@@ -9,6 +9,7 @@ run continues from the one before.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import sys
@@ -20,13 +21,17 @@ import jax
 import orbax.checkpoint as ocp
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import aside, atomic_text
+from evflow.files.atomic import REASONS, aside, atomic_text
 from evflow.files.json_text import parse_json
 from evflow.files.limits import FREE, read_whole
 from evflow.files.regular import is_there
 from evflow.process import devices
 
 ANEW = "choose another --out"
+# By the system's error, beside those for which there is none in particular.
+WRITE_ADVICE: dict[int | None, str] = {
+    errno.ENOSPC: "Make space on that disk.", errno.EDQUOT: "Make space within the quota.",
+    errno.ENOENT: "Was a part of it removed or moved meanwhile?"}
 
 
 class Checkpoints:
@@ -66,10 +71,12 @@ class Checkpoints:
         except MemoryError:
             raise
         except Exception as e:  # as in `restore`
+            number = _system_error(e)
+            reason = _first_line(e) if number is None else os.strerror(number)
             raise EvflowDataError(
-                "EV019", f"a checkpoint cannot be written to {self.steps} ({_first_line(e)}).",
-                "Is the disk full? With space on it the same command goes on from the last whole "
-                "checkpoint.") from e
+                "EV019", f"a checkpoint cannot be written to {self.steps} ({reason}).",
+                f"{WRITE_ADVICE.get(number, 'Can it be written?')} The same command goes on from "
+                "the last whole checkpoint.") from e
 
     @property
     def latest(self) -> int | None:
@@ -202,6 +209,14 @@ class Checkpoints:
         """Save the configuration beside the steps."""
         atomic_text(self.folder / "config.json", json.dumps(_as_json(config), indent=2) + "\n",
                     overwrite=True)
+
+
+def _system_error(error: Exception) -> int | None:
+    """The number of the system's error that an exception is or, as tensorstore's, quotes; None for
+    others."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno
+    return next((n for n in REASONS if os.strerror(n) in str(error)), None)
 
 
 def _first_line(error: Exception) -> str:

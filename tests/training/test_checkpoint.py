@@ -151,14 +151,25 @@ def test_a_run_whose_configuration_is_lost_is_told_from_none(run: Path) -> None:
         checkpoints.check_config({})
 
 
-def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise ValueError("INTERNAL: Error writing file: No space left on device\n[more]")
+@pytest.mark.parametrize(("error", "said", "advice"), [
+    (ValueError("RESOURCE_EXHAUSTED: Error writing local file \"/d/ocdbt/\": Failed writing: "
+                f"\"/d/{'x' * 300}\" [OS error 28: ENOSPC No space left on device]\n[more]"),
+     r"\(No space left on device\)", "Make space"),
+    (FileNotFoundError(2, "No such file or directory", "commit_success.txt"),
+     r"\(No such file or directory\)", "removed or moved"),
+    (ValueError("of another kind\nand more"), r"\(of another kind\)", "Can it be written")])
+def test_what_keeps_a_checkpoint_from_being_written_is_named(
+    error: Exception, said: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise error
 
     with Checkpoints(tmp_path) as checkpoints:
-        monkeypatch.setattr(checkpoints._manager(), "save", full)
-        with pytest.raises(EvflowDataError, match=r"EV019.*No space left on device\)"):
+        monkeypatch.setattr(checkpoints._manager(), "save", fails)
+        with pytest.raises(EvflowDataError, match=f"EV019.*{said}") as caught:
             checkpoints.save(1, state(1))
+    assert advice in caught.value.fix
+    assert ("space" in caught.value.fix) == ("space" in said)
 
 
 def test_steps_that_are_a_file(tmp_path: Path) -> None:
