@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -27,6 +28,7 @@ from evflow.files.limits import FREE, read_whole
 from evflow.files.regular import is_there
 from evflow.process import devices
 
+ORBAX = logging.getLogger("absl")  # by which orbax logs
 ANEW = "choose another --out"
 # By the system's error, beside those for which there is none in particular.
 WRITE_ADVICE: dict[int | None, str] = {
@@ -35,8 +37,8 @@ WRITE_ADVICE: dict[int | None, str] = {
 
 
 class Checkpoints:
-    """The checkpoints of one run in `folder`; a context manager that waits for writes. Raises
-    EV019 where that is a file, or cannot be made."""
+    """The checkpoints of one run in `folder`; a context manager that waits for writes, and in which
+    orbax is silent. Raises EV019 where that is a file, or cannot be made."""
 
     def __init__(self, folder: str | os.PathLike, keep: int = 2) -> None:
         self.folder = Path(folder).absolute()
@@ -52,16 +54,22 @@ class Checkpoints:
                                   "Choose another --out.") from e
         self._keep = keep
         self._writer: Any = None
+        self._level = ORBAX.level
 
     def __enter__(self) -> Checkpoints:
+        self._level = ORBAX.level
+        ORBAX.setLevel(logging.CRITICAL)  # each of its threads logs a traceback of what it raises
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None and self._writer is not None:
-            # not after an error: it may be the death of a process, which a write would wait for
-            with self._writing():
-                self._writer.wait_until_finished()
-                self._writer.close()
+        try:
+            if kind is None and self._writer is not None:
+                # not after an error: it may be the death of a process, which a write would wait for
+                with self._writing():
+                    self._writer.wait_until_finished()
+                    self._writer.close()
+        finally:
+            ORBAX.setLevel(self._level)
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:

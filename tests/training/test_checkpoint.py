@@ -4,6 +4,7 @@ a run that never had the others; where none is sound, each is named."""
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 from collections.abc import Callable
@@ -159,9 +160,11 @@ def test_a_run_whose_configuration_is_lost_is_told_from_none(run: Path) -> None:
      r"\(No such file or directory\)", "removed or moved"),
     (ValueError("of another kind\nand more"), r"\(of another kind\)", "Can it be written")])
 def test_what_keeps_a_checkpoint_from_being_written_is_named(
-    error: Exception, said: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    error: Exception, said: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     def fails(*_: object, **__: object) -> None:
+        logging.getLogger("absl").error("Traceback", exc_info=error)  # as orbax does
         raise error
 
     with Checkpoints(tmp_path) as checkpoints:
@@ -170,6 +173,7 @@ def test_what_keeps_a_checkpoint_from_being_written_is_named(
             checkpoints.save(1, state(1))
     assert advice in caught.value.fix
     assert ("space" in caught.value.fix) == ("space" in said)
+    assert not caplog.records
 
 
 def test_steps_that_are_a_file(tmp_path: Path) -> None:
