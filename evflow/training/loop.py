@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.process.devices import Votes, agree, is_main
@@ -67,9 +69,9 @@ def train(
         start: digest of the weights that the fresh state starts from; identifies the run too.
 
     Raises:
-        EvflowDataError: EV007 where a metric is not finite (that state is not saved), EV013 where
-            the folder holds another run, or another process trains in it, EV016 where there is
-            none to resume, EV020.
+        EvflowDataError: EV007 where a metric or the state is not finite (it is not saved), EV013
+            where the folder holds another run, or another process trains in it, EV016 where there
+            is none to resume, EV020.
     """
     if options.save_every < 1:
         raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
@@ -88,8 +90,11 @@ def train(
             state, lost = _steps(advance, state, config.steps, options, checkpoints, log, requests)
     # Raised after the checkpoints have been written.
     if lost:
-        raise EvflowDataError("EV007", f"{lost}.", f"Checkpoints before it are in {options.out}; "
-                              "train at a lower rate.")
+        latest = checkpoints.latest
+        kept = "no checkpoint was saved yet" if latest is None else (
+            f"the last checkpoint is of step {latest}")
+        raise EvflowDataError("EV007", f"{lost}; {kept}.", "Train at a lower rate, with another "
+                              "--out: this command would go on to the same step.")
     stopped = (f"stopped after step {int(state.step)} of {config.steps}; a checkpoint is saved, "
                "and the same command goes on." if agree(bool(requests)) else "")
     return Ended(state, log.figures, stopped, int(state.step) - begun)
@@ -112,7 +117,7 @@ def _steps(
     advance: Advance[State], state: State, steps: int, options: RunOptions,
     checkpoints: Checkpoints, log: Log, requests: list[int],
 ) -> tuple[State, str]:
-    """The last state, and a message naming metrics that are not finite, else ""."""
+    """The last state, and a message naming what is not finite, else ""."""
     step, votes = int(state.step), Votes()
     # All processes must stop after the same step, though signals and clocks differ.
     while step < steps and not votes.agree(bool(requests) or log.seconds >= options.max_seconds):
@@ -120,12 +125,24 @@ def _steps(
         step += 1
         lost = log.add(step, metrics)
         if not lost and step % options.save_every == 0:
-            lost = log.flush()
-            if not lost:
-                checkpoints.save(step, state)
+            lost = _save(step, state, checkpoints, log)
         if lost:
             return state, lost
-    lost = log.flush()
+    return state, _save(step, state, checkpoints, log)
+
+
+def _save(step: int, state: Any, checkpoints: Checkpoints, log: Log) -> str:
+    """Save a state whose metrics and arrays are finite; else the message. The metrics are those
+    before the step's update, which may be what is not finite."""
+    lost = log.flush() or _not_finite(step, state)
     if not lost:
         checkpoints.save(step, state)
-    return state, lost
+    return lost
+
+
+def _not_finite(step: int, state: Any) -> str:
+    """A message naming the first array of the state with NaN or infinity, else ""."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if jnp.issubdtype(leaf.dtype, jnp.inexact) and not np.isfinite(np.asarray(leaf)).all():
+            return f"{jax.tree_util.keystr(path)} of the state is not finite after step {step}"
+    return ""

@@ -152,11 +152,28 @@ def test_what_diverges_is_not_saved(bad: int, kept: set[str], tmp_path: Path) ->
             return state, metrics
         return Walk(state.step, state.at * jnp.nan), {"at": state.at * jnp.nan}
 
-    with pytest.raises(EvflowDataError, match=rf"EV007.*at = nan after step {bad}\."):
+    last = max(kept, default=None)
+    with pytest.raises(EvflowDataError, match=rf"EV007.*at = nan after step {bad}; (.*)\. Train at"
+                       ) as caught:
         train(lambda: (diverges, start()), Plan(), given(tmp_path))
+    assert (f"last checkpoint is of step {last}" if last else "no checkpoint") in caught.value.seen
     assert saved(tmp_path) == kept
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert json.loads(lines[-1])["step"] == bad
+
+
+@pytest.mark.parametrize(("bad", "kept"), [(3, set()), (6, {"3"}), (7, {"3", "6"})])
+def test_an_update_that_is_not_finite_is_not_saved(
+    bad: int, kept: set[str], tmp_path: Path
+) -> None:
+    """Its metrics are those before it; saved, it would end every later attempt."""
+    def diverges(state: Walk) -> Stepped:
+        state, metrics = advance(state)
+        return (Walk(state.step, state.at * jnp.inf) if int(state.step) == bad else state), metrics
+
+    with pytest.raises(EvflowDataError, match=rf"EV007.*\.at of the state.*after step {bad};"):
+        train(lambda: (diverges, start()), Plan(), given(tmp_path))
+    assert saved(tmp_path) == kept
 
 
 def test_the_next_step_is_on_its_way_before_metrics_are_fetched(tmp_path: Path) -> None:
