@@ -21,6 +21,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import types
 import typing
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ import pytest
 import evflow as ef
 from evflow.cli import command_type, main
 from evflow.dataset.sequence import EventSequence
+from evflow.downstream.tensor import event_tensor, normalise
 from evflow.errors import CODES
 from evflow.io import write_recording
 from evflow.io.registry import FORMATS, WRITERS
@@ -184,6 +186,22 @@ def test_a_camera_is_cropped_with_all_that_its_file_holds(
         assert {n: part[n].shape for n in ("theta_off", "valid", "undetermined")} == {
             "theta_off": (24, 32), "valid": (24, 32), "undetermined": (1,)}
     np.testing.assert_array_equal(ef.Camera.load("cam/cropped.npz").eta_on, whole.eta_on[:24, :32])
+
+
+@pytest.mark.parametrize(("t", "p"), [
+    ([], []), ([5], [1]), ([0, 10], [1, 1]), ([5, 5, 5], [1, 1, 1]), ([0, 0, 4, 9], [1, 0, 1, 0])])
+def test_tensors_of_the_data_sets_are_those_of_a_network(
+    t: list[int], p: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where all their entries are equal: NaN would stay in a network for ever."""
+    (recipe,) = (b for b in blocks(ROOT / "docs/networks.md") if "def five_bins" in b.text)
+    monkeypatch.setitem(sys.modules, "torch", types.SimpleNamespace(from_numpy=np.asarray))
+    names: dict[str, Any] = {}
+    exec(recipe.text, names)
+    pixels = np.arange(len(t), dtype=np.uint16)
+    events = ef.Events(pixels, pixels, np.array(t, np.int64), np.array(p, bool), (8, 6))
+    wanted = np.asarray(normalise(event_tensor(events))).transpose(2, 0, 1)
+    np.testing.assert_allclose(names["five_bins"](events), wanted, atol=1e-6)
 
 
 @pytest.mark.slow
