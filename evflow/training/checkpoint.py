@@ -29,6 +29,7 @@ from evflow.files.regular import is_there
 from evflow.process import devices
 
 ORBAX = logging.getLogger("absl")  # by which orbax logs
+CONFIG = "config.json"
 ANEW = "choose another --out"
 # By the system's error, beside those for which there is none in particular.
 WRITE_ADVICE: dict[int | None, str] = {
@@ -90,6 +91,11 @@ class Checkpoints:
     def latest(self) -> int | None:
         """The last step in the folder, readable or not, or None."""
         return max(self._found(), default=None)
+
+    @property
+    def has_config(self) -> bool:
+        """Whether a configuration is saved in the folder."""
+        return is_there(self.folder / CONFIG)
 
     def _found(self) -> list[int]:
         """All steps, the last one first; a file in place of a folder is a damaged one."""
@@ -173,7 +179,7 @@ class Checkpoints:
                 f"that made it, or {ANEW}.")
         return EvflowDataError(
             "EV009", f"no checkpoint in {self.folder} can be read ({names}).",
-            f"Restore one from a copy, or remove {self.steps} and {self.folder / 'config.json'} "
+            f"Restore one from a copy, or remove {self.steps} and {self.folder / CONFIG} "
             f"to begin anew, or {ANEW}.")
 
     def _is_other(self, step: int, like: Any) -> bool:
@@ -190,12 +196,12 @@ class Checkpoints:
         """Raise EV013, naming the fields, where the saved configuration is not `config`; EV009
         where it is damaged or missing beside steps, EV016 where none is saved, EV018 where another
         version saved it."""
-        path = self.folder / "config.json"
-        if not is_there(path) and self.latest is not None:
+        path = self.folder / CONFIG
+        if not self.has_config and self.latest is not None:
             raise EvflowDataError(
                 "EV009", f"{path} is missing, without which the run there cannot be identified.",
                 f"Restore it from a copy, or {ANEW}.")
-        if not is_there(path):
+        if not self.has_config:
             raise EvflowDataError("EV016", f"no run in {self.folder} (no config.json).",
                                   "Start the run with --resume auto.")
         saved, given = ({"start": None, **_flat(of)} for of in (_read(path), _as_json(config)))
@@ -215,7 +221,7 @@ class Checkpoints:
 
     def write_config(self, config: dict[str, Any]) -> None:
         """Save the configuration beside the steps."""
-        atomic_text(self.folder / "config.json", json.dumps(_as_json(config), indent=2) + "\n",
+        atomic_text(self.folder / CONFIG, json.dumps(_as_json(config), indent=2) + "\n",
                     overwrite=True)
 
 

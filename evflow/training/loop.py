@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import jax
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.files.regular import is_there
 from evflow.process.devices import Votes, agree, is_main
 from evflow.process.signals import stop_requests
 from evflow.training.checkpoint import Checkpoints
@@ -32,6 +34,7 @@ class Counted(Protocol):
     def step(self) -> jax.Array: ...
 
 
+LOG = "metrics.jsonl"
 State = TypeVar("State", bound=Counted)
 Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
 
@@ -85,7 +88,7 @@ def train(
         advance, state = begin()
         if resumed:
             state = checkpoints.restore(state)
-        path, begun = options.out / "metrics.jsonl", int(state.step)
+        path, begun = options.out / LOG, int(state.step)
         with Log(path, config.steps, begun, headline) as log:
             state, lost = _steps(advance, state, config.steps, options, checkpoints, log, requests)
     # Raised after the checkpoints have been written.
@@ -101,16 +104,28 @@ def train(
 
 
 def goes_on(checkpoints: Checkpoints, config: dict[str, Any], options: RunOptions) -> bool:
-    """Whether the run in the folder is continued; else the folder is made this run's."""
-    if options.resume == "never" and checkpoints.latest is not None:
+    """Whether the run in the folder is continued; else the folder is made this run's.
+
+    A log with steps is a run too, though its checkpoints were removed: another configuration must
+    not replace it. Without config.json it is nobody's, as after the removal that EV009 advises.
+    """
+    logged = checkpoints.latest is not None or _has_steps(options.out / LOG)
+    if options.resume == "never" and logged:
         raise EvflowDataError("EV013", f"{options.out} already holds a run.",
                               "Pass --resume auto to go on with it, or another --out.")
     if options.resume == "must" or checkpoints.latest is not None:
         checkpoints.check_config(config)
         return True
+    if logged and checkpoints.has_config:
+        checkpoints.check_config(config)
     if is_main():
         checkpoints.write_config(config)
     return False
+
+
+def _has_steps(log: Path) -> bool:
+    """Whether a log is there and not empty."""
+    return is_there(log) and log.stat().st_size > 0
 
 
 def _steps(

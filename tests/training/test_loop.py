@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import json
 import os
+import shutil
 import signal
 import types
 from pathlib import Path
@@ -129,6 +130,22 @@ def test_nothing_is_begun_in_the_folder_of_another_run(tmp_path: Path) -> None:
                           (Plan(), given(tmp_path, resume="never"))):
         with pytest.raises(EvflowDataError, match="EV013"):
             train(begin, plan, options)
+
+
+def test_a_run_without_its_checkpoints_is_not_replaced(tmp_path: Path) -> None:
+    begin = lambda: (advance, start())  # noqa: E731
+    train(begin, Plan(), given(tmp_path))
+    log = (tmp_path / "metrics.jsonl").read_text()
+    shutil.rmtree(tmp_path / "steps")
+    for plan, options, seen in ((Plan(seed=1), given(tmp_path), "seed: 0 there, 1 here"),
+                                (Plan(), given(tmp_path, resume="never"), "already holds a run")):
+        with pytest.raises(EvflowDataError, match=f"EV013.*{seen}"):
+            train(begin, plan, options)
+    assert (tmp_path / "metrics.jsonl").read_text() == log
+    assert train(begin, Plan(), given(tmp_path)).steps == 7  # the same run, from its beginning
+    shutil.rmtree(tmp_path / "steps")
+    (tmp_path / "config.json").unlink()  # as EV009 advises where the steps are damaged
+    assert train(begin, Plan(seed=1), given(tmp_path)).steps == 7
 
 
 def test_only_one_process_trains_in_a_folder(tmp_path: Path) -> None:
