@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def train_network(options: TrainOptions) -> Metrics:
     card = {"preset": options.preset, "steps": steps, "seed": config.seed,
             "devices": mesh.size, "training_figures": ended.figures, "config": as_dict(config),
             "start": options.start, "start_sha256": start, **provenance()}
-    if devices.is_main() and (ended.steps or not _holds(path, steps)):
+    if devices.is_main() and (ended.steps or not _holds(path, card)):
         save_weights(path, ended.state.average, card, overwrite=True)
     devices.leave_together()
     if ended.stopped:
@@ -56,12 +57,15 @@ def train_network(options: TrainOptions) -> Metrics:
     return ended.figures
 
 
-def _holds(path: Path, steps: int) -> bool:
-    """Whether there are weights of that step, as of a run that is only repeated."""
+def _holds(path: Path, card: dict[str, Any]) -> bool:
+    """Whether there are weights of this run and step, as where it is only repeated. Others of as
+    many steps are of a run that was in the folder before."""
     try:
-        return model_card(path).get("steps") == steps
+        there = model_card(path)
     except EvflowDataError:
         return False
+    here = json.loads(json.dumps(card))  # tuples are read as lists
+    return all(there.get(name) == here[name] for name in ("steps", "config", "start_sha256"))
 
 
 def bank_of(config: TrainConfig, photos: bool) -> TextureBank:

@@ -20,6 +20,7 @@ import pytest
 
 from evflow import cli
 from evflow.errors import EvflowDataError
+from evflow.network.weights import load_weights
 from evflow.process.devices import Votes
 from evflow.training import run
 from evflow.training.loop import Ended, train
@@ -219,6 +220,23 @@ def test_the_next_step_is_on_its_way_before_metrics_are_fetched(tmp_path: Path) 
 def test_alone_a_vote_counts_at_once(vote: bool) -> None:
     votes = Votes()
     assert [votes.agree(v) for v in (False, vote)] == [False, vote]
+
+
+def test_weights_of_another_run_in_the_folder_are_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though they are of as many steps; those of a run that is only repeated stay."""
+    def command(at: float, steps: int, *options: str) -> bool:
+        average = {"default": {"a": jnp.full(3, at)}}
+        state = types.SimpleNamespace(step=jnp.int32(5), average=average)
+        monkeypatch.setattr(run, "train", lambda *_: Ended(state, {"loss": 1.0}, "", steps))
+        assert cli.main(["train", "--preset", "debug", "--out", str(tmp_path), *options]) == 0
+        kept, = jax.tree.leaves(load_weights(tmp_path / "weights.safetensors"))
+        return bool(kept[0] == at)
+
+    assert command(1.0, 5)
+    assert not command(2.0, 0)
+    assert command(3.0, 0, "--seed", "1")
 
 
 @pytest.mark.parametrize(("stopped", "code"), [("", 0), ("stopped after step 5 of 20.", 130)])
