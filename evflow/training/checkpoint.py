@@ -30,6 +30,7 @@ from evflow.process import devices
 
 ORBAX = logging.getLogger("absl")  # by which orbax logs
 CONFIG = "config.json"
+PICTURES = "images_sha256"  # in it, of the pictures of the scenes
 ANEW = "choose another --out"
 # By the system's error, beside those for which there is none in particular.
 WRITE_ADVICE: dict[int | None, str] = {
@@ -205,6 +206,8 @@ class Checkpoints:
             raise EvflowDataError("EV016", f"no run in {self.folder} (no config.json).",
                                   "Start the run with --resume auto.")
         saved, given = ({"start": None, **_flat(of)} for of in (_read(path), _as_json(config)))
+        given.setdefault(PICTURES, None)
+        saved.setdefault(PICTURES, given[PICTURES])  # not saved by earlier versions
         if unknown := sorted(saved.keys() - given.keys()):
             raise EvflowDataError(
                 "EV018", f"{path} has options that this version does not know "

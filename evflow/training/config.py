@@ -125,7 +125,8 @@ class TrainConfig:
         sequences: number of fixed sequences, drawn once (the paper's 300); 0 draws new ones in
             every step.
         images: of the scenes, a folder of pictures or a COCO json of objects; None is procedural
-            textures and scikit-image's photographs.
+            textures and scikit-image's photographs. A run goes on with the same alone: a folder's
+            by the names and sizes of its files, a json by its bytes.
         steps: optimiser steps.
         warmup: steps over which the learning rates rise from 0; then they fall as a cosine.
         learning_rate: highest learning rate of the encoder and the spread.

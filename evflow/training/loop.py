@@ -7,7 +7,7 @@ the host, except where a checkpoint is due (the next step takes the state's buff
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -34,6 +34,7 @@ class Counted(Protocol):
     def step(self) -> jax.Array: ...
 
 
+NO_FILES: Mapping[str, str] = {}
 LOG = "metrics.jsonl"
 State = TypeVar("State", bound=Counted)
 Advance = Callable[[State], tuple[State, dict[str, jax.Array]]]
@@ -58,7 +59,7 @@ class Ended(Generic[State]):
 
 def train(
     begin: Callable[[], tuple[Advance[State], State]], config: Any, options: RunOptions,
-    headline: Headline = lambda _: "training", start: str | None = None,
+    headline: Headline = lambda _: "training", files: Mapping[str, str] = NO_FILES,
 ) -> Ended[State]:
     """Train for config.steps steps, from a fresh state or the run in options.out.
 
@@ -69,7 +70,8 @@ def train(
         config: a dataclass that identifies the run; one in the folder must be equal.
         options: where and how long to run.
         headline: text of the progress bar from metrics.
-        start: digest of the weights that the fresh state starts from; identifies the run too.
+        files: digests of the files that the run rests on, by their names in config.json; they
+            identify it too.
 
     Raises:
         EvflowDataError: EV007 where a metric or the state is not finite (it is not saved), EV013
@@ -83,7 +85,7 @@ def train(
                               "Check --out, or pass --resume auto.")
     checkpoints = Checkpoints(options.out)
     with stop_requests() as requests, locked(checkpoints.folder), checkpoints:
-        identity = as_dict(config) | ({} if start is None else {"start": start})
+        identity = as_dict(config) | dict(files)
         resumed = goes_on(checkpoints, identity, options)
         advance, state = begin()
         if resumed:

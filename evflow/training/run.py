@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 from pathlib import Path
@@ -12,10 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from evflow.errors import EvflowDataError
+from evflow.io.images.folder import list_images
+from evflow.io.images.frames import existing
 from evflow.network.config import MODELS, ModelConfig
 from evflow.network.weights import load_weights, model_card, save_weights, weights_hash
 from evflow.process import devices
-from evflow.process.provenance import provenance
+from evflow.process.provenance import provenance, sha256
 from evflow.scenes import TextureBank, make_bank, own_bank
 from evflow.training.config import TrainConfig, as_dict, preset
 from evflow.training.log import Metrics
@@ -42,13 +45,14 @@ def train_network(options: TrainOptions) -> Metrics:
         step = devices.parallel(make_run_step(config, tx), mesh)
         return lambda state: step(state, bank), state
 
-    start = None if options.start is None else weights_hash(options.start)
+    files = digests(options.start, config.images)
     with devices.compiled_quickly(small):
-        ended = train(begin, config, options, _headline, start)
+        ended = train(begin, config, options, _headline, files)
     steps, path = int(ended.state.step), options.out / "weights.safetensors"
     card = {"preset": options.preset, "steps": steps, "seed": config.seed,
             "devices": mesh.size, "training_figures": ended.figures, "config": as_dict(config),
-            "start": options.start, "start_sha256": start, **provenance()}
+            "start": options.start, "start_sha256": files.get("start"),
+            "images_sha256": files.get("images_sha256"), **provenance()}
     if devices.is_main() and (ended.steps or not _holds(path, card)):
         save_weights(path, ended.state.average, card, overwrite=True)
     devices.leave_together()
@@ -65,7 +69,22 @@ def _holds(path: Path, card: dict[str, Any]) -> bool:
     except EvflowDataError:
         return False
     here = json.loads(json.dumps(card))  # tuples are read as lists
-    return all(there.get(name) == here[name] for name in ("steps", "config", "start_sha256"))
+    return all(there.get(name) == here[name]
+               for name in ("steps", "config", "start_sha256", "images_sha256"))
+
+
+def digests(start: str | None, images: str | None) -> dict[str, str]:
+    """Digests of what a run takes from files, which identify it: of `start` the weights, of
+    `images` a json's bytes. A folder may hold more pictures than can be read at each start: of it
+    the names and sizes of the files."""
+    found = {} if start is None else {"start": weights_hash(start)}
+    if images is None:
+        return found
+    path = existing(images)
+    if not path.is_dir():
+        return found | {"images_sha256": sha256(path)}
+    sizes = "".join(f"{file.name}\0{file.stat().st_size}\n" for file in list_images(path))
+    return found | {"images_sha256": hashlib.sha256(sizes.encode()).hexdigest()}
 
 
 def bank_of(config: TrainConfig, photos: bool) -> TextureBank:

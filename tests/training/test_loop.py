@@ -25,6 +25,7 @@ from evflow.process.devices import Votes
 from evflow.training import run
 from evflow.training.loop import Ended, train
 from evflow.training.options import RunOptions
+from evflow.training.run import digests
 
 Stepped = tuple["Walk", dict[str, Any]]
 
@@ -97,14 +98,36 @@ def test_a_finished_run_that_is_repeated_makes_no_step_and_has_the_same_figures(
 
 def test_weights_to_start_from_identify_a_run(tmp_path: Path) -> None:
     begin = lambda: (advance, start())  # noqa: E731
-    train(begin, Plan(), given(tmp_path / "a", max_seconds=0.0), start="abc")
-    train(begin, Plan(), given(tmp_path / "a"), start="abc")
+    train(begin, Plan(), given(tmp_path / "a", max_seconds=0.0), files={"start": "abc"})
+    train(begin, Plan(), given(tmp_path / "a"), files={"start": "abc"})
     for there, here in (("abc", None), ("abc", "def")):
         with pytest.raises(EvflowDataError, match=f"EV013.*start: {there} there, {here} here"):
-            train(begin, Plan(), given(tmp_path / "a"), start=here)
+            train(begin, Plan(), given(tmp_path / "a"), files={"start": here} if here else {})
     train(begin, Plan(), given(tmp_path / "b"))
     with pytest.raises(EvflowDataError, match=r"EV013.*start: None there, abc here"):
-        train(begin, Plan(), given(tmp_path / "b"), start="abc")
+        train(begin, Plan(), given(tmp_path / "b"), files={"start": "abc"})
+
+
+def test_pictures_identify_a_run(tmp_path: Path) -> None:
+    """By their names and sizes, or a json by its bytes, not by the path alone."""
+    begin = lambda: (advance, start())  # noqa: E731
+    pictures, objects = tmp_path / "pictures", tmp_path / "objects.json"
+    pictures.mkdir()
+    (pictures / "0.png").write_bytes(b"one")
+    objects.write_text("[]")
+    changes = ((pictures, lambda: (pictures / "0.png").write_bytes(b"another")),
+               (objects, lambda: objects.write_text("[1]")))
+    for images, change in changes:
+        out = tmp_path / f"run of {images.name}"
+        assert train(begin, Plan(), given(out), files=digests(None, str(images))).steps == 7
+        assert train(begin, Plan(), given(out), files=digests(None, str(images))).steps == 0
+        change()
+        with pytest.raises(EvflowDataError, match=r"EV013.*images_sha256: \w+ there, \w+ here"):
+            train(begin, Plan(), given(out), files=digests(None, str(images)))
+        config = json.loads((out / "config.json").read_text())
+        del config["images_sha256"]  # as of an earlier version
+        (out / "config.json").write_text(json.dumps(config))
+        assert train(begin, Plan(), given(out), files=digests(None, str(images))).steps == 0
 
 
 def test_it_stops_in_time_and_keeps_runs_apart(tmp_path: Path) -> None:
