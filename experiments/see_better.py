@@ -90,6 +90,7 @@ def chosen(options: Options) -> Setting:
 def main(options: Options) -> dict[str, Any]:
     """Train and test what is missing; returns the tables' figures of all there is."""
     plots.require()
+    at_least(0, max_seconds=options.max_seconds)
     began, setting = time.monotonic(), chosen(options)
     runs = Trainings(setting, options.out, options.weights, named_files(options.recordings))
     conditions = runs.conditions(
@@ -99,9 +100,8 @@ def main(options: Options) -> dict[str, Any]:
     left = runs.complete_all(conditions, began + options.max_seconds)
     result = {k: gains.compared(scores) for k, scores in runs.scores(conditions).items()}
     untrained = runs.untrained(options.task)
-    head = heading(options.task, options.preset, setting, len(options.recordings))
-    text = f"{head}\n\n" + gains.report(
-        result, options.task, runs.camera_medians(conditions), left, untrained)
+    report = gains.report(result, options.task, runs.camera_medians(conditions), left, untrained)
+    text = f"{heading(options.task, options.preset, setting, len(options.recordings))}\n\n{report}"
     write_result(
         options.out / "see_better.json",
         {"targets": result, "without_network": untrained, "missing": left,

@@ -7,6 +7,7 @@ the host, except where a checkpoint is due (the next step takes the state's buff
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +64,8 @@ def train(
 ) -> Ended[State]:
     """Train for config.steps steps, from a fresh state or the run in options.out.
 
-    Every step is logged, and the last one saved, also where time or a signal ends the run.
+    Every step is logged, and the last one saved, also where time or a signal ends the run; time
+    does so with a line on stderr.
 
     Args:
         begin: returns the step and the fresh state; called after the folder has been checked.
@@ -80,6 +82,8 @@ def train(
     """
     if options.save_every < 1:
         raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
+    if not options.max_seconds >= 0:  # nor NaN, which no time reaches
+        raise EvflowDataError("EV020", f"--max-seconds {options.max_seconds}.", "Give 0 or more.")
     if options.resume == "must" and not options.out.is_dir():  # before a folder is made
         raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
                               "Check --out, or pass --resume auto.")
@@ -100,9 +104,13 @@ def train(
             f"the last checkpoint is of step {latest}")
         raise EvflowDataError("EV007", f"{lost}; {kept}.", "Train at a lower rate, with another "
                               "--out: this command would go on to the same step.")
-    stopped = (f"stopped after step {int(state.step)} of {config.steps}; a checkpoint is saved, "
-               "and the same command goes on." if agree(bool(requests)) else "")
-    return Ended(state, log.figures, stopped, int(state.step) - begun)
+    reached = int(state.step)
+    stopped = (f"stopped after step {reached} of {config.steps}; a checkpoint is saved, and the "
+               "same command goes on.")
+    by_signal = agree(bool(requests))
+    if not by_signal and reached < config.steps and is_main():
+        print(f"--max-seconds {options.max_seconds:g}: {stopped}", file=sys.stderr)
+    return Ended(state, log.figures, stopped if by_signal else "", reached - begun)
 
 
 def goes_on(checkpoints: Checkpoints, config: dict[str, Any], options: RunOptions) -> bool:

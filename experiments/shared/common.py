@@ -155,7 +155,7 @@ def estimator(weights: str | Path, *parts: str) -> tuple[str, dict[str, Any]]:
 def at_least(least: float, **options: float | None) -> None:
     """EV020 where an option that is given is less; by its name: `save_every` is --save-every."""
     for name, value in options.items():
-        if value is not None and value < least:
+        if value is not None and not value >= least:  # NaN is less than nothing
             raise EvflowDataError("EV020", f"--{name.replace('_', '-')} {value}.",
                                   f"Give {least} or more.")
 

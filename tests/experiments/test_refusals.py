@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -280,7 +281,8 @@ def test_a_file_is_no_folder_of_a_run(tmp_path: Path) -> None:
 
 
 def test_a_refused_command_leaves_its_folder_to_the_next(tmp_path: Path) -> None:
-    for wrong in ({"names": ("foo",)}, {"cameras": (f"mine={tmp_path / 'absent.npz'}",)}):
+    for wrong in ({"names": ("foo",)}, {"cameras": (f"mine={tmp_path / 'absent.npz'}",)},
+                  {"max_seconds": -1.0}, {"max_seconds": math.nan}):
         with pytest.raises(EvflowDataError, match=r"EV020|EV016"):
             see_better.main(see_better.Options(out=tmp_path / "sb", **wrong))
     assert not (tmp_path / "sb").exists()

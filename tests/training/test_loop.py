@@ -6,7 +6,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import math
 import os
+import re
 import shutil
 import signal
 import types
@@ -130,17 +132,21 @@ def test_pictures_identify_a_run(tmp_path: Path) -> None:
         assert train(begin, Plan(), given(out), files=digests(None, str(images))).steps == 0
 
 
-def test_it_stops_in_time_and_keeps_runs_apart(tmp_path: Path) -> None:
+def test_it_stops_in_time_and_keeps_runs_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     none = given(tmp_path / "a", max_seconds=0.0)
     assert int(train(lambda: (advance, start()), Plan(), none).completed().step) == 0
+    assert re.search("--max-seconds 0: stopped after step 0 of 7.*goes on", capsys.readouterr().err)
     with pytest.raises(EvflowDataError, match=r"EV013.*seed"):
         train(lambda: (advance, start()), Plan(seed=1), none)
     with pytest.raises(EvflowDataError, match="EV013"):
         train(lambda: (advance, start()), Plan(), dataclasses.replace(none, resume="never"))
     with pytest.raises(EvflowDataError, match="EV016"):
         train(lambda: (advance, start()), Plan(), given(tmp_path / "none", resume="must"))
-    with pytest.raises(EvflowDataError, match=r"EV020.*--save-every 0"):
-        train(lambda: (advance, start()), Plan(), given(tmp_path / "none", save_every=0))
+    for name, value in (("save_every", 0), ("max_seconds", -5.0), ("max_seconds", math.nan)):
+        with pytest.raises(EvflowDataError, match=rf"EV020.*--{name.replace('_', '-')} {value}"):
+            train(lambda: (advance, start()), Plan(), given(tmp_path / "none", **{name: value}))
     assert not (tmp_path / "none").exists()
 
 
