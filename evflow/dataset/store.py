@@ -37,7 +37,9 @@ def sequence_paths(folder: str | os.PathLike, split: str = "train") -> list[Path
         raise EvflowDataError("EV020", f"split={split!r}.", f"Choose from {SPLITS}.")
     place = Path(folder) / split
     found = sorted(place.iterdir()) if place.is_dir() else []
-    paths = [p for p in found if not p.name.startswith(".") and p.suffix in SUFFIXES.values()]
+    # A file without extension, as somebody's README, is none of them.
+    paths = [p for p in found if not p.name.startswith(".")
+             and (p.suffix == SUFFIXES["dsec"] or (p.suffix == SUFFIXES["npy"] and p.is_dir()))]
     if not paths:
         raise EvflowDataError("EV016", f"no sequences in {place}.", "Is this the set's folder?")
     return paths

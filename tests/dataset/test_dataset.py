@@ -28,7 +28,7 @@ from evflow.dataset import (
 )
 from evflow.dataset.manifest import Manifests
 from evflow.dataset.sequence import CAMERA
-from evflow.dataset.store import _save
+from evflow.dataset.store import SUFFIXES, _save
 from evflow.io import read_recording
 from evflow.recordings import iter_windows
 from evflow.scenes.config import SceneConfig
@@ -138,6 +138,18 @@ assert sum(1 for s in iter_sequences({str(whole)!r}, "train") if s.flow.size) ==
 assert "jax" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_what_others_left_in_a_set_is_no_sequence(tmp_path: Path) -> None:
+    (tmp_path / "train").mkdir()
+    for name in ("README", "notes.txt", ".00001.part"):
+        (tmp_path / "train" / name).write_text("hi")
+    with refused("EV016"):
+        sequence_paths(tmp_path)
+    for i, format in enumerate(FORMATS):
+        write_sequence(tmp_path / f"train/{i}{SUFFIXES[format]}", sequence(), format)
+    assert [p.name for p in sequence_paths(tmp_path)] == ["0.h5", "1"]
+    assert len(list(iter_sequences(tmp_path))) == 2
 
 
 def test_sequences_are_listed_by_split(whole: Path, tmp_path: Path) -> None:
