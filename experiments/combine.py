@@ -67,7 +67,8 @@ def main(options: Options) -> None:
     if options.summary is not None:
         net = {part: v for part, v in net.items() if part not in AFTER_SUMMARY}
         net |= {"summary": taken(options.summary, name, "summary")["summary"]}
-        card = card | {"summary": model_card(options.summary)}
+        card = {part: v for part, v in card.items() if part not in AFTER_SUMMARY}
+        card |= {"summary": model_card(options.summary)}
     save_weights(options.out, {name: net}, card, overwrite=options.overwrite)
 
 

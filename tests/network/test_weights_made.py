@@ -39,7 +39,8 @@ def test_parts_are_taken_from_other_weights(
     part: str, differ: set[str], tmp_path: Path
 ) -> None:
     first, out = tmp_path / "first.safetensors", tmp_path / "new.safetensors"
-    save_weights(first, load_weights("default"), {"pixels": {"steps": 1}, "calibration": {}})
+    save_weights(first, load_weights("default"), {"pixels": {"steps": 1}, "calibration": {},
+                                                  "fusion": {}, "signal": {}})
     run = doubled(tmp_path / "run.safetensors")
     taken = {"pixels": (run,)} if part == "pixels" else {"summary": run}
     combine.main(combine.Options(str(first), out, **taken))
@@ -49,6 +50,7 @@ def test_parts_are_taken_from_other_weights(
     assert set(made["default"]) == set(kept["default"])
     assert changed(kept, made) == differ
     assert model_card(out)[part] == {"steps": 3}
+    assert gone.isdisjoint(model_card(out))  # no figures of what is not there
     assert ("calibration" in model_card(out)) == (part == "summary")  # it is of the pixels
     with pytest.raises(EvflowDataError, match="neither"):
         combine.main(combine.Options("default", out))
