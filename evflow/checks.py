@@ -62,6 +62,12 @@ def require(config: Any, name: str, good: bool, rule: str) -> None:
         raise EvflowDataError("EV020", f"{kind}({name}={value!r}).", f"It must be {rule}.")
 
 
+def require_seed(config: Any) -> None:
+    """Raise EV020 where the seed of a configuration has more than 32 bits: JAX would drop the
+    others, and another seed's run would begin."""
+    require(config, "seed", -2**31 <= config.seed < 2**32, "of at most 32 bits")
+
+
 def check_size(size: Any) -> Size:
     """(width, height) as ints in 1..65536; raises EV020."""
     try:

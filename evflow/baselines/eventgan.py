@@ -27,6 +27,7 @@ from evflow.baselines.eventgan_losses import Pair, critic_loss, flow_loss, recon
 from evflow.baselines.unet import KERNEL, UNet, fresh
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SensorModel
+from evflow.checks import require_seed
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import lin_log_inverse
 from evflow.scenes import TextureBank
@@ -53,6 +54,7 @@ class GanConfig:
     of the generator; critic: features of the critic's first layer; scales: predictions of the cycle
     networks. paired: weight of the L1 distance to the simulated volume of the same frames; 0 as
     published, more for the strongest fair reading, as a simulator gives pairs.
+    Raises EV020 for a seed of more than 32 bits.
     """
 
     data: TrainConfig = DATA
@@ -70,6 +72,9 @@ class GanConfig:
     cycle_rate: float = 2e-4
     steps: int = 50_000
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_seed(self)
 
     @property
     def bins(self) -> int:

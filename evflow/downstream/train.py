@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import optax
 
 from evflow.camera import Camera
-from evflow.checks import require
+from evflow.checks import require, require_seed
 from evflow.downstream import losses
 from evflow.downstream.evflownet import EVFlowNet
 from evflow.downstream.network import Network, Params, run
@@ -55,6 +55,7 @@ class LearningConfig:
         for name, bound in least.items():
             fit = bound <= getattr(self, name) < math.inf  # NaN is below nothing
             require(self, name, fit, f">= {bound}, and finite")
+        require_seed(self)
         if self.skip + 2 > self.data.windows:
             raise EvflowDataError("EV020", f"skip={self.skip} of {self.data.windows} windows.",
                                   "Temporal consistency needs two images after those skipped.")

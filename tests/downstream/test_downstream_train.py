@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from evflow.baselines.eventgan import GanConfig
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.downstream import E2VID, EVFlowNet, losses
@@ -288,7 +289,8 @@ def test_steps_learn_a_batch_and_repeat_themselves(network) -> None:
     lambda: SequenceConfig(windows=1), lambda: SequenceConfig(pause=2.0),
     lambda: SequenceConfig(window_s=0.0), lambda: LearningConfig(rate=-1.0),
     lambda: LearningConfig(rate=np.nan), lambda: LearningConfig(clip=np.inf),
-    lambda: LearningConfig(data=DATA, skip=3),
+    lambda: LearningConfig(data=DATA, skip=3), lambda: LearningConfig(seed=2**32),
+    lambda: GanConfig(seed=99_999_999_999),
     lambda: make_step(EVFlowNet(base=2, scales=4), LearningConfig(SequenceConfig(crop=24)),
                       optimiser(LearningConfig())),
     lambda: make_step(E2VID(bins=4), LearningConfig(), optimiser(LearningConfig()))])
