@@ -1,4 +1,4 @@
-"""Train the network: `evflow train`, as a script of the source tree.
+"""Train the network: `evflow train`, with all its options, as a script of the source tree.
 
     python -m experiments.train --preset default --out runs/default --max-seconds 2400
     srun python -m experiments.train --out runs/default      # every device of every process
@@ -8,9 +8,19 @@
 
 from __future__ import annotations
 
+import sys
+
+import tyro
+
 from evflow.commands.train import Train as Options
-from evflow.training.run import train_network as main
-from experiments.shared.common import run_script
+from evflow.commands.train import with_configuration
+from experiments.shared.common import end_with
+
+
+def main(options: Options) -> None:
+    """One run, as the command's."""
+    options.run()
+
 
 if __name__ == "__main__":
-    run_script(main, Options, __doc__)
+    end_with(lambda: main(tyro.cli(with_configuration(sys.argv[1:]), description=__doc__)))

@@ -5,8 +5,11 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib
+import runpy
+import sys
 import typing
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -71,6 +74,23 @@ def test_a_script_has_options_a_main_and_few_lines(name: str) -> None:
     assert ast.get_docstring(tree(name))
     assert f"python -m experiments.{name}" in script.__doc__
     assert len((FOLDER / f"{name}.py").read_text().splitlines()) <= LINES
+
+
+def test_the_script_that_trains_has_the_options_of_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr("evflow.training.run.train_network", given.append)
+    monkeypatch.delitem(sys.modules, "experiments.train", raising=False)
+    for option, code in (("--loss.flow", 0), ("--loss.flw", 1)):
+        monkeypatch.setattr(sys, "argv", ["train", "--preset", "debug", option, ".25",
+                                          "--out", str(tmp_path)])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_module("experiments.train", run_name="__main__")
+        assert (ended.value.code != 0) == code
+    assert [(run.preset, run.loss.flow, run.out) for run in given] == [("debug", .25, tmp_path)]
+    assert f"written to {tmp_path}" in capsys.readouterr().out
+    assert "EV020" in str(ended.value)
 
 
 def test_held_out_means_held_out() -> None:
