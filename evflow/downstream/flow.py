@@ -32,9 +32,13 @@ def flow_of(trained: Trained) -> Trained:
 
 
 def window_flows(trained: Trained, events: Events, edges_us: np.ndarray) -> Iterator[np.ndarray]:
-    """Flow (2, H, W), px over the window, of each of the windows between edges_us (T + 1,)."""
-    inside = events.slice(int(edges_us[0]), int(edges_us[-1]) + 1)
-    return reconstructions(trained.network, trained.params, inside, edges_us[1:], **trained.how)
+    """Flow (2, H, W), px over the window, of each of the windows between edges_us (T + 1,).
+
+    An event on an edge belongs to the window that begins there, as where the flow is scored and
+    shown; the windows of `reconstructions` end with it, so they are cut a microsecond before."""
+    inside = events.slice(int(edges_us[0]), int(edges_us[-1]))
+    return reconstructions(
+        trained.network, trained.params, inside, edges_us[1:] - 1, **trained.how)
 
 
 def full_motion(trained: Trained, events: Events, edges_us: np.ndarray) -> float:

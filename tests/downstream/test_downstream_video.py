@@ -12,7 +12,7 @@ import pytest
 from helpers.event_networks import EVEN, MOTION, even, saved, steady
 from helpers.recordings import make
 
-from evflow.downstream import flow, load_network, sync_times, video, window_edges
+from evflow.downstream import flow, load_network, reconstruct, sync_times, video, window_edges
 from evflow.downstream.prior import WidePrior
 from evflow.downstream.sync import PER_PIXEL
 from evflow.errors import EvflowDataError
@@ -183,6 +183,20 @@ def test_scores_of_a_stream_are_those_of_the_whole(monkeypatch: pytest.MonkeyPat
     assert found["protocol"] == whole["protocol"]
     for kind in ("mse", "ssim", "psnr", "rmse"):
         assert found[kind] == pytest.approx(whole[kind], rel=1e-5)
+
+
+def test_an_event_on_an_edge_is_seen_in_the_window_where_it_is_scored() -> None:
+    t = np.array([0, 3_000, 10_000, 10_000, 14_000, 20_000])
+    events = Events(np.arange(6) * 9, np.arange(6) * 7, t, np.arange(6) % 2, (64, 48))
+    edges, trained = np.array([0, 10_000, 20_000]), load_network("evflownet-small")
+    scores = flow.FlowScores(events, edges)
+    for i, found in enumerate(flow.window_flows(trained, events, edges)):
+        alone = events.slice(*edges[i:i + 2].tolist())
+        (wanted,) = reconstruct(trained.network, trained.params, alone, edges[i + 1:i + 2],
+                                **trained.how)
+        np.testing.assert_array_equal(found, wanted)
+        scores.add(found)
+    assert scores.result()["events_per_window"] == 2.5  # 2 and 3: none is seen twice
 
 
 def test_flow_is_scored_window_by_window() -> None:
