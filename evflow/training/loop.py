@@ -80,13 +80,7 @@ def train(
             where the folder holds another run, or another process trains in it, EV016 where there
             is none to resume, EV020.
     """
-    if options.save_every < 1:
-        raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
-    if not options.max_seconds >= 0:  # nor NaN, which no time reaches
-        raise EvflowDataError("EV020", f"--max-seconds {options.max_seconds}.", "Give 0 or more.")
-    if options.resume == "must" and not options.out.is_dir():  # before a folder is made
-        raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
-                              "Check --out, or pass --resume auto.")
+    _check(options)
     checkpoints = Checkpoints(options.out)
     with stop_requests() as requests, locked(checkpoints.folder), checkpoints:
         identity = as_dict(config) | dict(files)
@@ -99,11 +93,7 @@ def train(
             state, lost = _steps(advance, state, config.steps, options, checkpoints, log, requests)
     # Raised after the checkpoints have been written.
     if lost:
-        latest = checkpoints.latest
-        kept = "no checkpoint was saved yet" if latest is None else (
-            f"the last checkpoint is of step {latest}")
-        raise EvflowDataError("EV007", f"{lost}; {kept}.", "Train at a lower rate, with another "
-                              "--out: this command would go on to the same step.")
+        raise _diverged(lost, checkpoints.latest)
     reached = int(state.step)
     stopped = (f"stopped after step {reached} of {config.steps}; a checkpoint is saved, and the "
                "same command goes on.")
@@ -111,6 +101,25 @@ def train(
     if not by_signal and reached < config.steps and is_main():
         print(f"--max-seconds {options.max_seconds:g}: {stopped}", file=sys.stderr)
     return Ended(state, log.figures, stopped if by_signal else "", reached - begun)
+
+
+def _check(options: RunOptions) -> None:
+    """EV020 for impossible options, EV016 where there is no folder to resume; none is made yet."""
+    if options.save_every < 1:
+        raise EvflowDataError("EV020", f"--save-every {options.save_every}.", "Give 1 or more.")
+    if not options.max_seconds >= 0:  # nor NaN, which no time reaches
+        raise EvflowDataError("EV020", f"--max-seconds {options.max_seconds}.", "Give 0 or more.")
+    if options.resume == "must" and not options.out.is_dir():
+        raise EvflowDataError("EV016", f"there is no {options.out} to resume.",
+                              "Check --out, or pass --resume auto.")
+
+
+def _diverged(lost: str, latest: int | None) -> EvflowDataError:
+    """EV007. lost: what is not finite; latest: the last step that was saved, if any."""
+    kept = "no checkpoint was saved yet" if latest is None else (
+        f"the last checkpoint is of step {latest}")
+    return EvflowDataError("EV007", f"{lost}; {kept}.", "Train at a lower rate, with another "
+                           "--out: this command would go on to the same step.")
 
 
 def goes_on(checkpoints: Checkpoints, config: dict[str, Any], options: RunOptions) -> bool:
