@@ -15,6 +15,7 @@ NOTES: dict[str, str] = {
     "events.layout": "how the file is laid out was inferred",
     "events.coarse": "event times have a coarse resolution",
     "events.narrow": "coordinates are stored in too few bits for the sensor",
+    "events.gaps": "time in which no pixel sent an event was left out",
     "events.late": "events with decreasing times were left out, sorted or joined",
     "events.none": "no event was simulated",
     "events.outside": "events outside the sensor were left out",

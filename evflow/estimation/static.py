@@ -23,9 +23,10 @@ from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.estimation.shot import Shot, by_light, measured_noise, measured_shot, scatter
 from evflow.notes import Note, why_no_frames
 from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
+from evflow.recordings.gaps import joined, stretches
 from evflow.recordings.stillness import unlike_noise
 from evflow.training.config import PRESETS
-from evflow.types import Recording
+from evflow.types import Events, Recording
 
 
 def estimate_noise(
@@ -37,14 +38,16 @@ def estimate_noise(
     over pixels that are neither hot nor dead. Thresholds are those of the network's training prior,
     with its width; `valid` is False everywhere. lux: the illuminance, for `.bench`, which
     `noise_over_light` joins. Leak is identified by its intervals, shot noise if frames show the
-    light. alone: noise is what was asked for, not what is left without frames. Raises EV017 (EV011
-    unless `alone`) if the scene moves, or the recording is too short to decide.
+    light. alone: noise is what was asked for, not what is left without frames. Gaps in the events,
+    as of lost packets, are not counted as time of observation. Raises EV017 (EV011 unless `alone`)
+    if the scene moves, or the recording is too short to decide.
     """
-    events = recording.events
+    parts = stretches(recording.events)
+    events = joined(parts)
     counts = events.count_map()
     total = counts.sum(0, dtype=np.uint32)
     hot, dead = hot_at_rest(total), dead_pixels(total)
-    _require_static(recording, hot, alone)
+    _require_static(recording, events, hot, alone)
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(
         *(_rates(n, hot, dead, seconds) for n in counts), strict=True)
@@ -58,7 +61,7 @@ def estimate_noise(
     def summary(theta: float, eta: tuple[float, ...], sigma: float) -> Summary:
         return Summary(*(jnp.float32(v) for v in (theta, theta, *eta, sigma, sigma)))
 
-    leak, shot = _kinds(recording, counts, hot | dead)
+    leak, shot = _kinds(recording, parts, counts, hot | dead)
     sensor, std = measured_noise(SensorModel(noise_resets_memory=True), {}, leak, shot)
     level = () if lux is None else (Level(
         lux, 1, seconds, means[0], mean_errors[0], means[1], mean_errors[1]),)
@@ -66,21 +69,28 @@ def estimate_noise(
         camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
         dead, 0,
-        (*_notes(hot, total, recording.has_frames), *dead_notes(dead), *noise_notes(shot)),
+        (*_notes(hot, total, recording.has_frames),
+         *_gap_notes(recording.events, len(parts) - 1, seconds),
+         *dead_notes(dead), *noise_notes(shot)),
         THRESHOLDS,
         sensor=sensor, sensor_std=std,
         bench=Bench("lux", level) if level else None)
 
 
-def _kinds(recording: Recording, counts: np.ndarray, faulty: np.ndarray) -> tuple[Leak, Shot]:
-    """Leak and, if frames show the light, shot noise."""
-    events, begin = recording.events, int(recording.events.t[0])
+def _kinds(
+    recording: Recording, parts: list[Events], counts: np.ndarray, faulty: np.ndarray
+) -> tuple[Leak, Shot]:
+    """Leak and, if frames show the light, shot noise. parts: the events between gaps, which end
+    every pixel's wait."""
+    begins = [int(part.t[0]) for part in parts]
     if recording.has_frames:
-        begin = min(begin, int(recording.frame_times[0]))
-    leak = measured_leak(waits_at_rest(events, faulty, (begin, int(events.t[-1]))))
+        begins[0] = min(begins[0], int(recording.frame_times[0]))
+    waits = [waits_at_rest(part, faulty, (begin, int(part.t[-1])))
+             for part, begin in zip(parts, begins, strict=True)]
+    leak = measured_leak(sum(waits[1:], waits[0]))
     if not recording.has_frames:
         return leak, Shot()
-    watched = np.full(faulty.shape, events.duration_us * 1e-6)
+    watched = np.full(faulty.shape, sum(part.duration_us for part in parts) * 1e-6)
     quiet = np.stack([np.stack([n, watched]) for n in counts])
     light = by_light(quiet, recording.frame_dn(len(recording.frame_times) // 2), faulty)
     return leak, measured_shot(light, leak.rate_hz, scatter(quiet, faulty))
@@ -103,8 +113,8 @@ def uniform(bounds: tuple[float, float]) -> tuple[float, float]:
     return 0.5 * sum(bounds), (bounds[1] - bounds[0]) / float(np.sqrt(12.0))
 
 
-def _require_static(recording: Recording, hot: np.ndarray, alone: bool) -> None:
-    reason = unlike_noise(recording.events, hot)
+def _require_static(recording: Recording, events: Events, hot: np.ndarray, alone: bool) -> None:
+    reason = unlike_noise(events, hot)
     if reason and alone:
         raise EvflowDataError(
             "EV017", f"noise is measured in a static scene, and {reason}",
@@ -131,6 +141,13 @@ def _rates(
         counts, np.where(dead, 0.0, seconds), max(mean, least) / seconds, hot)
     mean_error = np.sqrt(max(variance, mean, least) / normal.size)
     return rate, error, mean / seconds, float(mean_error) / seconds
+
+
+def _gap_notes(events: Events, gaps: int, seconds: float) -> tuple[Note, ...]:
+    lost = events.duration_us * 1e-6 - seconds
+    return (Note("events.gaps", f"for {lost:.3g} s no pixel sent an event ({gaps} "
+                 f"gap{'s' if gaps > 1 else ''}), as where packets are lost: the rates refer to "
+                 f"the other {seconds:.3g} s."),) if gaps else ()
 
 
 def _notes(hot: np.ndarray, total: np.ndarray, frames: bool) -> tuple[Note, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from evflow.files.spool import forget
+from evflow.types import Events
 
 Array = np.ndarray
 
@@ -29,6 +30,25 @@ def event_gaps(t: Array) -> Array:
         return longest
     usual = _usual_pause(t)
     return longest[t[longest + 1] - t[longest] > TICKS * usual]
+
+
+def stretches(events: Events) -> list[Events]:
+    """The events between the gaps; the events themselves if there is no gap."""
+    t, at = events.t, event_gaps(events.t)
+    if not len(at):
+        return [events]
+    begins, ends = [t[0], *t[at + 1]], [*t[at], t[-1]]
+    return [events.slice(int(a), int(b) + 1) for a, b in zip(begins, ends, strict=True)]
+
+
+def joined(parts: list[Events]) -> Events:
+    """Stretches one after the other, as if no time had passed between them."""
+    if len(parts) == 1:
+        return parts[0]
+    passed = np.cumsum([0, *(part.duration_us for part in parts[:-1])])
+    whole = Events.concatenate(parts)
+    t = np.concatenate([part.t - part.t[0] + by for part, by in zip(parts, passed, strict=True)])
+    return Events.unchecked(whole.x, whole.y, t + parts[0].t[0], whole.p, whole.size)
 
 
 def _packets(t: Array) -> Array:

@@ -169,3 +169,20 @@ def test_real_moving_scenes_are_refused(data_file: Callable[[str], Path], name: 
     recording = read_recording(data_file(f"data/{name}"))
     with pytest.raises(EvflowDataError, match=r"EV011.*the scene moves"):
         estimate_camera(recording)
+
+
+@pytest.mark.parametrize("lost_s", [2, 12])
+def test_time_without_any_event_is_not_observed(lost_s: int) -> None:
+    """Packets lost amid a static scene change neither its rates nor whether it is static."""
+    recording, rates, hot = static(hot=0)
+    t = recording.events.t
+    kept = (t < 4_000_000) | (t >= 1_000_000 * (4 + lost_s))
+    events = Events(*(getattr(recording.events, n)[kept] for n in ("x", "y", "t", "p")), SIZE)
+    found = estimate_noise(Recording.of_events(events), lux=5.0)
+    for i, name in enumerate(("eta_on", "eta_off")):
+        assert float(getattr(found.summary, name)) == pytest.approx(
+            rates[i][~hot].mean(), rel=0.05)
+    assert [note.code for note in found.notes] == ["frames.none", "events.gaps"]
+    assert f"for {lost_s} s no pixel sent an event (1 gap)" in found.notes[1].text
+    assert found.bench is not None
+    assert found.bench.levels[0].seconds == pytest.approx(SECONDS - lost_s, rel=1e-3)
