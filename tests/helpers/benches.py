@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import jax
 import numpy as np
 
-from evflow import Recording, simulate
+from evflow import Events, Recording, simulate
 from evflow.camera import Camera, CameraPrior
 from evflow.camera.sensors import SensorModel
 
@@ -43,3 +44,11 @@ def bench(
 def cameras(mismatch: float, noise: str = "none") -> Camera:
     prior = CameraPrior(theta=(0.15, 0.35), mismatch=(mismatch, mismatch), noise=noise)
     return Camera.sample(jax.random.key(3), SHAPE, prior)
+
+
+def without(recording: Recording, begin_us: int, end_us: int) -> Recording:
+    """The recording without its events in [begin_us, end_us), as where packets are lost."""
+    events = recording.events
+    kept = (events.t < begin_us) | (events.t >= end_us)
+    columns = (getattr(events, name)[kept] for name in ("x", "y", "t", "p"))
+    return dataclasses.replace(recording, events=Events(*columns, events.size))

@@ -188,15 +188,17 @@ def few_sizes(changes: np.ndarray) -> list[Note]:
 
 
 def measured_bench(
-    unit: Unit, events: Events, spans: list[Span], quiet: list[Span], light: np.ndarray,
-    logs: np.ndarray, rests: np.ndarray, clean: np.ndarray, kept: np.ndarray, theta: np.ndarray,
+    unit: Unit, events: Events, spans: list[Span], settled: list[int], quiet: list[Span],
+    light: np.ndarray, logs: np.ndarray, rests: np.ndarray, clean: np.ndarray, kept: np.ndarray,
+    theta: np.ndarray,
 ) -> Bench:
     """All measurements of a bench.
 
     Args:
         unit: of light.
         events: of the recording.
-        spans: the rests; other arguments as of `measured_levels`.
+        spans: the rests; settled: (R,) times until which events belong to the step that leads to
+            a rest; other arguments as of `measured_levels`.
         clean: (K, 2, H, W) events of the steps minus the noise.
         theta: (2, H, W) thresholds, NaN where unknown.
     """
@@ -205,13 +207,13 @@ def measured_bench(
     steps = []
     for k, change in enumerate(np.diff(logs)):
         side = 0 if change > 0 else 1
-        inside = events.slice(spans[k][1], quiet[k + 1][0])
+        inside = events.slice(spans[k][1], settled[k + 1])
         of_side = inside.p == (side == 0)
         t = inside.t[of_side & kept[inside.y, inside.x]]
         steps.append(Step(float(change), float(clean[k, side][kept].mean()), _duration(
             t, abs(change) * inverse[side], int(kept.sum()))))
     levels = measured_levels(quiet, light, logs, rests, kept, tuple(steps))
-    during = [events.slice(spans[k][1], quiet[k + 1][0]) for k in range(len(steps))]
+    during = [events.slice(spans[k][1], settled[k + 1]) for k in range(len(steps))]
     return Bench(unit, levels, tuple(steps), _dead_time(events, np.diff(logs), during))
 
 

@@ -10,7 +10,8 @@ where the remainder r_k is uniform in [0, theta_ON) after a rise, in (-theta_OFF
 mean half a threshold, variance theta²/12. Each pixel is a linear regression with these means and
 variances; r_0 is a third unknown. In most sensors a noise event at a rest resets the memory to the
 light, and the pixel starts anew with remainder 0. `storing` decides this from the steps after rests
-with events. NumPy, float64: 3x3 normal equations.
+with events. Where a step is lost, counting begins anew after it, with another unknown r_0. NumPy,
+float64: normal equations of each pixel.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ BIAS = 0.015  # relative error of the median threshold: 1.4 % low on eight simul
 
 
 def ratio(
-    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray,
+    lost: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """theta = dlogI / events (2, H, W) over the steps of each direction, and the std of one event.
     Arguments as of `regression`."""
-    change = np.diff(levels, axis=0)
+    change = np.where(lost, 0.0, np.diff(levels, axis=0))
     sums = [((s * change > 0) * s * change).sum(0) for s in (1.0, -1.0)]
     counts = [((s * change > 0) * n[:, i]).sum(0) for i, s in enumerate((1.0, -1.0))]
     theta = np.stack([d / np.where(c > 0, c, np.nan) for d, c in zip(sums, counts, strict=True)])
@@ -40,7 +42,8 @@ def ratio(
 
 
 def regression(
-    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray,
+    lost: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds by iterated weighted least squares for (theta_ON, theta_OFF, r_0).
 
@@ -50,47 +53,54 @@ def regression(
         strays: (K, 2) expected noise events of each step.
         fresh: whether r_0 is 0.
         noisy: (K+1, H, W) bool, rests with events.
+        lost: (K, H, W) bool, steps whose events or size are not known.
 
     Returns:
         theta and its std, (2, H, W).
     """
-    theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy))
+    theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy), lost)
     up = np.median(np.diff(levels, axis=0), (1, 2)) > 0
-    if storing(n, up, noisy, np.median(theta, (1, 2))) > 0.5:
+    if storing(n, up, noisy, np.median(theta, (1, 2)), lost) > 0.5:
         # A noise event amid a step discards half a threshold of change on average.
-        lost = 0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1)
-        return _regression(levels, n + lost[..., None, None], strays, fresh, noisy)
+        missed = 0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1)
+        return _regression(levels, n + missed[..., None, None], strays, fresh, noisy, lost)
     return theta, std
 
 
-def storing(n: np.ndarray, up: np.ndarray, noisy: np.ndarray, theta: np.ndarray) -> float:
+def storing(
+    n: np.ndarray, up: np.ndarray, noisy: np.ndarray, theta: np.ndarray, lost: np.ndarray
+) -> float:
     """About 1 where noise at a rest resets the memory to the light, about 0 where it does not.
 
     Compares the events of a step between pixels with and without noise at the rest before. If noise
     resets the memory, pixels with noise send half an event less than the others after a step in the
     same direction, and theta_other / (2 theta) events more after one in the opposite direction.
-    n: (K, 2, H, W); up: (K,); noisy: (K+1, H, W); theta: (2,)."""
+    n: (K, 2, H, W); up: (K,); noisy: (K+1, H, W); theta: (2,); lost: (K, H, W), left out."""
     excess, expected, weight = [], [], []
     for k in range(1, len(n)):
         side = 0 if up[k] else 1
-        anew = noisy[k]
-        if not 0 < anew.sum() < anew.size:
+        anew, others = noisy[k] & ~lost[k], ~noisy[k] & ~lost[k]
+        if not anew.any() or not others.any():
             continue
         sent = n[k, side]
-        excess.append(sent[anew].mean() - sent[~anew].mean())
+        excess.append(sent[anew].mean() - sent[others].mean())
         expected.append(-0.5 if up[k - 1] == up[k] else 0.5 * theta[1 - side] / theta[side])
-        weight.append(1.0 / (1.0 / anew.sum() + 1.0 / (~anew).sum()))
+        weight.append(1.0 / (1.0 / anew.sum() + 1.0 / others.sum()))
     w, x, y = map(np.array, (weight, expected, excess))
     return float((w * x) @ y / ((w * x) @ x)) if len(w) else 0.0
 
 
 def _regression(
-    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, stored: np.ndarray
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, stored: np.ndarray,
+    lost: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """`regression` for given rests at which the memory was reset, stored: (K+1, H, W) bool."""
     number = np.arange(len(n))[:, None, None]
     last = np.maximum.accumulate(np.where(stored[:-1], number, -1), 0)  # rest, of each step
-    known, base = last >= 0, np.maximum(last, 0)
+    # The part of the recording that a step belongs to, and the rest that the part begins with.
+    begin = np.maximum.accumulate(np.where(lost, number + 1, 0), 0)
+    part = np.cumsum(lost & ~np.roll(lost, -1, 0), 0)
+    known, base = last >= begin, np.minimum(np.maximum(last, begin), number)
 
     def since(total: np.ndarray) -> np.ndarray:
         return total[1:] - np.take_along_axis(total, base, 0)
@@ -99,22 +109,29 @@ def _regression(
     up = np.diff(levels, axis=0) > 0
     before = np.zeros((1, *n.shape[1:]))
     a, b = (since(sums) for sums in np.moveaxis(np.cumsum(np.concatenate([before, n]), 0), 1, 0))
-    design = np.stack([a + 0.5 * up, -(b + 0.5 * ~up), known - 1.0], -1)  # (K, H, W, 3)
+    starts = [np.where(part == i, known - 1.0, 0.0) for i in range(int(part.max()) + 1)]
+    design = np.stack([a + 0.5 * up, -(b + 0.5 * ~up), *starts], -1)  # (K, H, W, 2 + parts)
+    design = np.where(lost[..., None], 0.0, design)
+    after = [(up & (part == i) & lost).any(0) for i in range(1, len(starts))]
     sent = np.cumsum(np.concatenate([np.zeros((1, 2)), strays]), 0)
     extra = sent[1:, :, None, None] - np.moveaxis(sent[base], -1, 1)  # noise: variance, in events
     theta = np.stack([np.full(a.shape[1:], THETA_PRIOR)] * 2)
-    covariance = np.zeros((*a.shape[1:], 3, 3))
+    covariance = np.zeros((*a.shape[1:], design.shape[-1], design.shape[-1]))
     for _ in range(PASSES):
         each = theta**2
         remainder = np.where(up, each[0], each[1]) / 12.0
         weight = 1.0 / (remainder + np.einsum("kphw,phw->khw", extra, each))
         normal = np.einsum("khwi,khw,khwj->hwij", design, weight, design)
         right = np.einsum("khwi,khw,khw->hwi", design, weight, rise)
-        # r_0 is 0 in a fresh memory, else uniform in (-theta_OFF, theta_ON).
-        spread = 1e-9 if fresh else theta.sum(0) ** 2 / 12.0
-        centre = 0.0 if fresh else 0.5 * (theta[0] - theta[1])
-        normal[..., 2, 2] += 1.0 / spread
-        right[..., 2] += centre / spread
+        # r_0 is 0 in a fresh memory, else uniform in (-theta_OFF, theta_ON), or, after a lost step,
+        # in the half that its direction leaves.
+        low, high = (0.0, 0.0) if fresh else (-theta[1], theta[0])
+        for i, risen in enumerate([None, *after], 2):
+            if risen is not None:
+                low, high = np.where(risen, 0.0, -theta[1]), np.where(risen, theta[0], 0.0)
+            spread = np.maximum((high - low) ** 2 / 12.0, 1e-9)
+            normal[..., i, i] += 1.0 / spread
+            right[..., i] += 0.5 * (low + high) / spread
         # A negligible prior, for polarities without steps.
         normal[..., [0, 1], [0, 1]] += 1e-6
         right[..., :2] += 1e-6 * THETA_PRIOR
@@ -123,17 +140,18 @@ def _regression(
         theta = np.clip(np.moveaxis(found[..., :2], -1, 0), THETA_MIN, THETA_TOP)
     pulled = design * weight[..., None]
     scatter = normal - np.einsum("khwi,khw,khwj->hwij", pulled, 1.0 / weight - remainder, pulled)
-    scatter += _walked(pulled, np.einsum("kp,phw->khw", strays, each), stored)
+    anew = np.concatenate([stored[:1], stored[1:] | lost])
+    scatter += _walked(pulled, np.einsum("kp,phw->khw", strays, each), anew)
     covariance = covariance @ scatter @ covariance
     std = np.sqrt(np.stack([covariance[..., 0, 0], covariance[..., 1, 1]]))
     return theta, std
 
 
 def _walked(pulled: np.ndarray, variance: np.ndarray, stored: np.ndarray) -> np.ndarray:
-    """(H, W, 3, 3) scatter due to noise events, whose error persists over all later rests until the
-    memory is reset. pulled: (K, H, W, 3) weighted design; variance: (K, H, W) of each step; stored:
-    (K+1, H, W) bool, rests with a reset."""
-    scatter, after = np.zeros((*pulled.shape[1:], 3)), np.zeros(pulled.shape[1:])
+    """(H, W, D, D) scatter due to noise events, whose error persists over all later rests until the
+    memory is reset. pulled: (K, H, W, D) weighted design; variance: (K, H, W) of each step; stored:
+    (K+1, H, W) bool, rests with a reset, or after a lost step."""
+    scatter, after = np.zeros((*pulled.shape[1:], pulled.shape[-1])), np.zeros(pulled.shape[1:])
     for k in reversed(range(len(pulled))):
         after = pulled[k] + np.where(stored[k + 1][..., None], 0.0, after)
         scatter += variance[k][..., None, None] * after[..., None] * after[..., None, :]

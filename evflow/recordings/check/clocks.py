@@ -47,8 +47,8 @@ def _gaps(recording: Recording) -> list[Finding]:
     return [Finding(
         "EV025", "warning", f"no events between {from_s:.3f} s and {to_s:.3f} s{more}: dropped "
         "packets, or a scene that stood still?",
-        "An estimate leaves out windows there. To exclude it elsewhere: "
-        f"--stop {from_s:.3f} or --start {to_s:.3f}.")]
+        "An estimate leaves out the windows, or the steps of a bench, there. To exclude it "
+        f"elsewhere: --stop {from_s:.3f} or --start {to_s:.3f}.")]
 
 
 def _dropped(recording: Recording) -> list[Finding]:

@@ -113,12 +113,12 @@ def test_counts_after_noise_tell_whether_it_stores_the_light(
     noisy[1, :2] = True
     n = np.zeros((2, 2, 4, 4))
     n[:, 0] = np.where(noisy[1], sent[1], sent[0])
-    up = np.array([True, True])
-    assert storing(n, up, noisy, np.array([0.2, 0.3])) == pytest.approx(expected)
-    assert storing(n, up, np.zeros_like(noisy), np.array([0.2, 0.3])) == 0.0
+    up, none = np.array([True, True]), np.zeros(n[:, 0].shape, bool)
+    assert storing(n, up, noisy, np.array([0.2, 0.3]), none) == pytest.approx(expected)
+    assert storing(n, up, np.zeros_like(noisy), np.array([0.2, 0.3]), none) == 0.0
     back = np.where(noisy[1], 3.0 + 0.5 * 0.2 / 0.3 * expected, 3.0)
     n[:, 1] = back
-    turned = storing(n, np.array([True, False]), noisy, np.array([0.2, 0.3]))
+    turned = storing(n, np.array([True, False]), noisy, np.array([0.2, 0.3]), none)
     assert turned == pytest.approx(expected)
 
 

@@ -1,0 +1,147 @@
+"""What a screen's light did, and the events of its steps and rests.
+
+Rests are those of the frames, or given; levels of light those of the frames, or given. Steps and
+rests that the events do not cover are left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.errors import EvflowDataError
+from evflow.estimation.bench.coverage import covered, noise_us, watched
+from evflow.estimation.bench.levels import Unit, light_of_rests, lux_notes
+from evflow.estimation.bench.rests import check_steps, find_rests
+from evflow.light.log_maps import lin_log, lin_log_inverse
+from evflow.notes import Note
+from evflow.recordings.faulty_pixels import hot_at_rest
+from evflow.recordings.stillness import LEAST_EVENTS, MOVING, coincidence_excess
+from evflow.types import Events, Recording
+
+Span = tuple[int, int]
+
+SETTLE_US = 20_000  # events of a step come until this long after the light rests again
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Steps:
+    """K steps of light between K+1 rests.
+
+    levels: (K+1, H, W) log intensity at each rest; counts: (K, 2, H, W) ON and OFF events of each
+    step; seconds: (K,) counting time of each; rests: (K+1, 2, H, W) events at each rest; spans: the
+    rests; settled: times until which events belong to the step that leads to a rest; quiet: the
+    parts of the rests in which events were counted as noise; light: (K+1,) in unit;
+    uncovered, silent_s: steps beyond the events, and time at rest whose events are missing, both
+    left out; notes: on the light."""
+
+    levels: np.ndarray
+    counts: np.ndarray
+    seconds: np.ndarray
+    rests: np.ndarray
+    spans: list[Span]
+    settled: list[int]
+    quiet: list[Span]
+    light: np.ndarray
+    unit: Unit
+    uncovered: int
+    silent_s: float
+    notes: tuple[Note, ...]
+
+    @property
+    def rest(self) -> np.ndarray:
+        """(2, H, W) events of all rests."""
+        return self.rests.sum(0, dtype=np.float64)
+
+    @property
+    def rest_s(self) -> float:
+        """Total seconds of counting at rest."""
+        return sum(b - a for a, b in self.quiet) * 1e-6
+
+    @property
+    def changes(self) -> np.ndarray:
+        """(K,) log units, of the median pixel."""
+        return np.median(np.diff(self.levels, axis=0), (1, 2))
+
+
+def counted_steps(
+    recording: Recording, rests_us: Sequence[Span] | None, light: Sequence[float] | None,
+    lux: tuple[float, ...],
+) -> Steps:
+    """The steps and rests of a recording; arguments and errors as of `calibrate_step`."""
+    events, times = recording.events, recording.frame_times
+    frames = None if rests_us is not None else find_rests(recording)
+    spans = ([(int(times[a]), int(times[b])) for a, b in frames] if frames is not None
+             else [(int(a), int(b)) for a, b in rests_us or ()])
+    flat = [t for span in spans for t in span]
+    if (len(spans) < 2 or any(b < a for a, b in itertools.pairwise(flat))
+            or any(b == a for a, b in spans)):
+        raise EvflowDataError("EV020", f"rests_us={spans}.",
+                              "Give two or more (begin, end) in us, in order of time.")
+    if lux and light is not None:
+        raise EvflowDataError("EV020", "both light and lux.", "Give one of them.")
+    levels = _levels(recording, spans, light)
+    if light is None:
+        check_steps(levels)
+    unit: Unit = "DN" if light is None else "light"
+    doubts = []
+    if lux:
+        seen = np.median(levels, (1, 2))
+        unit, light = "lux", light_of_rests(seen, lux)
+        doubts = lux_notes(seen, lux)
+        levels = _levels(recording, spans, light)
+    settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
+    noise = noise_us(events, [(a, b) for a, (_, b) in zip(settled, spans, strict=True)])
+    inside = covered(events, spans, settled, noise)
+    uncovered = len(spans) - len(spans[inside])
+    levels, spans, settled = levels[inside], spans[inside], settled[inside]
+    light = None if light is None else light[inside]
+    counts = [events.slice(before[1], after).count_map()
+              for before, after in zip(spans, settled[1:], strict=False)]
+    seconds = [(after - before[1]) * 1e-6
+               for before, after in zip(spans, settled[1:], strict=False)]
+    rested = [(a, b) for a, (_, b) in zip(settled, spans, strict=True)]
+    quiet = [watched(events, span, noise) for span in rested]
+    silent = sum(b - a for a, b in rested) - sum(b - a for a, b in quiet)
+    rests = np.stack([events.slice(a, b).count_map() for a, b in quiet])
+    busiest = max((events.slice(a, b) for a, b in quiet), key=len)
+    shown = (np.asarray(light, np.float64) if light is not None else
+             np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))
+    return Steps(levels, np.array(counts, np.float64), np.array(seconds), rests, spans, settled,
+                 quiet, shown, unit, uncovered, silent * 1e-6, (*_restless(busiest), *doubts))
+
+
+def _restless(rest: Events) -> list[Note]:
+    """A note if the events of a rest are not noise alone."""
+    hot = hot_at_rest(rest.count_map().sum(0))
+    if len(rest) < LEAST_EVENTS or coincidence_excess(rest, hot) <= MOVING:
+        return []
+    return [Note(
+        "scene.restless", "neighbouring pixels fire together while the light should rest: does it "
+        "flicker or still settle, are its edges not where frames or triggers say, or does the "
+        "camera regulate its exposure? Then noise rates, and thresholds, are wrong.")]
+
+
+def _levels(
+    recording: Recording, spans: list[Span], light: Sequence[float] | None
+) -> np.ndarray:
+    width, height = recording.events.size
+    if light is not None:
+        given = np.asarray(light, np.float64)
+        if given.shape != (len(spans),) or not (np.isfinite(given) & (given > 0)).all():
+            raise EvflowDataError("EV020", f"light={light!r} for {len(spans)} rests.",
+                                  "Give one positive number per rest.")
+        return np.broadcast_to(np.log(given)[:, None, None], (len(spans), height, width))
+    times, levels = recording.frame_times, []
+    for begin, end in spans:
+        inside = np.flatnonzero((times >= begin) & (times <= end))
+        if not len(inside):
+            raise EvflowDataError("EV011", f"no frame between {begin} and {end} us.",
+                                  "Give light, its value at each rest.")
+        mean = np.mean([recording.frame_dn(int(i)) for i in inside], 0, np.float64)
+        levels.append(np.asarray(lin_log(mean.astype(np.float32)), np.float64))
+    return np.stack(levels)
