@@ -87,9 +87,12 @@ def rests_between(edges_us: np.ndarray, events: Events, count: int) -> list[tupl
     earlier, as a photodiode says half-way up, and last up to EDGE_US; edges closer together are
     one, those before the events none. Raises EV020 if there are not `count`."""
     last = int(events.t[-1])
-    edges = np.unique(edges_us)
-    edges = edges[(edges > int(events.t[0]) - EDGE_US) & (edges < last)]
-    edges = edges[np.diff(edges, prepend=-np.inf) > BEFORE_US + EDGE_US].tolist()
+    found = np.unique(edges_us)
+    found = found[found > int(events.t[0]) - EDGE_US]
+    found = found[np.diff(found, prepend=-np.inf) > BEFORE_US + EDGE_US]
+    # Without noise the last event may be a step's, and come before its trigger.
+    late = found[found < last + BEFORE_US].tolist()
+    edges = late if count == len(late) + 1 else found[found < last].tolist()
     first = min([int(events.t[0]), *(e - EDGE_US for e in edges)])
     last = max([last, *(e + 2 * EDGE_US for e in edges)])
     if count != len(edges) + 1:

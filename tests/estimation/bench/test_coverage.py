@@ -65,6 +65,14 @@ def test_a_recording_that_ends_amid_its_last_edge(whole: Recording) -> None:
                        lux=lux[:2], triggers_us=EDGES[:1])
 
 
+def test_a_late_trigger_after_the_last_event() -> None:
+    """Without noise the last event is a step's own."""
+    quiet = Recording.of_events(bench(cameras(0.03), LEVELS[:5]).events)
+    late = quiet.events.t[-1] + 5000 - EDGES[3]
+    found = calibrate_step(quiet, lux=LEVELS[:5], triggers_us=EDGES[:4] + min(late, 9900))
+    assert found.windows == 4
+
+
 @pytest.mark.parametrize("step", [0, 2, 11])
 def test_a_step_that_lost_its_events_is_left_out(whole: Recording, step: int) -> None:
     at = int(EDGES[step])
