@@ -29,10 +29,12 @@ FEW_SHORTER = 0.05  # maximum share of shorter intervals: from noise that ignore
 
 @dataclasses.dataclass(frozen=True)
 class DeadTime:
-    """seconds, std_s: the dead time, 0 and NaN if the recording does not show it."""
+    """seconds, std_s: the dead time, 0 and NaN if the recording does not show it; below_s: an upper
+    bound, from shortest intervals that may have another cause, NaN if there is none."""
 
     seconds: float = 0.0
     std_s: float = float("nan")
+    below_s: float = float("nan")
 
     @property
     def measured(self) -> bool:

@@ -239,16 +239,25 @@ def _speed(bench: Bench, unit: str) -> Panel:
     rows = [[number(v.light), *cells(v.up_s), *cells(v.down_s)] for v in bench.levels]
     seen = "" if bench.latency else (
         " Latency needs the instants of the edges: --triggers.")
-    dead = (f"Dead time of a pixel: {spread(1e3 * bench.dead.seconds, 1e3 * bench.dead.std_s)} ms."
-            if bench.dead.measured else
-            "No dead time is visible: no step makes enough pixels fire as fast as they can.")
     return Panel("speed", "Speed against light", grid([figure(
         page.drawing(bench_figures.speed(bench), "duration of steps over light"))], 26) + table(
             [f"light{unit}", "up to it [ms]", "cutoff at least [Hz]", "down to it [ms]",
              "cutoff at least [Hz]"], rows) + paragraph(
             "Time from half to nine tenths of a step, from its events, for steps of at least three "
             "thresholds; it includes the light's own edge, so the pixels are at least as fast. The "
-            f"cutoff is that of a first-order low-pass of the same duration. {dead}{seen}", "note"))
+            "cutoff is that of a first-order low-pass of the same duration. "
+            f"{_dead_time(bench)}{seen}", "note"))
+
+
+def _dead_time(bench: Bench) -> str:
+    if bench.dead.measured:
+        dead_ms = spread(1e3 * bench.dead.seconds, 1e3 * bench.dead.std_s)
+        return f"Dead time of a pixel: {dead_ms} ms."
+    if bench.dead.below_s > 0:
+        return (f"The dead time of a pixel is at most {number(1e3 * bench.dead.below_s)} ms: these "
+                "shortest intervals differ between sizes or directions of steps, or are known for "
+                "too few of them, so that they may be those of the light's own edge.")
+    return "No dead time is visible: no step makes enough pixels fire as fast as they can."
 
 
 def _facts(recording: Recording, source: Source) -> Panel:

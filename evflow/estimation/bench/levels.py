@@ -27,8 +27,9 @@ WAY = (0.5, 0.9)  # shares of a step in log units between which its duration is 
 BANDWIDTH = float(np.log(5.0)) / (2.0 * np.pi)  # of a first-order low-pass: cutoff times duration
 UNLIKE = 2.0  # ratio of two ratios of lux to frames, above which one of them is doubtful
 LARGE = 3.0  # thresholds: the duration of smaller steps is not measured
-APART, EVEN = 0.87, 0.08  # ratio of distinct sizes at most; tolerance of a ratio
+APART, EVEN = 0.87, 0.08  # ratio of distinct sizes at most; tolerance of equal intervals
 SHORT = 0.05  # quantile of a pixel's intervals
+LEAST_KINDS = 3  # of steps by direction and size, whose intervals are compared
 FEW_EVENTS = 100  # of a step, from all pixels: with fewer its duration is not measured
 
 
@@ -67,7 +68,8 @@ class Step:
 class Bench:
     """Measurements of a bench (`CameraEstimate.bench`). unit: of the light, "light" if unknown;
     levels: darkest first; steps: in order of time, none for a static scene; dead: dead time of the
-    pixels, if detected; latency: by size and level of steps, if triggers were given."""
+    pixels, if detected, or its upper bound; latency: by size and level of steps, if triggers were
+    given."""
 
     unit: Unit
     levels: tuple[Level, ...]
@@ -81,7 +83,8 @@ class Bench:
                 "steps": [dataclasses.asdict(v) for v in self.steps],
                 "latency": [dataclasses.asdict(v) for v in self.latency],
                 "dead_time_s": self.dead.seconds if self.dead.measured else None,
-                "dead_time_s_std": self.dead.std_s if self.dead.measured else None}
+                "dead_time_s_std": self.dead.std_s if self.dead.measured else None,
+                "dead_time_s_below": self.dead.below_s if self.dead.below_s > 0 else None}
 
 
 def cutoff_hz(duration_s: float) -> float:
@@ -218,19 +221,20 @@ def measured_bench(
 
 
 def _dead_time(events: Events, changes: np.ndarray, during: list[Events]) -> DeadTime:
-    """Dead time from all events; none where the intervals come from the edge of the light.
+    """Dead time from all events; an upper bound where the light's edge may cause the intervals.
 
-    An edge also sends a pixel's events at equal intervals, which are longer for smaller steps in
-    proportion; a dead time is the same for all. changes (K,), during (K): sizes and events of the
-    steps."""
-    found, sizes = dead_time(events), np.abs(changes)
-    smaller = sizes[sizes < APART * sizes.max()] if len(sizes) else sizes
-    if not found.measured or not len(smaller):
+    An edge also sends a pixel's events at regular intervals, which depend on the size of the step
+    and its direction; a dead time is the same for all. changes (K,), during (K): sizes and events
+    of the steps."""
+    found = dead_time(events)
+    if not found.measured:
         return found
-    waits = [own_intervals(Events.concatenate([
-        during[k] for k in np.flatnonzero(np.abs(sizes - size) < SAME)]))[0]
-        for size in (sizes.max(), smaller.max())]
-    if not all(map(len, waits)):
-        return found
-    longer = np.quantile(waits[1], SHORT) / max(np.quantile(waits[0], SHORT), 1.0)
-    return UNSEEN if abs(longer * smaller.max() / sizes.max() - 1.0) < EVEN else found
+    shortest = []
+    for changed in (changes, -changes):
+        sizes = np.unique(changed[changed > 0])[::-1]
+        for size in [*sizes[:1], *sizes[sizes < APART * sizes[:1]][:1]]:
+            alike = Events.concatenate([
+                during[k] for k in np.flatnonzero(np.abs(changed - size) < SAME)])
+            shortest += [np.quantile(waits, SHORT)] if len(waits := own_intervals(alike)[0]) else []
+    same = len(shortest) >= LEAST_KINDS and max(shortest) < (1.0 + EVEN) * min(shortest)
+    return found if same else DeadTime(below_s=found.seconds)

@@ -8,7 +8,9 @@ from helpers.benches import CYCLES, SHAPE, STAIRS, bench, cameras
 
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
-from evflow.estimation.bench.levels import _dead_time, few_sizes, lux_notes
+from evflow.estimation.bench.levels import Bench, _dead_time, few_sizes, lux_notes
+from evflow.estimation.dead_time import DeadTime
+from evflow.report.bench import _dead_time as said_of_dead_time
 from evflow.types import Events
 
 
@@ -65,18 +67,28 @@ def test_a_wrong_reading_of_the_light_meter_is_noted(
     assert [note.text.partition(" light")[0] for note in notes] == said
 
 
-@pytest.mark.parametrize(("small_us", "measured"), [(1000, True), (1500, False)])
-def test_an_even_edge_of_the_light_is_no_dead_time(small_us: int, measured: bool) -> None:
-    """Steps of 1.5 and 1 log units: pixels that wait do so in both, those that follow do not."""
+@pytest.mark.parametrize(("small_us", "down_us", "changes", "measured"), [
+    (1000, 1000, [1.5, -1.5, 1.0, -1.0], True), (1500, 1000, [1.5, -1.5, 1.0, -1.0], False),
+    (1100, 1000, [1.5, -1.5, 1.0, -1.0], False), (1000, 1200, [1.5, -1.5, 1.0, -1.0], False),
+    (1000, 1000, [1.5, -1.5, 1.5, -1.5], False)])
+def test_an_edge_of_the_light_is_no_dead_time(
+    small_us: int, down_us: int, changes: list[float], measured: bool
+) -> None:
+    """Pixels that wait do so alike in all steps, those that follow the light do not."""
     rng, n = np.random.default_rng(0), SHAPE[0] * SHAPE[1]
     during = []
-    for k, us in enumerate([1000, small_us, 1000, small_us]):
+    for k, us in enumerate([1000, down_us, small_us, down_us * small_us // 1000]):
         t = 1_000_000 * k + np.arange(6)[:, None] * us + rng.integers(0, 40, (6, n)).cumsum(0)
         order = np.argsort(t, axis=None, kind="stable")
         pixel = np.tile(np.arange(n), 6)[order]
         during.append(Events(pixel % SHAPE[1], pixel // SHAPE[1], t.ravel()[order],
                              np.full(t.size, k % 2 == 0), SHAPE[::-1]))
-    found = _dead_time(Events.concatenate(during), np.array([1.5, -1.0, 1.5, -1.0]), during)
+    found = _dead_time(Events.concatenate(during), np.array(changes), during)
     assert found.measured == measured
-    if measured:
-        assert found.seconds == pytest.approx(1e-3, rel=0.05)
+    assert (found.seconds if measured else found.below_s) == pytest.approx(1e-3, rel=0.05)
+
+
+def test_the_report_bounds_a_dead_time_that_may_be_an_edge() -> None:
+    bench = Bench("DN", (), (), DeadTime(below_s=1.5e-3))
+    assert "is at most 1.50 ms" in said_of_dead_time(bench)
+    assert (bench.as_dict()["dead_time_s"], bench.as_dict()["dead_time_s_below"]) == (None, 1.5e-3)
