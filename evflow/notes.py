@@ -64,6 +64,7 @@ NOTES: dict[str, str] = {
     "frames.unit": "the unit of the frame times was inferred",
     "frames.unused": "frames were left out",
     "frames.white": "the radiance that counts as white",
+    "levels.clipped": "saturated or black frames hide a level of light",
     "levels.few": "all light steps have the same size",
     "levels.lux": "the light meter's readings do not fit the frames",
     "maps.raised": "impossible values were raised to the smallest possible one",

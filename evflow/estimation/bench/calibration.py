@@ -20,7 +20,7 @@ from evflow.estimation.bench.counting import Span, Steps, counted_steps
 from evflow.estimation.bench.coverage import lost_steps, skipped_notes
 from evflow.estimation.bench.latency import measured_latency
 from evflow.estimation.bench.levels import few_sizes, measured_bench
-from evflow.estimation.bench.rests import rests_between
+from evflow.estimation.bench.rests import LEAST_STEP, rests_between
 from evflow.estimation.bench.steps import (
     camera_rate,
     camera_wide,
@@ -79,12 +79,14 @@ def calibrate_step(
     hz, kept = camera_rate(rest, steps.rest_s)
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
-    missed = lost_steps(steps.changes, clean[:, :, kept].mean(-1))
+    sized = steps.sized
+    missed = lost_steps(steps.changes, clean[:, :, kept].mean(-1), sized)
     lost = np.broadcast_to(missed[:, None, None], (len(missed), *kept.shape))
     theta, error = (ratio if literal else regression)(
-        steps.levels, clean, strays, fresh, steps.rests.max(1) > 0, lost)
+        steps.levels, clean, strays, fresh, steps.rests.max(1) > 0, lost, steps.lit)
     events = np.where(lost[:, None], 0.0, steps.counts).sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
+    enough &= steps.reach > LEAST_STEP
     sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
     maps, stds, medians, spreads, undetermined = [], [], [], [], list[str]()
     for i, name in enumerate(THRESHOLDS):
@@ -104,10 +106,12 @@ def calibrate_step(
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
     found = _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
                       n_events, ~kept, int((~missed).sum()),
-                      _notes(steps, undetermined, valid, ~kept, missed), tuple(undetermined))
+                      _notes(steps, undetermined, valid, ~kept, missed),
+                      tuple(undetermined))
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light,
-        np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan))
+        np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan),
+        sized & ~missed)
     if triggers_us is not None:
         shown = dataclasses.replace(shown, latency=measured_latency(
             recording.events, triggers_us, steps.spans, steps.settled,

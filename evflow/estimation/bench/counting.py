@@ -20,11 +20,13 @@ from evflow.estimation.bench.rests import check_steps, find_rests
 from evflow.light.log_maps import lin_log, lin_log_inverse
 from evflow.notes import Note
 from evflow.recordings.faulty_pixels import hot_at_rest
+from evflow.recordings.glitches import exposed
 from evflow.recordings.stillness import LEAST_EVENTS, MOVING, coincidence_excess
 from evflow.types import Events, Recording
 
 Span = tuple[int, int]
 
+MOST = 0.5  # share of pixels whose level must be known
 SETTLE_US = 20_000  # events of a step come until this long after the light rests again
 
 
@@ -32,7 +34,8 @@ SETTLE_US = 20_000  # events of a step come until this long after the light rest
 class Steps:
     """K steps of light between K+1 rests.
 
-    levels: (K+1, H, W) log intensity at each rest; counts: (K, 2, H, W) ON and OFF events of each
+    levels: (K+1, H, W) log intensity at each rest; lit: (K+1, H, W) bool, where it is known, as the
+    frames are neither saturated nor black; counts: (K, 2, H, W) ON and OFF events of each
     step; seconds: (K,) counting time of each; rests: (K+1, 2, H, W) events at each rest; spans: the
     rests; settled: times until which events belong to the step that leads to a rest; quiet: the
     parts of the rests in which events were counted as noise; light: (K+1,) in unit;
@@ -40,6 +43,7 @@ class Steps:
     left out; notes: on the light."""
 
     levels: np.ndarray
+    lit: np.ndarray
     counts: np.ndarray
     seconds: np.ndarray
     rests: np.ndarray
@@ -67,6 +71,17 @@ class Steps:
         """(K,) log units, of the median pixel."""
         return np.median(np.diff(self.levels, axis=0), (1, 2))
 
+    @property
+    def sized(self) -> np.ndarray:
+        """(K,) bool: steps of which most pixels' change is known."""
+        return (self.lit[1:] & self.lit[:-1]).mean((1, 2)) > MOST
+
+    @property
+    def reach(self) -> np.ndarray:
+        """(H, W) log units between the darkest and the brightest known level of a pixel."""
+        brightest = np.where(self.lit, self.levels, -np.inf).max(0)
+        return brightest - np.where(self.lit, self.levels, np.inf).min(0)
+
 
 def counted_steps(
     recording: Recording, rests_us: Sequence[Span] | None, light: Sequence[float] | None,
@@ -84,21 +99,24 @@ def counted_steps(
                               "Give two or more (begin, end) in us, in order of time.")
     if lux and light is not None:
         raise EvflowDataError("EV020", "both light and lux.", "Give one of them.")
-    levels = _levels(recording, spans, light)
+    levels, lit = _levels(recording, spans, light)
     if light is None:
         check_steps(levels)
+    # Frames saturate before the light rests, and still are while it begins to fall.
+    spans = [(a, b) if known.mean() > MOST else (a + (b - a) // 4, b - (b - a) // 4)
+             for (a, b), known in zip(spans, lit, strict=True)]
     unit: Unit = "DN" if light is None else "light"
     doubts = []
     if lux:
         seen = np.median(levels, (1, 2))
         unit, light = "lux", light_of_rests(seen, lux)
         doubts = lux_notes(seen, lux)
-        levels = _levels(recording, spans, light)
+        levels, lit = _levels(recording, spans, light)
     settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
     noise = noise_us(events, [(a, b) for a, (_, b) in zip(settled, spans, strict=True)])
     inside = covered(events, spans, settled, noise)
     uncovered = len(spans) - len(spans[inside])
-    levels, spans, settled = levels[inside], spans[inside], settled[inside]
+    levels, lit, spans, settled = levels[inside], lit[inside], spans[inside], settled[inside]
     light = None if light is None else light[inside]
     counts = [events.slice(before[1], after).count_map()
               for before, after in zip(spans, settled[1:], strict=False)]
@@ -111,8 +129,9 @@ def counted_steps(
     busiest = max((events.slice(a, b) for a, b in quiet), key=len)
     shown = (np.asarray(light, np.float64) if light is not None else
              np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))
-    return Steps(levels, np.array(counts, np.float64), np.array(seconds), rests, spans, settled,
-                 quiet, shown, unit, uncovered, silent * 1e-6, (*_restless(busiest), *doubts))
+    return Steps(levels, lit, np.array(counts, np.float64), np.array(seconds), rests, spans,
+                 settled, quiet, shown, unit, uncovered, silent * 1e-6,
+                 (*_restless(busiest), *doubts, *_clipped(lit)))
 
 
 def _restless(rest: Events) -> list[Note]:
@@ -126,17 +145,36 @@ def _restless(rest: Events) -> list[Note]:
         "camera regulate its exposure? Then noise rates, and thresholds, are wrong.")]
 
 
+def _clipped(lit: np.ndarray) -> list[Note]:
+    """A note where the level of rests is unknown to most pixels, lit (R, H, W) bool.
+
+    Raises:
+        EvflowDataError: EV017 if that leaves less than two rests.
+    """
+    hidden = int((lit.mean((1, 2)) <= MOST).sum())
+    if len(lit) - hidden < 2:
+        raise EvflowDataError(
+            "EV017", f"the frames are saturated or black at {hidden} of {len(lit)} rests of the "
+            "light.", "Expose the frames so that no level is white or black, or give the light of "
+            "each level, --lux.")
+    return [Note("levels.clipped", f"the frames are saturated or black at {hidden} of {len(lit)} "
+                 "rests of the light: thresholds follow from the light of the others, and from the "
+                 "events until then.")] if hidden else []
+
+
 def _levels(
     recording: Recording, spans: list[Span], light: Sequence[float] | None
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log intensity (R, H, W) at the rests, and where it is known, bool."""
     width, height = recording.events.size
     if light is not None:
         given = np.asarray(light, np.float64)
         if given.shape != (len(spans),) or not (np.isfinite(given) & (given > 0)).all():
             raise EvflowDataError("EV020", f"light={light!r} for {len(spans)} rests.",
                                   "Give one positive number per rest.")
-        return np.broadcast_to(np.log(given)[:, None, None], (len(spans), height, width))
-    times, levels = recording.frame_times, []
+        shape = (len(spans), height, width)
+        return np.broadcast_to(np.log(given)[:, None, None], shape), np.ones(shape, bool)
+    times, levels, lit = recording.frame_times, [], []
     for begin, end in spans:
         inside = np.flatnonzero((times >= begin) & (times <= end))
         if not len(inside):
@@ -144,4 +182,5 @@ def _levels(
                                   "Give light, its value at each rest.")
         mean = np.mean([recording.frame_dn(int(i)) for i in inside], 0, np.float64)
         levels.append(np.asarray(lin_log(mean.astype(np.float32)), np.float64))
-    return np.stack(levels)
+        lit.append(exposed(mean))
+    return np.stack(levels), np.stack(lit)

@@ -75,19 +75,20 @@ def watched(events: Events, span: Span, noise: float) -> Span:
     return int(begins[longest]), int(ends[longest])
 
 
-def lost_steps(changes: np.ndarray, sent: np.ndarray) -> np.ndarray:
+def lost_steps(changes: np.ndarray, sent: np.ndarray, sized: np.ndarray) -> np.ndarray:
     """(K,) bool: steps with far fewer events than the other steps' thresholds predict.
 
     Args:
         changes: (K,) log units.
         sent: (K, 2) ON and OFF events per pixel minus the noise.
+        sized: (K,) bool, steps whose change is known.
     """
     up = changes > 0
     own = np.where(up, sent[:, 0], sent[:, 1])
     # After a step in the other direction the memory must first return: about an event less.
     events = own + np.diff(up, prepend=not up[0])
     lost = np.zeros(len(changes), bool)
-    for side in (up, ~up):
+    for side in (up & sized, ~up & sized):
         if side.sum() >= LEAST_STEPS and (known := side & (events > 0)).any():
             predicted = np.abs(changes) / np.median(np.abs(changes[known]) / events[known])
             less = (events < predicted - LOST_EVENTS) & (own < LOST * (predicted - events + own))

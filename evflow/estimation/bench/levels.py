@@ -193,7 +193,7 @@ def few_sizes(changes: np.ndarray) -> list[Note]:
 def measured_bench(
     unit: Unit, events: Events, spans: list[Span], settled: list[int], quiet: list[Span],
     light: np.ndarray, logs: np.ndarray, rests: np.ndarray, clean: np.ndarray, kept: np.ndarray,
-    theta: np.ndarray,
+    theta: np.ndarray, sized: np.ndarray,
 ) -> Bench:
     """All measurements of a bench.
 
@@ -204,6 +204,7 @@ def measured_bench(
             a rest; other arguments as of `measured_levels`.
         clean: (K, 2, H, W) events of the steps minus the noise.
         theta: (2, H, W) thresholds, NaN where unknown.
+        sized: (K,) bool, steps whose size and events are known; the others are left out.
     """
     inverse = [float(np.mean(1.0 / known)) if (known := t[kept & np.isfinite(t)]).size else 0.0
                for t in theta]
@@ -214,10 +215,11 @@ def measured_bench(
         of_side = inside.p == (side == 0)
         t = inside.t[of_side & kept[inside.y, inside.x]]
         steps.append(Step(float(change), float(clean[k, side][kept].mean()), _duration(
-            t, abs(change) * inverse[side], int(kept.sum()))))
+            t, abs(change) * inverse[side], int(kept.sum())) if sized[k] else None))
     levels = measured_levels(quiet, light, logs, rests, kept, tuple(steps))
     during = [events.slice(spans[k][1], settled[k + 1]) for k in range(len(steps))]
-    return Bench(unit, levels, tuple(steps), _dead_time(events, np.diff(logs), during))
+    told = tuple(step for step, known in zip(steps, sized, strict=True) if known)
+    return Bench(unit, levels, told, _dead_time(events, np.diff(logs), during))
 
 
 def _dead_time(events: Events, changes: np.ndarray, during: list[Events]) -> DeadTime:

@@ -30,11 +30,11 @@ BIAS = 0.015  # relative error of the median threshold: 1.4 % low on eight simul
 
 def ratio(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray,
-    lost: np.ndarray,
+    lost: np.ndarray, lit: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """theta = dlogI / events (2, H, W) over the steps of each direction, and the std of one event.
     Arguments as of `regression`."""
-    change = np.where(lost, 0.0, np.diff(levels, axis=0))
+    change = np.where(lost | ~lit[1:] | ~lit[:-1], 0.0, np.diff(levels, axis=0))
     sums = [((s * change > 0) * s * change).sum(0) for s in (1.0, -1.0)]
     counts = [((s * change > 0) * n[:, i]).sum(0) for i, s in enumerate((1.0, -1.0))]
     theta = np.stack([d / np.where(c > 0, c, np.nan) for d, c in zip(sums, counts, strict=True)])
@@ -43,7 +43,7 @@ def ratio(
 
 def regression(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray,
-    lost: np.ndarray,
+    lost: np.ndarray, lit: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds by iterated weighted least squares for (theta_ON, theta_OFF, r_0).
 
@@ -53,17 +53,18 @@ def regression(
         strays: (K, 2) expected noise events of each step.
         fresh: whether r_0 is 0.
         noisy: (K+1, H, W) bool, rests with events.
-        lost: (K, H, W) bool, steps whose events or size are not known.
+        lost: (K, H, W) bool, steps whose events are not known.
+        lit: (K+1, H, W) bool, rests whose level is known.
 
     Returns:
         theta and its std, (2, H, W).
     """
-    theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy), lost)
+    theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy), lost, lit)
     up = np.median(np.diff(levels, axis=0), (1, 2)) > 0
     if storing(n, up, noisy, np.median(theta, (1, 2)), lost) > 0.5:
         # A noise event amid a step discards half a threshold of change on average.
         missed = 0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1)
-        return _regression(levels, n + missed[..., None, None], strays, fresh, noisy, lost)
+        return _regression(levels, n + missed[..., None, None], strays, fresh, noisy, lost, lit)
     return theta, std
 
 
@@ -92,9 +93,11 @@ def storing(
 
 def _regression(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, stored: np.ndarray,
-    lost: np.ndarray,
+    lost: np.ndarray, lit: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """`regression` for given rests at which the memory was reset, stored: (K+1, H, W) bool."""
+    lost = _without_begin(lost | _beside(stored & ~lit), lit)
+    stored = stored & lit
     number = np.arange(len(n))[:, None, None]
     last = np.maximum.accumulate(np.where(stored[:-1], number, -1), 0)  # rest, of each step
     # The part of the recording that a step belongs to, and the rest that the part begins with.
@@ -111,7 +114,7 @@ def _regression(
     a, b = (since(sums) for sums in np.moveaxis(np.cumsum(np.concatenate([before, n]), 0), 1, 0))
     starts = [np.where(part == i, known - 1.0, 0.0) for i in range(int(part.max()) + 1)]
     design = np.stack([a + 0.5 * up, -(b + 0.5 * ~up), *starts], -1)  # (K, H, W, 2 + parts)
-    design = np.where(lost[..., None], 0.0, design)
+    design = np.where((lost | ~lit[1:])[..., None], 0.0, design)
     after = [(up & (part == i) & lost).any(0) for i in range(1, len(starts))]
     sent = np.cumsum(np.concatenate([np.zeros((1, 2)), strays]), 0)
     extra = sent[1:, :, None, None] - np.moveaxis(sent[base], -1, 1)  # noise: variance, in events
@@ -145,6 +148,20 @@ def _regression(
     covariance = covariance @ scatter @ covariance
     std = np.sqrt(np.stack([covariance[..., 0, 0], covariance[..., 1, 1]]))
     return theta, std
+
+
+def _beside(rests: np.ndarray) -> np.ndarray:
+    """(K, H, W) bool: steps to or from rests (K+1, H, W)."""
+    return np.asarray(rests[1:] | rests[:-1])
+
+
+def _without_begin(lost: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """(K, H, W) bool: lost steps, and steps before the first rest whose level is known, from the
+    beginning or from a lost step on. Events of a step to or from a later unknown level count."""
+    found = lost.copy()
+    for k in range(len(lost)):
+        found[k] |= ~lit[k] & (found[k - 1] if k else True)
+    return found
 
 
 def _walked(pulled: np.ndarray, variance: np.ndarray, stored: np.ndarray) -> np.ndarray:
