@@ -33,6 +33,7 @@ from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels
 from evflow.types import Recording
 
+SURE, SEEN = 5.0, 3.0  # standard deviations of noise: polarity is swapped, steps are seen
 FEW_EVENTS = 2  # of a polarity, over all steps: the least for a measurement
 MOST = 0.5  # share of pixels measured, below which a note is added
 
@@ -62,8 +63,8 @@ def calibrate_step(
 
     Raises:
         EvflowDataError: EV001 (no events), EV011 (no frames and no light), EV012 (no trigger at a
-            step), EV017 (fewer than two rests in the frames, or no screen that steps), EV020, EV021
-            (polarities swapped).
+            step), EV017 (fewer than two rests in the frames, no screen that steps, or steps too
+            small), EV020, EV021 (polarities swapped).
     """
     metered, lux = False, () if lux is None else tuple(map(float, lux))
     if not len(recording.events):
@@ -74,7 +75,7 @@ def calibrate_step(
     steps = counted_steps(recording, rests_us, light, lux)
     if metered:
         steps = dataclasses.replace(steps, unit="lux")
-    _check_polarity(steps)
+    _check_polarity(steps, recording.has_frames)
     rest = steps.rest
     hz, kept = camera_rate(rest, steps.rest_s)
     strays = steps.seconds[:, None] * hz
@@ -139,13 +140,23 @@ def _notes(
     return tuple(notes)
 
 
-def _check_polarity(steps: Steps) -> None:
-    """EV021 where OFF events come with steps up."""
-    net = (steps.counts[:, 0] - steps.counts[:, 1]).sum((1, 2))
-    if (steps.changes * net).sum() < 0:
+def _check_polarity(steps: Steps, framed: bool) -> None:
+    """EV021 where OFF events come with steps up, more than by chance; EV017 where neither do."""
+    counts = steps.counts.sum((2, 3))
+    net = float(steps.changes @ (counts[:, 0] - counts[:, 1]))
+    chance = float(np.sqrt(steps.changes**2 @ counts.sum(1)))
+    if net < -SURE * chance:
         raise EvflowDataError(
             "EV021", "ON events come where the light falls, OFF events where it rises.",
-            "Pass --polarity invert (polarity='invert'), or are frames and events not aligned?")
+            "Pass --polarity invert (polarity='invert'), or are frames and events not aligned?"
+            if framed else
+            "Is the light of the rests, --lux, in order of time, and is there a trigger at each "
+            "step? If so, pass --polarity invert (polarity='invert').")
+    if net < SEEN * chance:
+        raise EvflowDataError(
+            "EV017", f"the events of {len(counts)} steps of light, of "
+            f"{np.expm1(np.abs(steps.changes).max()):.0%} at most, are no more than noise.",
+            "Take steps of several thresholds, for example twice as bright.")
 
 
 def _estimate(

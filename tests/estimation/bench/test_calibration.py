@@ -161,6 +161,20 @@ def test_what_is_no_bench_is_refused() -> None:
         calibrate_step(dataclasses.replace(recording, events=swapped))
 
 
+def test_inverted_polarity_is_told_from_steps_too_small_and_lux_out_of_order() -> None:
+    """Steps of 15 % send noise only, of either sign."""
+    noisy = Camera.constant(SHAPE, 0.3, 0.3, 1.0, 1.0)
+    for levels in ([100, 115] * 3, [115, 100] * 3):
+        small = bench(noisy, levels)
+        with pytest.raises(EvflowDataError, match=r"EV017.*5 steps of light, of 15% at most"):
+            calibrate_step(small)
+    light = [40, 100, 55, 220, 40]
+    alone = Recording.of_events(bench(noisy, light).events)
+    edges = 1000 * (100 + 120 * np.arange(4))
+    with pytest.raises(EvflowDataError, match=r"EV021.*Is the light of the rests, --lux, in order"):
+        calibrate_step(alone, lux=[100, 40, 220, 55, 100], triggers_us=edges)
+
+
 def textured(shift_px: int, part: float = 1.0) -> Recording:
     """A texture under CYCLES, which moves `shift_px` per frame; only `part` of it is the screen."""
     base = bench(cameras(0.03), CYCLES)
