@@ -65,6 +65,7 @@ NOTES: dict[str, str] = {
     "frames.unused": "frames were left out",
     "frames.white": "the radiance that counts as white",
     "levels.clipped": "saturated or black frames hide a level of light",
+    "levels.dark": "which logarithm dark levels of light have is open",
     "levels.few": "all light steps have the same size",
     "levels.lux": "the light meter's readings do not fit the frames",
     "maps.raised": "impossible values were raised to the smallest possible one",

@@ -16,6 +16,10 @@ from evflow.training.config import PRESETS
 UNDETERMINED = 2.0  # times the stated error of theta: what the light alone may change is told
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
+LOGARITHMIC = Note(
+    "pixels.log", "the pixels' response is logarithmic in dark light too, as ESIM's (log_eps), not "
+    "linear below 20 DN as v2e's (linlog): the thresholds are of that.")
+
 
 def camera_notes(
     stats: Stats, undetermined: tuple[str, ...], alone: tuple[str, ...], n_events: np.ndarray,
@@ -79,9 +83,7 @@ def receptor_notes(
                       + ("" if found.seen.by_light else ", equally fast in dark and bright light")
                       + "; ignoring it would change them where things move fast.")]
     if found.seen.logarithmic:
-        notes.append(Note(
-            "pixels.log", "the pixels' response is logarithmic in dark light too, as ESIM's "
-            "(log_eps), not linear below 20 DN as v2e's (linlog): the thresholds are of that."))
+        notes.append(LOGARITHMIC)
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
         notes.append(Note(

@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import THETA_MIN, Camera, Summary
+from evflow.camera.sensors import LogMap
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.counting import Span, Steps, counted_steps
 from evflow.estimation.bench.coverage import lost_steps, skipped_notes
 from evflow.estimation.bench.latency import measured_latency
 from evflow.estimation.bench.levels import few_sizes, measured_bench
+from evflow.estimation.bench.logarithm import chosen_map
 from evflow.estimation.bench.rests import LEAST_STEP, rests_between
 from evflow.estimation.bench.steps import (
     camera_rate,
@@ -28,6 +30,7 @@ from evflow.estimation.bench.steps import (
     regression,
     shrunk_rates,
 )
+from evflow.estimation.remarks import LOGARITHMIC
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels
@@ -81,6 +84,7 @@ def calibrate_step(
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
     sized = steps.sized
+    steps, log_map = _with_right_map(steps, clean[:, :, kept].mean(-1))
     missed = lost_steps(steps.changes, clean[:, :, kept].mean(-1), sized)
     lost = np.broadcast_to(missed[:, None, None], (len(missed), *kept.shape))
     theta, error = (ratio if literal else regression)(
@@ -119,7 +123,22 @@ def calibrate_step(
             steps.light, np.median(steps.levels, (1, 2)), kept))
     return dataclasses.replace(
         found, bench=shown, sensor_std={"refractory_s": shown.dead.std_s},
-        sensor=dataclasses.replace(found.sensor, refractory_s=shown.dead.seconds))
+        sensor=dataclasses.replace(
+            found.sensor, refractory_s=shown.dead.seconds, log_map=log_map))
+
+
+def _with_right_map(steps: Steps, sent: np.ndarray) -> tuple[Steps, LogMap]:
+    """The steps with the levels of the map that their events (K, 2) fit, and its name."""
+    if steps.other is None:
+        return steps, "linlog"
+    switch, notes = chosen_map(steps.levels, steps.other, sent, steps.sized)
+    maps: tuple[LogMap, LogMap] = ("linlog", "log_eps")
+    name = maps[(steps.other.log_map == "log_eps") == switch]
+    if name == "log_eps" and not notes:
+        notes = [LOGARITHMIC]
+    return dataclasses.replace(
+        steps, levels=steps.other.levels if switch else steps.levels,
+        notes=(*steps.notes, *notes)), name
 
 
 def _notes(

@@ -16,6 +16,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.coverage import covered, noise_us, watched
 from evflow.estimation.bench.levels import Unit, light_of_rests, lux_notes
+from evflow.estimation.bench.logarithm import Other, other_map
 from evflow.estimation.bench.rests import check_steps, find_rests
 from evflow.light.log_maps import lin_log, lin_log_inverse
 from evflow.notes import Note
@@ -40,7 +41,8 @@ class Steps:
     rests; settled: times until which events belong to the step that leads to a rest; quiet: the
     parts of the rests in which events were counted as noise; light: (K+1,) in unit;
     uncovered, silent_s: steps beyond the events, and time at rest whose events are missing, both
-    left out; notes: on the light."""
+    left out; other: the levels by another logarithm, if there is light so dark that it matters;
+    notes: on the light."""
 
     levels: np.ndarray
     lit: np.ndarray
@@ -54,6 +56,7 @@ class Steps:
     unit: Unit
     uncovered: int
     silent_s: float
+    other: Other | None
     notes: tuple[Note, ...]
 
     @property
@@ -100,6 +103,7 @@ def counted_steps(
     if lux and light is not None:
         raise EvflowDataError("EV020", "both light and lux.", "Give one of them.")
     levels, lit = _levels(recording, spans, light)
+    framed = None if light is not None else levels
     if light is None:
         check_steps(levels)
     # Frames saturate before the light rests, and still are while it begins to fall.
@@ -112,12 +116,14 @@ def counted_steps(
         unit, light = "lux", light_of_rests(seen, lux)
         doubts = lux_notes(seen, lux)
         levels, lit = _levels(recording, spans, light)
+    other = None if framed is None else other_map(levels, framed, bool(lux))
     settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
     noise = noise_us(events, [(a, b) for a, (_, b) in zip(settled, spans, strict=True)])
     inside = covered(events, spans, settled, noise)
     uncovered = len(spans) - len(spans[inside])
     levels, lit, spans, settled = levels[inside], lit[inside], spans[inside], settled[inside]
     light = None if light is None else light[inside]
+    other = other and dataclasses.replace(other, levels=other.levels[inside])
     counts = [events.slice(before[1], after).count_map()
               for before, after in zip(spans, settled[1:], strict=False)]
     seconds = [(after - before[1]) * 1e-6
@@ -130,7 +136,7 @@ def counted_steps(
     shown = (np.asarray(light, np.float64) if light is not None else
              np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))
     return Steps(levels, lit, np.array(counts, np.float64), np.array(seconds), rests, spans,
-                 settled, quiet, shown, unit, uncovered, silent * 1e-6,
+                 settled, quiet, shown, unit, uncovered, silent * 1e-6, other,
                  (*_restless(busiest), *doubts, *_clipped(lit)))
 
 
@@ -182,5 +188,5 @@ def _levels(
                                   "Give light, its value at each rest.")
         mean = np.mean([recording.frame_dn(int(i)) for i in inside], 0, np.float64)
         levels.append(np.asarray(lin_log(mean.astype(np.float32)), np.float64))
-        lit.append(exposed(mean))
+        lit.append(exposed(np.asarray(mean)))
     return np.stack(levels), np.stack(lit)
