@@ -116,7 +116,7 @@ def calibrate_step(
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light,
         np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan),
-        sized & ~missed)
+        sized & ~missed, not any(note.code == "steps.slow" for note in steps.notes))
     if triggers_us is not None:
         shown = dataclasses.replace(shown, latency=measured_latency(
             recording.events, triggers_us, steps.spans, steps.settled,

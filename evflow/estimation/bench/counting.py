@@ -18,6 +18,7 @@ from evflow.estimation.bench.coverage import covered, noise_us, watched
 from evflow.estimation.bench.levels import Unit, light_of_rests, lux_notes
 from evflow.estimation.bench.logarithm import Other, other_map
 from evflow.estimation.bench.rests import check_steps, find_rests
+from evflow.estimation.bench.settling import SETTLE_US, settled_at, settling_us
 from evflow.light.log_maps import lin_log, lin_log_inverse
 from evflow.notes import Note
 from evflow.recordings.faulty_pixels import hot_at_rest
@@ -28,7 +29,6 @@ from evflow.types import Events, Recording
 Span = tuple[int, int]
 
 MOST = 0.5  # share of pixels whose level must be known
-SETTLE_US = 20_000  # events of a step come until this long after the light rests again
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -117,11 +117,13 @@ def counted_steps(
         doubts = lux_notes(seen, lux)
         levels, lit = _levels(recording, spans, light)
     other = None if framed is None else other_map(levels, framed, bool(lux))
-    settled = [min(a + SETTLE_US, (a + b) // 2) for a, b in spans]
+    settled = settled_at(spans, SETTLE_US)
     noise = noise_us(events, [(a, b) for a, (_, b) in zip(settled, spans, strict=True)])
     inside = covered(events, spans, settled, noise)
     uncovered = len(spans) - len(spans[inside])
-    levels, lit, spans, settled = levels[inside], lit[inside], spans[inside], settled[inside]
+    levels, lit, spans = levels[inside], lit[inside], spans[inside]
+    settle, slow = settling_us(events, spans)
+    settled = settled_at(spans, settle)
     light = None if light is None else light[inside]
     other = other and dataclasses.replace(other, levels=other.levels[inside])
     counts = [events.slice(before[1], after).count_map()
@@ -137,7 +139,7 @@ def counted_steps(
              np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))
     return Steps(levels, lit, np.array(counts, np.float64), np.array(seconds), rests, spans,
                  settled, quiet, shown, unit, uncovered, silent * 1e-6, other,
-                 (*_restless(busiest), *doubts, *_clipped(lit)))
+                 (*_restless(busiest), *doubts, *slow, *_clipped(lit)))
 
 
 def _restless(rest: Events) -> list[Note]:

@@ -193,7 +193,7 @@ def few_sizes(changes: np.ndarray) -> list[Note]:
 def measured_bench(
     unit: Unit, events: Events, spans: list[Span], settled: list[int], quiet: list[Span],
     light: np.ndarray, logs: np.ndarray, rests: np.ndarray, clean: np.ndarray, kept: np.ndarray,
-    theta: np.ndarray, sized: np.ndarray,
+    theta: np.ndarray, sized: np.ndarray, whole: bool,
 ) -> Bench:
     """All measurements of a bench.
 
@@ -205,6 +205,7 @@ def measured_bench(
         clean: (K, 2, H, W) events of the steps minus the noise.
         theta: (2, H, W) thresholds, NaN where unknown.
         sized: (K,) bool, steps whose size and events are known; the others are left out.
+        whole: whether all events of the steps are known, and so their durations.
     """
     inverse = [float(np.mean(1.0 / known)) if (known := t[kept & np.isfinite(t)]).size else 0.0
                for t in theta]
@@ -215,7 +216,7 @@ def measured_bench(
         of_side = inside.p == (side == 0)
         t = inside.t[of_side & kept[inside.y, inside.x]]
         steps.append(Step(float(change), float(clean[k, side][kept].mean()), _duration(
-            t, abs(change) * inverse[side], int(kept.sum())) if sized[k] else None))
+            t, abs(change) * inverse[side], int(kept.sum())) if whole and sized[k] else None))
     levels = measured_levels(quiet, light, logs, rests, kept, tuple(steps))
     during = [events.slice(spans[k][1], settled[k + 1]) for k in range(len(steps))]
     told = tuple(step for step, known in zip(steps, sized, strict=True) if known)
