@@ -91,15 +91,7 @@ def counted_steps(
     lux: tuple[float, ...],
 ) -> Steps:
     """The steps and rests of a recording; arguments and errors as of `calibrate_step`."""
-    events, times = recording.events, recording.frame_times
-    frames = None if rests_us is not None else find_rests(recording)
-    spans = ([(int(times[a]), int(times[b])) for a, b in frames] if frames is not None
-             else [(int(a), int(b)) for a, b in rests_us or ()])
-    flat = [t for span in spans for t in span]
-    if (len(spans) < 2 or any(b < a for a, b in itertools.pairwise(flat))
-            or any(b == a for a, b in spans)):
-        raise EvflowDataError("EV020", f"rests_us={spans}.",
-                              "Give two or more (begin, end) in us, in order of time.")
+    events, spans = recording.events, _rests(recording, rests_us)
     if lux and light is not None:
         raise EvflowDataError("EV020", "both light and lux.", "Give one of them.")
     levels, lit = _levels(recording, spans, light)
@@ -140,6 +132,19 @@ def counted_steps(
     return Steps(levels, lit, np.array(counts, np.float64), np.array(seconds), rests, spans,
                  settled, quiet, shown, unit, uncovered, silent * 1e-6, other,
                  (*_restless(busiest), *doubts, *slow, *_clipped(lit)))
+
+
+def _rests(recording: Recording, rests_us: Sequence[Span] | None) -> list[Span]:
+    """The rests of the light in us, given or found in the frames; EV020 if given ones overlap."""
+    times = recording.frame_times
+    spans = ([(int(times[a]), int(times[b])) for a, b in find_rests(recording)]
+             if rests_us is None else [(int(a), int(b)) for a, b in rests_us])
+    flat = [t for span in spans for t in span]
+    if (len(spans) < 2 or any(b < a for a, b in itertools.pairwise(flat))
+            or any(b == a for a, b in spans)):
+        raise EvflowDataError("EV020", f"rests_us={spans}.",
+                              "Give two or more (begin, end) in us, in order of time.")
+    return spans
 
 
 def _restless(rest: Events) -> list[Note]:

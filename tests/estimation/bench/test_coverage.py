@@ -11,6 +11,7 @@ from evflow.camera import Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
 from evflow.estimation.bench.coverage import lost_steps
+from evflow.estimation.bench.rests import rests_between
 
 LEVELS = [40, 100, 55, 220, 40, 55, 220, 100, 40, 220, 55, 100, 40]
 EDGES = 1000 * (100 + 120 * np.arange(len(LEVELS) - 1))
@@ -66,11 +67,12 @@ def test_a_recording_that_ends_amid_its_last_edge(whole: Recording) -> None:
 
 
 def test_a_late_trigger_after_the_last_event() -> None:
-    """Without noise the last event is a step's own."""
-    quiet = Recording.of_events(bench(cameras(0.03), LEVELS[:5]).events)
-    late = quiet.events.t[-1] + 5000 - EDGES[3]
-    found = calibrate_step(quiet, lux=LEVELS[:5], triggers_us=EDGES[:4] + min(late, 9900))
-    assert found.windows == 4
+    """Without noise the last event is a step's own; whether it is there, --lux decides."""
+    events = bench(cameras(0.03), LEVELS[:5]).events.slice(0, int(EDGES[3]) + 4000)
+    for count in (4, 5):
+        assert len(rests_between(EDGES[:4] + 9000, events, count)) == count
+    with pytest.raises(EvflowDataError, match=r"EV020.*6 values of lux, 3 edges"):
+        rests_between(EDGES[:4] + 9000, events, 6)
 
 
 @pytest.mark.parametrize("step", [0, 2, 11])
