@@ -171,8 +171,8 @@ def _clipped(lit: np.ndarray) -> list[Note]:
             "light.", "Expose the frames so that no level is white or black, or give the light of "
             "each level, --lux.")
     return [Note("levels.clipped", f"the frames are saturated or black at {hidden} of {len(lit)} "
-                 "rests of the light: thresholds follow from the light of the others, and from the "
-                 "events until then.")] if hidden else []
+                 "rests of the light: thresholds follow from the light of the others, and all "
+                 "events between them.")] if hidden else []
 
 
 def _levels(
