@@ -28,6 +28,8 @@ from evflow.recordings.stillness import unlike_noise
 from evflow.training.config import PRESETS
 from evflow.types import Events, Recording
 
+MOSTLY, LEAST = 0.8, 0.25  # share of the time observed beside several gaps, and beside one
+
 
 def estimate_noise(
     recording: Recording, *, lux: float | None = None, alone: bool = True
@@ -42,7 +44,7 @@ def estimate_noise(
     as of lost packets, are not counted as time of observation. Raises EV017 (EV011 unless `alone`)
     if the scene moves, or the recording is too short to decide.
     """
-    parts = stretches(recording.events)
+    parts = _observed(recording.events)
     events = joined(parts)
     counts = events.count_map()
     total = counts.sum(0, dtype=np.uint32)
@@ -75,6 +77,14 @@ def estimate_noise(
         THRESHOLDS,
         sensor=sensor, sensor_std=std,
         bench=Bench("lux", level) if level else None)
+
+
+def _observed(events: Events) -> list[Events]:
+    """The events between gaps; all of them where gaps are more than lost packets explain, as
+    between the bursts of a flickering light: their rate is not that of noise."""
+    parts = stretches(events)
+    share = sum(part.duration_us for part in parts) / max(events.duration_us, 1)
+    return parts if share > (MOSTLY if len(parts) > 2 else LEAST) else [events]
 
 
 def _kinds(

@@ -62,7 +62,8 @@ def covered(events: Events, spans: list[Span], settled: list[int], noise: float)
 
 
 def watched(events: Events, span: Span, noise: float) -> Span:
-    """The longest part of a rest without a silence that its noise makes improbable."""
+    """The longest part of a rest without a silence that its noise makes improbable; all of it where
+    several silences leave less than half, as between the bursts of a flickering light."""
     t = events.slice(*span).t
     bounds = np.concatenate([[span[0]], t, [span[1]]])
     pauses = np.diff(bounds)
@@ -72,7 +73,8 @@ def watched(events: Events, span: Span, noise: float) -> Span:
         return span
     begins, ends = bounds[[0, *(silent + 1)]], bounds[[*silent, -1]]
     longest = int(np.argmax(ends - begins))
-    return int(begins[longest]), int(ends[longest])
+    kept = int(begins[longest]), int(ends[longest])
+    return span if len(silent) > 1 and 2 * (kept[1] - kept[0]) < span[1] - span[0] else kept
 
 
 def lost_steps(changes: np.ndarray, sent: np.ndarray, sized: np.ndarray) -> np.ndarray:

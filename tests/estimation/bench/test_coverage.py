@@ -10,8 +10,9 @@ from evflow import Recording
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.calibration import calibrate_step
-from evflow.estimation.bench.coverage import lost_steps
+from evflow.estimation.bench.coverage import lost_steps, noise_us, watched
 from evflow.estimation.bench.rests import rests_between
+from evflow.types import Events
 
 LEVELS = [40, 100, 55, 220, 40, 55, 220, 100, 40, 220, 55, 100, 40]
 EDGES = 1000 * (100 + 120 * np.arange(len(LEVELS) - 1))
@@ -91,6 +92,15 @@ def test_silence_at_rest_is_not_observed(whole: Recording) -> None:
     found = calibrate_step(without(whole, at + 45_000, at + 100_000))
     check(found)
     assert [n.code for n in found.notes] == ["events.gaps"]
+
+
+def test_silence_between_the_bursts_of_a_flicker_is_observed() -> None:
+    height, width = SHAPE
+    t = np.sort(np.concatenate([k * 50_000 + RNG.integers(0, 5_000, 400) for k in range(20)]))
+    events = Events(RNG.integers(0, width, t.size), RNG.integers(0, height, t.size), t,
+                    RNG.random(t.size) < 0.5, (width, height))
+    rests = [(0, 500_000), (500_000, 1_000_000)]
+    assert watched(events, rests[1], noise_us(events, rests)) == rests[1]
 
 
 def test_lost_steps_are_those_far_below_the_others() -> None:

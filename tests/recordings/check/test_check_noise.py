@@ -186,3 +186,16 @@ def test_time_without_any_event_is_not_observed(lost_s: int) -> None:
     assert f"for {lost_s} s no pixel sent an event (1 gap)" in found.notes[1].text
     assert found.bench is not None
     assert found.bench.levels[0].seconds == pytest.approx(SECONDS - lost_s, rel=1e-3)
+
+
+@pytest.mark.parametrize(("burst_us", "period_us"), [(10_000, 100_000), (40_000, 500_000)])
+def test_silence_between_the_bursts_of_a_flicker_is_observed(burst_us: int, period_us: int) -> None:
+    rng = np.random.default_rng(0)
+    width, height = SIZE
+    n, bursts = width * height, 10_000_000 // period_us
+    t = np.sort(np.concatenate(
+        [rng.integers(k * period_us, k * period_us + burst_us, n) for k in range(bursts)]))
+    events = Events(rng.integers(0, width, t.size), rng.integers(0, height, t.size), t,
+                    rng.random(t.size) < 0.5, SIZE)
+    with pytest.raises(EvflowDataError, match="EV017"):
+        estimate_noise(Recording.of_events(events))
