@@ -28,7 +28,8 @@ from evflow.recordings.stillness import unlike_noise
 from evflow.training.config import PRESETS
 from evflow.types import Events, Recording
 
-MOSTLY, LEAST = 0.8, 0.25  # share of the time observed beside several gaps, and beside one
+MOSTLY = 0.8  # share of the time that is observed beside several gaps
+LONG_S = 1.0  # and time beside one, as of a clock that jumps: a flash is shorter
 
 
 def estimate_noise(
@@ -83,8 +84,9 @@ def _observed(events: Events) -> list[Events]:
     """The events between gaps; all of them where gaps are more than lost packets explain, as
     between the bursts of a flickering light: their rate is not that of noise."""
     parts = stretches(events)
-    share = sum(part.duration_us for part in parts) / max(events.duration_us, 1)
-    return parts if share > (MOSTLY if len(parts) > 2 else LEAST) else [events]
+    seen = sum(part.duration_us for part in parts)
+    lost = seen > MOSTLY * events.duration_us if len(parts) > 2 else seen * 1e-6 > LONG_S
+    return parts if lost else [events]
 
 
 def _kinds(
