@@ -10,6 +10,7 @@ from pathlib import Path
 
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import aside, atomic_write, clear_leftovers, written_aside
+from evflow.files.locks import lock
 from evflow.files.moves import move_new, swap_folders
 from evflow.process.signals import uninterrupted
 
@@ -92,14 +93,16 @@ def need_writable(folder: Path) -> None:
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder, which other processes wait for: files of two of them would mix.
     Systems and file systems without such locks go on without."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(ImportError, OSError):
-            import fcntl
-
-            opened = os.open(folder, os.O_RDONLY)
-            stack.callback(os.close, opened)  # which frees the lock
-            fcntl.flock(opened, fcntl.LOCK_EX)
+    try:
+        opened = os.open(folder, os.O_RDONLY)
+    except OSError:  # a folder cannot be opened on Windows
         yield
+        return
+    try:
+        lock(opened, wait=True)
+        yield
+    finally:
+        os.close(opened)
 
 
 def _unstage(stage: Path, folder: Path, names: Sequence[str], *, overwrite: bool) -> None:

@@ -12,9 +12,9 @@ import os
 import platform
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
 
 from evflow.errors import EvflowDataError
+from evflow.files.locks import lock
 from evflow.process.devices import agree, is_main
 
 NAME = ".lock"
@@ -43,7 +43,7 @@ def _taken(opened: contextlib.ExitStack, folder: Path) -> str:
     except OSError as e:
         raise EvflowDataError("EV019", f"{folder / NAME} cannot be opened ({e.strerror}).",
                               "Choose another --out.") from e
-    if not _lock(file):
+    if not lock(file.fileno(), wait=False):
         file.seek(0)
         return file.read(200).strip() or "another process"
     with contextlib.suppress(OSError):  # a full disk: its name is all that is missing
@@ -51,16 +51,3 @@ def _taken(opened: contextlib.ExitStack, folder: Path) -> str:
         file.write(f"process {os.getpid()} on {platform.node()}\n")
         file.flush()
     return ""
-
-
-def _lock(file: TextIO) -> bool:
-    """Whether the file could be locked, or its system knows no locks."""
-    try:
-        import fcntl  # not on Windows
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except (ImportError, OSError):
-        return True
-    return True
