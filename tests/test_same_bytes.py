@@ -1,6 +1,6 @@
 """The same keys give the same bytes: hashes of a simulation, an estimate, a training step and a
-data set. Rounding differs between processors and versions of XLA, so hashes are kept for each;
-on another machine the test skips and says how to add it:
+data set. Rounding differs between processors, numbers of cores and versions of XLA, so hashes are
+kept for each; on another machine the test skips and says how to add it:
 
     python tests/test_same_bytes.py
 
@@ -31,6 +31,7 @@ from helpers.networks import hidden, small_config
 import evflow as ef
 from evflow.dataset.config import PRESETS
 from evflow.dataset.generate import make_sequence
+from evflow.process.chunks import cores_per_device
 from evflow.scenes import make_bank
 from evflow.training.step import init_state, make_run_step, optimiser
 
@@ -45,7 +46,8 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     flags = set(re.findall(r"\w+", info.read_text())) if info.exists() else set()
     versions = [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES]
-    return ", ".join([platform.machine(), *(f for f in FLAGS if f in flags), *versions])
+    cores = f"cores {cores_per_device()}"
+    return ", ".join([platform.machine(), *(f for f in FLAGS if f in flags), cores, *versions])
 
 
 def digest(arrays: Iterable[Any]) -> str:
