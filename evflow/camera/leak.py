@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 STEPS = 8  # fixed-point iterations, each of which at least halves the error
@@ -19,3 +20,20 @@ def without_leak(eta_on: Any, eta_off: Any, leak_hz: Any, resets: bool = True) -
         seen = leak_hz * waited / xp.expm1(waited) if resets else leak_hz
         left = xp.maximum(eta_on - seen, 0.0)
     return left
+
+
+def leak_behind(seen_hz: float, others_hz: float) -> float:
+    """The leak in Hz of which `seen_hz` are seen among other noise events, which reset the memory:
+    the inverse of `without_leak`. Of its periods of 1 / leak seconds, only those are seen in which
+    none of the others comes.
+
+    Args:
+        seen_hz: ON events of the leak per second.
+        others_hz: all other noise events per second, ON and OFF.
+
+    Returns:
+        The leak in Hz; `seen_hz` itself where nothing resets the memory.
+    """
+    if min(seen_hz, others_hz) <= 0:
+        return max(seen_hz, 0.0)
+    return others_hz / math.log1p(others_hz / seen_hz)

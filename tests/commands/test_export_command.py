@@ -23,6 +23,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.cli import main
 from evflow.io.source import open_frames
 from evflow.light.response import linear_light
+from evflow.simulator import simulate
 
 
 def run(capsys: pytest.CaptureFixture[str], *command: object) -> tuple[int, str, str]:
@@ -91,18 +92,31 @@ def test_the_spread_is_that_of_the_camera_not_of_its_estimates() -> None:
     assert float(words[words.index("--sigma_thres") + 1]) == pytest.approx(0.05, rel=0.05)
 
 
-def test_scalars_are_the_nearest(camera: Path) -> None:
-    export, _ = export_camera(Camera.load(camera), "v2e")
-    words = export.text.split()
-    given = {n: float(words[words.index(f"--{n}") + 1]) for n in (
+def scalars(camera: Camera, **circuit: float) -> dict[str, float]:
+    """The numbers on v2e's command line."""
+    words = export_camera(camera, "v2e", sensor=SensorModel(**circuit))[0].text.split()
+    return {name: float(words[words.index(f"--{name}") + 1]) for name in (
         "pos_thres", "neg_thres", "sigma_thres", "leak_rate_hz", "shot_noise_rate_hz")}
+
+
+def test_scalars_are_the_nearest(camera: Path) -> None:
+    given = scalars(Camera.load(camera))
     known = {n: np.asarray(v) for n, v in vars(Camera.load(camera)).items()}
     assert given["sigma_thres"] == pytest.approx(0.03, rel=0.05)
     assert given["pos_thres"] == pytest.approx(np.median(known["theta_on"]), abs=1e-4)
-    # what v2e then makes at 128 DN: shot noise by halves, and leak of ON
-    half = given["shot_noise_rate_hz"] / 2 * (1 - 0.75 * 148 / 275)
-    on, off = np.median(known["eta_on"]), np.median(known["eta_off"])
-    assert 2 * half + given["leak_rate_hz"] == pytest.approx(on + off, rel=1e-2)
+
+
+@pytest.mark.parametrize(("on", "off"), [(0.9, 0.3), (0.5, 0.4), (0.4, 0.0)])
+def test_v2e_makes_the_measured_noise_of_its_scalars(on: float, off: float) -> None:
+    """v2e's pixel at rest at 128 DN: its shot noise takes back what has leaked."""
+    given = scalars(Camera.constant((4, 6), eta_on=on, eta_off=off))
+    leak, shot = given["leak_rate_hz"], given["shot_noise_rate_hz"]
+    frames, times = np.full((602, 40, 50), 128, np.float32), np.arange(602) * 100_000
+    quiet = Camera.constant((40, 50), eta_on=0.0, eta_off=0.0)
+    model = SensorModel(leak_hz=leak, shot_hz=shot, noise_resets_memory=True)
+    p = simulate(jax.random.key(0), frames, times, quiet, model=model).p
+    seen = np.array([p.sum(), (~p).sum()]) / (40 * 50 * 60.1)
+    np.testing.assert_allclose(seen, (on, off), rtol=0.03)
 
 
 def test_v2e_script_replaces_what_v2e_draws(

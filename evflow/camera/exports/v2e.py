@@ -5,6 +5,7 @@ Log map, thresholds and memory are those of evflow's `SensorModel(kind="v2e")`.
 from __future__ import annotations
 
 from evflow.camera.exports.common import GREY, LIGHT, SRGB, SWITCH, Export, Maps, Settings
+from evflow.camera.leak import leak_behind
 
 SCRIPT = '''"""A video through v2e with the measured thresholds and noise of every pixel.
 
@@ -83,8 +84,9 @@ def export(maps: Maps, s: Settings) -> Export:
         leak, on = s.leak_hz, s.eta_on - s.leak_seen
         shot = s.shot_hz or (on + s.eta_off) / GREY
     else:
-        leak, both = max(s.eta_on - s.eta_off, 0.0), min(s.eta_on, s.eta_off)
-        shot = 2 * (both if leak else (s.eta_on + s.eta_off) / 2) / GREY
+        more = max(s.eta_on - s.eta_off, 0.0)
+        both = 2 * s.eta_off if more else s.eta_on + s.eta_off
+        leak, shot = leak_behind(more, both), both / GREY
     gain = s.shot_hz / max(on + s.eta_off, 1e-12) if s.shot_hz else 1 / GREY
     command = (
         f"v2e -i VIDEO -o OUT --output_width {s.width} --output_height {s.height} "
@@ -94,7 +96,8 @@ def export(maps: Maps, s: Settings) -> Export:
     excess = (
         "the noise\n  that is not leak, as measured" if separate else
         "the OFF noise (measured {eta_off:.4f} Hz); what\n  ON has more of it ({eta_on:.4f} Hz) is "
-        "--leak_rate_hz, a regular drift" if leak else
+        "leak, a regular drift. --leak_rate_hz is higher than\n  that difference, as every shot "
+        "noise event takes the drift back" if leak else
         "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))
     values = vars(s) | {
         "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess,
