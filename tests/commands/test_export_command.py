@@ -119,6 +119,14 @@ def test_v2e_makes_the_measured_noise_of_its_scalars(on: float, off: float) -> N
     np.testing.assert_allclose(seen, (on, off), rtol=0.03)
 
 
+def test_openeb_is_given_no_rate_of_noise_that_it_does_not_make(camera: Path) -> None:
+    export = export_camera(Camera.load(camera), "openeb")[0]
+    words = export.text.split()
+    assert words[words.index("--shot_noise_rate_hz") + 1] == "0"
+    assert "add_noise.py" in export.scripts
+    assert "the busiest pixel" in export.text
+
+
 def test_v2e_script_replaces_what_v2e_draws(
     tmp_path: Path, camera: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch

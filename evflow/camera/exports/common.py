@@ -12,7 +12,7 @@ from evflow.camera.sensors import SensorModel
 
 Maps = Mapping[str, np.ndarray]
 PACE = (128 + 20) / 275  # cutoff at 128 DN over that at 255 DN, for a low-pass that follows light
-GREY = 1 - 0.75 * PACE  # shot noise of v2e and OpenEB at 128 DN over that at 0 DN
+GREY = 1 - 0.75 * PACE  # shot noise of v2e at 128 DN over that at 0 DN
 MAD = 1.4826  # standard deviations in a median absolute deviation of a normal distribution
 
 LIGHT = '''# the light, 0..255, of each byte: sRGB is undone, as evflow simulate does for videos

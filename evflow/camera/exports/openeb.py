@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import GREY, LIGHT, NOISE, SRGB, SWITCH, Export, Maps, Settings
+from evflow.camera.exports.common import LIGHT, NOISE, SRGB, SWITCH, Export, Maps, Settings
 
 LOW, HIGH = 0.01, 1.0  # where OpenEB clips thresholds
 
@@ -47,19 +47,21 @@ TEXT = '''The camera for OpenEB (https://github.com/prophesee-ai/openeb, metavis
 Every pixel (recommended):
     python run_openeb.py VIDEO FPS EVENTS.npz
 {srgb}
-Scalars only, its own sample:
+Scalars only, its own sample, without noise (add_noise.py adds it):
     python viz_video_to_event_simulator.py VIDEO --Cp {theta_on:.4f} --Cn {theta_off:.4f} \\
         --sigma_threshold {sigma:.4f} --refractory_period {dead_us} --cutoff_hz {cutoff_hz:.1f} \\
-        --leak_rate_hz 0 --shot_noise_rate_hz {shot:.4f}
+        --leak_rate_hz 0 --shot_noise_rate_hz 0
 
 What OpenEB cannot represent
 - Its sample takes the bytes of a video as light. Of an sRGB video it sees about half the contrast,
   and sends about half the events.
 - The command line has one sigma for both polarities (measured ON {sigma_on:.4f}, OFF
   {sigma_off:.4f}); thresholds are clipped to .01 .. 1{clipped}.
-- Noise: one rate for ON and OFF together, in the dark; and its simulator makes shot noise only in
-  intervals in which some pixel has an event, none in a static scene. So the script turns it off and
-  add_noise.py adds the measured maps; noise events do not reset the pixels' memories.
+- Noise: its shot noise does not have the rate that it is given. OpenEB draws it once per frame, but
+  divides its rate by the crossings of the busiest pixel in that frame, and one more: on one video a
+  quarter was left at 1000 frames per second, a hundredth at 40; a static scene gets none. So both
+  turn it off, and add_noise.py adds the measured maps, ON {eta_on:.4f} and OFF {eta_off:.4f} Hz per
+  pixel; noise events do not reset the pixels' memories.
 - Its low-pass has two poles; one pole was measured ({circuit}).
 - The log map is log(I / 255 + 1e-7); {refers_to}:
   dark scenes give other counts.
@@ -74,7 +76,6 @@ def export(maps: Maps, s: Settings) -> Export:
     values = vars(s) | {
         "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
         "clipped": clipped, "light": LIGHT + SWITCH, "srgb": SRGB,
-        "same_size": s.same_size, "refers_to": s.refers_to,
-        "shot": (s.eta_on + s.eta_off) / GREY}
+        "same_size": s.same_size, "refers_to": s.refers_to}
     return Export(TEXT.format(**values),
                   {"run_openeb.py": SCRIPT.format(**values), "add_noise.py": NOISE})
