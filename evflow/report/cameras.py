@@ -53,15 +53,16 @@ def write_cameras(
         if name.startswith("theta"):
             rows.append(["in % of contrast", _percent(row, "a"), _percent(row, "b"), "", "", ""])
     head = ["", *(page.text(name) for name in names), "ratio", "apart", "r"]
-    drawn = [figure(page.drawing(histograms(cameras, name, names), LABELS[name]), "", LABELS[name])
+    drawn = [figure(page.drawing(histograms(cameras, name, names, numbers[name]), LABELS[name]), "",
+                    LABELS[name])
              for name in ("theta_on", "theta_off", "eta_on", "eta_off")
              if numbers[name]["a"] is not None or numbers[name]["b"] is not None]
     panels = [
         Panel("verdict", "Side by side", paragraph(verdict(numbers, LABELS)) + table(head, rows)
               + paragraph(NOTE, "note")),
         Panel("pixels", "Their pixels", grid(drawn, 22) + paragraph(
-            "All pixels of the maps; those without events of their own show the camera's value.",
-            "note")),
+            "All pixels of the maps; those without events of their own show the camera's value. "
+            "Vertical lines: the values of the table above.", "note")),
         Panel("facts", "What was compared", table(
             ["", ""], [[page.text(k), f"<code>{page.text(v)}</code>"] for k, v in facts.items()],
             numeric=False))]
@@ -88,17 +89,24 @@ def _percent(row: dict[str, Any], side: str) -> str:
             spread(slope - 100.0, slope * row[f"{side}_std"]))
 
 
-def histograms(cameras: tuple[Camera, Camera], name: str, names: tuple[str, str]) -> bytes:
-    """Distributions of a parameter over the pixels of both cameras."""
-    maps = [np.asarray(getattr(camera, name)).ravel() for camera in cameras]
+def histograms(
+    cameras: tuple[Camera, Camera], name: str, names: tuple[str, str], row: dict[str, Any]
+) -> bytes:
+    """Distributions of a parameter over the pixels of both cameras, with lines at the values of
+    its row of the table. A map that was not measured holds the prior and is named, not drawn."""
+    maps = [None if row[side] is None else np.asarray(getattr(camera, name)).ravel()
+            for side, camera in zip("ab", cameras, strict=True)]
 
     def draw(axis: Any) -> None:
-        spans = [robust_range(values, 0.5) for values in maps]
+        spans = [robust_range(values, 0.5) for values in maps if values is not None]
         bins = np.linspace(min(s[0] for s in spans), max(s[1] for s in spans), 50)
-        for values, colour, label in zip(maps, COLOURS, names, strict=True):
+        for side, values, colour, label in zip("ab", maps, COLOURS, names, strict=True):
+            if values is None:
+                axis.plot([], [], " ", label=f"{label}: not measured")
+                continue
             axis.hist(np.clip(values, bins[0], bins[-1]), bins=bins, color=colour, alpha=0.45,
                       weights=np.full(values.size, 100.0 / values.size), label=label)
-            axis.axvline(np.median(values), color=colour, lw=1.2)
+            axis.axvline(row[side], color=colour, lw=1.2)
         axis.set(xlabel="natural log units" if name.startswith("theta") else "Hz per pixel",
                  ylabel="pixels [%]")
         axis.legend()
