@@ -41,7 +41,9 @@ class Pixels:
     for each map: with another --seed, the whole camera differs by as much."""
     sensor: Literal["clean", "noisy", "v2e", "esim", "dvs346", "dvs240", "paper"] = "clean"
     """Pixel circuit. clean, noisy: v2e's presets; v2e: its defaults; esim; dvs346, dvs240:
-    DVS-Voltmeter's; paper: the paper's. The options below change parts of it."""
+    DVS-Voltmeter's; paper: the paper's. The options below change parts of it. With --camera, clean
+    is the measured circuit; any other replaces it, and its noise, if it has some, comes on top of
+    the camera's."""
     theta_on: Annotated[float | None, value("THETA")] = None
     """ON threshold of every pixel (natural log); by default the sensor's, with its mismatch."""
     theta_off: Annotated[float | None, value("THETA")] = None
@@ -167,8 +169,7 @@ class Pixels:
 
         refuse(self, THRESHOLDS, "--camera has its own")
         if self.sensor != "clean":
-            print(f"note: --sensor {self.sensor} adds its own noise and limits to the camera's "
-                  "measured noise.", file=sys.stderr)
+            print(f"note: {self._replaced(path)}", file=sys.stderr)
         camera, std = Camera.load_with_std(path)
         warn_of_prior(read_undetermined(path), "simulated")
         if self.draw:
@@ -177,6 +178,22 @@ class Pixels:
                                       "--draw needs the camera.npz of evflow estimate.")
             camera = camera.drawn(jax.random.key(self.seed), std, read_shared(path))
         return camera
+
+    def _replaced(self, path: Path) -> str:
+        """What a sensor other than the measured one takes from the camera at `path`, and keeps."""
+        from evflow.camera.optics import read_sensor
+
+        (measured, optics), theirs = read_sensor(path), self.model()
+        parts = [f"cutoff {measured.cutoff_hz:.0f} Hz"] * bool(measured.cutoff_hz)
+        parts += [f"dead time {1e3 * measured.refractory_s:.2f} ms"] * bool(measured.refractory_s)
+        parts += [f"{optics.offset_dn:+.1f} DN of light"] * bool(optics.offset_dn)
+        lost = (f"Its measured circuit ({', '.join(parts)}) is replaced by" if parts else
+                "The circuit is")
+        own = ("whose own noise comes on top" if theirs.kind == "voltmeter" else
+               "whose leak and shot noise come on top" if theirs.leak_hz or theirs.shot_hz else
+               "which adds no noise")
+        return (f"the thresholds and noise rates of every pixel are the camera's. {lost} that of "
+                f"--sensor {self.sensor}, {own}.")
 
     def _drawn(self, shape: tuple[int, int]) -> Camera:
         """The sensor's thresholds with its mismatch; given thresholds are the same at every pixel,

@@ -361,3 +361,17 @@ def test_cameras_of_two_sizes_are_told(tmp_path: Path, capsys: pytest.CaptureFix
     paths = [str(Camera.constant((4, n)).save(tmp_path / f"{n}.npz")) for n in (5, 6)]
     assert main(["compare", *paths]) == 0
     assert "(4, 5) and (4, 6)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("sensor", "noise"), [
+    ("esim", "adds no noise"), ("paper", "adds no noise"), ("dvs346", "own noise comes on top"),
+    ("v2e", "leak and shot noise come on top"), ("clean", "")])
+def test_what_a_sensor_takes_from_a_camera_is_told(
+    video: Path, capsys: pytest.CaptureFixture[str], sensor: str, noise: str
+) -> None:
+    camera = Camera.constant((24, 32)).save(
+        video.with_name("camera.npz"), sensor_cutoff_hz=155.0, sensor_refractory_s=1e-3)
+    Pixels(camera=camera, sensor=sensor).pixels((32, 24))  # type: ignore[arg-type]
+    said = capsys.readouterr().err
+    assert noise in said
+    assert ("(cutoff 155 Hz, dead time 1.00 ms) is replaced" in said) == bool(noise)
