@@ -148,7 +148,8 @@ def judge_stream(
     judged = [Judged(
         grade, name, float(np.log(factor) / np.log(RATE[0])),
         f"{name} has {ratio:.2f} times the recorded rate ({where}).", matter, f"{ratio:.2f} ×",
-        "" if grade == "good" else _rate_advice(ratio, tested=ceiling is not None, lost=lost))]
+        "" if grade == "good" else _rate_advice(
+            ratio, _whose(numbers, name), tested=ceiling is not None, lost=lost))]
     r, best = numbers["counts"]["r"][key], ceiling[key] if ceiling else 1.0
     if r is not None and best is not None and best > 0:
         lost = 1 - r / best
@@ -161,19 +162,29 @@ def judge_stream(
     return judged
 
 
-def _rate_advice(ratio: float, *, tested: bool, lost: bool) -> str:
-    """tested: the stream is of an estimate on its own recording; lost: the motion between its
-    frames was."""
-    how = "many" if ratio > 1 else "few"
+def _whose(numbers: dict[str, Any], name: str) -> str:
+    """"" where both polarities have too many events, or both too few; else `name` and a space."""
+    ratios = numbers["rate_hz"]["ratio"]
+    alike = (min(ratios[key] or 1.0 for key in ("on", "off")) > RATE[0]
+             or max(ratios[key] or 1.0 for key in ("on", "off")) < 1 / RATE[0])
+    return "" if alike else f"{name} "
+
+
+def _rate_advice(ratio: float, whose: str, *, tested: bool, lost: bool) -> str:
+    """whose: "ON ", "OFF ", or "" for both; tested: the stream is of an estimate on its own
+    recording; lost: the motion between its frames was."""
+    seen = f"Too {'many' if ratio > 1 else 'few'}"
     if tested and lost:
-        return (f"Too {how} events are simulated, and between some frames the motion is lost (see "
-                "the event rate over time): slower motion, or a higher frame rate, comes first.")
+        return (f"{seen} {whose}events are simulated, and between some frames the motion is lost "
+                "(see the event rate over time): slower motion, or a higher frame rate, comes "
+                "first.")
     if tested:
-        return (f"Too {how} events are simulated: look for motion too fast for the frames, frames "
-                "with a gamma, flickering light, or clocks that are not aligned (evflow check).")
-    return (f"Too {how} synthetic events. If the thresholds of the simulation were chosen, "
-            f"{'raise' if ratio > 1 else 'lower'} them, or measure them (evflow estimate). If they "
-            "were measured on this recording, its report says what is wrong.")
+        return (f"{seen} {whose}events are simulated: look for motion too fast for the frames, "
+                "frames with a gamma, flickering light, or clocks that are not aligned (evflow "
+                "check).")
+    return (f"{seen} synthetic {whose}events. If the {whose}thresholds of the simulation were "
+            f"chosen, {'raise' if ratio > 1 else 'lower'} them, or measure them (evflow estimate). "
+            "If they were measured on this recording, its report says what is wrong.")
 
 
 def _pixels(found: CameraEstimate) -> list[Judged]:
@@ -228,7 +239,11 @@ def _timing(numbers: dict[str, Any], kinds: list[str]) -> str:
         for kind, median in medians.items())
     ratios = [numbers["rate_hz"]["ratio"][side] for side in ("on", "off")]
     off = [ratio for ratio in ratios if ratio and max(ratio, 1.0 / ratio) > RATE[0]]
-    if off and slower == {all(ratio < 1 for ratio in off)}:
+    fewer = {ratio < 1 for ratio in off}
+    if len(fewer) > 1:
+        return (f"Synthetic events follow each other {how} (medians: {seen}): judge times again "
+                "once the rates of ON and OFF agree.")
+    if off and slower == fewer:
         return (f"Synthetic events follow each other {how} (medians: {seen}), as there are too "
                 f"{'few' if off[0] < 1 else 'many'}: judge times again once the rates agree.")
     return (f"Synthetic events follow each other {how} (medians: {seen}): look at the refractory "

@@ -107,13 +107,17 @@ def test_twice_the_rate() -> None:
     assert numbers["intervals"]["wasserstein_decades"] == pytest.approx(np.log10(2), abs=0.03)
 
 
-def numbers_of(rate: float, own: float, around: float) -> dict[str, Any]:
-    """Numbers of streams whose rates and median times have these ratios, 1 s and 10 ms recorded."""
+def numbers_of(
+    rate: float, own: float, around: float, rate_off: float | None = None
+) -> dict[str, Any]:
+    """Numbers of streams whose rates and median times have these ratios, 1 s and 10 ms recorded.
+    rate_off: that of OFF, if it is another."""
     times = {kind: {"wasserstein_decades": abs(float(np.log10(ratio))), "ks": 0.5,
                     "median_s": {"real": 0.01, "synthetic": 0.01 * ratio}}
              for kind, ratio in (("intervals", own), ("neighbours", around))}
     times["neighbours"]["alone"] = {"real": 0.1, "synthetic": 0.1}
-    rates = {"real": {"on": 1.0, "off": 1.0}, "synthetic": {"on": rate, "off": rate}}
+    rates = {"real": {"on": 1.0, "off": 1.0}, "synthetic": {
+        "on": rate, "off": rate if rate_off is None else rate_off}}
     return {"rate_hz": {**rates, "ratio": rates["synthetic"]}, "net_r": 0.9,
             "counts": {"r": {"on": 0.9, "off": 0.9}}, **times}
 
@@ -133,6 +137,17 @@ def test_each_advice_is_given_once(ratios: tuple[float, float, float], said: lis
     assert len(found) == len(said)
     for words, expected in zip(found, said, strict=True):
         assert expected in words
+
+
+def test_advice_on_rates_names_the_polarity_where_they_contradict() -> None:
+    found = advice(judge_streams(numbers_of(0.4, 0.1, 1.0, 3.0)))
+    assert len(found) == 3
+    for words, expected in zip(found, ("Too few synthetic ON events. If the ON thresholds",
+                                       "Too many synthetic OFF events. If the OFF thresholds",
+                                       "once the rates of ON and OFF agree"), strict=True):
+        assert expected in words
+    one = advice(judge_streams(numbers_of(0.5, 1.0, 1.0, 1.0)))
+    assert [words[:29] for words in one] == ["Too few synthetic ON events. "]
 
 
 def test_polarities_are_counted_apart() -> None:
