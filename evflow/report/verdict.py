@@ -206,10 +206,18 @@ def judge_streams(numbers: dict[str, Any]) -> list[Judged]:
     judged = [j for key in ("on", "off")
               for j in judge_stream(numbers, key, "synthetic")]
     if (net := numbers["net_r"]) is not None and net < SWAPPED:
-        judged.insert(0, Judged(
+        swapped = Judged(
             "poor", "", 9.0, "ON and OFF are swapped in one of them: net events of small areas "
             f"and times anti-correlate (r = {net:.2f}).",
-            advice="Read one of them with --polarity invert."))
+            advice="Read one of them with --polarity invert, and compare again.")
+        # What else differs may follow from it: other advice would be about the wrong polarity.
+        return [swapped, *(dataclasses.replace(j, advice="") for j in judged + _times(numbers))]
+    return judged + _times(numbers)
+
+
+def _times(numbers: dict[str, Any]) -> list[Judged]:
+    """How events follow each other, and how many come without company."""
+    judged = []
     slow = [kind for kind in TIMES if graded(numbers[kind]["wasserstein_decades"] or 0.0, APART)
             != "good"]
     for kind, (what, _) in TIMES.items():
