@@ -100,8 +100,9 @@ class Compare(Reading):
 
     def run(self) -> None:
         from evflow.metrics.streams import compare
+        from evflow.report.alike import describe_streams, judge_streams
         from evflow.report.streams import write_comparison
-        from evflow.report.verdict import describe_streams, judge_streams, worst
+        from evflow.report.verdict import worst
 
         if self.out:
             need_folder(self.out)

@@ -9,18 +9,11 @@ from typing import Any
 import numpy as np
 
 from evflow.report import figures, page
+from evflow.report.alike import ALIKE, RULE_STREAMS, how_compared, judge_streams
 from evflow.report.page import Panel, bullets, figure, grid, number, paragraph, table
 from evflow.report.plots import event_image, require
 from evflow.report.resimulate import INSTANT_US, busiest_instant
-from evflow.report.verdict import (
-    ALIKE,
-    RULE_STREAMS,
-    Judged,
-    advice,
-    how_compared,
-    judge_streams,
-    worst,
-)
+from evflow.report.verdict import Judged, advice, worst
 from evflow.types import Events
 
 Names = tuple[str, str]

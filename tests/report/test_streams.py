@@ -14,15 +14,9 @@ import evflow
 from evflow import Events, EvflowDataError, Recording, read_recording, write_events
 from evflow.cli import main
 from evflow.metrics.streams import distances
+from evflow.report.alike import describe_streams, judge_streams
 from evflow.report.page import WIDEST, blocks, write_page
-from evflow.report.verdict import (
-    Judged,
-    advice,
-    describe_streams,
-    judge_streams,
-    sentences,
-    worst,
-)
+from evflow.report.verdict import Judged, advice, sentences, worst
 
 SIZE = (32, 24)
 
@@ -118,7 +112,8 @@ def numbers_of(
     times["neighbours"]["alone"] = {"real": 0.1, "synthetic": 0.1}
     rates = {"real": {"on": 1.0, "off": 1.0}, "synthetic": {
         "on": rate, "off": rate if rate_off is None else rate_off}}
-    return {"rate_hz": {**rates, "ratio": rates["synthetic"]}, "net_r": 0.9,
+    return {"events": {"real": 1000, "synthetic": 1000}, "covered": 1.0, "net_r": 0.9,
+            "rate_hz": {**rates, "ratio": rates["synthetic"]},
             "counts": {"r": {"on": 0.9, "off": 0.9}}, **times}
 
 
@@ -301,6 +296,26 @@ def test_a_span_of_numpys_numbers_is_ready_for_json() -> None:
 def test_names_that_are_not_utf8_are_written(tmp_path: Path) -> None:
     write_page(tmp_path / "page.html", "fl\udcff.h5", "of fl\udcff.h5", [], {"file": "fl\udcff.h5"})
     assert "fl\\udcff.h5" in (tmp_path / "page.html").read_text("utf-8")
+
+
+def test_too_little_is_not_called_alike() -> None:
+    """As few events, or as little time, agree with much."""
+    events = edge()
+    few = dataclasses.replace(events, **{n: getattr(events, n)[:60] for n in "xytp"})
+    numbers = evflow.compare(events, few)
+    assert worst(judge_streams(numbers)) == "fair"
+    assert "has only 60 events in" in describe_streams(numbers)
+    later = dataclasses.replace(events, t=events.t + int(0.97 * events.duration_us))
+    numbers = evflow.compare(events, later)
+    assert numbers["covered"] == pytest.approx(0.03, rel=0.01)
+    assert "Only 3.0% of the shorter stream's time" in describe_streams(numbers)
+
+
+def test_silence_has_no_share_of_lonely_events() -> None:
+    first, second = edge(), dataclasses.replace(edge(), t=edge().t + 1)
+    numbers = evflow.compare(first, second, span_us=(0, 1))
+    assert numbers["events"] == {"real": 2, "synthetic": 0}
+    assert "without company" not in describe_streams(numbers)
 
 
 def test_swapped_polarity_is_named() -> None:
