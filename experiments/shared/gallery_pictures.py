@@ -13,6 +13,7 @@ from evflow import SENSORS, Camera, Events, simulate
 from evflow.downstream import load_network, reconstruct, window_edges
 from evflow.downstream.flow import full_motion, window_flows
 from evflow.files.atomic import atomic_text
+from evflow.metrics.cameras import compare_cameras
 from evflow.report import bench_figures, plots
 from evflow.report.cameras import histograms as camera_pair
 from evflow.report.caption import captioned
@@ -110,7 +111,8 @@ def latency(scenes: Scenes, path: Path) -> None:
 
 
 def compared(scenes: Scenes, path: Path) -> None:
-    drawn = camera_pair((scenes.bench.camera, scenes.other.camera), "theta_on", ("one", "another"))
+    pair = scenes.bench.camera, scenes.other.camera
+    drawn = camera_pair(pair, "theta_on", ("one", "another"), compare_cameras(*pair)["theta_on"])
     atomic_text(path.with_suffix(".svg"), drawn, overwrite=True)
 
 
